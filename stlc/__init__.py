@@ -1,0 +1,1 @@
+"""Signal Temporal Logic in, a trained, checked and guarded controller out."""

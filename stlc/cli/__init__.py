@@ -1,0 +1,1 @@
+"""The terminal: arguments, one call, one rendering."""

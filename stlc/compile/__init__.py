@@ -1,0 +1,1 @@
+"""What "satisfied" means: numbers and formulas as one intermediate representation."""

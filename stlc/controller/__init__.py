@@ -1,0 +1,1 @@
+"""Who acts: tasks, policies, training, backup, deployment, worlds."""

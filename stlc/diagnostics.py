@@ -1,0 +1,177 @@
+"""What can be wrong, as data: codes, labels, help. Rendering is done in `stlc.cli.render`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from stlc.source import Span
+
+Severity = Literal["error", "warning"]
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """A secondary place, with what is to be said about it."""
+
+    span: Span
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """Edits that repair the finding: (span, replacement) pairs."""
+
+    edits: tuple[tuple[Span, str], ...]
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnostic:
+    """One finding.
+
+    Attributes:
+        code: an entry of `CODES`; codes that start with W are warnings.
+        message: one terse headline, in the user's terms.
+        span: the place; None when there is no text to point at.
+        label: said beside the carets.
+        labels: secondary places.
+        help: what to do, one entry a line.
+        note: why, one entry a line.
+        fix: edits that would repair it.
+    """
+
+    code: str
+    message: str
+    span: Span | None = None
+    label: str = ""
+    labels: tuple[Label, ...] = ()
+    help: tuple[str, ...] = ()
+    note: tuple[str, ...] = ()
+    fix: Fix | None = None
+
+    @property
+    def severity(self) -> Severity:
+        """Whether this is an error or a warning."""
+        return "warning" if self.code.startswith("W") else "error"
+
+    def with_note(self, text: str) -> Diagnostic:
+        """The same finding with one more note."""
+        return replace(self, note=(*self.note, text))
+
+
+class StlcError(Exception):
+    """Something is wrong with what the user gave; `exit_code` is that of the command line."""
+
+    exit_code = 3
+
+    def __init__(self, *diagnostics: Diagnostic) -> None:
+        super().__init__("; ".join(f"{d.code}: {d.message}" for d in diagnostics))
+        self.diagnostics = diagnostics
+
+
+class SpecError(StlcError):
+    """A specification is invalid."""
+
+
+class SystemFileError(StlcError):
+    """A system file is invalid."""
+
+
+class TraceError(StlcError):
+    """A recorded trace cannot be used."""
+
+
+class RunError(StlcError):
+    """A run folder or checkpoint does not fit what was asked of it."""
+
+
+class UsageError(StlcError):
+    """The command line is off, or a named file does not exist."""
+
+    exit_code = 2
+
+
+class MissingError(StlcError):
+    """The environment lacks something: a package, a compiler, room on the disk."""
+
+    exit_code = 5
+
+
+CODES: dict[str, str] = {
+    # reading
+    "E001": "a character that is not of the language",
+    "E002": "`|` used as absolute-value bars",
+    "E003": "not a specification: a mesh, a binary file, or not UTF-8",
+    "E004": "a file that is missing or cannot be read",
+    "E005": "nested too deeply, or too large",
+    # syntax
+    "E010": "something is missing or unexpected",
+    "E011": "a bracket that is never closed",
+    "E012": "a chain of `until`s without parentheses",
+    "E013": "`=` where `==` is meant",
+    "E014": "a vector directly after a temporal operator",
+    "E015": "a feature of the language that this version does not compile yet",
+    # names
+    "E101": "an unknown name",
+    "E102": "a name defined twice",
+    "E103": "a signal that the system does not have",
+    "E104": "a constant that differs between specification and system",
+    "E105": "a definition that refers to itself, or wrong arguments",
+    # types and units
+    "E201": "a number where a formula is needed",
+    "E202": "a formula where a number is needed",
+    "E203": "units that do not agree",
+    "E204": "`==` between real numbers",
+    "E205": "an operation that its operands do not have",
+    # time
+    "E301": "an interval that ends before it starts",
+    "E302": "a future operator with a negative bound",
+    "E303": "an interval bound that is not a constant",
+    "W304": "an interval bound that is not a whole number of steps",
+    "E305": "an interval without a sample",
+    "E306": "more signal is needed than there is",
+    "E307": "an absolute interval under another temporal operator",
+    "E309": "a past operator without a finite timer",
+    "E310": "an absolute operator whose body looks into the future",
+    "E311": "`T`, `dt` or a number of steps without a system that says what they are",
+    "W101": "a bare number as an interval bound",
+    # numbers
+    "E401": "division or modulo by zero",
+    "W402": "a divisor whose range contains 0",
+    "W403": "a modulo in a predicate to be trained",
+    # tags and meaning
+    "E501": "an unknown or misplaced tag",
+    "W502": "a safety requirement that cannot constrain a prefix",
+    "W503": "a requirement that is satisfied vacuously",
+    # traces
+    "E601": "a trace that lacks a signal",
+    "E602": "a trace whose time is not uniform",
+    "E603": "a trace file that cannot be read, or is not safe to read",
+    "E604": "a trace that holds NaN or infinite values",
+    "E605": "a trace whose arrays do not fit together",
+    # system files
+    "S100": "not a YAML document",
+    "S101": "an unknown key",
+    "S102": "a key that is given twice, or a missing key",
+    "S103": "a value of the wrong kind",
+    "S201": "an expression that is not of the expression language",
+    "S202": "a name that is not a state",
+    "S203": "a formula or a number in the wrong place",
+    "S204": "a control without a range, or bounds in the wrong order",
+    "S206": "a world or plugin that cannot be loaded",
+    "S301": "initial states that are (nearly) all rejected",
+    "S302": "dynamics that give NaN or infinity",
+    "W601": "an acceptance rate of initial states below 1 %",
+    # runs
+    "R101": "no run, or a run folder that is damaged",
+    "R102": "a checkpoint of another specification or system",
+    "R103": "a run that is already finished",
+    "R104": "options that cannot change on resume",
+    "R201": "no room on the disk, or a file that cannot be written",
+    "R301": "a package that is not installed",
+    "R302": "a device that is not there",
+    "R401": "training diverged",
+    "U101": "a command line that cannot be understood",
+    "U102": "a file that does not exist",
+}

@@ -1,0 +1,1 @@
+"""How state moves: hybrid systems declared in YAML."""

@@ -1,0 +1,1 @@
+"""What was written: concrete syntax, AST, parser, printer."""

@@ -1,0 +1,1 @@
+"""How a recorded trace is judged and explained."""
