@@ -1,0 +1,208 @@
+"""Files: read with care, written beside and then renamed, found by name."""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from stlc.diagnostics import Diagnostic, MissingError, SpecError, UsageError
+from stlc.registry import closest
+from stlc.source import Source
+
+MAX_BYTES = 10_000_000
+LIBRARY = Path(__file__).parent / "library"
+
+_SYSTEM_SUFFIXES = ("", ".yaml", ".yml")
+_MESH = re.compile(r"\s*(solid\b[^\n]*)\n\s*(facet|endsolid)\b")
+
+# ----------------------------------------------------------------------- reading
+
+
+def read_source(path: Path | str) -> Source:
+    """The text of a file; `-` is the standard input.
+
+    Raises:
+        UsageError: U102, there is no such file, or it cannot be opened.
+        SpecError: E003, a mesh, a binary file or not UTF-8; E005, larger than `MAX_BYTES`.
+    """
+    name = str(path)
+    if name == "-":
+        return _decode("<stdin>", sys.stdin.buffer.read(MAX_BYTES + 1))
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise UsageError(_missing(path)) from None
+    except OSError as error:
+        raise UsageError(Diagnostic("U102", f"cannot read `{name}`: {_reason(error)}")) from None
+    return _decode(name, data)
+
+
+def _missing(path: Path) -> Diagnostic:
+    near = closest(path.name, _siblings(path.parent))
+    advice = (f"did you mean `{path.parent / near}`?",) if near else ()
+    return Diagnostic("U102", f"there is no file `{path}`", help=advice)
+
+
+def _siblings(folder: Path) -> list[str]:
+    with suppress(OSError):
+        return sorted(entry.name for entry in folder.iterdir() if entry.is_file())
+    return []
+
+
+def _reason(error: OSError) -> str:
+    return (error.strerror or type(error).__name__).lower()
+
+
+def _decode(name: str, data: bytes) -> Source:
+    if len(data) > MAX_BYTES:
+        raise SpecError(Diagnostic("E005", f"`{name}` is larger than {MAX_BYTES // 1_000_000} MB"))
+    if _is_binary_mesh(data):
+        raise SpecError(_mesh(name, None))
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise SpecError(_not_utf8(name, data, error)) from None
+    if "\0" in text:
+        raise SpecError(Diagnostic("E003", f"`{name}` is a binary file, not a text"))
+    source = Source(name, text)
+    if _MESH.match(text):
+        raise SpecError(_mesh(name, source))
+    return source
+
+
+def _is_binary_mesh(data: bytes) -> bool:
+    """80 bytes of header, a count of triangles, 50 bytes for each."""
+    return len(data) >= 84 and b"\0" in data and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little")
+
+
+def _mesh(name: str, source: Source | None) -> Diagnostic:
+    start = 0 if source is None else len(source.text) - len(source.text.lstrip())
+    return Diagnostic(
+        "E003",
+        f"`{name}` is a 3-D mesh, not a specification",
+        span=None if source is None else source.span(start, start + len("solid")),
+        label="" if source is None else "ASCII stereolithography starts like this",
+        note=(
+            "both formats use the suffix .stl; stlc specifications are UTF-8 text that start with a "
+            "declaration or `spec NAME`",
+        ),
+    )
+
+
+def _not_utf8(name: str, data: bytes, error: UnicodeDecodeError) -> Diagnostic:
+    if b"\0" in data[:1024]:
+        return Diagnostic("E003", f"`{name}` is a binary file, not a text")
+    line = data.count(b"\n", 0, error.start) + 1
+    return Diagnostic(
+        "E003",
+        f"`{name}` is not UTF-8: byte 0x{data[error.start]:02x} in line {line}",
+        help=("save it as UTF-8 in your editor",),
+    )
+
+
+# ----------------------------------------------------------------------- writing
+
+
+def write_atomic(path: Path | str, data: bytes | str) -> None:
+    """Write a whole file so that a reader sees the old one or the new one, never a part.
+
+    Raises:
+        MissingError: R201, no room or no permission; the old file is untouched.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+@contextmanager
+def atomic_path(path: Path | str) -> Iterator[Path]:
+    """A path beside `path`, with the same suffix, that replaces it when the block ends well.
+
+    Missing folders are made. What is no regular file (a pipe, `/dev/null`) is written in place.
+
+    Raises:
+        MissingError: R201, no room or no permission; the old file is untouched, the new one removed.
+    """
+    path = Path(path)
+    target = path.resolve()
+    if target.exists() and not target.is_file() and not target.is_dir():
+        with _reported(path):
+            yield target
+        return
+    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
+    try:
+        with _reported(path):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            yield temporary
+            _flush(temporary)
+            temporary.replace(target)
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _reported(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise MissingError(Diagnostic("R201", f"cannot write `{path}`: {_reason(error)}")) from error
+
+
+def _flush(path: Path) -> None:
+    with path.open("rb+") as file:
+        os.fsync(file.fileno())
+
+
+# ----------------------------------------------------------------------- finding
+
+
+def find_system(name: str, spec_path: Path | None = None) -> Path:
+    """The system file called `name`: as given, beside the spec, in `examples`, among the installed ones.
+
+    The suffix `.yaml` may be left out. Raises UsageError (U102) with the places looked at.
+    """
+    folders = [Path()]
+    if spec_path is not None:
+        folders.append(spec_path.parent)
+    folders += [Path("examples"), LIBRARY]
+    for folder in folders:
+        for suffix in _SYSTEM_SUFFIXES:
+            path = folder / f"{name}{suffix}"
+            if path.is_file():
+                return path
+    raise UsageError(_no_such("system", name, folders))
+
+
+def find_trace(name: str, runs: Path = Path("runs")) -> Path:
+    """The trace called `name`: as given, then in the newest run below `runs`.
+
+    Raises UsageError (U102) with the places looked at.
+    """
+    folders = [Path(), runs / "latest"]
+    for folder in folders:
+        path = folder / name
+        if path.is_file():
+            return path
+    raise UsageError(_no_such("trace", name, folders))
+
+
+def _no_such(kind: str, name: str, folders: Sequence[Path]) -> Diagnostic:
+    wanted = Path(name).name
+    nearby = {entry: folder for folder in reversed(folders) for entry in _siblings(folder)}
+    if kind == "system":
+        nearby = {entry: folder for entry, folder in nearby.items() if entry.endswith((".yaml", ".yml"))}
+    near = closest(wanted, nearby)
+    places = ", ".join(dict.fromkeys(_shown(folder / name) for folder in folders))
+    advice = (f"did you mean `{_shown(nearby[near] / near)}`?",) if near else ()
+    return Diagnostic("U102", f"there is no {kind} `{name}`", help=advice, note=(f"looked at: {places}",))
+
+
+def _shown(path: Path) -> str:
+    return f"installed: {path.name}" if LIBRARY in path.parents else str(path)

@@ -1,0 +1,99 @@
+"""Names to plugins, with "did you mean"."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from difflib import SequenceMatcher
+from typing import Generic, TypeVar
+
+from stlc.diagnostics import Diagnostic, UsageError
+
+T = TypeVar("T")
+U = TypeVar("U")
+
+_SIMILAR = 0.6
+
+
+def closest(name: str, candidates: Iterable[str]) -> str | None:
+    """The candidate that `name` is most probably a slip of, or None if none is near.
+
+    One that differs in case alone comes first; then up to a third of the letters (at least one) may be
+    inserted, dropped, replaced or swapped with their neighbour; then what difflib calls similar.
+    """
+    pool = sorted({candidate for candidate in candidates if candidate and candidate != name})
+    folded = name.casefold()
+    scored = [(_distance(folded, candidate.casefold()), candidate) for candidate in pool]
+    within = [item for item in scored if item[0] <= max(1, len(name) // 3) and item[0] < len(name)]
+    if within:
+        return min(within, key=lambda item: (item[0], -_ratio(name, item[1]), item[1]))[1]
+    best = max(pool, key=lambda candidate: _ratio(folded, candidate.casefold()), default=None)
+    return best if best is not None and _ratio(folded, best.casefold()) >= _SIMILAR else None
+
+
+def _ratio(left: str, right: str) -> float:
+    return SequenceMatcher(None, left, right).ratio()
+
+
+def _distance(left: str, right: str) -> int:
+    """Edits between two words; a swap of neighbours counts once (optimal string alignment)."""
+    before: list[int] = []
+    above = list(range(len(right) + 1))
+    for i, a in enumerate(left, start=1):
+        row = [i]
+        for j, b in enumerate(right, start=1):
+            cost = min(above[j] + 1, row[j - 1] + 1, above[j - 1] + (a != b))
+            if i > 1 and j > 1 and a == right[j - 2] and left[i - 2] == b:
+                cost = min(cost, before[j - 2] + 1)
+            row.append(cost)
+        before, above = above, row
+    return above[-1]
+
+
+class Registry(Generic[T]):
+    """A table of plugins of one kind, filled by a decorator.
+
+    Args:
+        kind: what one entry is, in the singular and in the user's terms: "integrator".
+    """
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+        self._entries: dict[str, T] = {}
+
+    def register(self, name: str) -> Callable[[U], U]:
+        """A decorator that enters what it decorates as `name`. Raises ValueError if the name is taken."""
+
+        def enter(entry: U) -> U:
+            if name in self._entries:
+                raise ValueError(f"{self.kind} `{name}` is registered twice")
+            self._entries[name] = entry  # type: ignore[assignment]
+            return entry
+
+        return enter
+
+    def get(self, name: str) -> T:
+        """The entry `name`. Raises UsageError (U101) that names the nearest entry and all others."""
+        if name not in self._entries:
+            finding = Diagnostic("U101", f"unknown {self.kind} `{name}`", help=(self.suggest(name),))
+            raise UsageError(finding)
+        return self._entries[name]
+
+    def suggest(self, name: str) -> str:
+        """One line of help for somebody who wrote `name`."""
+        known = f"{self.kind}s: {', '.join(self.names)}" if self._entries else f"there is no {self.kind}"
+        near = closest(name, self._entries)
+        return known if near is None else f"did you mean `{near}`?  {known}"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All names, in the order in which they were entered."""
+        return tuple(self._entries)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._entries
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
