@@ -1,0 +1,205 @@
+"""Physical units: dimensions as exponent vectors, scales to SI as exact fractions.
+
+Angles are dimensionless (`rad` is 1, `deg` is pi/180), and so are `%` and `1`. `steps` is no physical unit;
+whoever reads an interval handles it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from types import MappingProxyType
+
+Dims = tuple[int, int, int, int, int]
+
+_BASES = ("m", "kg", "s", "A", "K")
+_NONE: Dims = (0, 0, 0, 0, 0)
+_FACTOR = re.compile(r"(?P<symbol>[A-Za-zµ°Ω]+|%|1)(?:\^?(?P<power>[+-]?\d+)|(?P<raised>⁻?[¹²³⁴]))?")
+_RAISED = str.maketrans("⁻¹²³⁴", "-1234")
+_MAX_POWER = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """A physical unit. Equality ignores how it is written.
+
+    Attributes:
+        dims: exponents of m, kg, s, A and K.
+        ratio: how many SI units one of it is, exactly (pi to double precision).
+        text: as written; "" where nothing was written, which is how undeclared units are told from `1`.
+    """
+
+    dims: Dims = _NONE
+    ratio: Fraction = Fraction(1)
+    text: str = field(default="", compare=False)
+
+    @property
+    def scale(self) -> float:
+        """How many SI units one of it is."""
+        return float(self.ratio)
+
+    @property
+    def dimensionless(self) -> bool:
+        """Whether all exponents are 0."""
+        return self.dims == _NONE
+
+    @property
+    def si(self) -> Unit:
+        """The SI unit of the same dimensions."""
+        return self if self.ratio == 1 else Unit(self.dims, text=_si_text(self.dims))
+
+    def __mul__(self, other: Unit) -> Unit:
+        return _product(((self, 1), (other, 1)))
+
+    def __truediv__(self, other: Unit) -> Unit:
+        return _product(((self, 1), (other, -1)))
+
+    def __pow__(self, power: int | Fraction) -> Unit:
+        """The unit to a power. Raises ValueError where an exponent would not be whole."""
+        power = Fraction(power)
+        if power.denominator == 1:
+            return _product(((self, int(power)),))
+        dims = tuple(exponent * power for exponent in self.dims)
+        if any(exponent.denominator != 1 for exponent in dims):
+            raise ValueError(f"[{self}] to the power {power} has no unit")
+        whole = _dims(int(exponent) for exponent in dims)
+        return Unit(whole, Fraction(self.scale ** float(power)), text=_si_text(whole))
+
+    def __str__(self) -> str:
+        return self.text or _si_text(self.dims)
+
+
+DIMENSIONLESS = Unit()
+
+
+def _dims(exponents: Iterable[int]) -> Dims:
+    m, kg, s, amp, kelvin = exponents
+    return (m, kg, s, amp, kelvin)
+
+
+def _symbols() -> Mapping[str, Unit]:
+    pi = Fraction(math.pi)
+    table: dict[str, Unit] = {}
+
+    def define(text: str, dims: Dims, ratio: Fraction | int | str = 1) -> None:
+        table[text] = Unit(dims, Fraction(ratio), text)
+
+    def prefixed(text: str, dims: Dims, prefixes: str) -> None:
+        powers = {"": 0, "n": -9, "u": -6, "µ": -6, "m": -3, "c": -2, "k": 3, "M": 6, "G": 9}
+        for prefix in ("", *prefixes):
+            define(prefix + text, dims, Fraction(10) ** powers[prefix])
+
+    for text, dims, prefixes in (
+        ("m", (1, 0, 0, 0, 0), "nuµmck"),
+        ("s", (0, 0, 1, 0, 0), "nuµm"),
+        ("A", (0, 0, 0, 1, 0), "uµmk"),
+        ("K", (0, 0, 0, 0, 1), "m"),
+        ("N", (1, 1, -2, 0, 0), "mkM"),
+        ("Nm", (2, 1, -2, 0, 0), "mk"),
+        ("J", (2, 1, -2, 0, 0), "mkMG"),
+        ("W", (2, 1, -3, 0, 0), "mkMG"),
+        ("Pa", (-1, 1, -2, 0, 0), "kMG"),
+        ("V", (2, 1, -3, -1, 0), "mk"),
+        ("Hz", (0, 0, -1, 0, 0), "kMG"),
+        ("C", (0, 0, 1, 1, 0), "m"),
+        ("ohm", (2, 1, -3, -2, 0), "k"),
+        ("rad", _NONE, "m"),
+    ):
+        prefixed(text, dims, prefixes)
+    for text, dims, ratio in (
+        ("kg", (0, 1, 0, 0, 0), 1),
+        ("g", (0, 1, 0, 0, 0), "1/1000"),
+        ("mg", (0, 1, 0, 0, 0), "1/1000000"),
+        ("min", (0, 0, 1, 0, 0), 60),
+        ("h", (0, 0, 1, 0, 0), 3600),
+        ("bar", (-1, 1, -2, 0, 0), 100_000),
+        ("Ah", (0, 0, 1, 1, 0), 3600),
+        ("Wh", (2, 1, -2, 0, 0), 3600),
+        ("kWh", (2, 1, -2, 0, 0), 3_600_000),
+        ("l", (3, 0, 0, 0, 0), "1/1000"),
+        ("deg", _NONE, pi / 180),
+        ("°", _NONE, pi / 180),
+        ("rpm", (0, 0, -1, 0, 0), pi / 30),
+        ("%", _NONE, "1/100"),
+        ("1", _NONE, 1),
+    ):
+        define(text, dims, ratio)
+    table["Ω"] = table["ohm"]
+    return MappingProxyType(table)
+
+
+SYMBOLS = _symbols()
+
+
+def parse_unit(text: str) -> Unit:
+    """The unit that `text` writes: a product or quotient of powers, e.g. `m/s^2`, `kg*m`, `1/s`, `deg`.
+
+    Raises:
+        ValueError: it is not a unit; the message says what is wrong.
+    """
+    cleaned = text.strip()
+    if not cleaned:
+        raise ValueError("an empty unit")
+    dims, ratio = _NONE, Fraction(1)
+    for symbol, power in _factors(cleaned):
+        unit = SYMBOLS.get(symbol)
+        if unit is None:
+            raise ValueError(f"unknown unit `{symbol}`")
+        if abs(power) > _MAX_POWER:
+            raise ValueError(f"the power {power} of `{symbol}` is too large")
+        dims = _dims(a + b * power for a, b in zip(dims, unit.dims, strict=True))
+        ratio *= unit.ratio**power
+    return Unit(dims, ratio, cleaned)
+
+
+def same_dims(a: Unit, b: Unit) -> bool:
+    """Whether quantities of these units can be added and compared."""
+    return a.dims == b.dims
+
+
+def _factors(text: str) -> list[tuple[str, int]]:
+    """(symbol, power) pairs; every `/` divides by the one factor behind it."""
+    factors: list[tuple[str, int]] = []
+    position, sign = 0, 1
+    while True:
+        match = _FACTOR.match(text, position)
+        if match is None:
+            raise ValueError(f"`{text}` is not a unit")
+        raised = (match["raised"] or "").translate(_RAISED)
+        factors.append((match["symbol"], sign * int(match["power"] or raised or 1)))
+        rest = text[match.end() :].lstrip()
+        if not rest:
+            return factors
+        sign = -1 if rest[0] == "/" else 1
+        tail = rest[1:] if rest[0] in "/*·." else rest
+        position = len(text) - len(tail.lstrip())
+
+
+def _product(parts: Iterable[tuple[Unit, int]]) -> Unit:
+    """The product of units to whole powers; its text keeps the symbols that were written."""
+    dims, ratio = _NONE, Fraction(1)
+    powers: dict[str, int] = {}
+    for unit, power in parts:
+        dims = _dims(a + b * power for a, b in zip(dims, unit.dims, strict=True))
+        ratio *= unit.ratio**power
+        for symbol, exponent in _factors(unit.text) if unit.text else ():
+            powers[symbol] = powers.get(symbol, 0) + exponent * power
+    return Unit(dims, ratio, _text(powers) if any(unit.text for unit, _ in parts) else "")
+
+
+def _si_text(dims: Dims) -> str:
+    return _text(dict(zip(_BASES, dims, strict=True)))
+
+
+def _text(powers: Mapping[str, int]) -> str:
+    """`kg*m/s^2`, `1/s`, `1`."""
+
+    def written(symbol: str, power: int) -> str:
+        return symbol if power == 1 else f"{symbol}^{power}"
+
+    above = [written(s, p) for s, p in powers.items() if p > 0 and s != "1"]
+    below = [written(s, -p) for s, p in powers.items() if p < 0 and s != "1"]
+    return "/".join(["*".join(above) or "1", *below])
