@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 from rich.console import Console, Group
@@ -77,7 +78,7 @@ def sparkline(values: list[float], *, width: int = SPARK_WIDTH, blocks: str = BL
         return ""
     count = min(width, len(values))
     edges = [round(i * len(values) / count) for i in range(count + 1)]
-    means = [sum(values[a:b]) / (b - a) for a, b in zip(edges, edges[1:], strict=False)]
+    means = [sum(values[a:b]) / (b - a) for a, b in pairwise(edges)]
     low, high = min(means), max(means)
     top = len(blocks) - 1
     if high - low < 1e-9:
@@ -167,7 +168,7 @@ class Progress:
         return BLOCKS if self._unicode else ASCII_BLOCKS
 
     def _plain(self, text: str) -> str:
-        return text if self._unicode else text.replace("·", "|").replace("–", "-")
+        return text if self._unicode else text.replace("·", "|")
 
     def _print(self, text: str) -> None:
         self.console.print(Text(self._plain(text)), soft_wrap=True)
@@ -206,7 +207,7 @@ class Progress:
 
     def _accuracy_parts(self) -> list[str]:
         accuracy, feasible = self._row.get("accuracy"), self._row.get("feasible")
-        parts = ["–" if accuracy is None else f"{accuracy:.3f}"]
+        parts = ["-" if accuracy is None else f"{accuracy:.3f}"]
         if feasible:
             parts.append(f"known feasible {feasible:.3f}")
             if accuracy is not None:

@@ -1,1 +1,35 @@
-"""Plots, animation, reports."""
+"""Pictures of training and deployment: curves, signals, failures, animation, one report.
+
+Drawing needs matplotlib and Pillow (`pip install 'stlc[plot]'`). Nothing here imports them before a picture
+is asked for, so that training and deployment work without; `available` says whether they are there.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from stlc.diagnostics import Diagnostic, MissingError
+
+_PACKAGES = {"matplotlib": "matplotlib", "PIL": "pillow"}
+
+
+def available() -> bool:
+    """Whether pictures can be drawn here."""
+    return not _missing()
+
+
+def require_drawing() -> None:
+    """Raise MissingError R301 where pictures cannot be drawn."""
+    missing = _missing()
+    if missing:
+        raise MissingError(
+            Diagnostic(
+                "R301",
+                f"pictures need {' and '.join(missing)}, which {'is' if len(missing) == 1 else 'are'} not installed",
+                help=("pip install 'stlc[plot]'",),
+            )
+        )
+
+
+def _missing() -> list[str]:
+    return [package for module, package in _PACKAGES.items() if find_spec(module) is None]
