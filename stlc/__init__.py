@@ -1,1 +1,3 @@
 """Signal Temporal Logic in, a trained, checked and guarded controller out."""
+
+__version__ = "0.1.0"

@@ -169,9 +169,12 @@ CODES: dict[str, str] = {
     "R103": "a run that is already finished",
     "R104": "options that cannot change on resume",
     "R201": "no room on the disk, or a file that cannot be written",
+    "R202": "not enough memory",
     "R301": "a package that is not installed",
     "R302": "a device that is not there",
     "R401": "training diverged",
     "U101": "a command line that cannot be understood",
     "U102": "a file that does not exist",
+    # the tool itself
+    "B001": "a bug in stlc",
 }

@@ -1,0 +1,114 @@
+"""The program `stlc`: its commands, the options that stand before or after them, and `main`.
+
+Nothing is imported here that a command does not need to be described: a command's body imports what it
+works with, so `stlc --help` stays fast.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from importlib import import_module
+from types import FrameType
+from typing import Annotated
+
+import typer
+
+from stlc import __version__
+from stlc.cli.errors import TERMINATED
+from stlc.cli.errors import report as report_error
+from stlc.cli.options import describe
+from stlc.cli.output import COLOR, ColorMode, emit, tolerate_closed
+
+app = typer.Typer(
+    name="stlc",
+    help=describe(
+        "Train, check and guard controllers from Signal Temporal Logic requirements.",
+        "stlc train specs/traffic.stl --system car.yaml --budget 60s",
+        "stlc simulate --backup",
+        "stlc check trace.npz",
+    ),
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for group in ("train", "simulate", "check", "compile", "report"):
+    with suppress(ModuleNotFoundError):
+        import_module(f"stlc.cli.{group}").register(app)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        emit(f"stlc {__version__}")
+        raise typer.Exit
+
+
+@app.callback(invoke_without_command=True)
+def _global_options(
+    context: typer.Context,
+    color: Annotated[ColorMode, typer.Option("--color", help="Whether the output may be coloured.")] = "auto",
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", is_eager=True, callback=_show_version)
+    ] = False,
+) -> None:
+    COLOR.set(color)
+    if context.invoked_subcommand is None and not version:
+        emit(context.get_help())
+        raise typer.Exit(2)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code.
+
+    The one place where an exception becomes a message and an exit code; see `stlc.cli.errors`.
+
+    Args:
+        argv: the arguments without the program's name; by default those of the process.
+    """
+    front, rest = _split(sys.argv[1:] if argv is None else argv)
+    try:
+        with _terminable():
+            command = typer.main.get_command(app)
+            code = command.main(args=[*front, *rest], prog_name="stlc", standalone_mode=False)
+    except BaseException as error:  # the boundary
+        code = report_error(error, rest)
+    for stream in (sys.stdout, sys.stderr):
+        with tolerate_closed(stream):
+            stream.flush()
+    return code if isinstance(code, int) else 0
+
+
+def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The options of the whole program and the rest: `--color` may stand before or after the command."""
+    front: list[str] = []
+    rest: list[str] = []
+    queue = list(arguments)
+    while queue and queue[0] != "--":
+        word = queue.pop(0)
+        if word == "--color" and queue:
+            front += [word, queue.pop(0)]
+        elif word.startswith("--color="):
+            front.append(word)
+        else:
+            rest.append(word)
+    return front, [*rest, *queue]
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """While a command runs, SIGTERM unwinds it (so that its `finally` blocks run) and exits 143."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _terminate(_number: int, _frame: FrameType | None) -> None:
+    raise SystemExit(TERMINATED)

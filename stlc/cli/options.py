@@ -1,0 +1,52 @@
+"""Options that several commands share, and how their help is laid out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from stlc.diagnostics import Diagnostic, UsageError
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on the standard output.")]
+SystemOption = Annotated[
+    str | None,
+    typer.Option(
+        "--system",
+        "-s",
+        metavar="FILE",
+        help="The system: as given, beside the spec, in examples/, or an installed one.",
+    ),
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NAME=VALUE", help="Change a constant of the spec or a key of the system."),
+]
+
+
+def describe(sentence: str, *examples: str, note: str = "") -> str:
+    """The help of a command: one sentence, examples as they are typed, then what else is to be known."""
+    shown = "\b\nExample:\n" if len(examples) == 1 else "\b\nExamples:\n"
+    lines = "\n".join(f"  {example}" for example in examples)
+    return "\n\n".join(part for part in (sentence, shown + lines, note) if part)
+
+
+def parse_overrides(pairs: Sequence[str] | None) -> dict[str, str]:
+    """`["T_red=3 s"]` as `{"T_red": "3 s"}`.
+
+    Raises:
+        UsageError: U101, an entry is no `NAME=VALUE`, or a name is given twice.
+    """
+    values: dict[str, str] = {}
+    for pair in pairs or ():
+        name, sign, value = (part.strip() for part in pair.partition("="))
+        if not (name and sign and value):
+            finding = Diagnostic(
+                "U101", f"`--set {pair}` is not of the form NAME=VALUE", help=("write it as --set T_red=3s",)
+            )
+            raise UsageError(finding)
+        if name in values:
+            raise UsageError(Diagnostic("U101", f"`--set {name}=…` is given twice"))
+        values[name] = value
+    return values

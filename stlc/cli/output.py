@@ -1,0 +1,144 @@
+"""What reaches the terminal: the result on the standard output, the talk on the standard error.
+
+A reader that goes away (`stlc … | head`) is no error: what is left is dropped and the exit code stays
+that of the work.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TYPE_CHECKING, Literal, TextIO
+
+from stlc.diagnostics import Diagnostic
+from stlc.jsontext import dumps, plain
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+ColorMode = Literal["auto", "always", "never"]
+
+COLOR: ContextVar[ColorMode] = ContextVar("stlc_color", default="auto")
+
+
+def emit(text: str) -> None:
+    """Write `text` and a line break to the standard output."""
+    _write(sys.stdout, text)
+
+
+def say(text: str) -> None:
+    """Write `text` and a line break to the standard error."""
+    _write(sys.stderr, text)
+
+
+def emit_json(
+    schema: str,
+    *,
+    ok: bool,
+    exit_code: int,
+    diagnostics: Iterable[Diagnostic] = (),
+    result: object = None,
+) -> None:
+    """Write the one JSON document of a command to the standard output.
+
+    Args:
+        schema: name and major number, such as "check/1".
+        ok: whether the answer is yes.
+        exit_code: the one that the command is about to exit with.
+        diagnostics: findings, warnings among them.
+        result: what was computed; numbers that are not finite become texts.
+    """
+    from stlc import __version__
+    from stlc.cli.render import to_json
+
+    document = {
+        "stlc": __version__,
+        "schema": schema,
+        "ok": ok,
+        "exit_code": exit_code,
+        "diagnostics": [to_json(finding) for finding in diagnostics],
+        "result": plain(result),
+    }
+    emit(dumps(document, indent=2))
+
+
+def show_diagnostics(diagnostics: Sequence[Diagnostic]) -> None:
+    """Render findings on the standard error."""
+    from stlc.cli.render import render_text
+
+    if diagnostics:
+        say(render_text(tuple(diagnostics), color=wants_color(sys.stderr)).rstrip("\n"))
+
+
+def wants_color(stream: TextIO) -> bool:
+    """Whether colour may be written to `stream`: by `--color`, then `NO_COLOR`, then being a terminal."""
+    mode = COLOR.get()
+    if mode != "auto":
+        return mode == "always"
+    if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
+        return False
+    return stream.isatty()
+
+
+def console(*, stderr: bool = False, width: int | None = None) -> Console:
+    """A rich console for the result (or, with `stderr`, for the talk). Never guesses at markup.
+
+    What is no terminal gets 120 columns, so that a piped table does not depend on the window.
+    """
+    from rich.console import Console
+
+    stream = sys.stderr if stderr else sys.stdout
+    colored = wants_color(stream)
+    if width is None and not stream.isatty():
+        width = 120
+    return Console(
+        file=stream,
+        force_terminal=colored or None,
+        no_color=not colored,
+        highlight=False,
+        markup=False,
+        width=width,
+        soft_wrap=not stream.isatty(),
+    )
+
+
+def table(rows: Sequence[Sequence[str]], *, header: Sequence[str] = (), indent: str = "  ") -> str:
+    """Columns of text, aligned by width, two blanks apart; a cell that reads as a number stands right."""
+    lines = [tuple(header), *map(tuple, rows)] if header else [tuple(row) for row in rows]
+    if not lines:
+        return ""
+    count = max(len(line) for line in lines)
+    widths = [max((len(line[i]) for line in lines if i < len(line)), default=0) for i in range(count)]
+    return "\n".join(
+        (indent + "  ".join(_cell(cell, width) for cell, width in zip(line, widths, strict=False))).rstrip()
+        for line in lines
+    )
+
+
+def _cell(text: str, width: int) -> str:
+    digits = text.lstrip("+-").replace(",", "").replace(".", "", 1)
+    return text.rjust(width) if digits.isdigit() else text.ljust(width)
+
+
+def _write(stream: TextIO, text: str) -> None:
+    with tolerate_closed(stream):
+        try:
+            stream.write(text + "\n")
+        except UnicodeEncodeError:
+            encoding = stream.encoding or "ascii"
+            stream.write(text.encode(encoding, "replace").decode(encoding) + "\n")
+        stream.flush()
+
+
+@contextmanager
+def tolerate_closed(stream: TextIO) -> Iterator[None]:
+    """Let the reader of `stream` go away: from then on what is written to it goes nowhere."""
+    try:
+        yield
+    except BrokenPipeError:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)

@@ -1,0 +1,62 @@
+"""JSON that every reader accepts: no NaN tokens, arrays as lists, paths and fractions as text or numbers."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from fractions import Fraction
+from pathlib import PurePath
+from typing import TypeAlias
+
+Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
+
+
+def plain(value: object) -> Json:
+    """`value` as JSON data.
+
+    Numbers that are not finite become the texts "inf", "-inf" and "nan"; mappings, dataclasses,
+    sequences, sets, arrays and array scalars are taken apart; paths become text.
+
+    Raises:
+        TypeError: `value` holds something that is no data.
+    """
+    match value:
+        case None | bool() | str():
+            return value
+        case Enum():
+            return plain(value.value)
+        case int():
+            return int(value)
+        case float() | Fraction():
+            return _number(float(value))
+        case Mapping():
+            return {str(key): plain(item) for key, item in value.items()}
+        case list() | tuple() | set() | frozenset():
+            return [plain(item) for item in value]
+        case PurePath():
+            return value.as_posix()
+    return _foreign(value)
+
+
+def _foreign(value: object) -> Json:
+    """Dataclasses, and whatever turns itself into plain numbers (`tolist`: NumPy, torch)."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {entry.name: plain(getattr(value, entry.name)) for entry in fields(value)}
+    to_list = getattr(value, "tolist", None)
+    if to_list is None:
+        raise TypeError(f"{type(value).__name__} is no JSON data")
+    return plain(to_list())
+
+
+def _number(value: float) -> float | str:
+    if math.isfinite(value):
+        return value
+    return "nan" if math.isnan(value) else "inf" if value > 0 else "-inf"
+
+
+def dumps(value: object, *, indent: int | None = None) -> str:
+    """`value` as a JSON text, by the rules of `plain`; on one line unless `indent` is given."""
+    return json.dumps(plain(value), indent=indent, ensure_ascii=False, allow_nan=False)

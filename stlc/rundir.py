@@ -1,0 +1,325 @@
+"""One folder = one run, self-describing: `runs/<spec>/<number>-<words>`.
+
+A run is never overwritten: a new one takes the next number. `runs/latest` and `runs/<spec>/latest` are links
+to the newest. Whole files are written beside and renamed; rows are appended so that a kill costs at most
+the last one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from stlc.diagnostics import Diagnostic, MissingError, RunError, UsageError
+from stlc.files import write_atomic
+from stlc.jsontext import dumps
+from stlc.registry import closest
+from stlc.words import draw_words
+
+Status = Literal["running", "finished", "interrupted", "failed"]
+
+RUNS = Path("runs")
+LATEST = "latest"
+RECORD = "run.json"
+ROWS = "train.jsonl"
+
+_NUMBERED = re.compile(r"(\d{4,})-(.+)")
+
+
+@dataclass(frozen=True, slots=True)
+class RunDir:
+    """The folder of one run.
+
+    Attributes:
+        path: of the folder.
+    """
+
+    path: Path
+
+    # ------------------------------------------------------------------ making and finding
+
+    @classmethod
+    def create(cls, root: Path, spec_name: str, words: str | None = None) -> RunDir:
+        """Make the folder of a new run and point the links at it.
+
+        Args:
+            root: folder of all runs.
+            spec_name: of the specification.
+            words: a name for the run; drawn if None.
+
+        Raises:
+            UsageError: U101, `words` cannot be part of a folder's name.
+            MissingError: R201, the folder cannot be made.
+        """
+        words = _checked(words) if words is not None else draw_words()
+        home = root / _slug(spec_name)
+        try:
+            home.mkdir(parents=True, exist_ok=True)
+            path = _reserve(home, words)
+            _point(home / LATEST, path.name)
+            _point(root / LATEST, f"{home.name}/{path.name}")
+        except OSError as error:
+            reason = (error.strerror or type(error).__name__).lower()
+            raise MissingError(Diagnostic("R201", f"cannot make a run below `{root}`: {reason}")) from error
+        return cls(path)
+
+    @classmethod
+    def newest(cls, root: Path = RUNS) -> RunDir:
+        """The run that `latest` points to; without that link the one that was started last.
+
+        Raises:
+            UsageError: R101, there is no run below `root`.
+        """
+        linked = root / LATEST
+        if (linked / RECORD).is_file():
+            return cls(linked.resolve())
+        runs = sorted(every_run(root), key=lambda run: run.path.stat().st_mtime)
+        if not runs:
+            raise UsageError(
+                Diagnostic(
+                    "R101",
+                    f"there is no run in `{root}`",
+                    help=("train one: stlc train specs/traffic.stl --system car.yaml",),
+                )
+            )
+        return runs[-1]
+
+    @classmethod
+    def open(cls, where: Path | str, root: Path = RUNS) -> RunDir:
+        """The run called `where`.
+
+        That is a folder (or a file in one), `latest`, a spec's name (its newest run), a run's number,
+        its words, or both, with or without `SPEC/` before it.
+
+        Raises:
+            UsageError: R101, there is no such run, or several fit.
+            RunError: R101, the folder is damaged.
+        """
+        given = Path(where)
+        if given.exists() and given.resolve() != Path.cwd() / root:
+            return cls(_folder_of(given).resolve()).checked()
+        if str(where) == LATEST:
+            return cls.newest(root).checked()
+        return _by_name(str(where), root).checked()
+
+    def checked(self) -> RunDir:
+        """This run, if its record can be read. Raises RunError (R101) otherwise."""
+        self.record()
+        return self
+
+    # ------------------------------------------------------------------ its name
+
+    @property
+    def name(self) -> str:
+        """Number and words, such as `0007-quiet-heron`."""
+        return self.path.name
+
+    @property
+    def shown(self) -> str:
+        """The path as it is printed: relative to the current folder where it lies below it."""
+        with suppress(ValueError):
+            return self.path.resolve().relative_to(Path.cwd()).as_posix()
+        return self.path.as_posix()
+
+    # ------------------------------------------------------------------ whole files
+
+    def write_json(self, name: str, value: object) -> None:
+        """Write `value` as the file `name`. Raises MissingError (R201) where that fails."""
+        write_atomic(self.path / name, dumps(value, indent=2) + "\n")
+
+    def read_json(self, name: str) -> Any:
+        """The content of the JSON file `name`. Raises RunError (R101) if it is missing or damaged."""
+        try:
+            return json.loads((self.path / name).read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise RunError(self._damaged(name, error)) from error
+
+    def record(self) -> dict[str, Any]:
+        """What `run.json` says about the run. Raises RunError (R101) if it is missing or damaged."""
+        record = self.read_json(RECORD)
+        if not isinstance(record, dict):
+            raise RunError(self._damaged(RECORD, ValueError("it is no JSON object")))
+        return record
+
+    def update(self, facts: Mapping[str, object]) -> dict[str, Any]:
+        """Enter `facts` into `run.json`, which is made if it is not there, and return all of it."""
+        before = self.record() if (self.path / RECORD).exists() else {}
+        after = {**before, **facts}
+        self.write_json(RECORD, after)
+        return after
+
+    @property
+    def status(self) -> Status:
+        """How far the run came. Raises RunError (R101) if `run.json` is damaged."""
+        status: Status = self.record().get("status", "running")
+        return status
+
+    def finish(self, status: Status, result: object = None) -> None:
+        """Close the record: how the run ended, when, and with what result."""
+        ended = {"status": status, "finished": now()}
+        self.update(ended if result is None else {**ended, "result": result})
+
+    def _damaged(self, name: str, error: Exception) -> Diagnostic:
+        if isinstance(error, FileNotFoundError):
+            return Diagnostic("R101", f"`{self.shown}` is not a run: it has no {name}")
+        reason = str(error) or type(error).__name__
+        return Diagnostic("R101", f"`{self.shown}/{name}` is damaged", note=(reason,))
+
+    # ------------------------------------------------------------------ rows
+
+    def append_row(self, row: Mapping[str, object], name: str = ROWS) -> None:
+        """Append one object to a file of JSON lines, in a single write.
+
+        A last line that a kill has cut short is removed first.
+        """
+        data = (dumps(row) + "\n").encode()
+        try:
+            with (self.path / name).open("ab+") as file:
+                _drop_torn_line(file.fileno())
+                os.write(file.fileno(), data)
+        except OSError as error:
+            reason = (error.strerror or type(error).__name__).lower()
+            raise MissingError(Diagnostic("R201", f"cannot write `{self.shown}/{name}`: {reason}")) from error
+
+    def rows(self, name: str = ROWS) -> list[dict[str, Any]]:
+        """The rows of a file of JSON lines, without a last one that was cut short; [] if there is no file.
+
+        Raises:
+            RunError: R101, a whole line is not JSON.
+        """
+        try:
+            data = (self.path / name).read_bytes()
+        except FileNotFoundError:
+            return []
+        lines = data[: data.rfind(b"\n") + 1].splitlines()
+        try:
+            return [json.loads(line) for line in lines if line]
+        except ValueError as error:
+            raise RunError(self._damaged(name, error)) from error
+
+    def keep_rows(self, wanted: Callable[[dict[str, Any]], bool], name: str = ROWS) -> None:
+        """Drop the rows that are not `wanted`, as a resumed run does with those past its checkpoint."""
+        kept = [row for row in self.rows(name) if wanted(row)]
+        write_atomic(self.path / name, "".join(dumps(row) + "\n" for row in kept))
+
+
+def every_run(root: Path = RUNS) -> list[RunDir]:
+    """All runs below `root` that have a record, by spec and number."""
+    paths = (path for path in root.glob("*/*") if not path.is_symlink() and _NUMBERED.fullmatch(path.name))
+    return [RunDir(path) for path in sorted(paths) if (path / RECORD).is_file()]
+
+
+def now() -> str:
+    """The time in UTC, as run records and traces have it."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+# ---------------------------------------------------------------------- names
+
+
+def _by_name(where: str, root: Path) -> RunDir:
+    runs = every_run(root)
+    if any(run.path.parent.name == where for run in runs):
+        return [run for run in runs if run.path.parent.name == where][-1]
+    spec, _, wanted = where.rpartition("/")
+    fitting = [run for run in runs if spec in ("", run.path.parent.name) and wanted in _names(run)]
+    if len(fitting) == 1:
+        return fitting[0]
+    if fitting:
+        choices = tuple(f"{run.path.parent.name}/{run.name}" for run in fitting)
+        raise UsageError(Diagnostic("R101", f"several runs are called `{where}`", help=choices))
+    near = closest(
+        where, {name for run in runs for name in (run.name, _names(run)[-1], run.path.parent.name)}
+    )
+    advice = (f"did you mean `{near}`?",) if near else ()
+    raise UsageError(Diagnostic("R101", f"there is no run `{where}` in `{root}`", help=advice))
+
+
+def _names(run: RunDir) -> tuple[str, str, str, str]:
+    """Everything that names a run: all of it, its number twice, its words."""
+    number, _, words = run.name.partition("-")
+    return run.name, number, str(int(number)), words
+
+
+def _folder_of(path: Path) -> Path:
+    """The run that a path lies in: itself, or the nearest folder above it that has a record."""
+    candidates = (path, *path.parents)
+    return next((folder for folder in candidates if (folder / RECORD).is_file()), path)
+
+
+def _slug(name: str) -> str:
+    return re.sub(r"[^\w.-]+", "-", name).strip("-.") or "spec"
+
+
+def _checked(words: str) -> str:
+    if _slug(words) != words or words == LATEST:
+        raise UsageError(
+            Diagnostic(
+                "U101", f"`{words}` cannot name a run", help=("use letters, digits, `-`, `_` and `.`",)
+            )
+        )
+    return words
+
+
+# ---------------------------------------------------------------------- the file system
+
+
+def _reserve(home: Path, words: str) -> Path:
+    """Make the folder with the next free number. Of two processes no two get the same one.
+
+    Folders of one number may have different words, so making the folder cannot be the test. Whoever makes
+    the marker of a number owns it, and looks again whether the number was used before the marker was free.
+    """
+    number = max(_numbers(home), default=0)
+    while True:
+        number += 1
+        with _marker(home / f".{number:04d}") as owned:
+            if owned and number not in _numbers(home):
+                path = home / f"{number:04d}-{words}"
+                path.mkdir()
+                return path
+
+
+def _numbers(home: Path) -> set[int]:
+    matches = (_NUMBERED.fullmatch(path.name) for path in home.iterdir())
+    return {int(match[1]) for match in matches if match}
+
+
+@contextmanager
+def _marker(path: Path) -> Iterator[bool]:
+    try:
+        path.mkdir()
+    except FileExistsError:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        path.rmdir()
+
+
+def _point(link: Path, target: str) -> None:
+    """Make `link` point to `target`, replacing it in one step. Where links are not allowed there is none."""
+    temporary = link.with_name(f".{link.name}.{os.getpid()}")
+    with suppress(FileNotFoundError):
+        temporary.unlink()
+    try:
+        temporary.symlink_to(target, target_is_directory=True)
+    except (OSError, NotImplementedError):
+        return
+    temporary.replace(link)
+
+
+def _drop_torn_line(descriptor: int) -> None:
+    size = os.fstat(descriptor).st_size
+    if size == 0 or os.pread(descriptor, 1, size - 1) == b"\n":
+        return
+    data = os.pread(descriptor, size, 0)
+    os.ftruncate(descriptor, data.rfind(b"\n") + 1)
