@@ -1,0 +1,218 @@
+"""Named columns in a `.csv` file, in and out; every cell is a plain number or a diagnostic.
+
+The first line names the columns, units in brackets if one likes: `t, x [m], v [km/h]`. A column `trace` or
+`agent` says to which of several traces a line belongs.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.files import write_atomic
+from stlc.source import Source, Span
+from stlc.trace_npz import unreadable
+
+Floats = NDArray[np.float64]
+
+MAX_BYTES = 1_000_000_000
+GROUPS = ("trace", "agent")
+
+_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
+_HEAD = re.compile(r"(?P<name>[^\[\]\s]+(?:\[\d+\])?)\s*(?:\[(?P<unit>[^\]]*)\])?")
+_WORDS = {"true": 1.0, "false": 0.0}
+_MAX_FINDINGS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A file as read.
+
+    Attributes:
+        columns: name -> values, one per line of the file.
+        units: unit in brackets behind a name, "" where there is none.
+        lines: number of each line in the file, from 1.
+    """
+
+    columns: dict[str, Floats]
+    units: dict[str, str]
+    lines: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class _Sheet:
+    """The text of a file, cut into its header and the lines below."""
+
+    source: Source
+    delimiter: str
+    header: str
+    header_at: int
+    body_at: int
+
+
+def read_csv(path: Path) -> Table:
+    """The columns of a `.csv` file (comma, semicolon or tab; UTF-8).
+
+    Raises:
+        UsageError: U102, the file does not exist or cannot be opened.
+        TraceError: E603, not text, or a cell that is no number; E605, a header or line that does not fit.
+    """
+    sheet = _open_sheet(path)
+    names, units = _read_header(sheet)
+    values, lines = _read_fast(sheet, len(names)) or _read_strict(sheet, len(names))
+    columns = {name: np.ascontiguousarray(values[:, i]) for i, name in enumerate(names)}
+    return Table(columns, units, lines)
+
+
+def _open_sheet(path: Path) -> _Sheet:
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        reason = (error.strerror or type(error).__name__).lower()
+        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: {reason}")) from None
+    if len(data) > MAX_BYTES:
+        raise unreadable(path, f"it is larger than {MAX_BYTES / 1e9:.0f} GB", advice="save it as `.npz`")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise unreadable(path, f"it is not UTF-8 (byte {error.start})") from None
+    if "\0" in text:
+        raise unreadable(path, "it is a binary file, not a table")
+    body = text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+    stripped = body.lstrip()
+    if not stripped:
+        raise unreadable(path, "it is empty")
+    start = len(body) - len(stripped)
+    end = body.find("\n", start)
+    end = len(body) if end < 0 else end
+    header = body[start:end]
+    delimiter = max(",;\t", key=header.count)
+    return _Sheet(Source(str(path), body), delimiter, header, start, min(end + 1, len(body)))
+
+
+def _read_header(sheet: _Sheet) -> tuple[list[str], dict[str, str]]:
+    findings: list[Diagnostic] = []
+    names: list[str] = []
+    units: dict[str, str] = {}
+    for text, span in _cells(sheet.source, sheet.header_at, sheet.header, sheet.delimiter):
+        match = _HEAD.fullmatch(text)
+        name = match["name"] if match else ""
+        if match is None:
+            shown = f"`{text}` is not the name of a column" if text else "a column without a name"
+            findings.append(Diagnostic("E605", shown, span, label="expected a signal's name"))
+        elif name in units:
+            findings.append(Diagnostic("E605", f"two columns are called `{name}`", span))
+        elif _NUMBER.fullmatch(name):
+            findings.append(
+                Diagnostic("E605", "the first line must name the columns", span, help=("e.g. `t,x,v`",))
+            )
+        names.append(name)
+        units[name] = (match["unit"] or "").strip() if match else ""
+    if findings:
+        raise TraceError(*findings[:_MAX_FINDINGS])
+    return names, units
+
+
+def _cells(source: Source, start: int, line: str, delimiter: str) -> Iterator[tuple[str, Span]]:
+    """Cells of a line with blanks and quotes taken off, and where each stands."""
+    for raw in line.split(delimiter):
+        text = raw.strip()
+        at = start + (len(raw) - len(raw.lstrip()))
+        if len(text) >= 2 and text[0] == text[-1] == '"':
+            text = text[1:-1].strip()
+        yield text, source.span(at, max(at + len(raw.strip()), at + 1))
+        start += len(raw) + 1
+
+
+def _read_fast(sheet: _Sheet, width: int) -> tuple[Floats, NDArray[np.int64]] | None:
+    """All lines at once with NumPy's reader; None if anything about them is unusual."""
+    body = sheet.source.text[sheet.body_at :]
+    if not body.strip() or '"' in body or "\n\n" in body:
+        return None
+    try:
+        values = np.loadtxt(
+            io.StringIO(body), delimiter=sheet.delimiter, comments=None, ndmin=2, dtype=np.float64
+        )
+    except ValueError:
+        return None
+    if values.shape[1] != width:
+        return None
+    first = sheet.source.position(sheet.header_at)[0] + 1
+    return values, np.arange(first, first + len(values))
+
+
+def _read_strict(sheet: _Sheet, width: int) -> tuple[Floats, NDArray[np.int64]]:
+    """Cell by cell, with the place of everything that is wrong."""
+    findings: list[Diagnostic] = []
+    rows: list[list[float]] = []
+    lines: list[int] = []
+    start, number = sheet.body_at, sheet.source.position(sheet.header_at)[0]
+    for line in sheet.source.text[sheet.body_at :].split("\n"):
+        number += 1
+        if line.strip():
+            cells = list(_cells(sheet.source, start, line, sheet.delimiter))
+            rows.append(_read_row(sheet, cells, width, findings))
+            lines.append(number)
+        start += len(line) + 1
+        if len(findings) >= _MAX_FINDINGS:
+            break
+    if findings:
+        raise TraceError(*findings)
+    if not rows:
+        raise unreadable(sheet.source.name, "no line of numbers follows the header")
+    return np.array(rows, dtype=np.float64).reshape(-1, width), np.array(lines, dtype=np.int64)
+
+
+def _read_row(
+    sheet: _Sheet, cells: Sequence[tuple[str, Span]], width: int, findings: list[Diagnostic]
+) -> list[float]:
+    if len(cells) != width:
+        span = cells[0][1].to(cells[-1][1])
+        message = f"this line has {len(cells)} cells, the header names {width} columns"
+        findings.append(Diagnostic("E605", message, span, help=_decimal_comma(sheet, cells, width)))
+        return []
+    row = []
+    for text, span in cells:
+        if _NUMBER.fullmatch(text):
+            row.append(float(text))
+        elif text.lower() in _WORDS:
+            row.append(_WORDS[text.lower()])
+        else:
+            shown = f"`{text}` is not a number" if text else "an empty cell"
+            findings.append(
+                Diagnostic(
+                    "E603", shown, span, help=("write truth values as 0 and 1, enum values as numbers",)
+                )
+            )
+    return row
+
+
+def _decimal_comma(sheet: _Sheet, cells: Sequence[object], width: int) -> tuple[str, ...]:
+    if sheet.delimiter == "," and len(cells) == 2 * width:
+        return ("decimal commas? write a point, or separate the columns with `;`",)
+    return ()
+
+
+def write_csv(path: Path | str, columns: Mapping[str, NDArray[Any]], units: Mapping[str, str]) -> None:
+    """Write columns of equal length so that reading them back gives the same numbers.
+
+    Raises:
+        MissingError: R201, no room or no permission; an old file stays as it was.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    heads = [f"{name} [{units[name]}]" if units.get(name) else name for name in columns]
+    writer.writerow(heads)
+    for row in zip(*(values.tolist() for values in columns.values()), strict=True):
+        writer.writerow([repr(value) for value in row])
+    write_atomic(path, text.getvalue())

@@ -1,0 +1,117 @@
+"""What a trace says about itself: where it comes from, and what its signals mean, as a JSON text."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.signature import Column, Signature
+from stlc.trace_npz import unreadable
+from stlc.units import DIMENSIONLESS, parse_unit
+
+_KINDS: dict[str, tuple[type, ...]] = {"seed": (int,), "horizon": (int,), "dt": (int, float)}
+
+
+@dataclass(frozen=True, slots=True)
+class TraceMeta:
+    """What was recorded, and by whom; every field may be unknown ("" or None).
+
+    Attributes:
+        spec_name: name of the specification.
+        spec_path: its path as the user gave it.
+        spec_text: its whole text, so that `stlc check` needs no other file.
+        spec_hash: SHA-256 of that text, hexadecimal.
+        system_name: name of the system.
+        system_path: its path as the user gave it.
+        system_text: the text of its file.
+        system_hash: SHA-256 of the system.
+        run: name of the run that recorded.
+        seed: of the recording.
+        horizon: planning horizon T in steps.
+        dt: time step in seconds.
+        created: ISO 8601 time.
+        stlc_version: of the recorder.
+    """
+
+    spec_name: str = ""
+    spec_path: str = ""
+    spec_text: str = ""
+    spec_hash: str = ""
+    system_name: str = ""
+    system_path: str = ""
+    system_text: str = ""
+    system_hash: str = ""
+    run: str = ""
+    seed: int | None = None
+    horizon: int | None = None
+    dt: float | None = None
+    created: str = ""
+    stlc_version: str = ""
+
+
+def read_meta(path: Path, array: NDArray[Any] | None) -> tuple[TraceMeta, dict[str, Column]]:
+    """What the array `meta` of a trace says, and the columns that it describes.
+
+    Raises:
+        TraceError: E603, it is no JSON text of the expected form.
+    """
+    if array is None:
+        return TraceMeta(), {}
+    if array.dtype.kind != "U" or array.shape != ():
+        raise unreadable(path, "`meta` is not a JSON text")
+    try:
+        written = json.loads(str(array))
+        return _meta_of(written), _columns_of(written)
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
+        raise unreadable(path, f"`meta` is damaged ({str(error)[:80]})") from None
+
+
+def meta_array(meta: TraceMeta, signature: Signature) -> NDArray[Any]:
+    """The inverse of `read_meta`: a 0-d array that holds the JSON text."""
+    signals = {column.name: _written(column) for column in signature.columns}
+    return np.array(json.dumps(asdict(meta) | {"signals": signals}))
+
+
+def _meta_of(written: Mapping[str, Any]) -> TraceMeta:
+    known = {f.name: written[f.name] for f in fields(TraceMeta) if f.name in written}
+    for name, value in known.items():
+        optional = name in _KINDS and value is None
+        if not optional and (not isinstance(value, _KINDS.get(name, (str,))) or isinstance(value, bool)):
+            raise ValueError(f"`{name}` is {value!r:.40}")
+    return TraceMeta(**known)
+
+
+def _columns_of(written: Mapping[str, Any]) -> dict[str, Column]:
+    return {name: _column(name, entry) for name, entry in written.get("signals", {}).items()}
+
+
+def _column(name: str, entry: Mapping[str, Any]) -> Column:
+    kind, role = entry.get("kind", "real"), entry.get("role", "state")
+    if kind not in ("real", "int", "bool", "enum") or role not in (
+        "input",
+        "output",
+        "state",
+        "env",
+        "timer",
+    ):
+        raise ValueError(f"`{name}` is {kind!r:.20} {role!r:.20}")
+    labels = tuple((str(label), float(value)) for label, value in entry.get("labels", {}).items())
+    unit = parse_unit(entry["unit"]) if entry.get("unit") else DIMENSIONLESS
+    low, high = (None if entry.get(end) is None else float(entry[end]) for end in ("low", "high"))
+    return Column(name, unit, kind, role, low, high, labels)
+
+
+def _written(column: Column) -> dict[str, Any]:
+    entry: dict[str, Any] = {"kind": column.kind, "role": column.role}
+    if column.unit.text:
+        entry["unit"] = column.unit.text
+    entry |= {key: value for key in ("low", "high") if (value := getattr(column, key)) is not None}
+    if column.labels:
+        entry["labels"] = dict(column.labels)
+    return entry

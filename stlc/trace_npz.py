@@ -1,0 +1,155 @@
+"""Named arrays in an `.npz` file, in and out, without ever unpickling anything.
+
+The archive is read member by member: the header of each array is checked against the size that the archive
+declares before memory is asked for, so that neither a pickle nor a bomb gets past the door.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import warnings
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import numpy.lib.format as npy
+from numpy.typing import NDArray
+
+from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.files import atomic_path
+
+Array = NDArray[Any]
+
+MAX_BYTES = 4_000_000_000
+MAX_ARRAYS = 10_000
+
+_NUMERIC = "biuf"
+_TEXT = "U"
+_ZIP_MAGIC = (b"PK\x03\x04", b"PK\x05\x06")
+_DAMAGE = (
+    ValueError,
+    TypeError,
+    SyntaxError,
+    OverflowError,
+    MemoryError,
+    RecursionError,
+    EOFError,
+    OSError,
+    NotImplementedError,
+    RuntimeError,
+    struct.error,
+    zlib.error,
+    zipfile.BadZipFile,
+)
+
+
+def unreadable(path: Path | str, why: str, *, advice: str = "") -> TraceError:
+    """E603: the file cannot be read, or is not safe to read."""
+    return TraceError(
+        Diagnostic("E603", f"cannot read `{path}`: {why}", help=(advice,) if advice else ()),
+    )
+
+
+def read_npz(path: Path) -> dict[str, Array]:
+    """The arrays of an `.npz` file: numbers of any shape, and texts.
+
+    Raises:
+        UsageError: U102, the file does not exist or cannot be opened.
+        TraceError: E603, it is no archive of plain arrays, is damaged, or would not fit into memory.
+    """
+    try:
+        with path.open("rb") as file:
+            _check_magic(path, file)
+            with zipfile.ZipFile(file) as archive:
+                return _read_members(path, archive)
+    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
+        reason = (error.strerror or type(error).__name__).lower()
+        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: {reason}")) from None
+    except _DAMAGE as error:
+        raise unreadable(path, f"the archive is damaged or cut short ({_brief(error)})") from None
+
+
+def _brief(error: BaseException) -> str:
+    text = str(error).strip().splitlines()
+    return text[0][:100] if text else type(error).__name__
+
+
+def _check_magic(path: Path, file: IO[bytes]) -> None:
+    start = file.read(6)
+    file.seek(0)
+    if start[:4] in _ZIP_MAGIC:
+        return
+    if start.startswith(b"\x93NUMPY"):
+        raise unreadable(path, "it is a single array", advice="save one array per signal with `np.savez`")
+    if start[:1] == b"\x80":
+        raise unreadable(
+            path, "it is a pickle, and pickles can run code", advice="save arrays with `np.savez`"
+        )
+    raise unreadable(path, "it is empty" if not start else "it is not an `.npz` archive")
+
+
+def _read_members(path: Path, archive: zipfile.ZipFile) -> dict[str, Array]:
+    members = archive.infolist()
+    if len(members) > MAX_ARRAYS:
+        raise unreadable(path, f"it holds {len(members)} arrays, more than {MAX_ARRAYS}")
+    size = sum(member.file_size for member in members)
+    if size > MAX_BYTES:
+        raise unreadable(
+            path, f"it unpacks to {size / 1e9:.1f} GB, more than {MAX_BYTES / 1e9:.0f} GB", advice="split it"
+        )
+    arrays: dict[str, Array] = {}
+    for member in members:
+        name = member.filename.removesuffix(".npy")
+        if name in arrays:
+            raise unreadable(path, f"it holds the array `{name}` twice")
+        arrays[name] = _read_array(path, archive, member, name)
+    return arrays
+
+
+def _read_array(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) -> Array:
+    with archive.open(member) as stream:
+        shape, fortran, dtype = _read_header(stream)
+        if dtype.hasobject:
+            raise unreadable(
+                path,
+                f"`{name}` holds Python objects, and unpickling them can run code",
+                advice="save it as an array of numbers, one array per signal",
+            )
+        if dtype.kind not in _NUMERIC + _TEXT or (dtype.kind == "f" and dtype.itemsize > 8):
+            raise unreadable(path, f"`{name}` holds `{dtype}`, not numbers")
+        size = math.prod(shape) * dtype.itemsize
+        room = member.file_size - stream.tell()
+        if min(shape, default=1) < 0 or size != room:
+            shown = " x ".join(map(str, shape))
+            raise unreadable(path, f"`{name}` declares {shown} values, but {max(room, 0)} bytes follow")
+        data = stream.read(size)
+    if len(data) != size:
+        raise unreadable(path, f"`{name}` is cut short")
+    flat = np.frombuffer(bytearray(data), dtype=dtype) if size else np.zeros(0, dtype)
+    return flat.reshape(shape, order="F" if fortran else "C")
+
+
+def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    version = npy.read_magic(stream)
+    readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+    if version not in readers:
+        raise ValueError(f"array format {version[0]}.{version[1]}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return readers[version](stream)
+
+
+def write_npz(path: Path | str, arrays: Mapping[str, Array]) -> None:
+    """Write arrays beside `path`, then rename; the same arrays always give the same bytes.
+
+    Raises:
+        MissingError: R201, no room or no permission; an old file stays as it was.
+    """
+    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in arrays.items():
+            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as stream:
+                npy.write_array(stream, np.asarray(array), allow_pickle=False)

@@ -1,0 +1,98 @@
+"""The clock of a trace: one uniform grid, or a diagnostic that says where it is not."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.diagnostics import Diagnostic, TraceError
+
+Floats = NDArray[np.float64]
+
+TOLERANCE = 0.05
+"""Share of a step by which samples may stand beside the grid (rounded decimals, jitter)."""
+
+_SNAP = 1e-6
+
+
+def read_clock(
+    name: str, clock: NDArray[Any] | None, dt: float | None, samples: int
+) -> tuple[float, float, int]:
+    """First time, time step and number of samples.
+
+    Args:
+        name: of the trace, for messages.
+        clock: the recorded times (samples,) in seconds, or None.
+        dt: the recorded time step, or None; needed where there are no times, or only one.
+        samples: of the signals, where there are no times.
+
+    Raises:
+        TraceError: E601, neither times nor a step; E602, times that are not uniform; E605, no samples.
+    """
+    if dt is not None and not (np.isfinite(dt) and dt > 0):
+        raise TraceError(Diagnostic("E602", f"the time step of `{name}` is {dt:g} s"))
+    if clock is None:
+        if dt is None:
+            help_ = ("add an array `t` with the time of every sample in seconds",)
+            raise TraceError(Diagnostic("E601", f"trace `{name}` has no `t`", help=help_))
+        return 0.0, dt, samples
+    if clock.ndim != 1:
+        shape = " x ".join(map(str, clock.shape)) or "a single number"
+        raise TraceError(Diagnostic("E605", f"`t` in `{name}` is {shape}; it has one value per sample"))
+    times = clock.astype(np.float64)
+    if not len(times):
+        raise TraceError(Diagnostic("E605", f"trace `{name}` has no samples"))
+    _check_finite(name, times)
+    if len(times) == 1:
+        if dt is None:
+            raise TraceError(
+                Diagnostic("E602", f"trace `{name}` has one sample, so its time step is unknown")
+            )
+        return float(times[0]), dt, 1
+    return float(times[0]), _step(name, times, dt), len(times)
+
+
+def _check_finite(name: str, times: Floats) -> None:
+    bad = np.flatnonzero(~np.isfinite(times))
+    if len(bad):
+        raise TraceError(Diagnostic("E604", f"time in `{name}` is {times[bad[0]]} at t[{bad[0]}]"))
+
+
+def _step(name: str, times: Floats, dt: float | None) -> float:
+    gaps = np.diff(times)
+    usual = float(np.median(gaps))
+    backwards = np.flatnonzero(gaps <= 0)
+    if len(backwards):
+        i = int(backwards[0])
+        message = (
+            f"time in `{name}` does not increase: t[{i}] = {times[i]:g} s, t[{i + 1}] = {times[i + 1]:g} s"
+        )
+        raise TraceError(Diagnostic("E602", message))
+    odd = np.abs(gaps - usual)
+    if odd.max() > TOLERANCE * usual:
+        i = int(np.argmax(odd > TOLERANCE * usual))
+        message = (
+            f"time in `{name}` is not uniform: dt is {usual:.6g} s except at t[{i}] = {times[i]:.6g} s, "
+            f"where it is {gaps[i]:.6g} s"
+        )
+        raise TraceError(Diagnostic("E602", message, help=("resample the signals on a uniform grid",)))
+    mean = float(times[-1] - times[0]) / len(gaps)
+    drift = np.abs(times - times[0] - mean * np.arange(len(times)))
+    if drift.max() > TOLERANCE * mean:
+        i = int(np.argmax(drift))
+        message = (
+            f"time in `{name}` is not uniform: t[{i}] = {times[i]:.6g} s is {drift[i]:.3g} s beside the grid"
+        )
+        raise TraceError(Diagnostic("E602", message, help=("resample the signals on a uniform grid",)))
+    return _snap(mean, dt)
+
+
+def _snap(mean: float, dt: float | None) -> float:
+    """The recorded step if the times agree with it, else the mean, as a plain fraction if one is near."""
+    if dt is not None and abs(dt - mean) <= 1e-3 * mean:
+        return dt
+    near = float(Fraction(mean).limit_denominator(100_000))
+    return near if abs(near - mean) <= _SNAP * mean else mean
