@@ -168,7 +168,7 @@ def _from_csv(path: Path) -> Trace:
     table = read_csv(path)
     group = next((name for name in GROUPS if name in table.columns), None)
     columns = {name: values for name, values in table.columns.items() if name != group}
-    keys = table.columns[group] if group else np.zeros(len(table.lines))
+    keys = table.columns[group] if group else np.zeros(table.rows)
     labels, sizes = np.unique(keys, return_counts=True)
     if len(set(sizes.tolist())) > 1:
         i = int(np.argmax(sizes != sizes[0]))

@@ -40,12 +40,15 @@ class Table:
     Attributes:
         columns: name -> values, one per line of the file.
         units: unit in brackets behind a name, "" where there is none.
-        lines: number of each line in the file, from 1.
     """
 
     columns: dict[str, Floats]
     units: dict[str, str]
-    lines: NDArray[np.int64]
+
+    @property
+    def rows(self) -> int:
+        """How many lines of numbers."""
+        return len(next(iter(self.columns.values())))
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +71,11 @@ def read_csv(path: Path) -> Table:
     """
     sheet = _open_sheet(path)
     names, units = _read_header(sheet)
-    values, lines = _read_fast(sheet, len(names)) or _read_strict(sheet, len(names))
+    values = _read_fast(sheet, len(names))
+    if values is None:
+        values = _read_strict(sheet, len(names))
     columns = {name: np.ascontiguousarray(values[:, i]) for i, name in enumerate(names)}
-    return Table(columns, units, lines)
+    return Table(columns, units)
 
 
 def _open_sheet(path: Path) -> _Sheet:
@@ -134,10 +139,10 @@ def _cells(source: Source, start: int, line: str, delimiter: str) -> Iterator[tu
         start += len(raw) + 1
 
 
-def _read_fast(sheet: _Sheet, width: int) -> tuple[Floats, NDArray[np.int64]] | None:
+def _read_fast(sheet: _Sheet, width: int) -> Floats | None:
     """All lines at once with NumPy's reader; None if anything about them is unusual."""
     body = sheet.source.text[sheet.body_at :]
-    if not body.strip() or '"' in body or "\n\n" in body:
+    if not body.strip() or '"' in body:
         return None
     try:
         values = np.loadtxt(
@@ -145,24 +150,18 @@ def _read_fast(sheet: _Sheet, width: int) -> tuple[Floats, NDArray[np.int64]] | 
         )
     except ValueError:
         return None
-    if values.shape[1] != width:
-        return None
-    first = sheet.source.position(sheet.header_at)[0] + 1
-    return values, np.arange(first, first + len(values))
+    return values if values.shape[1] == width else None
 
 
-def _read_strict(sheet: _Sheet, width: int) -> tuple[Floats, NDArray[np.int64]]:
+def _read_strict(sheet: _Sheet, width: int) -> Floats:
     """Cell by cell, with the place of everything that is wrong."""
     findings: list[Diagnostic] = []
     rows: list[list[float]] = []
-    lines: list[int] = []
-    start, number = sheet.body_at, sheet.source.position(sheet.header_at)[0]
+    start = sheet.body_at
     for line in sheet.source.text[sheet.body_at :].split("\n"):
-        number += 1
         if line.strip():
             cells = list(_cells(sheet.source, start, line, sheet.delimiter))
             rows.append(_read_row(sheet, cells, width, findings))
-            lines.append(number)
         start += len(line) + 1
         if len(findings) >= _MAX_FINDINGS:
             break
@@ -170,7 +169,7 @@ def _read_strict(sheet: _Sheet, width: int) -> tuple[Floats, NDArray[np.int64]]:
         raise TraceError(*findings)
     if not rows:
         raise unreadable(sheet.source.name, "no line of numbers follows the header")
-    return np.array(rows, dtype=np.float64).reshape(-1, width), np.array(lines, dtype=np.int64)
+    return np.array(rows, dtype=np.float64).reshape(-1, width)
 
 
 def _read_row(

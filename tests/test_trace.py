@@ -1,0 +1,442 @@
+"""Round trips, and every way in which a trace file can be hostile or damaged."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import tracemalloc
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.lib.format as npy
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from stlc import trace_csv
+from stlc.diagnostics import StlcError, TraceError, UsageError
+from stlc.signature import Column, Signature
+from stlc.trace import Trace, TraceMeta, as_fraction, load_trace, save_trace
+from stlc.units import parse_unit
+
+FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
+SIGNATURE = Signature(
+    (
+        Column("x", parse_unit("m"), low=-10.0, high=8.0),
+        Column("sign", kind="enum", role="env", labels=(("stop", 0.0), ("light", 1.0))),
+        Column("q[0]", parse_unit("rad")),
+    )
+)
+
+
+def a_trace(x: np.ndarray | None = None) -> Trace:
+    x = np.linspace(-1, 1, 12).reshape(2, 6) if x is None else x
+    data = {"x": x, "sign": np.ones_like(x), "q[0]": -x}
+    meta = TraceMeta(
+        "traffic", spec_text="spec traffic □", spec_hash="ab", run="r", seed=3, horizon=25, dt=0.1
+    )
+    return Trace(SIGNATURE, 0.1, data, 0.5, {"decision": np.array([[0, 1, 2]])}, meta, "unnamed")
+
+
+def code_of(path: Path) -> str:
+    with pytest.raises(StlcError) as caught:
+        load_trace(path)
+    return caught.value.diagnostics[0].code
+
+
+def message_of(path: Path) -> str:
+    with pytest.raises(StlcError) as caught:
+        load_trace(path)
+    return caught.value.diagnostics[0].message
+
+
+def npz(path: Path, **arrays: object) -> Path:
+    np.savez(path, **{name: np.asarray(values) for name, values in arrays.items()})
+    return path
+
+
+def zipped(path: Path, **members: bytes) -> Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(f"{name}.npy", data)
+    return path
+
+
+def header(shape: tuple[int, ...], descr: str = "<f8") -> bytes:
+    buffer = io.BytesIO()
+    npy.write_array_header_1_0(buffer, {"shape": shape, "fortran_order": False, "descr": descr})
+    return buffer.getvalue()
+
+
+# ------------------------------------------------------------------ round trips
+
+
+@given(hnp.arrays(np.float64, st.tuples(st.integers(1, 3), st.integers(2, 5)), elements=FINITE))
+@settings(deadline=None, max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@pytest.mark.parametrize("suffix", [".npz", ".csv"])
+def test_round_trip_keeps_every_bit(tmp_path: Path, suffix: str, x: np.ndarray) -> None:
+    path = tmp_path / f"a{suffix}"
+    save_trace(path, a_trace(x))
+    back = load_trace(path)
+    assert list(back.data) == ["x", "sign", "q[0]"]
+    assert all(np.array_equal(back.data[name], a_trace(x).data[name]) for name in back.data)
+    assert (back.dt, back.t0, back.traces, back.samples) == (0.1, 0.5, *x.shape)
+    assert back.signature["x"].unit.text == "m"
+
+
+def test_npz_keeps_columns_extras_and_meta(tmp_path: Path) -> None:
+    save_trace(tmp_path / "a.npz", a_trace())
+    back = load_trace(tmp_path / "a.npz")
+    assert back.signature == SIGNATURE
+    assert back.meta == a_trace().meta
+    assert back.extras["decision"].tolist() == [[0, 1, 2]]
+    assert back.name == str(tmp_path / "a.npz")
+
+
+def test_the_same_trace_gives_the_same_bytes(tmp_path: Path) -> None:
+    save_trace(tmp_path / "a.npz", a_trace())
+    save_trace(tmp_path / "b.npz", a_trace())
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_numpy_can_read_what_we_write(tmp_path: Path) -> None:
+    save_trace(tmp_path / "a.npz", a_trace())
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as arrays:
+        assert np.allclose(arrays["t"], 0.5 + 0.1 * np.arange(6))
+        assert arrays["x"].shape == (2, 6)
+
+
+def test_a_failed_save_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    save_trace(path, a_trace())
+    old = path.read_bytes()
+    broken = replace(a_trace(), extras={"objects": np.array([object()])})
+    with pytest.raises(ValueError, match="Object arrays"):
+        save_trace(path, broken)
+    assert path.read_bytes() == old
+    assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
+
+
+@pytest.mark.parametrize("name", ["t", "meta", "extra.x"])
+def test_reserved_names_are_refused(tmp_path: Path, name: str) -> None:
+    trace = replace(a_trace(), signature=Signature((Column(name),)), data={name: np.zeros((1, 3))})
+    with pytest.raises(TraceError, match="cannot be called"):
+        save_trace(tmp_path / "a.npz", trace)
+
+
+def test_shapes_and_dtypes_that_are_accepted(tmp_path: Path) -> None:
+    t = np.arange(4) * 0.1
+    path = npz(
+        tmp_path / "a.npz",
+        t=t.astype(np.float32),
+        one=np.arange(4),
+        flag=np.array([[True, False, True, True]] * 3),
+        p=np.zeros((3, 4, 2), np.float32),
+        r=np.asfortranarray(np.arange(12.0).reshape(3, 4)),
+    )
+    trace = load_trace(path)
+    assert (trace.traces, trace.samples, trace.dt) == (3, 4, 0.1)
+    assert list(trace.data) == ["one", "flag", "p[0]", "p[1]", "r"]
+    assert trace.data["r"][2].tolist() == [8, 9, 10, 11]
+    assert all(values.dtype == np.float64 and values.shape == (3, 4) for values in trace.data.values())
+
+
+def test_renamed_signals() -> None:
+    trace = a_trace().renamed({"position": "x"})
+    assert list(trace.data) == ["position", "sign", "q[0]"]
+    assert trace.signature["position"].unit.text == "m"
+    with pytest.raises(TraceError, match=r"E601.*no signal `vlead`"):
+        a_trace().renamed({"v_lead": "vlead"})
+
+
+def test_renaming_onto_a_signal_replaces_it() -> None:
+    trace = a_trace().renamed({"x": "q[0]"})
+    assert list(trace.data) == ["sign", "x"]
+    assert np.array_equal(trace.data["x"], -a_trace().data["x"])
+
+
+# --------------------------------------------------------------- hostile archives
+
+
+class Exploit:
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return Path.touch, (Path("owned"),)
+
+
+def test_an_array_of_objects_is_not_unpickled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = npz(tmp_path / "a.npz", t=np.arange(3) * 0.1, x=np.array([Exploit()] * 3, dtype=object))
+    assert code_of(path) == "E603"
+    assert "Python objects" in message_of(path)
+    assert not Path("owned").exists()
+
+
+def test_a_pickle_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "a.npz"
+    path.write_bytes(pickle.dumps({"x": Exploit()}))
+    assert code_of(path) == "E603"
+    assert "pickle" in message_of(path)
+    assert not Path("owned").exists()
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "it is empty"),
+        (b"hello, world", "not an `.npz` archive"),
+        (b"\x93NUMPY\x01\x00", "a single array"),
+        (b"PK\x03\x04 and then nothing", "damaged"),
+    ],
+)
+def test_files_that_are_no_archive(tmp_path: Path, data: bytes, words: str) -> None:
+    (tmp_path / "a.npz").write_bytes(data)
+    assert code_of(tmp_path / "a.npz") == "E603"
+    assert words in message_of(tmp_path / "a.npz")
+
+
+def test_a_huge_declared_shape_asks_for_no_memory(tmp_path: Path) -> None:
+    path = zipped(tmp_path / "a.npz", t=header((10**15,)) + b"\0" * 64, x=header((10**15,)))
+    tracemalloc.start()
+    assert code_of(path) == "E603"
+    assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    tracemalloc.stop()
+
+
+def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stlc.trace_npz.MAX_BYTES", 1_000_000)
+    np.savez_compressed(tmp_path / "a.npz", t=np.zeros(1_000_000))
+    assert (tmp_path / "a.npz").stat().st_size < 20_000
+    assert "unpacks to" in message_of(tmp_path / "a.npz")
+
+
+def test_too_many_arrays_and_arrays_given_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stlc.trace_npz.MAX_ARRAYS", 2)
+    assert "3 arrays" in message_of(npz(tmp_path / "a.npz", t=[0.0], x=[0.0], y=[0.0]))
+    with zipfile.ZipFile(tmp_path / "b.npz", "w") as archive:
+        archive.writestr("x.npy", header((0,)))
+        with pytest.warns(UserWarning, match="Duplicate"):
+            archive.writestr("x.npy", header((0,)))
+    assert "twice" in message_of(tmp_path / "b.npz")
+
+
+@pytest.mark.parametrize(
+    "values", [np.array(["a", "b"]), np.zeros(2, complex), np.zeros(2, "M8[s]"), np.zeros(2, [("a", "f8")])]
+)
+def test_arrays_of_the_wrong_kind(tmp_path: Path, values: np.ndarray) -> None:
+    assert code_of(npz(tmp_path / "a.npz", t=[0.0, 0.1], x=values)) == "E603"
+
+
+@pytest.mark.parametrize("nested", [b"(" * 3000, b"-" * 3000 + b"1", b"{'descr': '<f8'}"])
+def test_malicious_headers(tmp_path: Path, nested: bytes) -> None:
+    block = npy.magic(1, 0) + len(nested).to_bytes(2, "little") + nested
+    assert code_of(zipped(tmp_path / "a.npz", t=block)) == "E603"
+
+
+def outcome(path: Path) -> str:
+    """ "read", or the code of the diagnostic; every other exception fails the test."""
+    try:
+        return "read" if load_trace(path).samples > 0 else "nothing"
+    except StlcError as error:
+        return error.diagnostics[0].code
+
+
+def damaged(data: bytes, cut: int, flips: list[tuple[int, int]]) -> bytes:
+    changed = bytearray(data[: len(data) - cut])
+    for at, value in flips:
+        if changed:
+            changed[at % len(changed)] = value
+    return bytes(changed)
+
+
+@given(
+    cut=st.integers(0, 2000),
+    flips=st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), max_size=4),
+)
+@settings(deadline=None, max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_damage_is_a_diagnostic_or_harmless(tmp_path: Path, cut: int, flips: list[tuple[int, int]]) -> None:
+    whole = tmp_path / "whole.npz"
+    if not whole.exists():
+        save_trace(whole, a_trace())
+    path = tmp_path / "damaged.npz"
+    path.write_bytes(damaged(whole.read_bytes(), cut, flips))
+    assert outcome(path) in ("read", "E601", "E602", "E603", "E604", "E605")
+
+
+@pytest.mark.parametrize("cut", [1, 30, 400])
+def test_a_truncated_file(tmp_path: Path, cut: int) -> None:
+    save_trace(tmp_path / "a.npz", a_trace())
+    (tmp_path / "a.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:-cut])
+    assert code_of(tmp_path / "a.npz") == "E603"
+
+
+@pytest.mark.parametrize(
+    "meta",
+    [
+        np.array("{"),
+        np.array("[" * 5000),
+        np.array("[1]"),
+        np.array('{"seed": "x"}'),
+        np.array('{"horizon": true}'),
+        np.array('{"spec_text": 3}'),
+        np.array('{"signals": {"x": {"kind": "tensor"}}}'),
+        np.array('{"signals": {"x": {"unit": "[["}}}'),
+        np.array(3.0),
+        np.array(["{}"]),
+    ],
+)
+def test_damaged_meta(tmp_path: Path, meta: np.ndarray) -> None:
+    assert code_of(npz(tmp_path / "a.npz", t=[0.0, 0.1], x=[0.0, 0.1], meta=meta)) == "E603"
+
+
+def test_missing_file_and_folder(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.npz", tmp_path / "none.csv", tmp_path):
+        with pytest.raises(UsageError):
+            load_trace(path)
+
+
+# -------------------------------------------------------------- shapes and times
+
+
+@pytest.mark.parametrize(
+    ("arrays", "code", "words"),
+    [
+        ({"x": [1.0, 2.0]}, "E601", "has no `t`"),
+        ({"t": [0.0, 0.1]}, "E601", "no signals"),
+        ({"t": [0.0, 0.1], "x": [1.0, 2.0, 3.0]}, "E605", "`x` in .* is 3, and `t` has 2 samples"),
+        ({"t": [0.0, 0.1], "x": 3.0}, "E605", "a single number"),
+        (
+            {"t": [0.0, 0.1], "x": np.zeros((2, 2)), "y": np.zeros((3, 2))},
+            "E605",
+            "2 traces, other signals have 3",
+        ),
+        ({"t": [0.0, 0.1], "x": np.zeros((0, 2))}, "E605", "no traces"),
+        ({"t": [], "x": []}, "E605", "no samples"),
+        ({"t": [[0.0, 0.1]], "x": [1.0, 2.0]}, "E605", "`t` in .* is 1 x 2"),
+        ({"t": [0.0], "x": [1.0]}, "E602", "one sample"),
+        ({"t": [0.0, np.nan, 0.2], "x": [1.0, 2.0, 3.0]}, "E604", r"nan at t\[1\]"),
+        ({"t": [0.0, 0.1, 0.1], "x": [1.0, 2.0, 3.0]}, "E602", "does not increase"),
+        (
+            {"t": [0.0, 0.1, 0.2, 0.9], "x": np.zeros(4)},
+            "E602",
+            r"except at t\[2\] = 0.2 s, where it is 0.7 s",
+        ),
+    ],
+)
+def test_arrays_that_do_not_fit(tmp_path: Path, arrays: dict[str, object], code: str, words: str) -> None:
+    path = npz(tmp_path / "a.npz", **arrays)
+    assert code_of(path) == code
+    with pytest.raises(TraceError, match=words):
+        load_trace(path)
+
+
+def test_a_slow_drift_is_not_uniform(tmp_path: Path) -> None:
+    gaps = np.repeat([0.100, 0.103], 50)
+    path = npz(tmp_path / "a.npz", t=np.cumsum(gaps), x=np.zeros(100))
+    assert "beside the grid" in message_of(path)
+
+
+@pytest.mark.parametrize("dt", [0.1, 1 / 30, 0.004, 1e-6, 2.0])
+def test_the_step_is_the_fraction_that_was_meant(tmp_path: Path, dt: float) -> None:
+    times = 3 + np.cumsum(np.full(1000, dt))
+    trace = load_trace(npz(tmp_path / "a.npz", t=times, x=np.zeros(1000)))
+    assert trace.dt == pytest.approx(dt, rel=1e-12)
+    assert as_fraction(trace.dt).denominator <= 1_000_000
+
+
+def test_fractions_of_steps() -> None:
+    assert str(as_fraction(0.1)) == "1/10"
+    assert str(as_fraction(1 / 30)) == "1/30"
+    assert float(as_fraction(1e-9)) == 1e-9
+
+
+# ----------------------------------------------------------------------------- csv
+
+
+def csv(path: Path, text: str) -> Path:
+    path.write_bytes(text.encode())
+    return path
+
+
+def test_csv_with_units_agents_and_blanks(tmp_path: Path) -> None:
+    text = "\ufeff t ; agent ; v [km/h]; q[0] [rad]\r\n0;7;1;2\r\n0.5;7;3;4\r\n\r\n0;9;5;true\r\n"
+    text += "0.5;9;-.5e1;0\r\n"
+    trace = load_trace(csv(tmp_path / "a.csv", text))
+    assert (trace.dt, trace.traces, trace.samples) == (0.5, 2, 2)
+    assert trace.data["v"].tolist() == [[1, 3], [5, -5]]
+    assert trace.data["q[0]"].tolist() == [[2, 4], [1, 0]]
+    assert trace.signature["v"].unit.text == "km/h"
+
+
+def test_csv_lines_of_agents_may_alternate(tmp_path: Path) -> None:
+    trace = load_trace(csv(tmp_path / "a.csv", "t,trace,x\n0,0,1\n0,1,2\n1,0,3\n1,1,4\n"))
+    assert trace.data["x"].tolist() == [[1, 3], [2, 4]]
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "place", "words"),
+    [
+        ("t,x\n0,1\n0.1,oops\n", "E603", (3, 5), "`oops` is not a number"),
+        ("t,x\n0,1\n0.1,\n", "E603", (3, 5), "an empty cell"),
+        ("t,x\n0,1\n0.1,1_0\n", "E603", (3, 5), "`1_0` is not a number"),
+        ("t,x\n0,1\n0.1,0x10\n", "E603", (3, 5), "`0x10` is not a number"),
+        ("t,x\n0,1\n0.1,__import__('os')\n", "E603", (3, 5), "is not a number"),
+        ("t,x\n0,1\n0.1,2,3\n", "E605", (3, 1), "this line has 3 cells"),
+        ("t,x\n0,1\n0.1\n", "E605", (3, 1), "this line has 1 cells"),
+        ("t,x,x\n0,1,2\n", "E605", (1, 5), "two columns are called `x`"),
+        ("t,,x\n0,1,2\n", "E605", (1, 3), "a column without a name"),
+        ("0,1\n0.1,2\n", "E605", (1, 1), "must name the columns"),
+        ("t,x\n", "E603", None, "no line of numbers"),
+        (" \n ", "E603", None, "empty"),
+        ("t,x\n0,1\0\n", "E603", None, "binary"),
+        ("t,x [m/q]\n0,1\n1,2\n", "E605", None, "column `x`"),
+        ("x\n1\n2\n", "E601", None, "no `t`"),
+        (
+            "t,trace,x\n0,0,1\n1,0,1\n0,1,1\n",
+            "E605",
+            None,
+            "differ in length: trace 0 has 2 samples, 1 has 1",
+        ),
+        ("t,trace,x\n0,0,1\n1,0,1\n5,1,1\n6,1,1\n", "E605", None, "same times"),
+    ],
+)
+def test_csv_that_is_wrong(
+    tmp_path: Path, text: str, code: str, place: tuple[int, int] | None, words: str
+) -> None:
+    with pytest.raises(StlcError) as caught:
+        load_trace(csv(tmp_path / "a.csv", text))
+    finding = caught.value.diagnostics[0]
+    assert finding.code == code
+    assert words in finding.message
+    assert (finding.span and (finding.span.line, finding.span.column)) == place
+
+
+def test_csv_reports_all_bad_cells_at_once(tmp_path: Path) -> None:
+    with pytest.raises(TraceError) as caught:
+        load_trace(csv(tmp_path / "a.csv", "t,x,y\n0,a,b\n1,2,c\n"))
+    assert [d.message.split("`")[1] for d in caught.value.diagnostics] == ["a", "b", "c"]
+
+
+def test_csv_that_is_not_text(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(b"t,x\n0,\xff\xfe\n")
+    assert "not UTF-8" in message_of(tmp_path / "a.csv")
+
+
+@given(st.text(alphabet='t,x\n0123.e-"; ', max_size=60))
+@settings(deadline=None, max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_csv_is_read_or_refused(tmp_path: Path, text: str) -> None:
+    assert outcome(csv(tmp_path / "a.csv", text)) in ("read", "E601", "E602", "E603", "E604", "E605")
+
+
+@given(st.lists(st.lists(FINITE, min_size=2, max_size=2), min_size=1, max_size=5))
+@settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_both_csv_readers_agree(tmp_path: Path, rows: list[list[float]]) -> None:
+    body = "".join(f"{a!r},{b!r}\n" for a, b in rows)
+    fast = trace_csv.read_csv(csv(tmp_path / "a.csv", "a,b\n" + body))
+    strict = trace_csv.read_csv(
+        csv(tmp_path / "b.csv", "a,b\n\n" + body.replace(",", ',"', 1).replace("\n", '"\n', 1))
+    )
+    assert all(np.array_equal(fast.columns[name], strict.columns[name]) for name in ("a", "b"))
