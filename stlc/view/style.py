@@ -95,10 +95,9 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def quiet(axes: Axes) -> None:
-    """Take frame, ticks and grid away."""
+    """Take frame, ticks and grid away; ticks shared with other axes stay theirs."""
     axes.grid(visible=False)
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.tick_params(labelbottom=False, labelleft=False)
     for spine in axes.spines.values():
         spine.set_visible(False)
 
