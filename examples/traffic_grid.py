@@ -1,0 +1,400 @@
+"""The traffic of Meng & Fan (2023): cars on a 4 x 5 grid of junctions with lights, stop signs and queues.
+
+The truth beside the model of `car.yaml`. Each car drives on its own path, by arc length, as the model's own
+step says; what it meets is decided here. Right-hand traffic, metres, seconds.
+
+* A leader is the nearest car ahead on the own path, through the junction and into the lane behind it. A car
+  in the junction ahead on a crossing or merging path (or that cannot stop before it any more) stands for a
+  leader at rest, where the paths begin to conflict. The gap is the one between bumpers.
+* At a stop sign one car has the grant, the nearest of those that are first in their lanes, until it has left
+  the junction; everybody else yields. So `yielding` only goes from 1 to 0 while a car approaches.
+* The full cycle of a light is T_total + 2 c. The timer that cars see is held at 0 for 2 c when red begins,
+  then runs to T_total; the crossing direction is half a cycle later. So c seconds of red for all lie between two
+  greens: c = 1.5 s is what a car of 1 m needs at 5 m/s for the box of 6 m. No plan looks from the start of
+  red to the next green, so the held timer never makes it count on green too early.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+
+COLUMNS, ROWS = 4, 5
+COLUMN_SPACING = (13.0, 15.0, 18.0, 21.0)
+ROW_SPACING = (15.0, 16.0, 18.0, 23.0)
+WIDTH = 6.0  # of a road, both directions
+LENGTH_CAR, WIDTH_CAR = 1.0, 0.6
+SIGHT = 10.0  # m: further than this a car sees neither the line nor a leader
+BRAKE = 10.0  # m/s^2
+ALL_RED = 1.5  # s, the c above
+START_SPEED = 5.0
+DIRECTIONS = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])  # east, north, west, south
+LEFT, STRAIGHT, RIGHT = 1, 0, -1
+RADIUS = {LEFT: 0.75 * WIDTH, RIGHT: 0.25 * WIDTH}
+SPAN = {STRAIGHT: WIDTH, LEFT: math.pi / 2 * RADIUS[LEFT], RIGHT: math.pi / 2 * RADIUS[RIGHT]}
+STEP = 0.1  # m: resolution of the conflict tables
+BEFORE = 2.0  # m before the box where the tables begin
+DECIDED = ("policy", "backup", "safest")
+COLOURS: dict[int | str, str] = {
+    **{"road": "#e3e5e8", "line": "#ffffff", "policy": "#2563a8", "backup": "#e08a00", "safest": "#c0267e"},
+    **{-1: "#4a4f57", 0: "#d43d3d", 1: "#2f9e57"},
+}
+
+
+def right_of(direction: int) -> np.ndarray:
+    """The unit vector to the right of a direction of travel."""
+    return DIRECTIONS[(direction - 1) % 4]
+
+
+def turn_pose(direction: int, turn: int, s: float) -> tuple[float, float, float]:
+    """Place and heading from the junction's centre, after `s` metres of a turn that began in `direction`."""
+    forward, right = DIRECTIONS[direction], right_of(direction)
+    entry = -WIDTH / 2 * forward + WIDTH / 4 * right
+    heading = direction * math.pi / 2
+    ahead, aside, over = s, 0.0, 0.0
+    if turn != STRAIGHT and s > 0:
+        radius, angle = RADIUS[turn], min(s, SPAN[turn]) / RADIUS[turn]
+        over = max(s - SPAN[turn], 0.0)
+        ahead, aside = radius * math.sin(angle), -turn * (radius * (1 - math.cos(angle)) + over)
+        heading += turn * angle
+    place = entry + ahead * forward + aside * right
+    return float(place[0]), float(place[1]), heading
+
+
+def overlap(a: np.ndarray, b: np.ndarray, grow: float = 0.0) -> np.ndarray:
+    """Whether cars at the poses `a`, `b` (..., 3), grown by `grow` metres, intersect (separating axes)."""
+    half = np.array([LENGTH_CAR, WIDTH_CAR]) / 2 + grow
+    delta = b[..., :2] - a[..., :2]
+    turned = np.abs(np.stack([np.cos(b[..., 2] - a[..., 2]), np.sin(b[..., 2] - a[..., 2])], -1))
+    reach = half + np.stack([turned @ half, turned @ half[::-1]], -1)  # own half side and the other's shadow
+    hit = np.ones(delta.shape[:-1], dtype=bool)
+    for pose in (a, b):
+        cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+        along = delta[..., 0] * cos + delta[..., 1] * sin
+        across = delta[..., 1] * cos - delta[..., 0] * sin
+        hit &= (np.abs(along) < reach[..., 0]) & (np.abs(across) < reach[..., 1])
+    return hit
+
+
+@cache
+def conflicts(relative: int, mine: int, other: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Where my turn meets that of a car which entered `relative` quarter turns to the left of my direction.
+
+    Two tables over the other's position (from 0, every `STEP`): my first position at which I would touch what
+    it has still to sweep, and the first at which I would touch its body where it is now; infinity for none.
+    """
+    own = np.arange(-BEFORE, SPAN[mine] + LENGTH_CAR, STEP)
+    theirs = np.arange(0.0, SPAN[other] + LENGTH_CAR, STEP)
+    a = np.array([turn_pose(0, mine, s) for s in own])[:, None]
+    b = np.array([turn_pose(relative, other, s) for s in theirs])[None]
+
+    def first(hit: np.ndarray) -> tuple[float, ...]:
+        return tuple(np.where(hit.any(0), own[hit.argmax(0)], np.inf).tolist())
+
+    swept = np.logical_or.accumulate(overlap(a, b, grow=0.15)[:, ::-1], axis=1)[:, ::-1]
+    return first(swept), first(overlap(a, b))
+
+
+@dataclass(slots=True)
+class Car:
+    """One car, on the lane from `past` to `here` or `inside` junction `here`; then to `onward`, `beyond`."""
+
+    past: int
+    here: int
+    onward: int
+    beyond: int
+    inside: bool = False
+    s: float = 0.0  # metres along the lane or the turn
+    v: float = START_SPEED
+    tau: float = 0.0
+    order: float = math.inf  # when it came into the junction, in steps
+    passed: int = 0
+
+    @property
+    def way(self) -> tuple[int, int, int]:
+        """Through which junction, from where to where."""
+        return self.past, self.here, self.onward
+
+
+Lead = tuple[float, float]  # bumper gap in metres, speed
+Lanes = dict[tuple[int, int], list[Car]]  # first in lane first
+Inside = dict[int, list[Car]]  # in a junction, or about to be
+
+
+@dataclass(slots=True)
+class Grid:
+    """Where the junctions are, which have lights, and at what phase."""
+
+    places: np.ndarray  # (20, 2)
+    light: np.ndarray  # (20,) bool
+    phase: np.ndarray  # (20,) seconds
+    neighbours: list[dict[int, int]] = field(default_factory=list)  # direction -> junction
+    heading: dict[tuple[int, int], int] = field(default_factory=dict)
+    length: dict[tuple[int, int], float] = field(default_factory=dict)
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, cycle: float) -> Grid:
+        """Random spacings, signs and phases; the four corners always have stop signs."""
+        xs = np.concatenate([[0.0], np.cumsum(rng.choice(COLUMN_SPACING, COLUMNS - 1))])
+        ys = np.concatenate([[0.0], np.cumsum(rng.choice(ROW_SPACING, ROWS - 1))])
+        places = np.array([(x, y) for y in ys for x in xs])
+        light = rng.random(len(places)) < 0.5
+        light[[0, COLUMNS - 1, -COLUMNS, -1]] = False
+        grid = cls(places, light, rng.uniform(0, cycle, len(places)))
+        for junction in range(len(places)):
+            row, column = divmod(junction, COLUMNS)
+            around = ((row, column + 1), (row + 1, column), (row, column - 1), (row - 1, column))
+            near = {
+                d: r * COLUMNS + c for d, (r, c) in enumerate(around) if 0 <= r < ROWS and 0 <= c < COLUMNS
+            }
+            grid.neighbours.append(near)
+            for direction, other in near.items():
+                grid.heading[junction, other] = direction
+                grid.length[junction, other] = float(np.abs(places[other] - places[junction]).sum()) - WIDTH
+        return grid
+
+    def turn(self, past: int, here: int, onward: int) -> int:
+        """LEFT, STRAIGHT or RIGHT."""
+        return (self.heading[here, onward] - self.heading[past, here] + 1) % 4 - 1
+
+    def choose(self, past: int, here: int, rng: np.random.Generator) -> int:
+        """A random way on: no U-turn, and no left turn at a light."""
+        ways = [j for j in self.neighbours[here].values() if j != past]
+        if self.light[here]:
+            ways = [j for j in ways if self.turn(past, here, j) != LEFT]
+        return int(ways[rng.integers(len(ways))])
+
+    def pose(self, car: Car) -> tuple[float, float, float]:
+        """Place and heading of a car."""
+        direction, place = self.heading[car.past, car.here], self.places[car.here]
+        if car.inside:
+            x, y, angle = turn_pose(direction, self.turn(*car.way), car.s)
+        else:
+            x, y, angle = turn_pose(direction, STRAIGHT, car.s - self.length[car.past, car.here])
+        return x + float(place[0]), y + float(place[1]), angle
+
+
+class TrafficGrid:
+    """The world of `car.yaml`; see the module's text. Implements `stlc.controller.world.World`."""
+
+    def __init__(self, system: Any, agents: int, generator: torch.Generator) -> None:
+        self.system, self.agents = system, agents
+        self.rng = np.random.default_rng(int(torch.randint(2**62, (1,), generator=generator)))
+        self.at = {name: index for index, name in enumerate(system.names)}
+        self.period = float(system.decl.constants["T_total"][0])
+        self.cycle = self.period + 2 * ALL_RED
+        self.grid = Grid.drawn(self.rng, self.cycle)
+        lanes = len(self.grid.length)
+        if agents > lanes:
+            raise ValueError(f"{agents} cars do not fit on {lanes} lanes")
+
+    def reset(self) -> torch.Tensor:
+        """Every car at 5 m/s at the beginning of a lane, the first 20 coming from different junctions."""
+        starts: list[tuple[int, int]] = []
+        while len(starts) < self.agents:
+            for junction in self.rng.permutation(len(self.grid.neighbours)).tolist():
+                free = [j for j in self.grid.neighbours[junction].values() if (junction, j) not in starts]
+                if free and len(starts) < self.agents:
+                    starts.append((junction, int(self.rng.choice(free))))
+        self.cars = []
+        for past, here in starts:
+            onward = self.grid.choose(past, here, self.rng)
+            self.cars.append(Car(past, here, onward, self.grid.choose(here, onward, self.rng)))
+        self.clock, self.holder = 0, dict[int, Car]()
+        self.speeds, self.touched, self.min_gap = 0.0, set[tuple[int, int]](), math.inf
+        return self._observe()
+
+    def advance(self, x: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """Move every car as the model says for one step; (agents, n), (agents, m) -> (agents, n)."""
+        moved = self.system.step(x, action)
+        travel = (moved[:, self.at["x"]] - x[:, self.at["x"]]).tolist()
+        speed, tau = moved[:, self.at["v"]].tolist(), moved[:, self.at["tau"]].tolist()
+        self.clock += 1
+        for index, car in enumerate(self.cars):
+            car.s, car.v, car.tau = car.s + travel[index], speed[index], tau[index]
+            self._pass_on(car, travel[index])
+            self.speeds += car.v
+        self._count_overlaps()
+        return self._observe()
+
+    def progress(self) -> Mapping[str, float]:
+        """Mean speed (m/s), junctions passed, pairs of cars that ever overlapped, smallest gap (m)."""
+        return {
+            "mean_speed": self.speeds / max(self.clock * self.agents, 1),
+            "junctions_passed": float(sum(car.passed for car in self.cars)),
+            "overlapping_pairs": float(len(self.touched)),
+            "min_gap": self.min_gap,
+        }
+
+    def snapshot(self) -> Mapping[str, np.ndarray]:
+        """Poses (agents, 3), junctions (20, 2), and what they show (20, 2) to east-west and north-south cars.
+
+        `shows` is -1 for a stop sign, 0 for red, 1 for green.
+        """
+        green = [[self._timer(j, d) > self.period / 2 for d in (0, 1)] for j in range(len(self.grid.places))]
+        shows = np.where(self.grid.light[:, None], np.array(green, dtype=np.int8), np.int8(-1))
+        return {"pose": self._poses(), "junctions": self.grid.places, "shows": shows}
+
+    @staticmethod
+    def draw(axes: Any, scene: Mapping[str, np.ndarray], index: int) -> None:
+        """One frame: roads, signs, and the cars coloured by who decided (policy, backup, safest)."""
+        from matplotlib.patches import Polygon, Rectangle
+
+        places, shows = scene["junctions"][index], scene["shows"][index]
+        (left, bottom), (right, top) = places.min(0), places.max(0)
+        roads = [((x, bottom), (x, top)) for x in set(places[:, 0])]
+        roads += [((left, y), (right, y)) for y in set(places[:, 1])]
+        for road in np.array(roads):
+            corner, extent = road[0] - WIDTH / 2, road[1] - road[0] + WIDTH
+            axes.add_patch(Rectangle(corner, *extent, color=COLOURS["road"], lw=0))
+            axes.plot(*road.T, color=COLOURS["line"], lw=0.6, dashes=(4, 4), zorder=2)
+        for place, state in zip(places, shows, strict=True):
+            axes.add_patch(Rectangle(place - WIDTH / 2, WIDTH, WIDTH, color=COLOURS["road"], lw=0, zorder=3))
+            for direction, forward in enumerate(DIRECTIONS):
+                x, y = place - WIDTH * forward
+                if left - 1 < x < right + 1 and bottom - 1 < y < top + 1:
+                    line = place - WIDTH / 2 * forward + np.outer((0.06, 0.44), WIDTH * right_of(direction))
+                    axes.plot(*line.T, color=COLOURS[int(state[direction % 2])], lw=2, zorder=4)
+        decided = scene["decision"][index] if "decision" in scene else np.zeros(len(scene["pose"][index]))
+        for (x, y, angle), source in zip(scene["pose"][index], decided, strict=True):
+            cos, sin = math.cos(angle), math.sin(angle)
+            turned = np.array([(cos, sin), (-sin, cos)]) * (np.array([[LENGTH_CAR], [WIDTH_CAR]]) * 0.7)
+            corners = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) @ turned + (x, y)
+            axes.add_patch(Polygon(corners, color=COLOURS[DECIDED[int(source)]], lw=0, zorder=5))
+        axes.set(xlim=(left - 4, right + 4), ylim=(bottom - 4, top + 4), aspect="equal")
+        axes.set_axis_off()
+
+    def _pass_on(self, car: Car, travel: float) -> None:
+        if not car.inside and car.s > self.grid.length[car.past, car.here]:
+            car.s -= self.grid.length[car.past, car.here]
+            car.inside, car.tau, car.order = True, 0.0, self.clock - car.s / travel
+        span = SPAN[self.grid.turn(*car.way)]
+        if car.inside and car.s > span:
+            car.s, car.inside, car.order, car.passed = car.s - span, False, math.inf, car.passed + 1
+            car.past, car.here, car.onward = car.here, car.onward, car.beyond
+            car.beyond = self.grid.choose(car.here, car.onward, self.rng)
+
+    def _poses(self) -> np.ndarray:
+        return np.array([self.grid.pose(car) for car in self.cars]).reshape(-1, 3)
+
+    def _count_overlaps(self) -> None:
+        poses = self._poses()
+        first, second = np.triu_indices(len(poses), 1)
+        near = np.abs(poses[first, :2] - poses[second, :2]).max(-1) < 2 * LENGTH_CAR
+        first, second = first[near], second[near]
+        hit = overlap(poses[first], poses[second])
+        self.touched.update(zip(first[hit].tolist(), second[hit].tolist(), strict=True))
+
+    def _to_line(self, car: Car) -> float:
+        """Metres to the next stop line."""
+        if car.inside:
+            return SPAN[self.grid.turn(*car.way)] - car.s + self.grid.length[car.here, car.onward]
+        return self.grid.length[car.past, car.here] - car.s
+
+    def _committed(self, car: Car) -> bool:
+        """Inside a junction, or too fast to stop before it."""
+        return car.inside or car.v**2 / (2 * BRAKE) + car.v * self.system.dt / 2 > self._to_line(car)
+
+    def _rank(self, car: Car) -> tuple[float, float]:
+        """Who goes first: by the time of coming in, then those that cannot stop, the nearest first."""
+        return car.order, self._to_line(car) if self._committed(car) else math.inf
+
+    def _timer(self, junction: int, direction: int) -> float:
+        """What the light of `junction` shows to cars that go in `direction`."""
+        shift = self.cycle / 2 if direction % 2 == 0 else 0.0
+        now = (self.grid.phase[junction] + self.clock * self.system.dt + shift) % self.cycle
+        return max(float(now) - 2 * ALL_RED, 0.0)
+
+    def _grant(self, lanes: Lanes, inside: Inside) -> None:
+        """Let the nearest first-in-lane car into each free stop junction."""
+        for junction in np.flatnonzero(~self.grid.light).tolist():
+            holder = self.holder.get(junction)
+            if holder is not None and holder.here == junction:
+                continue
+            self.holder.pop(junction, None)
+            arms = self.grid.neighbours[junction].values()
+            queue = [lanes[arm, junction][0] for arm in arms if lanes.get((arm, junction))]
+            if queue and not inside.get(junction):
+                self.holder[junction] = max(queue, key=lambda c: c.v**2 / (2 * BRAKE) - self._to_line(c))
+
+    def _observe(self) -> torch.Tensor:
+        lanes: Lanes = {}
+        inside: Inside = {}
+        for car in sorted(self.cars, key=lambda car: -car.s):
+            if car.inside:
+                inside.setdefault(car.here, []).append(car)
+            else:
+                lanes.setdefault((car.past, car.here), []).append(car)
+        self._grant(lanes, inside)
+        for car in self.cars:
+            if not car.inside and self._committed(car):
+                inside.setdefault(car.here, []).append(car)
+        rows = np.zeros((self.agents, len(self.at)))
+        for row, car in zip(rows, self.cars, strict=True):
+            self._fill(row, car, self._leader(car, lanes, inside))
+        return torch.from_numpy(rows)
+
+    def _fill(self, row: np.ndarray, car: Car, lead: Lead) -> None:
+        """The state of the model as this car sees it."""
+        past, ahead = (car.here, car.onward) if car.inside else (car.past, car.here)
+        light = bool(self.grid.light[ahead])
+        gap, speed = lead
+        seen = gap <= SIGHT
+        row[self.at["x"]] = max(-self._to_line(car), -SIGHT)
+        row[self.at["v"]] = car.v
+        row[self.at["sign"]] = light
+        row[self.at["tau"]] = self._timer(ahead, self.grid.heading[past, ahead]) if light else car.tau
+        row[self.at["dx"]] = max(gap, 0.0) if seen else -1.0
+        row[self.at["v_lead"]] = max(speed, 0.0) if seen else 0.0
+        row[self.at["yielding"]] = not light and self.holder.get(ahead) is not car
+
+    def _leader(self, car: Car, lanes: Lanes, inside: Inside) -> Lead:
+        """The nearest car on the path of `car`, or one in the junction ahead that it must let pass."""
+        found, start = (
+            list[Lead](),
+            -car.s,
+        )  # where the piece of road that is looked at begins, seen from the car
+        ways = car.way, (car.here, car.onward, car.beyond)
+        pieces = (ways[0][:2], ways[0], ways[1][:2], ways[1], ways[1][1:])
+        for piece in pieces[car.inside :]:
+            if start > SIGHT + LENGTH_CAR or found:
+                break
+            if len(piece) == 2:
+                ahead = [other for other in lanes.get(piece, ()) if other.s > -start]
+                found += [(start + other.s - LENGTH_CAR, other.v) for other in ahead]
+                start += self.grid.length[piece]
+            else:
+                others = [other for other in inside.get(piece[1], ()) if other is not car]
+                found += [lead for other in others if (lead := self._inside(car, other, piece, -start))]
+                start += SPAN[self.grid.turn(*piece)]
+        lead = min(found, default=(math.inf, 0.0))
+        self.min_gap = min(self.min_gap, lead[0])
+        return lead
+
+    def _inside(self, car: Car, other: Car, way: tuple[int, int, int], mine: float) -> Lead | None:
+        """Gap to and speed of `other` in the junction of `way`, seen from `mine` metres into it."""
+        past, here, onward = way
+        theirs = other.s if other.inside else 0.0
+        if other.past == past:
+            clear = other.onward != onward and self._meet(way, other, theirs)[1] == math.inf
+            ahead = other.inside and theirs > mine and not clear
+            return (theirs - mine - LENGTH_CAR, other.v) if ahead else None
+        waits = not car.inside and not self.grid.light[here] and self.holder.get(here) is not car
+        if here != car.here or waits:
+            return None
+        swept, body = self._meet(way, other, theirs)
+        if self._rank(other) < self._rank(car) and mine <= swept < math.inf:
+            return swept - mine, 0.0
+        return (body - mine, 0.0) if other.inside and mine <= body < math.inf else None
+
+    def _meet(self, way: tuple[int, int, int], other: Car, theirs: float) -> tuple[float, float]:
+        relative = (self.grid.heading[other.past, other.here] - self.grid.heading[way[0], way[1]]) % 4
+        tables = conflicts(relative, self.grid.turn(*way), self.grid.turn(*other.way))
+        index = min(int(theirs / STEP), len(tables[0]) - 1)
+        return tables[0][index], tables[1][index]
