@@ -1,3 +1,114 @@
-"""Signal Temporal Logic in, a trained, checked and guarded controller out."""
+"""Signal Temporal Logic in, a trained, checked and guarded controller out.
 
-__version__ = "0.1.0"
+The names of the library are imported when they are first used:
+
+    spec = stlc.load("specs/traffic.stl")
+    verdict = stlc.Monitor(spec).check("trace.npz")
+
+    task = stlc.compile(spec, stlc.System.load("examples/car.yaml"))
+    run = stlc.train(task, budget=60)
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from stlc.version import __version__
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from stlc.controller.run import Run
+    from stlc.controller.task import Task
+    from stlc.diagnostics import SpecError, StlcError
+    from stlc.dynamics.system import System
+    from stlc.grammar import ast
+    from stlc.monitor.verdict import Monitor
+    from stlc.trace import Trace
+
+    def compile(spec: ast.Spec, system: System) -> Task:
+        """What the package `stlc.compile` does when it is called."""
+
+else:
+    import stlc.compile as compile
+
+__all__ = [
+    "Monitor",
+    "Run",
+    "SpecError",
+    "StlcError",
+    "System",
+    "Task",
+    "Trace",
+    "__version__",
+    "compile",
+    "load",
+    "parse",
+    "train",
+]
+
+_HOMES = {
+    "Monitor": "stlc.monitor.verdict",
+    "Run": "stlc.controller.run",
+    "SpecError": "stlc.diagnostics",
+    "StlcError": "stlc.diagnostics",
+    "System": "stlc.dynamics.system",
+    "Task": "stlc.controller.task",
+    "Trace": "stlc.trace",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'stlc' has no attribute '{name}'")
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def load(path: Path | str) -> ast.Spec:
+    """Read and parse a specification; it remembers its path, so that the system it names is found.
+
+    Raises:
+        UsageError: there is no such file.
+        SpecError: the text is no specification; the error carries all diagnostics.
+    """
+    from stlc.files import read_source
+    from stlc.grammar.parser import parse as parse_source
+
+    return parse_source(read_source(path))
+
+
+def parse(text: str, name: str = "<text>") -> ast.Spec:
+    """Parse the text of a specification; `name` stands for it in messages. Raises SpecError."""
+    from stlc.grammar.parser import parse as parse_source
+    from stlc.source import Source
+
+    return parse_source(Source(name, text))
+
+
+class _CallablePackage(ModuleType):
+    """The package `stlc.compile`, which is also the function of that name.
+
+    The name is taken twice on purpose: the package compiles, and so does the call that a notebook makes.
+    Python looks up what it calls in the class, so the package gets a class that can be called.
+    """
+
+    def __call__(self, spec: ast.Spec, system: System) -> Task:
+        """Join a specification and a system: the states with the timers, and the robustness graph.
+
+        Raises:
+            SpecError: the specification is invalid, or does not fit the system.
+        """
+        from stlc.controller.task import Task
+
+        return Task.of(spec, system)
+
+
+compile.__class__ = _CallablePackage

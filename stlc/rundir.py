@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import secrets
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -307,9 +308,7 @@ def _marker(path: Path) -> Iterator[bool]:
 
 def _point(link: Path, target: str) -> None:
     """Make `link` point to `target`, replacing it in one step. Where links are not allowed there is none."""
-    temporary = link.with_name(f".{link.name}.{os.getpid()}")
-    with suppress(FileNotFoundError):
-        temporary.unlink()
+    temporary = link.with_name(f".{link.name}.{secrets.token_hex(4)}")
     try:
         temporary.symlink_to(target, target_is_directory=True)
     except (OSError, NotImplementedError):

@@ -17,11 +17,11 @@ from typing import Annotated
 
 import typer
 
-from stlc import __version__
 from stlc.cli.errors import TERMINATED
 from stlc.cli.errors import report as report_error
 from stlc.cli.options import describe
 from stlc.cli.output import COLOR, ColorMode, emit, tolerate_closed
+from stlc.version import __version__
 
 app = typer.Typer(
     name="stlc",

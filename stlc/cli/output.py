@@ -51,8 +51,8 @@ def emit_json(
         diagnostics: findings, warnings among them.
         result: what was computed; numbers that are not finite become texts.
     """
-    from stlc import __version__
     from stlc.cli.render import to_json
+    from stlc.version import __version__
 
     document = {
         "stlc": __version__,

@@ -1,0 +1,193 @@
+"""The rooms of docs/architecture.md: imports go down only, and heavy libraries stay where they belong."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / "stlc"
+
+# From the bottom up; what stands in one line is one room.
+ROOMS = (
+    {"source", "version"},
+    {"diagnostics"},
+    {"registry", "units", "words", "jsontext"},
+    {"signature"},
+    {"trace", "trace_csv", "trace_meta", "trace_npz", "trace_time", "rundir", "files", "provenance"},
+    {"grammar"},
+    {"compile"},
+    {"dynamics"},
+    {"monitor"},
+    {"controller"},
+    {"view"},
+    {"cli", "__main__"},
+    {"__init__"},
+)
+
+# Where a library may be imported, as prefixes of module names. What is not listed may be used anywhere.
+HOMES = {
+    "torch": ("stlc.compile.ops_torch", "stlc.dynamics", "stlc.controller", "stlc.view", "stlc.cli"),
+    "safetensors": ("stlc.controller",),
+    "lark": ("stlc.grammar.parser",),
+    "rich": ("stlc.cli", "stlc.view"),
+    "typer": ("stlc.cli",),
+    "click": (),
+    "yaml": ("stlc.dynamics.yaml_nodes", "stlc.rundir"),
+    "pydantic": ("stlc.dynamics",),
+    "matplotlib": ("stlc.view",),
+    "PIL": ("stlc.view",),
+    "numpy": (
+        "stlc.trace",
+        "stlc.compile",
+        "stlc.dynamics",
+        "stlc.monitor",
+        "stlc.controller",
+        "stlc.view",
+        "stlc.cli",
+    ),
+    "pickle": (),
+    "marshal": (),
+    "shelve": (),
+    "dill": (),
+}
+
+
+@dataclass(frozen=True)
+class Import:
+    """One imported module: from where, and whether only type checkers see it."""
+
+    module: str
+    target: str
+    line: int
+    typing_only: bool
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" and len(parts) > 2 else parts)
+
+
+MODULES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
+
+
+def imports_of(name: str) -> Iterator[Import]:
+    guarded = {
+        id(node)
+        for block in ast.walk(TREES[name])
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
+        for statement in block.body
+        for node in ast.walk(statement)
+    }
+    for node in ast.walk(TREES[name]):
+        for target in targets_of(node):
+            yield Import(name, target, node.lineno, id(node) in guarded)
+
+
+def targets_of(node: ast.AST) -> Iterator[str]:
+    """Modules that a statement imports; `from package import module` names the module."""
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names)
+    elif isinstance(node, ast.ImportFrom):
+        assert node.level == 0, "imports are absolute"
+        for alias in node.names:
+            full = f"{node.module}.{alias.name}"
+            yield full if full in MODULES else str(node.module)
+    elif isinstance(node, ast.Call) and ast.unparse(node.func) in (
+        "import_module",
+        "importlib.import_module",
+    ):
+        argument = node.args[0]
+        if isinstance(argument, ast.Constant):
+            yield str(argument.value)
+
+
+def room_of(module: str) -> int:
+    top = module.split(".")[1] if "." in module else "__init__"
+    (room,) = [index for index, names in enumerate(ROOMS) if top in names]
+    return room
+
+
+EVERY_IMPORT = [entry for name in MODULES for entry in imports_of(name)]
+
+
+def test_every_module_has_one_room():
+    assert len(MODULES) > 20
+    for name in MODULES:
+        room_of(name)
+
+
+def test_imports_go_down_only():
+    upward = [
+        f"{entry.module}:{entry.line} imports {entry.target}"
+        for entry in EVERY_IMPORT
+        if entry.target.partition(".")[0] == "stlc" and room_of(entry.target) > room_of(entry.module)
+    ]
+    assert not upward, "\n".join(upward)
+
+
+def test_no_cycles():
+    graph: dict[str, set[str]] = {name: set() for name in MODULES}
+    for entry in EVERY_IMPORT:
+        if entry.target in MODULES and entry.target != entry.module and not entry.typing_only:
+            graph[entry.module].add(entry.target)
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
+
+
+@pytest.mark.parametrize("library", HOMES)
+def test_a_library_is_imported_only_where_it_belongs(library):
+    strays = [
+        f"{entry.module}:{entry.line}"
+        for entry in EVERY_IMPORT
+        if entry.target.partition(".")[0] == library
+        and not entry.typing_only
+        and not entry.module.startswith(HOMES[library])
+    ]
+    assert not strays, f"{library} is imported in {strays}"
+
+
+def test_schemas_do_not_import_torch():
+    strays = [
+        entry
+        for entry in EVERY_IMPORT
+        if entry.module.startswith("stlc.dynamics.schema") and entry.target.partition(".")[0] == "torch"
+    ]
+    assert not strays
+
+
+DANGEROUS = {
+    "eval": "evaluates text",
+    "exec": "runs text",
+    "compile": "compiles text",
+    "yaml.load": "builds objects",
+    "yaml.unsafe_load": "builds objects",
+    "yaml.full_load": "builds objects",
+    "os.system": "runs a shell",
+}
+
+
+def calls(tree: ast.Module) -> Iterator[tuple[str, ast.Call]]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            yield ast.unparse(node.func), node
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_nothing_that_a_user_gives_is_run(name):
+    for function, call in calls(TREES[name]):
+        options = {option.arg: ast.unparse(option.value) for option in call.keywords}
+        assert function not in DANGEROUS, f"{name}:{call.lineno}: {function} {DANGEROUS[function]}"
+        assert options.get("shell", "False") == "False", f"{name}:{call.lineno}: a shell"
+        if function.endswith("torch.load"):
+            assert options.get("weights_only") == "True", f"{name}:{call.lineno}: unpickles"
+        if function in ("np.load", "numpy.load"):
+            assert options.get("allow_pickle") == "False", f"{name}:{call.lineno}: may unpickle"
