@@ -1,0 +1,63 @@
+"""How long a plan stays safe: the longest prefix that phi_safe does not yet condemn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import assert_never
+
+import torch
+from torch import Tensor
+
+from stlc.compile import ir
+from stlc.compile.graph import evaluate
+from stlc.compile.ops_torch import TORCH
+from stlc.compile.semantics import TOLERANCE, Exact
+
+BEYOND = "#beyond"
+
+
+def open_ended(formula: ir.Formula) -> ir.Formula:
+    """The formula with every predicate true where the column `BEYOND` is positive.
+
+    In negation normal form robustness grows with that of each predicate, so this is the upper bound over all
+    ways in which the trace may go on: negative exactly where the known samples already violate the formula.
+    """
+    match formula:
+        case ir.Truth():
+            return formula
+        case ir.Atom():
+            return ir.Join("or", (formula, ir.Atom(ir.Col(BEYOND), strict=True, guard=True)))
+        case ir.Join():
+            return replace(formula, items=tuple(map(open_ended, formula.items)))
+        case ir.Over() | ir.Past() | ir.Shift():
+            return replace(formula, body=open_ended(formula.body))
+        case ir.Until() | ir.Since():
+            return replace(formula, left=open_ended(formula.left), right=open_ended(formula.right))
+        case _:
+            assert_never(formula)
+
+
+def safe_samples(formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor]) -> Tensor:
+    """How many samples from the start on keep all formulas, by bisection; exact.
+
+    Args:
+        formulas: the safety requirements.
+        columns: name -> (time, batch).
+
+    Returns:
+        (batch,) int64, 0 to time.
+    """
+    steps, batch = next(iter(columns.values())).shape
+    device = next(iter(columns.values())).device
+    opened = [open_ended(formula) for formula in formulas]
+    index = torch.arange(steps, device=device)[:, None]
+    low = torch.zeros(batch, dtype=torch.int64, device=device)
+    high = torch.full_like(low, steps if opened else 0)
+    while bool((low < high).any()):
+        middle = (low + high + 1) // 2
+        beyond = torch.where(index >= middle, 1.0, -1.0).to(torch.float64)
+        margins = evaluate(opened, {**columns, BEYOND: beyond}, ops=TORCH, semantics=Exact())
+        kept = torch.stack([margin[0] for margin in margins]).amin(0) >= -TOLERANCE
+        low, high = torch.where(kept, middle, low), torch.where(kept, high, middle - 1)
+    return low if opened else torch.full_like(low, steps)

@@ -1,0 +1,131 @@
+"""Repairing plans: batched hill climbing on the exact robustness, from the policy's own plan.
+
+Gradients see nothing from outside a stop zone or across an obstacle; a search does. Each round tries a batch of
+changed plans per state and keeps the best. Proposals mix noise over a random stretch of time, a constant shift of
+a stretch, a stretch held at one random level, and plans that solved other states.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from stlc.controller.task import FLOAT32_SLACK
+
+if TYPE_CHECKING:
+    from stlc.controller.task import Task
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How much is tried: `rounds` rounds of `tries` plans per state."""
+
+    rounds: int
+    tries: int
+
+
+QUICK = Effort(rounds=30, tries=64)
+DEEP = Effort(rounds=15, tries=256)
+
+
+@dataclass(frozen=True, slots=True)
+class Repaired:
+    """What a search found.
+
+    Attributes:
+        plans: the best plan per state, (B, T, m).
+        rho: its exact robustness, (B,).
+    """
+
+    plans: Tensor
+    rho: Tensor
+
+    @property
+    def solved(self) -> Tensor:
+        """Where the plan satisfies the specification with a little to spare, (B,)."""
+        return self.rho >= FLOAT32_SLACK
+
+
+class Searcher:
+    """A hill climber over open-loop plans of one task."""
+
+    def __init__(self, task: Task, generator: torch.Generator, *, enough: float) -> None:
+        """Search plans of `task`; a state is left alone once its robustness reaches `enough`."""
+        self.task = task
+        self.generator = generator
+        self.enough = enough
+        self.low = task.system.control_low
+        self.high = task.system.control_high
+
+    def repair(self, x0: Tensor, plans: Tensor, bank: Tensor, efforts: tuple[Effort, ...] = (QUICK, DEEP)) -> Repaired:
+        """Improve plans until they satisfy the specification or the effort is spent.
+
+        Args:
+            x0: states, (B, n).
+            plans: where to start, (B, T, m).
+            bank: plans that solved other states, (k, T, m); may be empty.
+            efforts: one after the other; each works on what is still unsolved.
+        """
+        best = plans.clone()
+        rho = self.task.judge(x0, plans).rho.clone()
+        for effort in efforts:
+            for _ in range(effort.rounds):
+                open_ = (rho < self.enough).nonzero()[:, 0]
+                if open_.numel() == 0:
+                    break
+                self._round(x0, best, rho, open_, effort.tries, bank)
+        return Repaired(best, rho)
+
+    def _round(
+        self, x0: Tensor, best: Tensor, rho: Tensor, open_: Tensor, tries: int, bank: Tensor
+    ) -> None:
+        """One round for the states `open_`: updates `best` and `rho` in place."""
+        tried = self._proposals(best[open_], tries, bank)
+        judged = self.task.judge(x0[open_].repeat_interleave(tries, 0), tried.flatten(0, 1))
+        value, which = judged.rho.view(-1, tries).max(1)
+        better = (value > rho[open_]).nonzero()[:, 0]
+        rows = open_[better]
+        best[rows] = tried[better, which[better]]
+        rho[rows] = value[better]
+
+    def _proposals(self, plans: Tensor, tries: int, bank: Tensor) -> Tensor:
+        """Changed plans, (B, tries, T, m), within the bounds."""
+        quarter = tries // 4
+        span = self.high - self.low
+        start = plans[:, None]
+        shape = (plans.shape[0], quarter, *plans.shape[1:])
+        size = span * 0.5 * torch.exp(-3.0 * self._rand(*shape[:2], 1, 1))
+        noise = start + size * self._stretch(shape) * self._randn(*shape)
+        shift = start + size * self._stretch(shape) * self._randn(*shape[:2], 1, shape[3])
+        level = self.low + span * self._rand(*shape[:2], 1, shape[3])
+        held = torch.where(self._stretch(shape) > 0, level, start)
+        others = self._others(plans, tries - 3 * quarter, bank)
+        return torch.cat((noise, shift, held, others), 1).clamp(self.low, self.high)
+
+    def _others(self, plans: Tensor, count: int, bank: Tensor) -> Tensor:
+        """Plans that solved other states; piecewise constant ones while there are few."""
+        states, steps, controls = plans.shape
+        if bank.shape[0] >= 64:
+            index = torch.randint(bank.shape[0], (states, count), generator=self.generator, device=plans.device)
+            return bank[index]
+        pieces = 4
+        levels = self.low + (self.high - self.low) * self._rand(states, count, pieces, controls)
+        return levels.repeat_interleave(-(-steps // pieces), 2)[:, :, :steps]
+
+    def _stretch(self, shape: tuple[int, ...]) -> Tensor:
+        """1 on a random stretch of time per plan and control, else 0; (B, tries, T, m)."""
+        states, tries, steps, controls = shape
+        device = self.low.device
+        first = torch.randint(steps, (states, tries, 1, controls), generator=self.generator, device=device)
+        length = torch.randint(1, steps + 1, (states, tries, 1, controls), generator=self.generator, device=device)
+        time = torch.arange(steps, device=device)[None, None, :, None]
+        return ((time >= first) & (time < first + length)).to(self.low.dtype)
+
+    def _rand(self, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=self.generator, device=self.low.device)
+
+    def _randn(self, *shape: int) -> Tensor:
+        return torch.randn(*shape, generator=self.generator, device=self.low.device)

@@ -1,0 +1,162 @@
+"""Specification and system joined: states to start from, plans to try, and how well they do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from stlc.compile.graph import RobustnessGraph
+from stlc.compile.semantics import TOLERANCE
+from stlc.compile.switch import Hard, Switch
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from stlc.compile.pipeline import Compiled, Rule
+    from stlc.dynamics.system import System
+
+HARD = Hard()
+FLOAT32_SLACK = 1e-5
+"""Rounding that a float32 rollout may add to a margin that is 0 by construction."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """What became of a batch of plans, exact semantics, no gradient.
+
+    Attributes:
+        rho: robustness of the whole specification, (batch,).
+        safe: robustness of phi_safe, (batch,); +inf where nothing is tagged `@safety`.
+        requirements: robustness per requirement, before weight and scale, (batch, requirements).
+        columns: the predicted states, name -> (time, batch).
+    """
+
+    rho: Tensor
+    safe: Tensor
+    requirements: Tensor
+    columns: Mapping[str, Tensor]
+
+
+def satisfied(rho: Tensor) -> Tensor:
+    """Where a robustness counts as satisfied: rho >= -1e-6, with float32 rounding allowed for.
+
+    Args:
+        rho: any shape.
+
+    Returns:
+        A boolean tensor of the same shape.
+    """
+    slack = TOLERANCE if rho.dtype == torch.float64 else FLOAT32_SLACK
+    return rho >= -slack
+
+
+class Task:
+    """What a policy is trained for.
+
+    Attributes:
+        compiled: the specification in steps, its timers included.
+        system: the system, with the timers as its last columns.
+        graph: robustness of the whole specification.
+        safety: robustness of phi_safe.
+    """
+
+    def __init__(self, compiled: Compiled, system: System) -> None:
+        self.compiled = compiled
+        self.system = system.augmented(compiled.timers) if compiled.timers else system
+        self.graph = RobustnessGraph(compiled.requirements, self.system.signature)
+        self.safety = RobustnessGraph(compiled.safety, self.system.signature)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Columns of a state: the system's, then the timers."""
+        return self.system.names
+
+    @property
+    def dt(self) -> float:
+        """Step in seconds."""
+        return self.system.dt
+
+    @property
+    def horizon(self) -> int:
+        """Steps of a plan."""
+        return self.system.horizon
+
+    @property
+    def rules(self) -> tuple[Rule, ...]:
+        """The compiled requirements, in order."""
+        return self.compiled.requirements
+
+    @cached_property
+    def _safe_indices(self) -> list[int]:
+        names = [rule.name for rule in self.rules]
+        return [names.index(rule.name) for rule in self.compiled.safety]
+
+    def sample(
+        self,
+        n: int,
+        *,
+        seed: int | None = None,
+        generator: torch.Generator | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
+    ) -> Tensor:
+        """Initial states, (n, dim). See `System.sample`."""
+        return self.system.sample(n, seed=seed, generator=generator, dtype=dtype, device=device)
+
+    def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
+        """States under a plan: (B, n), (B, T, m) -> (B, T+1, n)."""
+        return self.system.rollout(x0, u, switch)
+
+    def robustness(self, x: Tensor, smoothing: float | None = None) -> Tensor:
+        """Robustness at time 0: (B, T+1, n) -> (B,). Exact (Eq. 4) unless `smoothing` is the paper's k (Eq. 7)."""
+        return self.graph.robustness(x, smoothing)
+
+    def requirement_robustness(self, x: Tensor, smoothing: float | None = None) -> Tensor:
+        """Robustness per requirement, before weight and scale: (B, T+1, n) -> (B, requirements)."""
+        return self.graph.per_requirement(x, smoothing)
+
+    def judge(self, x0: Tensor, u: Tensor) -> Judged:
+        """Roll plans out exactly and judge them, without gradient.
+
+        Args:
+            x0: initial states, (B, n).
+            u: plans in physical units, (B, T, m).
+
+        Returns:
+            The verdicts, in the dtype of `x0`. A plan that holds NaN counts as violated (robustness -inf).
+        """
+        with torch.no_grad():
+            columns = self.system.rollout_columns(x0, u.to(x0.dtype), HARD)
+            each = self.graph.columns(columns)
+            rho = self.graph.overall(each)
+            safe = self.safety.overall(each[:, self._safe_indices])
+        broken = ~torch.isfinite(u).all(2).all(1) | torch.isnan(rho)
+        if bool(broken.any()):
+            lost = torch.full_like(rho, -torch.inf)
+            rho, safe = torch.where(broken, lost, rho), torch.where(broken, lost, safe)
+            each = torch.where(broken[:, None], lost[:, None], each)
+        return Judged(rho, safe, each, columns)
+
+    def cost(self, judged: Judged) -> Tensor:
+        """Performance terms of judged plans, as if every one were satisfying, without gradient: (batch,)."""
+        with torch.no_grad():
+            return self.system.performance(judged.columns, torch.ones_like(judged.rho), rho=judged.rho)
+
+
+def rank(rho: Tensor, cost: Tensor) -> Tensor:
+    """One number to choose plans by: among satisfying plans the cheapest, else the most robust.
+
+    Args:
+        rho: robustness, any shape.
+        cost: performance terms, the same shape.
+
+    Returns:
+        Larger is better: > 1 where satisfied (falling with cost), < 1 elsewhere (rising with robustness).
+    """
+    good = 1.0 + 1.0 / (1.0 + cost.clamp(min=0.0))
+    poor = torch.where(torch.isfinite(rho), rho / (1.0 + rho.abs()), torch.full_like(rho, -1.0))
+    return torch.where(satisfied(rho) & ~torch.isnan(cost), good, poor)
