@@ -9,9 +9,9 @@ step says; what it meets is decided here. Right-hand traffic, metres, seconds.
 * At a stop sign one car has the grant, the nearest of those that are first in their lanes, until it has left
   the junction; everybody else yields. So `yielding` only goes from 1 to 0 while a car approaches.
 * The full cycle of a light is T_total + 2 c. The timer that cars see is held at 0 for 2 c when red begins,
-  then runs to T_total; the crossing direction is half a cycle later. So c seconds of red for all lie between two
-  greens: c = 1.5 s is what a car of 1 m needs at 5 m/s for the box of 6 m. No plan looks from the start of
-  red to the next green, so the held timer never makes it count on green too early.
+  then runs to T_total; the crossing direction is half a cycle later. So c seconds of red for all lie between
+  two greens: c = 1.5 s is what a car of 1 m needs at 5 m/s for the box of 6 m. No plan looks from the start
+  of red to the next green, so the held timer never makes it count on green too early.
 """
 
 from __future__ import annotations
