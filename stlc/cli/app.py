@@ -20,7 +20,7 @@ import typer
 from stlc.cli.errors import TERMINATED
 from stlc.cli.errors import report as report_error
 from stlc.cli.options import describe
-from stlc.cli.output import COLOR, ColorMode, emit, tolerate_closed
+from stlc.cli.output import COLOR, ColorMode, emit, silence
 from stlc.version import __version__
 
 app = typer.Typer(
@@ -75,10 +75,19 @@ def main(argv: Sequence[str] | None = None) -> int:
             code = command.main(args=[*front, *rest], prog_name="stlc", standalone_mode=False)
     except BaseException as error:  # the boundary
         code = report_error(error, rest)
-    for stream in (sys.stdout, sys.stderr):
-        with tolerate_closed(stream):
-            stream.flush()
+    _flush()
     return code if isinstance(code, int) else 0
+
+
+def _flush() -> None:
+    """Leave nothing in the buffers: what cannot be written must not become a message of the interpreter."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (AttributeError, ValueError):
+            continue
+        except OSError:
+            silence(stream)
 
 
 def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:

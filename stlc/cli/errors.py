@@ -35,6 +35,8 @@ class BugError(StlcError):
 def report(error: BaseException, argv: Sequence[str]) -> int:
     """Tell the user about `error` and return the exit code it stands for."""
     match error:
+        case SystemExit() if isinstance(error.__context__, BrokenPipeError):
+            return 0  # the reader has seen enough of a help text
         case SystemExit(code=int() as code):
             return code
         case SystemExit(code=code):

@@ -123,7 +123,9 @@ def _cell(text: str, width: int) -> str:
     return text.rjust(width) if digits.isdigit() else text.ljust(width)
 
 
-def _write(stream: TextIO, text: str) -> None:
+def _write(stream: TextIO | None, text: str) -> None:
+    if stream is None:  # closed by the caller: stlc … >&-
+        return
     with tolerate_closed(stream):
         try:
             stream.write(text + "\n")
@@ -139,6 +141,11 @@ def tolerate_closed(stream: TextIO) -> Iterator[None]:
     try:
         yield
     except BrokenPipeError:
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, stream.fileno())
-        os.close(nowhere)
+        silence(stream)
+
+
+def silence(stream: TextIO) -> None:
+    """Send what is still buffered, and what is written from now on, nowhere."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)

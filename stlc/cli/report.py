@@ -1,0 +1,41 @@
+"""`stlc report`: the page that shows a run."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from stlc.cli.options import JsonOption, describe
+from stlc.cli.output import emit, emit_json
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command(
+        help=describe(
+            "Write a self-contained report.html with the pictures of a run into its folder.",
+            "stlc report latest",
+            note="Training curves, signals with the robustness of each requirement, and the animation of a "
+            "simulation, as far as the run has them. The page opens without a network.",
+        )
+    )(report)
+
+
+def report(
+    run: Annotated[
+        str, typer.Argument(metavar="RUN", help="A run's folder, number, words, spec, or latest.")
+    ] = "latest",
+    as_json: JsonOption = False,
+) -> None:
+    """Write the report of `run` and print where it is."""
+    from stlc.rundir import RunDir
+    from stlc.view.report import write_report
+
+    folder = RunDir.open(run)
+    write_report(folder)
+    path = f"{folder.shown}/report.html"
+    if as_json:
+        emit_json("report/1", ok=True, exit_code=0, result={"run": folder.shown, "report": path})
+    else:
+        emit(path)

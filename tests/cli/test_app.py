@@ -1,0 +1,301 @@
+"""The boundary of the program: whatever happens becomes a message and the right exit code."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+import typer
+
+from stlc.cli.app import app, main
+from stlc.diagnostics import (
+    Diagnostic,
+    MissingError,
+    RunError,
+    SpecError,
+    StlcError,
+    SystemFileError,
+    TraceError,
+    UsageError,
+)
+from stlc.version import __version__
+
+COMMANDS = ("train", "simulate", "check", "compile", "report")
+HEAVY = ("torch", "numpy", "matplotlib", "lark", "yaml")
+
+
+@pytest.fixture
+def boundary(monkeypatch, tmp_path):
+    """Run `main` on a program whose only command does what it is told; crash reports land in `tmp_path`."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+    def run(action, *options):
+        fake = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False)
+
+        @fake.callback()
+        def _program() -> None: ...
+
+        @fake.command()
+        def act(as_json: Annotated[bool, typer.Option("--json")] = False) -> None:
+            action()
+            assert not as_json
+
+        monkeypatch.setattr("stlc.cli.app.app", fake)
+        return main(["act", *options])
+
+    return run
+
+
+def fail(error):
+    def action():
+        raise error
+
+    return action
+
+
+def os_error(number, path=None):
+    return OSError(number, os.strerror(number), path)
+
+
+FAILURES = {
+    "spec": (SpecError(Diagnostic("E203", "units")), 3, "E203"),
+    "system": (SystemFileError(Diagnostic("S101", "key")), 3, "S101"),
+    "trace": (TraceError(Diagnostic("E601", "lacks")), 3, "E601"),
+    "run": (RunError(Diagnostic("R102", "other")), 3, "R102"),
+    "usage": (UsageError(Diagnostic("U102", "gone")), 2, "U102"),
+    "missing": (MissingError(Diagnostic("R301", "no")), 5, "R301"),
+    "bad parameter": (typer.BadParameter("too large"), 2, "U101"),
+    "disk full": (os_error(errno.ENOSPC, "a.npz"), 5, "R201"),
+    "read-only": (os_error(errno.EROFS, "a.npz"), 5, "R201"),
+    "not allowed": (os_error(errno.EACCES, "a.npz"), 5, "R201"),
+    "no file": (os_error(errno.ENOENT, "a.npz"), 2, "U102"),
+    "a folder": (os_error(errno.EISDIR, "a.npz"), 2, "U102"),
+    "memory": (MemoryError(), 5, "R202"),
+    "an extra": (ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib.pyplot"), 5, "R301"),
+    "our own module": (ModuleNotFoundError("No module named 'stlc.x'", name="stlc.x"), 70, "B001"),
+    "division": (ZeroDivisionError("division by zero"), 70, "B001"),
+    "assertion": (AssertionError(), 70, "B001"),
+    "end of file": (EOFError(), 70, "B001"),
+    "recursion": (RecursionError("too deep"), 70, "B001"),
+    "socket": (os_error(errno.ECONNREFUSED), 70, "B001"),
+}
+
+
+@pytest.mark.parametrize(("error", "exit_code", "code"), FAILURES.values(), ids=FAILURES)
+def test_failures_are_told_on_stderr(boundary, capsys, error, exit_code, code):
+    assert boundary(fail(error)) == exit_code
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert f"error[{code}]" in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(("error", "exit_code", "code"), FAILURES.values(), ids=FAILURES)
+def test_failures_are_one_json_document(boundary, capsys, error, exit_code, code):
+    assert boundary(fail(error), "--json") == exit_code
+    out, err = capsys.readouterr()
+    document = json.loads(out)
+    assert err == ""
+    assert document["schema"] == "act/1"
+    assert document["stlc"] == __version__
+    assert (document["ok"], document["exit_code"], document["result"]) == (False, exit_code, None)
+    assert [finding["code"] for finding in document["diagnostics"]] == [code]
+
+
+def test_all_findings_are_shown(boundary, capsys):
+    error = StlcError(Diagnostic("E101", "first"), Diagnostic("W304", "second"))
+    assert boundary(fail(error)) == 3
+    err = capsys.readouterr().err
+    assert "error[E101]: first" in err
+    assert "warning[W304]: second" in err
+
+
+def test_a_crash_leaves_a_report(boundary, capsys, tmp_path):
+    assert boundary(fail(ZeroDivisionError("division by zero")), "--json") == 70
+    (report,) = tmp_path.glob("stlc-crash-*.txt")
+    assert str(report) in capsys.readouterr().out
+    text = report.read_text()
+    assert "command   stlc act --json" in text
+    assert "Traceback (most recent call last)" in text
+    assert "ZeroDivisionError: division by zero" in text
+
+
+def test_a_crash_without_room_for_a_report_still_exits_70(boundary, capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    assert boundary(fail(ZeroDivisionError())) == 70
+    assert "no crash report could be written" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("code", [0, 1, 4])
+def test_exit_codes_of_commands_come_out(boundary, capsys, code):
+    assert boundary(fail(typer.Exit(code))) == code
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [(KeyboardInterrupt(), 130), (typer.Abort(), 130), (SystemExit(143), 143), (SystemExit(None), 0)],
+)
+def test_interruptions(boundary, capsys, error, code):
+    assert boundary(fail(error)) == code
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_sigterm_unwinds_and_exits_143(boundary):
+    unwound = []
+
+    def action():
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(5)
+        finally:
+            unwound.append(True)
+
+    before = signal.getsignal(signal.SIGTERM)
+    assert boundary(action) == 143
+    assert unwound == [True]
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+# ---------------------------------------------------------------------- the real program
+
+
+def stlc(*arguments, **options):
+    environment = {**os.environ, "COLUMNS": "100"}
+    return subprocess.run(
+        [sys.executable, "-m", "stlc", *arguments],
+        text=True,
+        env=environment,
+        timeout=60,
+        check=False,
+        **options,
+    )
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"stlc {__version__}\n"
+
+
+@pytest.mark.parametrize("flag", ["-h", "--help"])
+def test_help_opens_with_a_sentence_and_examples(capsys, flag):
+    assert main([flag]) == 0
+    out = capsys.readouterr().out
+    assert out.splitlines()[2].strip().startswith("Train, check and guard controllers")
+    assert "\n    stlc check trace.npz\n" in out
+    for name in COMMANDS:
+        assert f"\n  {name} " in out
+
+
+def test_nothing_asked_shows_the_help(capsys):
+    assert main([]) == 2
+    assert "Usage: stlc" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "command", "message"),
+    [
+        (["chek"], "stlc", "no such command 'chek'"),
+        (["check", "--nonsense", "--json"], "stlc check", "no such option: --nonsense"),
+        (["compile", "--json"], "stlc compile", "missing argument 'SPEC'"),
+        (["--color", "sometimes", "check"], "stlc", "'sometimes'"),
+    ],
+)
+def test_usage_errors(capsys, arguments, command, message):
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    if "--json" in arguments:
+        (finding,) = json.loads(out)["diagnostics"]
+        assert finding["code"] == "U101"
+        assert message in finding["message"].lower()
+        assert finding["help"] == [f"{command} --help"]
+        assert json.loads(out)["schema"] == f"{arguments[0]}/1"
+    else:
+        assert message in err.lower()
+        assert f"{command} --help" in err
+
+
+def test_color_may_stand_anywhere(capsys):
+    assert main(["check", "no-such.npz", "--color", "always"]) == 2
+    assert "\x1b[" in capsys.readouterr().err
+    assert main(["--color=never", "check", "no-such.npz"]) == 2
+    assert "\x1b[" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_open_their_help_with_a_sentence_and_an_example(capsys, command):
+    assert main([command, "--help"]) == 0
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    assert lines[0].startswith(f"Usage: stlc {command}")
+    assert lines[2][0].isupper()
+    heading = next(i for i, line in enumerate(lines) if line in ("Example:", "Examples:"))
+    assert lines[heading + 1].startswith(f"stlc {command}")
+    assert heading < lines.index("Options:")
+
+
+def test_a_reader_that_goes_away_is_no_error():
+    read, write = os.pipe()
+    os.close(read)
+    done = stlc("--help", stdout=write, stderr=subprocess.PIPE)
+    os.close(write)
+    assert done.returncode == 0
+    assert done.stderr == ""
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_standard_output_is_the_environments_fault():
+    with open("/dev/full", "w") as full:  # noqa: PTH123
+        done = stlc("--version", stdout=full, stderr=subprocess.PIPE)
+    assert done.returncode == 5
+    assert "error[R201]" in done.stderr
+    assert "Exception ignored" not in done.stderr
+
+
+def test_a_closed_standard_output_is_no_error():
+    done = subprocess.run(
+        f"'{sys.executable}' -m stlc --version >&-", shell=True, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+# ---------------------------------------------------------------------- what help costs
+
+
+def imported_by(*arguments):
+    program = (
+        "import sys; from stlc.cli.app import main; main(sys.argv[1:]); print(*sys.modules, file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=True
+    )
+    return {name.partition(".")[0] for name in done.stderr.split()}
+
+
+@pytest.mark.parametrize("arguments", [("--help",), *((name, "--help") for name in COMMANDS)], ids=" ".join)
+def test_help_imports_nothing_heavy(arguments):
+    assert not imported_by(*arguments) & {*HEAVY, "rich", "pydantic"}
+
+
+@pytest.mark.bench
+def test_help_is_fast():
+    seconds = []
+    for _ in range(5):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        stlc("--help", stdout=subprocess.DEVNULL)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        seconds.append(after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime)
+    assert min(seconds) < 0.25, f"{min(seconds):.3f} s of CPU time"
+
+
+def test_every_command_is_there():
+    assert {command.name for command in typer.main.get_command(app).commands.values()} == set(COMMANDS)
