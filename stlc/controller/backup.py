@@ -1,38 +1,31 @@
-"""The paper's backup policy: sampled prefixes, finished by the policy ("MPC-based Deployment with a Backup Policy").
+"""The paper's backup policy: sampled prefixes, finished by the policy (section "MPC-based Deployment").
 
-For T0 = 1, 2, … every sequence of T0 actions on a grid of L values a control, M = L^(m T0), is followed from the state at
-hand, and the policy plans on from where it ends. The first T0 with a plan that satisfies phi, or else phi_safe, decides.
+For T0 = 1, 2, … every sequence of T0 actions on a grid of L values a control, M = L^(m T0), is followed from
+the state at hand, and the policy plans on from where it ends. The first T0 with a plan that satisfies phi, or
+else phi_safe, decides; where none has, the plan with the longest safe prefix at the last T0.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from stlc.compile.semantics import TOLERANCE
 from stlc.controller.prefix import safe_samples
-from stlc.controller.task import Task
 
-Aim: TypeAlias = Literal["phi", "safe", "prefix"]
-
-TIE = 1e-9
-
-
-class Planner(Protocol):
-    """What plans: a network, a search, a rule."""
-
-    def plan(self, x0: Tensor) -> Tensor:
-        """(batch, states) -> (batch, horizon, controls), physical units."""
+if TYPE_CHECKING:
+    from stlc.controller.policy import Policy
+    from stlc.controller.task import Task
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """What is tried: `values` a control, prefixes of each of `lengths`, at most `batch` trajectories at a time."""
+    """What is tried: `values` a control, prefixes of each of `lengths`, at most `batch` at a time."""
 
     values: tuple[tuple[float, ...], ...]
     lengths: tuple[int, ...]
@@ -62,12 +55,14 @@ class Found:
 
     Attributes:
         plan: (agents, horizon, controls) float64.
+        source: (agents,) int64, 1 where phi or phi_safe holds, 2 where the longest safe prefix decided.
         t0: (agents,) int64, length of the prefix.
         rho: (agents,) float64, robustness of phi.
         safe: (agents,) bool, whether phi_safe holds.
     """
 
     plan: Tensor
+    source: Tensor
     t0: Tensor
     rho: Tensor
     safe: Tensor
@@ -75,12 +70,12 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class _Candidates:
-    """Plans of several agents from one state each: (agents, choices, …); choice 0 is the policy's own."""
+    """Plans of several agents: (agents, choices, …); choice 0 begins as the policy's own plan does."""
 
-    x: Tensor
     plans: Tensor
     rho: Tensor
     safe: Tensor
+    cost: Tensor
 
 
 class Backup:
@@ -88,57 +83,135 @@ class Backup:
 
     Args:
         task: specification and system.
-        planner: who finishes the prefixes.
+        policy: who finishes the prefixes.
         grid: what is tried; by default what the system file says.
     """
 
-    def __init__(self, task: Task, planner: Planner, *, grid: Grid | None = None) -> None:
-        self.task, self.planner = task, planner
+    def __init__(self, task: Task, policy: Policy, *, grid: Grid | None = None) -> None:
+        self.task, self.policy = task, policy
         self.grid = grid or Grid.of(task)
+        self._formulas = [rule.formula for rule in task.compiled.safety]
 
+    @torch.no_grad()
     def search(self, x: Tensor, plan: Tensor) -> Found:
         """Better plans for states whose own plan was found wanting.
 
+        Among plans of the same rank, robustness decides, then the performance terms of the objective (robustness
+        is flat where a deadline cannot be met), then closeness to the policy.
+
         Args:
             x: (agents, n) float64.
-            plan: (agents, T, m) float64, what the policy would do.
+            plan: (agents, T, m), what the policy would do; entries that are not finite are replaced.
+
+        Returns:
+            One plan an agent; `found.source` says by which rank.
         """
-        agents = len(x)
-        found = Found(
-            plan.clone(),
-            torch.zeros(agents, dtype=torch.int64, device=x.device),
-            torch.full((agents,), -torch.inf, dtype=torch.float64, device=x.device),
-            torch.zeros(agents, dtype=torch.bool, device=x.device),
-        )
-        open_ = torch.arange(agents, device=x.device)
+        plan = finite(plan.to(x.dtype), self.task)
+        found = _nothing(plan)
+        todo = torch.arange(len(x), device=x.device)
         for length in self.grid.lengths:
-            prefixes = self.grid.prefixes(length).to(x.device)
+            prefixes = self.grid.prefixes(length).to(x)
             last = length == self.grid.lengths[-1]
-            left = [
-                self._settle(found, group, (x, plan, prefixes), last=last)
-                for group in open_.split(max(self.grid.batch // (len(prefixes) + 1), 1))
-            ]
-            open_ = torch.cat(left) if left else open_
-            if not len(open_):
-                break
+            left = []
+            for group in _pieces(todo, max(self.grid.batch // (len(prefixes) + 1), 1)):
+                candidates = self._candidates(x[group], plan[group], prefixes)
+                done = self._enter(found, candidates, group, length)
+                if last and not bool(done.all()):
+                    self._enter_safest(found, _at(candidates, ~done), (x[group[~done]], group[~done]), length)
+                left.append(group[~done])
+            todo = torch.cat(left) if left else todo
         return found
 
-    def _settle(
-        self, found: Found, group: Tensor, given: tuple[Tensor, Tensor, Tensor], *, last: bool
-    ) -> Tensor:
-        """Enter the choices of one T0 for some agents; returns those that are still open."""
-        x, plan, prefixes = given
-        candidates = self._candidates(x[group], plan[group], prefixes)
-        satisfied, safe = candidates.rho >= -TOLERANCE, candidates.safe
-        eligible = torch.where(satisfied.any(1, keepdim=True), satisfied, safe)
+    def _candidates(self, x: Tensor, own: Tensor, prefixes: Tensor) -> _Candidates:
+        """All plans of one T0 for some agents, judged; at most `grid.batch` trajectories at a time."""
+        agents, (count, length, _) = len(x), prefixes.shape
+        heads = torch.cat((own[:, None, :length], prefixes.expand(agents, -1, -1, -1)), 1).flatten(0, 1)
+        starts = x.repeat_interleave(count + 1, 0)
+        parts = [
+            self._finish(start, head)
+            for start, head in zip(self._parts(starts), self._parts(heads), strict=True)
+        ]
+        columns = [torch.cat(column) for column in zip(*parts, strict=True)]
+        return _Candidates(*(column.view(agents, count + 1, *column.shape[1:]) for column in columns))
+
+    def _finish(self, x: Tensor, head: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Plans that begin with `head` and go on as the policy plans from its end, and their verdicts."""
+        reached = self.task.rollout(x, head)[:, -1]
+        tail = finite(self.policy.plan(reached).to(x.dtype), self.task)
+        plans = torch.cat((head, tail[:, : self.task.horizon - head.shape[1]]), 1)
+        judged = self.task.judge(x, plans)
+        cost = self.task.system.performance(judged.columns, torch.ones_like(judged.rho))
+        return plans, judged.rho, judged.safe >= -TOLERANCE, cost
+
+    def _parts(self, rows: Tensor) -> list[Tensor]:
+        return _pieces(rows, self.grid.batch)
+
+    def _enter(self, found: Found, candidates: _Candidates, group: Tensor, length: int) -> Tensor:
+        """Take the best plan where one satisfies phi, or else phi_safe; returns where that was so."""
+        good = candidates.rho >= -TOLERANCE
+        eligible = torch.where(good.any(1, keepdim=True), good, candidates.safe)
         done = eligible.any(1)
-        for rows, aim in ((done, "rho"), (~done if last else torch.zeros_like(done), "prefix")):
-            if bool(rows.any()):
-                part = _Candidates(*(value[rows] for value in _fields(candidates)))
-                allowed = eligible[rows] if aim == "rho" else self._longest(part)
-                pick = self._best(part, allowed)
-                row = torch.arange(len(pick), device=x.device)
-                at = group[rows]
-                found.plan[at], found.t0[at] = part.plans[row, pick], prefixes.shape[1]
-                found.rho[at], found.safe[at] = part.rho[row, pick], part.safe[row, pick]
-        return group[~done]
+        _take(found, _at(candidates, done), (eligible[done], group[done]), (1, length))
+        return done
+
+    def _enter_safest(
+        self, found: Found, candidates: _Candidates, where: tuple[Tensor, Tensor], length: int
+    ) -> None:
+        """Take the plan with the longest safe prefix."""
+        x, group = where
+        agents, choices = candidates.rho.shape
+        starts = self._parts(x.repeat_interleave(choices, 0))
+        plans = self._parts(candidates.plans.flatten(0, 1))
+        samples = torch.cat(
+            [
+                safe_samples(self._formulas, self.task.system.rollout_columns(start, plan))
+                for start, plan in zip(starts, plans, strict=True)
+            ]
+        ).view(agents, choices)
+        _take(found, candidates, (samples == samples.amax(1, keepdim=True), group), (2, length))
+
+
+def finite(plan: Tensor, task: Task) -> Tensor:
+    """The plan with every entry that is no number replaced by the control's value nearest to 0."""
+    low, high = task.system.control_low.to(plan), task.system.control_high.to(plan)
+    return torch.where(torch.isfinite(plan), plan, torch.zeros_like(plan).clamp(low, high))
+
+
+def best(allowed: Tensor, keys: Sequence[Tensor]) -> Tensor:
+    """Per row the first allowed choice that is best by the keys in order; (rows, choices) each -> (rows,)."""
+    for key in keys:
+        value = torch.where(allowed & ~key.isnan(), key, -torch.inf)
+        allowed = allowed & (value >= value.amax(1, keepdim=True) - TOLERANCE)
+    return allowed.to(torch.uint8).argmax(1)
+
+
+def _pieces(rows: Tensor, size: int) -> list[Tensor]:
+    return [rows[at : at + size] for at in range(0, len(rows), size)]
+
+
+def _nothing(plan: Tensor) -> Found:
+    agents = len(plan)
+    number = torch.zeros(agents, dtype=torch.int64, device=plan.device)
+    return Found(
+        plan.clone(),
+        number + 2,
+        number.clone(),
+        torch.full((agents,), -torch.inf, dtype=plan.dtype, device=plan.device),
+        torch.zeros(agents, dtype=torch.bool, device=plan.device),
+    )
+
+
+def _at(candidates: _Candidates, rows: Tensor) -> _Candidates:
+    return _Candidates(
+        candidates.plans[rows], candidates.rho[rows], candidates.safe[rows], candidates.cost[rows]
+    )
+
+
+def _take(found: Found, candidates: _Candidates, which: tuple[Tensor, Tensor], how: tuple[int, int]) -> None:
+    """Enter the best allowed candidates for the agents of a group."""
+    allowed, group = which
+    row = torch.arange(len(group), device=group.device)
+    pick = best(allowed, (candidates.rho, -candidates.cost))
+    found.plan[group] = candidates.plans[row, pick]
+    found.source[group], found.t0[group] = how
+    found.rho[group], found.safe[group] = candidates.rho[row, pick], candidates.safe[row, pick]

@@ -12,7 +12,7 @@ from torch import Tensor
 from stlc.compile import ir
 from stlc.compile.graph import evaluate
 from stlc.compile.ops_torch import TORCH
-from stlc.compile.semantics import TOLERANCE, Exact
+from stlc.compile.semantics import TOLERANCE
 
 BEYOND = "#beyond"
 
@@ -57,7 +57,7 @@ def safe_samples(formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor]) 
     while bool((low < high).any()):
         middle = (low + high + 1) // 2
         beyond = torch.where(index >= middle, 1.0, -1.0).to(torch.float64)
-        margins = evaluate(opened, {**columns, BEYOND: beyond}, ops=TORCH, semantics=Exact())
+        margins = evaluate(opened, {**columns, BEYOND: beyond}, ops=TORCH)
         kept = torch.stack([margin[0] for margin in margins]).amin(0) >= -TOLERANCE
         low, high = torch.where(kept, middle, low), torch.where(kept, high, middle - 1)
     return low if opened else torch.full_like(low, steps)

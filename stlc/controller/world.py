@@ -1,8 +1,8 @@
 """The world of a deployment: what is true outside the model that the policy plans with.
 
-A system file names one as `test: {world: "traffic_grid.py:TrafficGrid"}`: a class in a Python file beside it, imported
-only when a deployment of that system is asked for. Without one, `ModelWorld` moves independent agents by the model
-itself and lets the `events` of the file happen to them.
+A system file names one as `test: {world: "traffic_grid.py:TrafficGrid"}`, a class in a Python file beside it
+that is imported only when that system is deployed. Without one, independent agents move as the model does and
+meet the `events` of the file.
 """
 
 from __future__ import annotations
@@ -10,17 +10,149 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections.abc import Mapping
-from pathlib import Path
-from types import ModuleType
-from typing import Any, ClassVar, Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stlc.compile.ops_torch import TORCH
 from stlc.controller.events import Events
 from stlc.diagnostics import Diagnostic, SystemFileError
-from stlc.dynamics.decl import SystemDecl, WorldRef
-from stlc.dynamics.system import System
+from stlc.registry import closest
+
+if TYPE_CHECKING:
+    from stlc.dynamics.decl import SystemDecl, WorldRef
+    from stlc.dynamics.system import System
+
+Scene = Mapping[str, NDArray[Any]]
+
+
+class World(Protocol):
+    """What agents meet, and what they cannot plan for. States are the system's, float64, without timers."""
+
+    def reset(self) -> Tensor:
+        """Begin; (agents, n) states."""
+
+    def advance(self, x: Tensor, action: Tensor) -> Tensor:
+        """One step of the truth: (agents, n), (agents, m) -> (agents, n)."""
+
+    def progress(self) -> Mapping[str, float]:
+        """How much of the task got done since `reset`."""
+
+    def snapshot(self) -> Scene:
+        """What a picture of this instant needs: arrays that keep their shape through a deployment."""
+
+    @staticmethod
+    def draw(axes: Any, scene: Scene, index: int) -> None:
+        """Draw frame `index` of snapshots stacked over time, with `decision` (frames, agents) beside them."""
+
+
+class WorldType(Protocol):
+    """How a world is made: everything random in it comes from `generator`."""
+
+    def __call__(self, system: System, agents: int, generator: torch.Generator) -> World: ...
+
+
+class ModelWorld:
+    """Independent agents that move exactly as the model does, and the events of the system file."""
+
+    def __init__(self, system: System, agents: int, generator: torch.Generator) -> None:
+        self._system, self._agents, self._generator = system, agents, generator
+        self._events = Events(system.decl.test.events, system.names, system.dt)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._step = 0
+        self._counts = {event.name: 0.0 for event in self._system.decl.test.events if event.when is not None}
+
+    def reset(self) -> Tensor:
+        """Initial states as in training."""
+        self._begin()
+        drawn = self._system.sample(self._agents, generator=self._generator, dtype=torch.float64)
+        return self._happen(drawn)
+
+    def advance(self, x: Tensor, action: Tensor) -> Tensor:
+        """One step of the model, then what happens to whom."""
+        moved = self._system.step(x, action)
+        self._step += 1
+        return self._happen(moved)
+
+    def progress(self) -> Mapping[str, float]:
+        """How often each event that waits for a state has happened, over all agents."""
+        return dict(self._counts)
+
+    def snapshot(self) -> Scene:
+        """The states and the names of their columns."""
+        return {"state": self._x.numpy(force=True), "names": np.array(self._system.names)}
+
+    @staticmethod
+    def draw(axes: Any, scene: Scene, index: int) -> None:
+        """Agents in the plane of the first two columns."""
+        names, state = scene["names"][index], scene["state"]
+        decided = scene["decision"][index] if "decision" in scene else np.zeros(state.shape[1], dtype=int)
+        second = min(1, state.shape[2] - 1)
+        for source, color in enumerate(("#2563a8", "#e08a00", "#c0267e")):
+            points = state[index][decided == source]
+            axes.scatter(points[:, 0], points[:, second], s=18, color=color, lw=0)
+        for column, limit in ((0, axes.set_xlim), (second, axes.set_ylim)):
+            low, high = float(state[..., column].min()), float(state[..., column].max())
+            limit(low - 0.05 * (high - low) - 1e-3, high + 0.05 * (high - low) + 1e-3)
+        axes.set(xlabel=str(names[0]), ylabel=str(names[second]))
+
+    def _happen(self, x: Tensor) -> Tensor:
+        self._x, counts = self._events.apply(x, self._step, self._generator)
+        for name, count in counts.items():
+            self._counts[name] += count
+        return self._x
+
+
+_METHODS = ("reset", "advance", "progress", "snapshot", "draw")
+
+
+def world_type(decl: SystemDecl) -> WorldType:
+    """The world that a system file names, else `ModelWorld`.
+
+    Raises:
+        SystemFileError: S206, the file or the class cannot be loaded or is no world.
+    """
+    return ModelWorld if decl.test.world is None else _load(decl.test.world)
+
+
+def _load(reference: WorldRef) -> WorldType:
+    path, name = reference.path, reference.name
+    if not path.is_file():
+        raise _refused(reference, f"there is no file `{path}`")
+    module_name = f"stlc_world_{path.stem}"
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    if spec is None or spec.loader is None:
+        raise _refused(reference, f"`{path}` is not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[module_name] = module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[module_name]
+        raise _refused(reference, f"importing `{path}` fails", f"{type(error).__name__}: {error}") from error
+    found = getattr(module, name, None)
+    if not isinstance(found, type):
+        guess = closest(name, [key for key, value in vars(module).items() if isinstance(value, type)])
+        advice = f"did you mean `{guess}`?" if guess else ""
+        raise _refused(reference, f"`{path}` has no class `{name}`", advice=advice)
+    missing = [method for method in _METHODS if not callable(getattr(found, method, None))]
+    if missing:
+        raise _refused(reference, f"`{name}` in `{path}` is no world: it lacks {', '.join(missing)}")
+    return cast(WorldType, found)
+
+
+def _refused(reference: WorldRef, message: str, note: str = "", advice: str = "") -> SystemFileError:
+    return SystemFileError(
+        Diagnostic(
+            "S206",
+            message,
+            reference.span,
+            label="named here",
+            note=(note,) if note else (),
+            help=(advice,) if advice else (),
+        )
+    )
