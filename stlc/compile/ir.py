@@ -160,13 +160,15 @@ class Shift:
     """The value `steps` later (negative: earlier).
 
     `outside` says what stands beyond the ends of the trace: None leaves it undefined like any window;
-    False is what `rise` and `fall` need at the first sample.
+    False is what `rise` and `fall` need at the first sample. Where windows are cut to the trace an undefined
+    value is false, or true for a `weak` one, which is what the negation of the other kind is.
     """
 
     steps: int
     body: Formula
     outside: bool | None = None
     span: Span | None = field(default=None, compare=False, repr=False)
+    weak: bool = False
 
 
 Formula: TypeAlias = Truth | Atom | Join | Over | Past | Until | Since | Shift

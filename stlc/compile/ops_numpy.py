@@ -1,0 +1,143 @@
+"""The array namespace over NumPy: for recorded traces, and wherever torch must not be imported."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from functools import reduce
+from typing import Any, cast, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.ops import Array, Mask, Ops
+
+
+@final
+class NumpyOps:
+    """`stlc.compile.ops.Ops` over NumPy arrays. There are no gradients: straight-through is hard."""
+
+    name = "numpy"
+
+    add = staticmethod(operator.add)
+    sub = staticmethod(operator.sub)
+    mul = staticmethod(operator.mul)
+    div = staticmethod(np.true_divide)
+    abs = staticmethod(np.abs)
+    exp = staticmethod(np.exp)
+    log = staticmethod(np.log)
+    sin = staticmethod(np.sin)
+    cos = staticmethod(np.cos)
+    tan = staticmethod(np.tan)
+    asin = staticmethod(np.arcsin)
+    acos = staticmethod(np.arccos)
+    atan = staticmethod(np.arctan)
+    tanh = staticmethod(np.tanh)
+    sign = staticmethod(np.sign)
+    floor = staticmethod(np.floor)
+    ceil = staticmethod(np.ceil)
+    round = staticmethod(np.rint)
+    square = staticmethod(np.square)
+    minimum = staticmethod(np.minimum)
+    maximum = staticmethod(np.maximum)
+    sqrt = staticmethod(np.sqrt)
+    pow = staticmethod(np.power)
+    mod = staticmethod(np.mod)
+    atan2 = staticmethod(np.arctan2)
+    gt = staticmethod(operator.gt)
+    ge = staticmethod(operator.ge)
+    both = staticmethod(operator.and_)
+    either = staticmethod(operator.or_)
+    where = staticmethod(np.where)
+    cat = staticmethod(np.concatenate)
+    stack = staticmethod(np.stack)
+
+    def axpy(self, a: Array, b: Array, factor: float) -> Array:
+        """`a + factor * b`."""
+        return a + factor * b
+
+    def addcmul(self, a: Array, b: Array, c: Array, factor: float) -> Array:
+        """`a + factor * b * c`."""
+        product = b * c
+        return a + (product if factor == 1.0 else factor * product)
+
+    def clamp(self, x: Array, low: float | None, high: float | None) -> Array:
+        """`x` cut to [low, high]."""
+        return np.clip(x, low, high)
+
+    def norm(self, *components: Array | float) -> Array:
+        """Euclidean length."""
+        return np.sqrt(reduce(operator.add, (np.square(part) for part in components)))
+
+    def number(self, mask: Mask, like: Array) -> Array:
+        """1 where `mask`, else 0."""
+        return mask.astype(like.dtype)
+
+    def lerp(self, no: Array | float, yes: Array | float, weight: Array) -> Array:
+        """`no + weight (yes - no)`, exact at both ends."""
+        span = yes - no
+        return np.where(weight < 0.5, no + weight * span, yes - span * (1.0 - weight))
+
+    def infinite(self, mask: Mask, like: Array) -> Array:
+        """+inf where `mask`, else -inf."""
+        return np.where(mask, np.inf, -np.inf).astype(like.dtype)
+
+    def straight_through(self, rho: Array, strict: bool, slope: float) -> Array:  # noqa: ARG002
+        """1 where `rho` > 0 (>= 0 unless `strict`), else 0."""
+        return self.number(rho > 0 if strict else rho >= 0, rho)
+
+    def amin(self, x: Array) -> Array:
+        """Minimum over axis 0, kept."""
+        return x.min(axis=0, keepdims=True)
+
+    def amax(self, x: Array) -> Array:
+        """Maximum over axis 0, kept."""
+        return x.max(axis=0, keepdims=True)
+
+    def cummin(self, x: Array) -> Array:
+        """Running minimum along axis 0."""
+        return np.minimum.accumulate(x, axis=0)
+
+    def cummax(self, x: Array) -> Array:
+        """Running maximum along axis 0."""
+        return np.maximum.accumulate(x, axis=0)
+
+    def softmax(self, x: Array, k: float) -> Array:
+        """Smooth extremum over axis 0, kept."""
+        top = self.amax(x) if k > 0 else self.amin(x)
+        finite = np.where(np.isfinite(top), top, 0.0)
+        with self.quiet():
+            total = np.exp(np.minimum(k * (x - finite), 0.0)).sum(axis=0, keepdims=True)
+            return top + np.log(np.maximum(total, 1.0)) / k
+
+    def softmax2(self, a: Array, b: Array, k: float) -> Array:
+        """Smooth extremum of two."""
+        top = np.maximum(a, b) if k > 0 else np.minimum(a, b)
+        with self.quiet():
+            gap = np.where(np.isfinite(top), np.abs(a - b), np.inf)
+            return top + np.log1p(np.exp(-abs(k) * gap)) / k
+
+    def full(self, shape: tuple[int, ...], value: float, like: Array) -> Array:
+        """A constant array."""
+        return np.full(shape, value, dtype=like.dtype)
+
+    def flip(self, x: Array) -> Array:
+        """Reversed along axis 0."""
+        return x[::-1]
+
+    def rows(self, keep: NDArray[np.bool_], x: Array, value: float) -> Array:
+        """`x` with `value` in the rows that are not kept."""
+        return np.where(keep.reshape(-1, *(1,) * (x.ndim - 1)), x, np.asarray(value, dtype=x.dtype))
+
+    def columns(self, x: Array) -> Sequence[Array]:
+        """One `(time, batch)` array for every column of `(batch, time, dim)`."""
+        return list(np.ascontiguousarray(x.transpose(2, 1, 0)))
+
+    def quiet(self) -> AbstractContextManager[object]:
+        """Numerical exceptions give inf and NaN."""
+        context: Any = np.errstate(all="ignore")
+        return context  # type: ignore[no-any-return]
+
+
+NUMPY: Ops = cast("Ops", NumpyOps())

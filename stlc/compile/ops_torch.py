@@ -1,0 +1,242 @@
+"""The array namespace over torch: gradients, batches, any device. Every method is one or two operations."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, cast, final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from stlc.compile.ops import Mask, Ops
+
+
+class _SafeSqrt(torch.autograd.Function):
+    """Square root whose gradient at 0 is 0."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        root = torch.sqrt(x)
+        ctx.save_for_backward(root)
+        return root
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (root,) = ctx.saved_tensors
+        return torch.where(root > 0, grad / (2.0 * root), 0.0)
+
+
+class _StraightThrough(torch.autograd.Function):
+    """Hard forward, the slope of a tanh backward."""
+
+    @staticmethod
+    def forward(ctx: Any, rho: Tensor, strict: bool, slope: float) -> Tensor:
+        ctx.save_for_backward(rho)
+        ctx.slope = slope
+        return (rho > 0 if strict else rho >= 0).to(rho.dtype)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        (rho,) = ctx.saved_tensors
+        bend = torch.tanh(rho * ctx.slope).square_()
+        return grad * torch.add(0.5 * ctx.slope, bend, alpha=-0.5 * ctx.slope), None, None
+
+
+class _SmoothMax(torch.autograd.Function):
+    """`log(sum(exp(k x))) / k` over axis 0; infinite entries carry no gradient and make no NaN."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, k: float) -> Tensor:
+        top = x.amax(dim=0, keepdim=True) if k > 0 else x.amin(dim=0, keepdim=True)
+        finite = torch.nan_to_num(top, nan=torch.nan, posinf=0.0, neginf=0.0)
+        total = torch.exp(((x - finite) * k).clamp_max_(0.0)).sum(dim=0, keepdim=True)
+        out = top + total.clamp_min_(1.0).log_() / k
+        ctx.save_for_backward(x, out)
+        ctx.k = k
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        x, out = ctx.saved_tensors
+        weights = torch.exp((x - out) * ctx.k)
+        return torch.where(torch.isfinite(x), grad * weights, 0.0), None
+
+
+class _SmoothMax2(torch.autograd.Function):
+    """`log(exp(k a) + exp(k b)) / k` for operands of one shape."""
+
+    @staticmethod
+    def forward(ctx: Any, a: Tensor, b: Tensor, k: float) -> Tensor:
+        top = torch.maximum(a, b) if k > 0 else torch.minimum(a, b)
+        gap = torch.where(torch.isfinite(top), (a - b).abs_(), torch.inf)
+        out = top + torch.log1p(torch.exp(gap * -abs(k))) / k
+        ctx.save_for_backward(a, b, out)
+        ctx.k = k
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+        a, b, out = ctx.saved_tensors
+        left = torch.where(torch.isfinite(a), grad * torch.exp((a - out) * ctx.k), 0.0)
+        right = torch.where(torch.isfinite(b), grad * torch.exp((b - out) * ctx.k), 0.0)
+        return left, right, None
+
+
+def _pair(a: Tensor | float, b: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Both as tensors, where torch wants two of them."""
+    if isinstance(a, Tensor):
+        return a, b if isinstance(b, Tensor) else a.new_tensor(b)
+    assert isinstance(b, Tensor)
+    return b.new_tensor(a), b
+
+
+@final
+class TorchOps:
+    """`stlc.compile.ops.Ops` over torch tensors; dtype and device follow the operands."""
+
+    name = "torch"
+
+    add = staticmethod(operator.add)
+    sub = staticmethod(operator.sub)
+    mul = staticmethod(operator.mul)
+    div = staticmethod(operator.truediv)
+    pow = staticmethod(operator.pow)
+    abs = staticmethod(torch.abs)
+    exp = staticmethod(torch.exp)
+    log = staticmethod(torch.log)
+    sin = staticmethod(torch.sin)
+    cos = staticmethod(torch.cos)
+    tan = staticmethod(torch.tan)
+    asin = staticmethod(torch.asin)
+    acos = staticmethod(torch.acos)
+    atan = staticmethod(torch.atan)
+    tanh = staticmethod(torch.tanh)
+    sign = staticmethod(torch.sign)
+    floor = staticmethod(torch.floor)
+    ceil = staticmethod(torch.ceil)
+    round = staticmethod(torch.round)
+    square = staticmethod(torch.square)
+    mod = staticmethod(torch.remainder)
+    minimum = staticmethod(torch.minimum)
+    maximum = staticmethod(torch.maximum)
+    gt = staticmethod(operator.gt)
+    ge = staticmethod(operator.ge)
+    both = staticmethod(operator.and_)
+    either = staticmethod(operator.or_)
+    where = staticmethod(torch.where)
+
+    def sqrt(self, x: Tensor) -> Tensor:
+        """Square root; gradient 0 at 0."""
+        root: Tensor = _SafeSqrt.apply(x)  # type: ignore[no-untyped-call]
+        return root
+
+    def atan2(self, a: Tensor | float, b: Tensor | float) -> Tensor:
+        """Angle of the point (b, a)."""
+        return torch.atan2(*_pair(a, b))
+
+    def axpy(self, a: Tensor | float, b: Tensor, factor: float) -> Tensor:
+        """`a + factor * b`."""
+        return torch.add(a, b, alpha=factor) if isinstance(a, Tensor) else b * factor + a
+
+    def addcmul(self, a: Tensor | float, b: Tensor, c: Tensor, factor: float) -> Tensor:
+        """`a + factor * b * c`."""
+        start = a if isinstance(a, Tensor) else b.new_tensor(a)
+        return torch.addcmul(start, b, c, value=factor)
+
+    def clamp(self, x: Tensor, low: float | None, high: float | None) -> Tensor:
+        """`x` cut to [low, high]; the gradient at a bound is 1."""
+        return torch.clamp(x, low, high)
+
+    def norm(self, *components: Tensor | float) -> Tensor:
+        """Euclidean length; gradient 0 at 0."""
+        like = next(part for part in components if isinstance(part, Tensor))
+        parts = [part if isinstance(part, Tensor) else like.new_tensor(part) for part in components]
+        stacked = torch.stack(torch.broadcast_tensors(*parts))  # type: ignore[no-untyped-call]
+        length: Tensor = torch.linalg.vector_norm(stacked, dim=0)
+        return length
+
+    def number(self, mask: Mask, like: Tensor) -> Tensor:
+        """1 where `mask`, else 0."""
+        out: Tensor = mask.to(like.dtype)
+        return out
+
+    def lerp(self, no: Tensor | float, yes: Tensor | float, weight: Tensor) -> Tensor:
+        """`no + weight (yes - no)`, exact at both ends."""
+        return torch.lerp(*_pair(no, yes), weight)
+
+    def infinite(self, mask: Mask, like: Tensor) -> Tensor:
+        """+inf where `mask`, else -inf, without gradient."""
+        low = like.new_full((), -torch.inf)
+        return torch.where(mask, -low, low)
+
+    def straight_through(self, rho: Tensor, strict: bool, slope: float) -> Tensor:
+        """Hard forward, the slope of a tanh backward."""
+        out: Tensor = _StraightThrough.apply(rho, strict, slope)  # type: ignore[no-untyped-call]
+        return out
+
+    def amin(self, x: Tensor) -> Tensor:
+        """Minimum over axis 0, kept; ties share the gradient."""
+        return x.amin(dim=0, keepdim=True)
+
+    def amax(self, x: Tensor) -> Tensor:
+        """Maximum over axis 0, kept; ties share the gradient."""
+        return x.amax(dim=0, keepdim=True)
+
+    def cummin(self, x: Tensor) -> Tensor:
+        """Running minimum along axis 0."""
+        return torch.cummin(x, dim=0).values
+
+    def cummax(self, x: Tensor) -> Tensor:
+        """Running maximum along axis 0."""
+        return torch.cummax(x, dim=0).values
+
+    def softmax(self, x: Tensor, k: float) -> Tensor:
+        """Smooth extremum over axis 0, kept."""
+        out: Tensor = _SmoothMax.apply(x, k)  # type: ignore[no-untyped-call]
+        return out
+
+    def softmax2(self, a: Tensor, b: Tensor, k: float) -> Tensor:
+        """Smooth extremum of two of one shape."""
+        out: Tensor = _SmoothMax2.apply(a, b, k)  # type: ignore[no-untyped-call]
+        return out
+
+    def full(self, shape: tuple[int, ...], value: float, like: Tensor) -> Tensor:
+        """A constant array."""
+        return like.new_full(shape, value)
+
+    def cat(self, parts: Sequence[Tensor]) -> Tensor:
+        """Joined along axis 0."""
+        return torch.cat(list(parts))
+
+    def stack(self, parts: Sequence[Tensor]) -> Tensor:
+        """A new axis 0 in front."""
+        return torch.stack(list(parts))
+
+    def flip(self, x: Tensor) -> Tensor:
+        """Reversed along axis 0."""
+        return x.flip(0)
+
+    def rows(self, keep: NDArray[np.bool_], x: Tensor, value: float) -> Tensor:
+        """`x` with `value` in the rows that are not kept."""
+        kept = torch.from_numpy(keep).to(x.device).reshape(-1, *(1,) * (x.ndim - 1))
+        return torch.where(kept, x, value)
+
+    def columns(self, x: Tensor) -> Sequence[Tensor]:
+        """One `(time, batch)` tensor for every column of `(batch, time, dim)`: a copy, and views of it."""
+        return x.permute(2, 1, 0).contiguous().unbind(0)
+
+    def quiet(self) -> AbstractContextManager[object]:
+        """Torch does not warn."""
+        return nullcontext()
+
+
+TORCH: Ops = cast("Ops", TorchOps())

@@ -1,0 +1,191 @@
+"""Which values a formula needs at which instants: a formula and a trace length -> steps in order.
+
+Nothing is computed where nobody asks: a state predicate at the root is read at one instant, the body of
+`always[0, T]` at T + 1. Equal sub-formulas at equal instants are one step; predicates that are needed at the
+same instants are one program.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias, assert_never
+
+from stlc.compile import ir
+from stlc.compile.arith import Program
+
+End: TypeAlias = Literal["strict", "truncate", "lower", "upper"]
+"""What stands beyond the last sample.
+
+`strict`: nothing, and whoever asks is told. `truncate`: nothing, windows are cut. `lower` and `upper`: the
+trace may go on, and unknown predicates are -inf or +inf there; windows to the end of the trace end at the
+last known sample all the same.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """How long a trace is, and whether it may go on."""
+
+    samples: int
+    end: End = "strict"
+
+    @property
+    def open(self) -> bool:
+        """Whether instants beyond the last sample exist, with unknown predicates."""
+        return self.end in ("lower", "upper")
+
+    def last(self, window: ir.Window, latest: int) -> int:
+        """The last instant that a window of the future reads when asked at `latest` at the latest."""
+        if window.hi is None:
+            return self.samples - 1
+        return latest + window.hi if self.open else min(latest + window.hi, self.samples - 1)
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Consecutive instants: `count` of them from `start` on; none if `count` <= 0."""
+
+    start: int
+    count: int
+
+    @property
+    def last(self) -> int:
+        """The last instant."""
+        return self.start + self.count - 1
+
+
+def upto(start: int, last: int) -> Run:
+    """The instants from `start` to `last`, both included."""
+    return Run(start, last - start + 1)
+
+
+def operands(node: ir.Formula, run: Run, extent: Extent) -> tuple[tuple[ir.Formula, Run], ...]:
+    """What `node` at the instants `run` needs of its parts; runs may be empty."""
+    match node:
+        case ir.Truth() | ir.Atom():
+            return ()
+        case ir.Join(_, items):
+            return tuple((item, run) for item in items)
+        case ir.Over(_, window, body):
+            return ((body, upto(run.start + window.lo, extent.last(window, run.last))),)
+        case ir.Past(_, window, body):
+            return ((body, upto(_first(window, run), run.last - window.lo)),)
+        case ir.Until(_, window, left, right):
+            last = extent.last(window, run.last)
+            if last < run.start + window.lo:
+                return ((left, Run(0, 0)), (right, Run(0, 0)))
+            return ((left, upto(run.start, last)), (right, upto(run.start + window.lo, last)))
+        case ir.Since(_, window, left, right):
+            if run.last < window.lo:
+                return ((left, Run(0, 0)), (right, Run(0, 0)))
+            first = _first(window, run)
+            return ((left, upto(first, run.last)), (right, upto(first, run.last - window.lo)))
+        case ir.Shift(steps, body):
+            last = run.last + steps if extent.open else min(run.last + steps, extent.samples - 1)
+            return ((body, upto(max(run.start + steps, 0), last)),)
+        case _:
+            assert_never(node)
+
+
+def _first(window: ir.Window, run: Run) -> int:
+    """The first instant that a window of the past reads."""
+    return 0 if window.hi is None else max(run.start - window.hi, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One value to compute.
+
+    Attributes:
+        node: the formula.
+        run: at which instants.
+        parts: steps with the values of its parts; None where a part is not needed at any instant.
+    """
+
+    node: ir.Formula
+    run: Run
+    parts: tuple[int | None, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Predicates that are computed together at the same instants, all of them within the trace."""
+
+    run: Run
+    program: Program
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """What to compute, in order.
+
+    Attributes:
+        extent: of the trace.
+        batches: programs of the predicates.
+        steps: values, parts first.
+        atoms: step of a predicate -> (batch, name of the output); absent where it lies beyond the trace.
+        roots: steps of the formulas that were asked for.
+    """
+
+    extent: Extent
+    batches: tuple[Batch, ...]
+    steps: tuple[Step, ...]
+    atoms: dict[int, tuple[int, str]]
+    roots: tuple[int, ...]
+
+
+def schedule(formulas: Sequence[ir.Formula], run: Run, extent: Extent) -> Schedule:
+    """All steps that `formulas` at the instants `run` take."""
+    steps: list[Step] = []
+    known: dict[tuple[ir.Formula, Run], int] = {}
+
+    def place(node: ir.Formula, instants: Run) -> int | None:
+        if instants.count <= 0:
+            return None
+        key = (node, instants)
+        if key not in known:
+            parts = tuple(place(part, its_run) for part, its_run in operands(node, instants, extent))
+            known[key] = len(steps)
+            steps.append(Step(node, instants, parts))
+        return known[key]
+
+    roots = tuple(index for formula in formulas if (index := place(formula, run)) is not None)
+    batches, atoms = _batches(steps, extent)
+    return Schedule(extent, batches, tuple(steps), atoms, roots)
+
+
+def _batches(steps: Sequence[Step], extent: Extent) -> tuple[tuple[Batch, ...], dict[int, tuple[int, str]]]:
+    """One program for all predicates that are needed over the same stretch of the trace."""
+    wanted: dict[ir.Num, list[tuple[Run, int]]] = {}
+    for index, step in enumerate(steps):
+        if isinstance(step.node, ir.Atom) and step.run.start < extent.samples:
+            inside = upto(step.run.start, min(step.run.last, extent.samples - 1))
+            wanted.setdefault(_signed(step.node), []).append((inside, index))
+    grouped: dict[Run, dict[ir.Num, list[int]]] = {}
+    for num, asked in wanted.items():
+        for stretch, indices in _stretches(asked):
+            grouped.setdefault(stretch, {})[num] = indices
+    batches, atoms = [], {}
+    for number, (stretch, nums) in enumerate(grouped.items()):
+        outputs = {str(i): num for i, num in enumerate(nums)}
+        batches.append(Batch(stretch, Program(outputs)))
+        for i, indices in enumerate(nums.values()):
+            atoms.update(dict.fromkeys(indices, (number, str(i))))
+    return tuple(batches), atoms
+
+
+def _signed(atom: ir.Atom) -> ir.Num:
+    return atom.num if atom.sign > 0 else ir.Op("neg", (atom.num,))
+
+
+def _stretches(asked: list[tuple[Run, int]]) -> list[tuple[Run, list[int]]]:
+    """Runs that touch are put together."""
+    out: list[tuple[Run, list[int]]] = []
+    for run, index in sorted(asked, key=lambda item: (item[0].start, item[0].count)):
+        if out and run.start <= out[-1][0].last + 1:
+            whole, indices = out[-1]
+            out[-1] = (upto(whole.start, max(whole.last, run.last)), [*indices, index])
+        else:
+            out.append((run, [index]))
+    return out
