@@ -96,7 +96,7 @@ class Backup:
     def search(self, x: Tensor, plan: Tensor) -> Found:
         """Better plans for states whose own plan was found wanting.
 
-        Among plans of the same rank, robustness decides, then the performance terms of the objective (robustness
+        Among plans of the same rank robustness decides, then the performance terms of the objective (robustness
         is flat where a deadline cannot be met), then closeness to the policy.
 
         Args:
