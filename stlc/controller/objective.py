@@ -23,7 +23,7 @@ class Objective:
         margin: the paper's gamma; robustness beyond it earns nothing more.
         smoothing: the paper's k; None trains on exact min and max with subgradients.
         switch: how jumps and indicators become differentiable.
-        saturation: s of `s log(1 + hinge / s)`, so that infeasible states do not dominate; None for the plain hinge.
+        saturation: s of `s log(1 + hinge / s)`, so that infeasible states do not dominate; None: plain hinge.
         stl_weight: the paper's lambda.
         performance_weight: factor of the performance terms.
     """

@@ -1,11 +1,12 @@
 """A state becomes a plan: one network proposes several, the monitor picks one.
 
-A continuous function cannot jump from left of an obstacle to right of it; several can, and judging a few plans
-exactly costs well under a millisecond.
+A continuous function cannot jump from left of an obstacle to right of it; several can, and judging a few
+plans exactly costs well under a millisecond.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING, Protocol
 
 import torch
@@ -46,7 +47,7 @@ class PlanNetwork(nn.Module):
         self._width = raw_width(task.system.controls)
         widths = [task.system.observed_count, *hidden]
         layers: list[nn.Module] = []
-        for inputs, outputs in zip(widths, widths[1:], strict=False):
+        for inputs, outputs in pairwise(widths):
             layers += [nn.Linear(inputs, outputs), nn.ReLU()]
         layers.append(nn.Linear(widths[-1], plans * task.horizon * self._width))
         self.body = nn.Sequential(*layers)

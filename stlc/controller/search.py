@@ -1,8 +1,8 @@
 """Repairing plans: batched hill climbing on the exact robustness, from the policy's own plan.
 
-Gradients see nothing from outside a stop zone or across an obstacle; a search does. Each round tries a batch of
-changed plans per state and keeps the best. Proposals mix noise over a random stretch of time, a constant shift of
-a stretch, a stretch held at one random level, and plans that solved other states.
+Gradients see nothing from outside a stop zone or across an obstacle; a search does. Each round tries a batch
+of changed plans per state and keeps the best. Proposals mix noise over a random stretch of time, a constant
+shift of a stretch, a stretch held at one random level, and plans that solved other states.
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ class Searcher:
         self.low = task.system.control_low
         self.high = task.system.control_high
 
-    def repair(self, x0: Tensor, plans: Tensor, bank: Tensor, efforts: tuple[Effort, ...] = (QUICK, DEEP)) -> Repaired:
+    def repair(
+        self, x0: Tensor, plans: Tensor, bank: Tensor, efforts: tuple[Effort, ...] = (QUICK, DEEP)
+    ) -> Repaired:
         """Improve plans until they satisfy the specification or the effort is spent.
 
         Args:
@@ -69,27 +71,25 @@ class Searcher:
             bank: plans that solved other states, (k, T, m); may be empty.
             efforts: one after the other; each works on what is still unsolved.
         """
-        best = plans.clone()
-        rho = self.task.judge(x0, plans).rho.clone()
+        found = Repaired(plans.clone(), self.task.judge(x0, plans).rho.clone())
         for effort in efforts:
             for _ in range(effort.rounds):
-                open_ = (rho < self.enough).nonzero()[:, 0]
-                if open_.numel() == 0:
+                still = (found.rho < self.enough).nonzero()[:, 0]
+                if still.numel() == 0:
                     break
-                self._round(x0, best, rho, open_, effort.tries, bank)
-        return Repaired(best, rho)
+                tried = self._proposals(found.plans[still], effort.tries, bank)
+                self._keep_better(x0, found, still, tried)
+        return found
 
-    def _round(
-        self, x0: Tensor, best: Tensor, rho: Tensor, open_: Tensor, tries: int, bank: Tensor
-    ) -> None:
-        """One round for the states `open_`: updates `best` and `rho` in place."""
-        tried = self._proposals(best[open_], tries, bank)
-        judged = self.task.judge(x0[open_].repeat_interleave(tries, 0), tried.flatten(0, 1))
+    def _keep_better(self, x0: Tensor, found: Repaired, still: Tensor, tried: Tensor) -> None:
+        """Judge the plans tried, (k, tries, T, m), for the states `still`, (k,), and update `found` in place."""
+        tries = tried.shape[1]
+        judged = self.task.judge(x0[still].repeat_interleave(tries, 0), tried.flatten(0, 1))
         value, which = judged.rho.view(-1, tries).max(1)
-        better = (value > rho[open_]).nonzero()[:, 0]
-        rows = open_[better]
-        best[rows] = tried[better, which[better]]
-        rho[rows] = value[better]
+        better = (value > found.rho[still]).nonzero()[:, 0]
+        rows = still[better]
+        found.plans[rows] = tried[better, which[better]]
+        found.rho[rows] = value[better]
 
     def _proposals(self, plans: Tensor, tries: int, bank: Tensor) -> Tensor:
         """Changed plans, (B, tries, T, m), within the bounds."""
@@ -109,8 +109,7 @@ class Searcher:
         """Plans that solved other states; piecewise constant ones while there are few."""
         states, steps, controls = plans.shape
         if bank.shape[0] >= 64:
-            index = torch.randint(bank.shape[0], (states, count), generator=self.generator, device=plans.device)
-            return bank[index]
+            return bank[self._randint(0, bank.shape[0], states, count)]
         pieces = 4
         levels = self.low + (self.high - self.low) * self._rand(states, count, pieces, controls)
         return levels.repeat_interleave(-(-steps // pieces), 2)[:, :, :steps]
@@ -118,10 +117,9 @@ class Searcher:
     def _stretch(self, shape: tuple[int, ...]) -> Tensor:
         """1 on a random stretch of time per plan and control, else 0; (B, tries, T, m)."""
         states, tries, steps, controls = shape
-        device = self.low.device
-        first = torch.randint(steps, (states, tries, 1, controls), generator=self.generator, device=device)
-        length = torch.randint(1, steps + 1, (states, tries, 1, controls), generator=self.generator, device=device)
-        time = torch.arange(steps, device=device)[None, None, :, None]
+        first = self._randint(0, steps, states, tries, 1, controls)
+        length = self._randint(1, steps + 1, states, tries, 1, controls)
+        time = torch.arange(steps, device=self.low.device)[None, None, :, None]
         return ((time >= first) & (time < first + length)).to(self.low.dtype)
 
     def _rand(self, *shape: int) -> Tensor:
@@ -129,3 +127,6 @@ class Searcher:
 
     def _randn(self, *shape: int) -> Tensor:
         return torch.randn(*shape, generator=self.generator, device=self.low.device)
+
+    def _randint(self, low: int, high: int, *shape: int) -> Tensor:
+        return torch.randint(low, high, shape, generator=self.generator, device=self.low.device)

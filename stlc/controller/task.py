@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from stlc.compile.graph import RobustnessGraph
+from stlc.compile.interface import Grid
+from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics import TOLERANCE
 from stlc.compile.switch import Hard, Switch
 
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 
     from stlc.compile.pipeline import Compiled, Rule
     from stlc.dynamics.system import System
+    from stlc.grammar import ast
 
 HARD = Hard()
 FLOAT32_SLACK = 1e-5
@@ -70,6 +73,24 @@ class Task:
         self.graph = RobustnessGraph(compiled.requirements, self.system.signature)
         self.safety = RobustnessGraph(compiled.safety, self.system.signature)
 
+    @classmethod
+    def of(cls, spec: ast.Spec, system: System, *, overrides: Mapping[str, str] | None = None) -> Task:
+        """Compile a specification for a system.
+
+        Args:
+            spec: as parsed.
+            system: that it speaks about.
+            overrides: constants to change, name -> text such as `3 s`.
+
+        Raises:
+            SpecError: the specification is invalid, or does not fit the system.
+        """
+        decl = system.decl
+        grid = Grid(dt=decl.dt, horizon=decl.horizon)
+        return cls(
+            compile_spec(spec, grid=grid, interface=decl.interface(), overrides=overrides or {}), system
+        )
+
     @property
     def names(self) -> tuple[str, ...]:
         """Columns of a state: the system's, then the timers."""
@@ -112,7 +133,7 @@ class Task:
         return self.system.rollout(x0, u, switch)
 
     def robustness(self, x: Tensor, smoothing: float | None = None) -> Tensor:
-        """Robustness at time 0: (B, T+1, n) -> (B,). Exact (Eq. 4) unless `smoothing` is the paper's k (Eq. 7)."""
+        """Robustness at time 0: (B, T+1, n) -> (B,). Exact (Eq. 4); `smoothing` is the paper's k (Eq. 7)."""
         return self.graph.robustness(x, smoothing)
 
     def requirement_robustness(self, x: Tensor, smoothing: float | None = None) -> Tensor:

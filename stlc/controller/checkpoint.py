@@ -1,0 +1,121 @@
+"""Checkpoints: tensors as safetensors, facts as JSON, and a pointer that moves last.
+
+`ckpt/step-NNNNNN.safetensors` and its `.json` are written whole before `ckpt/last.json` is replaced to name
+them, so a kill or a full disk at any moment leaves the last good checkpoint in place. Nothing is unpickled.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor
+
+from stlc.diagnostics import Diagnostic, RunError
+from stlc.files import write_atomic
+from stlc.provenance import sha256
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from stlc.rundir import RunDir
+
+FOLDER = "ckpt"
+POINTER = "last.json"
+_NAME = re.compile(r"step-\d{6,}\.safetensors")
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """What was saved: tensors by name, and plain facts."""
+
+    tensors: dict[str, Tensor]
+    facts: dict[str, Any]
+
+
+def save_checkpoint(
+    run: RunDir, tensors: Mapping[str, Tensor], facts: Mapping[str, object], *, step: int
+) -> Path:
+    """Write a checkpoint and point at it; older ones are removed afterwards.
+
+    Raises:
+        MissingError: R201, there is no room or no right to write; the last good checkpoint stays.
+    """
+    folder = run.path / FOLDER
+    folder.mkdir(exist_ok=True)
+    data = save_tensors({name: value.detach().cpu().contiguous() for name, value in tensors.items()})
+    path = folder / f"step-{step:06d}.safetensors"
+    write_atomic(path, data)
+    text = json.dumps({**facts, "file": path.name, "sha256": sha256(data)}, indent=1)
+    write_atomic(path.with_suffix(".json"), text)
+    write_atomic(folder / POINTER, text)
+    for old in folder.glob("step-*"):
+        if old.stem != path.stem:
+            with suppress(OSError):
+                old.unlink()
+    return path
+
+
+def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpoint:
+    """Read the last checkpoint of a run.
+
+    Args:
+        run: its folder.
+        spec_hash: SHA-256 of the specification that the weights are for.
+        system_hash: SHA-256 of the system file.
+
+    Raises:
+        RunError: R101, there is none or it is damaged; R102, it belongs to another specification or system.
+    """
+    folder = run.path / FOLDER
+    facts, data = _read(folder)
+    for key, wanted, word in (
+        ("spec_hash", spec_hash, "specification"),
+        ("system_hash", system_hash, "system"),
+    ):
+        if facts.get(key) != wanted:
+            raise RunError(
+                Diagnostic(
+                    "R102",
+                    f"the checkpoint in `{folder}` was trained for another {word}",
+                    help=(f"train again, or put the {word} back that the checkpoint was made with",),
+                    note=(f"{word} now {wanted[:12]}, of the checkpoint {str(facts.get(key))[:12]}",),
+                )
+            )
+    return Checkpoint(load_tensors(data), facts)
+
+
+def _read(folder: Path) -> tuple[dict[str, Any], bytes]:
+    """The facts and the bytes that the pointer names, checked against each other."""
+    try:
+        facts = json.loads((folder / POINTER).read_text())
+        name = facts["file"]
+        if not _NAME.fullmatch(name):
+            raise ValueError(f"`{name}` is not the name of a checkpoint")
+        data = (folder / name).read_bytes()
+    except FileNotFoundError as error:
+        raise RunError(
+            Diagnostic("R101", f"there is no checkpoint in `{folder}`", help=("train: stlc train SPEC",))
+        ) from error
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RunError(_damaged(folder, str(error))) from error
+    if sha256(data) != facts.get("sha256"):
+        raise RunError(_damaged(folder, f"`{name}` is not what was written"))
+    return facts, data
+
+
+def _damaged(folder: Path, why: str) -> Diagnostic:
+    return Diagnostic("R101", f"the checkpoint in `{folder}` is damaged: {why}", help=("train again",))
+
+
+def weights(checkpoint: Checkpoint, prefix: str) -> dict[str, torch.Tensor]:
+    """The tensors of one module, without its prefix."""
+    start = prefix + "."
+    return {name[len(start) :]: value for name, value in checkpoint.tensors.items() if name.startswith(start)}

@@ -1,0 +1,104 @@
+"""Everything that a training run was told, and what the engine chose by itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from stlc.controller.task import Task
+
+Method = Literal["guided", "gradient"]
+
+HELD_OUT = 5000
+HELD_OUT_SEED = 981_273
+"""Seed of the held-out states: used for reports only, never while training or tuning."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrainConfig:
+    """What the user may say; None leaves the choice to the system file, then to the engine.
+
+    Attributes:
+        method: `guided` searches and distils; `gradient` is the paper's.
+        budget: seconds, turned into steps in the first of them.
+        steps: of the optimiser; wins over `budget`.
+        seed: of everything random in training.
+        device: of torch.
+        threads: of torch; None leaves its default.
+        plans: number of plans of the network.
+        lr: peak learning rate.
+        batch: fresh states a step.
+    """
+
+    method: Method = "guided"
+    budget: float | None = None
+    steps: int | None = None
+    seed: int = 0
+    device: str = "cpu"
+    threads: int | None = None
+    plans: int | None = None
+    lr: float | None = None
+    batch: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Engine:
+    """The numbers of a run, all of them decided. They are saved with it.
+
+    Attributes:
+        method: as told.
+        seed: as told.
+        hidden: widths of the network.
+        plans: number of plans of the network.
+        batch: fresh states a step.
+        hard: solved hard states a step, once there are any.
+        lr: peak learning rate.
+        warmup: share of the steps over which it rises.
+        clip: bound of the gradient's norm.
+        average: decay of the average of the weights.
+        pool: fresh states that a search round judges.
+        every: steps between search rounds.
+        most: failing states that a round repairs at most.
+        slope: backward slope of switches, per unit.
+        imitation: weight of the distance to a repaired plan.
+        share: weight of the mean over plans beside the winner's loss.
+        performance: factor of the performance terms.
+    """
+
+    method: Method
+    seed: int
+    hidden: tuple[int, ...]
+    plans: int
+    batch: int
+    hard: int
+    lr: float
+    warmup: float = 0.03
+    clip: float = 1.0
+    average: float = 0.99
+    pool: int = 2048
+    every: int = 50
+    most: int = 256
+    slope: float = 5.0
+    imitation: float = 1.0
+    share: float = 0.05
+    performance: float = 0.3
+
+
+def decide(task: Task, config: TrainConfig) -> Engine:
+    """The engine's numbers for a task: the user's words, then the system file's, then defaults."""
+    declared = task.system.decl.train
+    guided = config.method == "guided"
+    batch = config.batch or declared.batch or 512
+    plans = config.plans or (4 if guided else 1)
+    return Engine(
+        method=config.method,
+        seed=config.seed,
+        hidden=task.system.decl.policy.hidden,
+        plans=plans,
+        batch=batch,
+        hard=batch if guided else 0,
+        lr=config.lr or declared.lr or 1e-3,
+        share=0.05 if plans > 1 else 0.0,
+        performance=0.3 if guided else 1.0,
+    )

@@ -1,0 +1,45 @@
+"""A time budget becomes a number of steps, once, in the first seconds; everything after counts steps."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from stlc.controller.trainer import Trainer
+
+if TYPE_CHECKING:
+    import torch
+
+    from stlc.controller.config import Engine
+    from stlc.controller.task import Task
+
+WARM_UP = 10
+TIMED_STEPS = 60
+RESERVE = 0.04
+"""Share of the budget that is kept for the verdict on held-out states."""
+
+
+def steps_within(task: Task, engine: Engine, seconds: float, device: torch.device) -> int:
+    """How many steps fit into `seconds`, measured on a trainer that is thrown away.
+
+    The real run starts afresh, so a run of the same seed and the same number of steps gives the same weights
+    whether the steps were named or found here.
+    """
+    begun = time.perf_counter()
+    trial = Trainer(task, engine, steps=10_000, device=device)
+    built = time.perf_counter() - begun
+    for _ in range(WARM_UP):
+        trial.advance()
+    step = _time(trial.advance, TIMED_STEPS)
+    look = _time(trial.look, 2)
+    left = seconds * (1.0 - RESERVE) - (time.perf_counter() - begun) - built
+    return max(engine.every, int(left / (step + look / engine.every)))
+
+
+def _time(call: object, times: int) -> float:
+    """Median-free mean seconds of a call."""
+    assert callable(call)
+    begun = time.perf_counter()
+    for _ in range(times):
+        call()
+    return (time.perf_counter() - begun) / times

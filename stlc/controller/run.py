@@ -1,0 +1,106 @@
+"""A finished or unfinished training run: its folder, its task, its policy."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from stlc.controller.checkpoint import load_checkpoint, weights
+from stlc.controller.config import Engine
+from stlc.controller.policy import Mlp, PlanNetwork
+from stlc.controller.task import Task
+from stlc.diagnostics import Diagnostic, RunError
+from stlc.dynamics.system import System
+from stlc.files import read_source, write_atomic
+from stlc.grammar.parser import parse
+from stlc.provenance import sha256
+from stlc.rundir import RunDir
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SPEC = "spec.stl"
+SYSTEM = "system.yaml"
+CONFIG = "config.resolved.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One run.
+
+    Attributes:
+        dir: its folder.
+        task: what was trained for.
+        policy: the trained policy; call it with states (B, n) for plans (B, T, m) in physical units.
+    """
+
+    dir: RunDir
+    task: Task
+    policy: Mlp
+
+    @classmethod
+    def open(cls, where: Path | str = "latest", *, device: str = "cpu") -> Run:
+        """Load a run by folder, name, number, or `latest`.
+
+        Raises:
+            UsageError: there is no such run.
+            RunError: R101, it is damaged or has no checkpoint yet; R102, its checkpoint is of another task.
+            SpecError, SystemFileError: its specification or system is invalid.
+        """
+        folder = RunDir.open(where)
+        task = load_task(folder)
+        engine = load_engine(folder)
+        saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
+        network = PlanNetwork(task, hidden=engine.hidden, plans=engine.plans)
+        try:
+            network.load_state_dict(weights(saved, "average"))
+        except RuntimeError as error:
+            raise RunError(
+                Diagnostic(
+                    "R101", f"the checkpoint of `{folder.shown}` does not fit its network", note=(str(error),)
+                )
+            ) from error
+        return cls(folder, task, Mlp(task, network.to(torch.device(device)).eval()))
+
+
+def load_task(folder: RunDir) -> Task:
+    """Compile the specification and the system that lie in a run's folder."""
+    overrides = folder.record().get("overrides") or {}
+    spec = parse(read_source(folder.path / SPEC))
+    return Task.of(spec, System.load(folder.path / SYSTEM, overrides), overrides=overrides)
+
+
+def spec_hash(folder: RunDir) -> str:
+    """SHA-256 of the specification in a run's folder and of what `--set` changed in it."""
+    return _hash(folder, SPEC)
+
+
+def system_hash(folder: RunDir) -> str:
+    """SHA-256 of the system file in a run's folder and of what `--set` changed in it."""
+    return _hash(folder, SYSTEM)
+
+
+def _hash(folder: RunDir, name: str) -> str:
+    overrides = folder.record().get("overrides") or {}
+    return sha256(read_source(folder.path / name).text + json.dumps(overrides, sort_keys=True))
+
+
+def save_engine(folder: RunDir, engine: Engine) -> None:
+    """Write what the engine decided; JSON is YAML too."""
+    write_atomic(folder.path / CONFIG, json.dumps(asdict(engine), indent=1) + "\n")
+
+
+def load_engine(folder: RunDir) -> Engine:
+    """Read what the engine decided. Raises RunError R101 when that is damaged."""
+    try:
+        values: dict[str, Any] = json.loads((folder.path / CONFIG).read_text())
+        known = {field.name for field in fields(Engine)}
+        engine = {key: value for key, value in values.items() if key in known}
+        return Engine(**{**engine, "hidden": tuple(engine["hidden"])})
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RunError(
+            Diagnostic("R101", f"`{folder.shown}/{CONFIG}` is missing or damaged: {error}")
+        ) from error

@@ -1,0 +1,215 @@
+"""Training from beginning to end: steps, search rounds, rows, checkpoints, the verdict on held-out states."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from stlc.controller.checkpoint import load_checkpoint, save_checkpoint
+from stlc.controller.config import Engine, TrainConfig, decide
+from stlc.controller.held_out import Score, save_states, score
+from stlc.controller.pace import steps_within
+from stlc.controller.run import Run, load_engine, load_task, save_engine, spec_hash, system_hash
+from stlc.controller.trainer import Look, Trainer
+from stlc.diagnostics import Diagnostic, MissingError, RunError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from stlc.controller.task import Task
+    from stlc.rundir import RunDir
+
+DEFAULT_BUDGET = 60.0
+SAVE_EVERY = 500
+"""Steps between checkpoints."""
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """How the outside follows a run and ends it early.
+
+    Attributes:
+        row: called with every row of `train.jsonl`.
+        stop: asked after every step; True saves and ends.
+    """
+
+    row: Callable[[dict[str, Any]], None] = lambda _row: None
+    stop: Callable[[], bool] = lambda: False
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What training gave.
+
+    Attributes:
+        run: the run with its policy.
+        score: on held-out states; None where training was interrupted.
+        seconds: of training, held-out verdict included.
+        interrupted: ended by `Watch.stop`.
+    """
+
+    run: Run
+    score: Score | None
+    seconds: float
+    interrupted: bool
+
+
+def train(task: Task, config: TrainConfig, folder: RunDir, watch: Watch | None = None) -> Outcome:
+    """Train a policy in a new run folder that already holds its specification and system.
+
+    Args:
+        task: what to train for.
+        config: what the user said.
+        folder: of the run.
+        watch: progress and interruption.
+
+    Raises:
+        MissingError: R201, a checkpoint cannot be written; R302, there is no such device.
+        RunError: R401, the loss is not finite.
+    """
+    begun = time.perf_counter()
+    device = find_device(config.device)
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    engine = decide(task, config)
+    save_engine(folder, engine)
+    declared = task.system.decl.train
+    steps = config.steps or (declared.steps if config.budget is None else None)
+    if steps is None:
+        steps = steps_within(task, engine, config.budget or declared.budget or DEFAULT_BUDGET, device)
+    trainer = Trainer(task, engine, steps=steps, device=device)
+    folder.update({"steps": steps, "margin": trainer.margin, "engine": asdict(engine)})
+    return _Session(folder, trainer, watch or Watch(), begun).finish()
+
+
+def resume(
+    folder: RunDir, *, steps: int | None = None, device: str = "cpu", watch: Watch | None = None
+) -> Outcome:
+    """Go on with a run that was interrupted; the weights become those of an uninterrupted run, bit for bit.
+
+    Args:
+        folder: of the run.
+        steps: a new total of steps; None keeps the old one. Another total is another schedule.
+        device: of torch.
+        watch: progress and interruption.
+
+    Raises:
+        RunError: R101, R102, or R103 when there is nothing left to do.
+    """
+    begun = time.perf_counter()
+    task = load_task(folder)
+    engine: Engine = load_engine(folder)
+    saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
+    trainer = Trainer(task, engine, steps=int(saved.facts["steps"]), device=find_device(device))
+    trainer.restore(saved.tensors, saved.facts)
+    trainer.steps = steps or trainer.steps
+    if trainer.step >= trainer.steps and folder.status == "finished":
+        raise RunError(
+            Diagnostic(
+                "R103",
+                f"run `{folder.name}` is finished: {trainer.step} of {trainer.steps} steps",
+                help=(f"stlc train --resume {folder.name} --steps {2 * trainer.steps} goes on",),
+            )
+        )
+    folder.keep_rows(lambda row: row.get("step", 0) <= trainer.step)
+    folder.update({"status": "running", "steps": trainer.steps})
+    before = max((row.get("seconds", 0.0) for row in folder.rows()), default=0.0)
+    return _Session(folder, trainer, watch or Watch(), begun - before).finish()
+
+
+def find_device(name: str) -> torch.device:
+    """A torch device. Raises MissingError R302 where it is not there."""
+    try:
+        best = "cuda" if torch.cuda.is_available() else "cpu"
+        device = torch.device(best if name == "auto" else name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise MissingError(
+            Diagnostic(
+                "R302", f"there is no device `{name}` here", help=("use --device cpu",), note=(reason,)
+            )
+        ) from error
+    return device
+
+
+class _Session:
+    """One sitting of training: from wherever the trainer stands to the end, or to an interruption."""
+
+    def __init__(self, folder: RunDir, trainer: Trainer, watch: Watch, begun: float) -> None:
+        self.folder = folder
+        self.trainer = trainer
+        self.watch = watch
+        self.begun = begun
+        self.hashes = {"spec_hash": spec_hash(folder), "system_hash": system_hash(folder)}
+
+    def finish(self) -> Outcome:
+        """Train to the end, judge, and close the record."""
+        trainer = self.trainer
+        sat_down, first = time.perf_counter(), trainer.step
+        value = math.nan
+        while trainer.step < trainer.steps:
+            if trainer.step % trainer.engine.every == 0 and trainer.step > 0:
+                pace = (time.perf_counter() - sat_down) / max(1, trainer.step - first)
+                self._row(trainer.look(), value, pace)
+            value = trainer.advance()
+            if not math.isfinite(value):
+                raise self._diverged()
+            if trainer.step % SAVE_EVERY == 0:
+                self._save()
+            if self.watch.stop() and trainer.step < trainer.steps:
+                return self._interrupted()
+        self._save()
+        return self._judged()
+
+    def _judged(self) -> Outcome:
+        policy = self.trainer.policy
+        result = score(policy)
+        save_states(self.folder.path / "eval" / "held_out.npz", self.trainer.task, result)
+        seconds = time.perf_counter() - self.begun
+        self.folder.finish("finished", {**result.summary(), "seconds": seconds})
+        return Outcome(Run(self.folder, self.trainer.task, policy), result, seconds, interrupted=False)
+
+    def _interrupted(self) -> Outcome:
+        self._save()
+        self.folder.finish("interrupted")
+        run = Run(self.folder, self.trainer.task, self.trainer.policy)
+        return Outcome(run, None, time.perf_counter() - self.begun, interrupted=True)
+
+    def _save(self) -> None:
+        facts = {**self.trainer.facts(), **self.hashes}
+        save_checkpoint(self.folder, self.trainer.tensors(), facts, step=self.trainer.step)
+
+    def _row(self, look: Look, value: float, pace: float) -> None:
+        trainer = self.trainer
+        names = [rule.name for rule in trainer.task.rules]
+        row = {
+            "step": trainer.step,
+            "steps": trainer.steps,
+            "seconds": time.perf_counter() - self.begun,
+            "loss": value,
+            "accuracy": look.accuracy,
+            "requirements": dict(zip(names, look.requirements, strict=True)),
+            "feasible": look.feasible,
+            "lr": trainer.rate,
+            "repaired": look.repaired,
+            "failing": look.failing,
+            "s_per_step": pace,
+        }
+        self.folder.append_row(row)
+        self.watch.row(row)
+
+    def _diverged(self) -> RunError:
+        self.folder.finish("failed")
+        return RunError(
+            Diagnostic(
+                "R401",
+                f"training diverged: the loss is not finite at step {self.trainer.step}",
+                help=("try a smaller --lr; `stlc compile` shows the dynamics that are rolled out",),
+                note=("the last checkpoint of the run is kept",),
+            )
+        )

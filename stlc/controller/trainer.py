@@ -1,0 +1,219 @@
+"""The training loop's state and its three moves: a gradient step, a search round, a look at the clock.
+
+Search and distil: every few dozen steps fresh states are judged, the failing ones are repaired by search that
+starts at the policy's own plan, and repaired plans are imitated for as long as their state still fails. Each
+gradient step mixes fresh states with such hard ones. Of the network's plans the one that does best is trained
+(winner takes all), with a little of the mean so that none starves.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from stlc.controller.buffer import Buffer
+from stlc.controller.objective import Objective, guided_objective, loss, paper_objective
+from stlc.controller.policy import Mlp, PlanNetwork
+from stlc.controller.search import QUICK, Searcher
+from stlc.controller.task import satisfied
+
+if TYPE_CHECKING:
+    from stlc.controller.config import Engine
+    from stlc.controller.task import Task
+
+MARGIN_STATES = 256
+MARGIN_SHARE = 0.2
+MARGIN_RANGE = (0.01, 0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What a search round saw on fresh states.
+
+    Attributes:
+        accuracy: share whose plan satisfies the specification.
+        requirements: share per requirement, in the order of the task's rules.
+        feasible: share for which a satisfying plan is known after the search (None: no search was made).
+        failing: states that the search worked on.
+        repaired: how many of them it solved.
+    """
+
+    accuracy: float
+    requirements: tuple[float, ...]
+    feasible: float | None
+    failing: int
+    repaired: int
+
+
+class Trainer:
+    """Everything that changes while training. Same seed and steps: same weights on the same machine."""
+
+    def __init__(self, task: Task, engine: Engine, *, steps: int, device: torch.device) -> None:
+        self.task = task
+        self.engine = engine
+        self.steps = steps
+        self.device = device
+        self.step = 0
+        self.generator = torch.Generator(device=device).manual_seed(engine.seed)
+        self.network = _network(task, engine, device)
+        self.average = _network(task, engine, device)
+        self.network.normalise(self._sample(4096))
+        self.average.load_state_dict(self.network.state_dict())
+        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=engine.lr, fused=True)
+        self.buffer = Buffer.empty(len(task.names), task.horizon, len(task.system.control_names), device)
+        self.margin = paper_objective(task).margin
+        if engine.method == "guided":
+            self.margin = self._feasible_margin()
+        self.objective = self._objective()
+
+    def advance(self) -> float:
+        """One gradient step; returns its loss (not finite: training has diverged)."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.rate
+        value = self._loss()
+        self.optimizer.zero_grad()
+        value.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.engine.clip)
+        self.optimizer.step()
+        self.step += 1
+        decay = min(self.engine.average, self.step / (self.step + 10.0))
+        with torch.no_grad():
+            averaged, current = list(self.average.parameters()), list(self.network.parameters())
+            torch._foreach_lerp_(averaged, current, 1.0 - decay)
+        return float(value.detach())
+
+    @property
+    def rate(self) -> float:
+        """Learning rate of the next step: a short rise, then half a cosine to 0."""
+        done = self.step / self.steps
+        rise = min(1.0, (self.step + 1) / max(1.0, self.engine.warmup * self.steps))
+        return self.engine.lr * rise * 0.5 * (1.0 + math.cos(math.pi * done))
+
+    @property
+    def policy(self) -> Mlp:
+        """The policy that is handed out: the averaged weights."""
+        return Mlp(self.task, self.average)
+
+    @torch.no_grad()
+    def look(self) -> Look:
+        """Judge fresh states; with the guided method also repair what fails."""
+        x0 = self._sample(self.engine.pool)
+        plans, judged = Mlp(self.task, self.network).plan_judged(x0)
+        good = satisfied(judged.rho)
+        shares = tuple(float(share) for share in satisfied(judged.requirements).double().mean(0))
+        accuracy = float(good.double().mean())
+        if self.engine.method != "guided":
+            return Look(accuracy, shares, None, 0, 0)
+        failing = (~good).nonzero()[:, 0][: self.engine.most]
+        found = self._searcher().repair(x0[failing], plans[failing], self.buffer.bank)
+        solved = found.solved
+        self.buffer.add(x0[failing][solved], found.plans[solved])
+        repaired = int(solved.sum())
+        rate = repaired / max(1, len(failing))
+        return Look(accuracy, shares, accuracy + (1.0 - accuracy) * rate, len(failing), repaired)
+
+    # ------------------------------------------------------------------ pieces
+
+    def _loss(self) -> Tensor:
+        engine = self.engine
+        fresh = self._sample(engine.batch)
+        hard = engine.hard if len(self.buffer) else 0
+        x0, targets = fresh, fresh.new_zeros(0)
+        if hard:
+            states, targets = self.buffer.draw(hard, self.generator)
+            x0 = torch.cat((fresh, states))
+        plans: Tensor = self.network(x0)
+        count = engine.plans
+        outcome = loss(self.task, self.objective, x0.repeat_interleave(count, 0), plans.flatten(0, 1))
+        total = outcome.total.view(-1, count)
+        winner = (10.0 * outcome.stl.detach() + engine.performance * outcome.cost).view(-1, count).argmin(1)
+        value = (total.gather(1, winner[:, None])[:, 0] + engine.share * total.mean(1)).mean()
+        if hard:
+            solved = outcome.satisfied.view(-1, count)[-hard:].any(1)
+            value = value + self._imitation(plans[-hard:], targets, solved)
+        return value
+
+    def _imitation(self, plans: Tensor, targets: Tensor, solved: Tensor) -> Tensor:
+        """Distance of the nearest plan to the repaired one, where the state still fails."""
+        half = 0.5 * (self.task.system.control_high - self.task.system.control_low)
+        distance = ((plans - targets[:, None]) / half).square().mean((2, 3)).amin(1)
+        return self.engine.imitation * torch.where(solved, torch.zeros_like(distance), distance).mean()
+
+    def _feasible_margin(self) -> float:
+        """A gamma of the size that plans can reach: a share of what search reaches on the median state."""
+        x0 = self._sample(MARGIN_STATES)
+        middle = 0.5 * (self.task.system.control_low + self.task.system.control_high)
+        start = middle.expand(MARGIN_STATES, self.task.horizon, -1)
+        searcher = Searcher(self.task, self.generator, enough=math.inf)
+        rho = searcher.repair(x0, start, self.buffer.bank, (QUICK,)).rho
+        reached = rho[satisfied(rho)]
+        if reached.numel() == 0:
+            return MARGIN_RANGE[0]
+        return min(max(MARGIN_SHARE * float(reached.median()), MARGIN_RANGE[0]), MARGIN_RANGE[1])
+
+    def _searcher(self) -> Searcher:
+        return Searcher(self.task, self.generator, enough=MARGIN_SHARE * self.margin)
+
+    def _objective(self) -> Objective:
+        if self.engine.method == "gradient":
+            return paper_objective(self.task)
+        return guided_objective(
+            self.margin, slope=self.engine.slope, performance_weight=self.engine.performance
+        )
+
+    def _sample(self, n: int) -> Tensor:
+        return self.task.sample(n, generator=self.generator, device=self.device)
+
+    # ------------------------------------------------------------- checkpoints
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything that a resumed run needs to go on bit for bit."""
+        found: dict[str, Tensor] = {"generator": self.generator.get_state()}
+        for prefix, module in (("network", self.network), ("average", self.average)):
+            found.update({f"{prefix}.{name}": value for name, value in module.state_dict().items()})
+        for index, state in self.optimizer.state_dict()["state"].items():
+            found.update({f"adam.{index}.{name}": value for name, value in state.items()})
+        kept = len(self.buffer)
+        found["buffer.states"], found["buffer.plans"] = self.buffer.states[:kept], self.buffer.plans[:kept]
+        return found
+
+    def facts(self) -> dict[str, float | int]:
+        """The plain numbers that go with `tensors`."""
+        return {"step": self.step, "steps": self.steps, "margin": self.margin, "solved": self.buffer.count}
+
+    def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
+        """Go on where `tensors` and `facts` were taken."""
+        self.step, self.steps = int(facts["step"]), int(facts["steps"])
+        self.margin = float(facts["margin"])
+        self.objective = self._objective()
+        for prefix, module in (("network", self.network), ("average", self.average)):
+            module.load_state_dict(_below(tensors, prefix))
+        layout = self.optimizer.state_dict()
+        adam = _below(tensors, "adam")
+        for key, value in adam.items():
+            index, name = key.split(".")
+            layout["state"].setdefault(int(index), {})[name] = value
+        self.optimizer.load_state_dict(layout)
+        kept = tensors["buffer.states"].shape[0]
+        self.buffer.states[:kept] = tensors["buffer.states"]
+        self.buffer.plans[:kept] = tensors["buffer.plans"]
+        self.buffer.count = int(facts["solved"])
+        self.generator.set_state(tensors["generator"].cpu())
+
+
+def _network(task: Task, engine: Engine, device: torch.device) -> PlanNetwork:
+    """A network whose first weights depend on the seed alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(engine.seed)
+        return PlanNetwork(task, hidden=engine.hidden, plans=engine.plans).to(device)
+
+
+def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The entries under `prefix.`, without it."""
+    return {
+        name[len(prefix) + 1 :]: value for name, value in tensors.items() if name.startswith(prefix + ".")
+    }
