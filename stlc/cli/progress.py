@@ -12,6 +12,8 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from stlc.cli.output import console as open_console
+
 LINE_EVERY = 30.0  # seconds between lines where there is no terminal to redraw
 BLOCKS = "▁▂▃▄▅▆▇█"
 ASCII_BLOCKS = "_.-:=+*#"
@@ -114,7 +116,7 @@ class Progress:
         clock: Callable[[], float] = time.monotonic,
         every: float = LINE_EVERY,
     ) -> None:
-        self.console = console or Console(stderr=True, highlight=False)
+        self.console = console or open_console(stderr=True)
         self._clock = clock
         self._every = every
         self._unicode = "utf" in (self.console.encoding or "").lower()
@@ -129,9 +131,9 @@ class Progress:
         """Open the panel (or print the opening line)."""
         self._info = info
         self._row_at = self._line_at = self._clock()
-        if self.console.is_terminal:
+        if self.console.file.isatty() and not self.console.is_dumb_terminal:
             self._live = Live(
-                get_renderable=self._panel, console=self.console, refresh_per_second=2, transient=True
+                get_renderable=self.panel, console=self.console, refresh_per_second=2, transient=True
             )
             self._live.start()
         else:
@@ -229,7 +231,8 @@ class Progress:
         spark = sparkline(self._accuracies, width=room, blocks=self._blocks) if room >= 4 else ""
         return f"  plan accuracy   {spark}  {figures}" if spark else f"  plan accuracy   {figures}"
 
-    def _panel(self) -> Group:
+    def panel(self) -> Group:
+        """What the terminal shows at this moment."""
         width = self.console.width
         lines = [*_spread(self._title(), f"{self._counter()}   {self._time_left()}".rstrip(), width)]
         lines.append(self._accuracy_line(width))

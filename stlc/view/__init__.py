@@ -22,13 +22,13 @@ def require_drawing() -> None:
     """Raise MissingError R301 where pictures cannot be drawn."""
     missing = _missing()
     if missing:
-        raise MissingError(
-            Diagnostic(
-                "R301",
-                f"pictures need {' and '.join(missing)}, which {'is' if len(missing) == 1 else 'are'} not installed",
-                help=("pip install 'stlc[plot]'",),
-            )
+        verb = "is" if len(missing) == 1 else "are"
+        finding = Diagnostic(
+            "R301",
+            f"pictures need {' and '.join(missing)}, which {verb} not installed",
+            help=("pip install 'stlc[plot]'",),
         )
+        raise MissingError(finding)
 
 
 def _missing() -> list[str]:

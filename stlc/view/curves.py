@@ -30,8 +30,9 @@ def draw_curves(rows: Rows) -> Picture | None:
         for axes in (left, middle, right):
             axes.set_xlabel("training time [s]")
             axes.margins(x=0.01)
-    last = measured[-1]
-    alt = f"Plan accuracy rises from {measured[0]['accuracy']:.3f} to {last['accuracy']:.3f} in {last['seconds']:.0f} s."
+    first, last = measured[0], measured[-1]
+    course = f"from {first['accuracy']:.3f} to {last['accuracy']:.3f} in {last['seconds']:.0f} s"
+    alt = f"Plan accuracy while training, {course}."
     return Picture(figure, alt)
 
 

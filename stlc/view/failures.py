@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile.semantics import TOLERANCE
 from stlc.signature import Signature
 from stlc.view.held_out import (
-    TOLERANCE,
     Condition,
     HeldOut,
     Weakness,
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def draw_failures(held: HeldOut, signature: Signature | None = None) -> Picture | None:
-    """The worst requirement over the two columns that tell most, and its robustness; None if nothing fails."""
+    """The worst requirement over the two columns that tell most; None if nothing fails."""
     weakness = find_weakness(held)
     if weakness is None:
         return None
@@ -65,7 +65,9 @@ def _draw_starts(axes: Axes, held: HeldOut, weakness: Weakness, signature: Signa
     axes.set_xlabel(_label(held.names[a], signature))
     axes.set_ylabel(_label(held.names[b], signature))
     axes.margins(0.02)
-    legend = axes.legend(loc="upper right", bbox_to_anchor=(1.01, 1.12), ncols=2, handletextpad=0.1, markerscale=1.6)
+    legend = axes.legend(
+        loc="upper right", bbox_to_anchor=(1.01, 1.12), ncols=2, handletextpad=0.1, markerscale=1.6
+    )
     for handle in legend.legend_handles:
         if handle is not None:
             handle.set_alpha(1)
@@ -100,9 +102,10 @@ def _draw_margins(axes: Axes, held: HeldOut, weakness: Weakness) -> None:
     low, high = np.quantile(rho, [0.002, 0.998])
     edges = np.linspace(min(low, -1e-3), max(high, 1e-3), 46)
     edges = np.sort(np.append(edges, -TOLERANCE))
+    bins = edges.tolist()
     clipped = np.clip(rho, edges[0], edges[-1])
     for mask, color in ((rho >= -TOLERANCE, BLUE), (rho < -TOLERANCE, RED)):
-        axes.hist(clipped[mask], bins=edges, color=color, alpha=0.85)
+        axes.hist(clipped[mask], bins=bins, color=color, alpha=0.85)
     axes.axvline(0, color=INK, lw=0.8)
     axes.set_yscale("symlog", linthresh=10)
     axes.set_ylim(bottom=0)

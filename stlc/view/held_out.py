@@ -15,9 +15,9 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile.semantics import TOLERANCE
 from stlc.signature import Signature
 
-TOLERANCE = 1e-6
 MAX_CONDITIONS = 4
 LEAST_GAIN = 1.04  # an added condition has to better the F-score by this factor
 FEW_VALUES = 8  # columns with at most so many distinct values are compared by `=`
@@ -60,14 +60,9 @@ class Condition:
 
     def holds(self, x0: Array) -> Mask:
         """Which starts (starts, columns) meet it."""
-        values = x0[:, self.column]
-        match self.op:
-            case "<=":
-                return values <= self.value
-            case ">=":
-                return values >= self.value
-            case "=":
-                return values == self.value
+        compare = {"<=": np.less_equal, ">=": np.greater_equal, "=": np.equal}[self.op]
+        meets: Mask = compare(x0[:, self.column], self.value)
+        return meets
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +102,7 @@ def load_held_out(path: Path) -> HeldOut | None:
 
 
 def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | None:
-    """The region of the initial set where `requirement` (by default the worst) fails; None if it never does."""
+    """Where in the initial set `requirement` (by default the worst) fails; None if it never does."""
     index = held.worst if requirement is None else requirement
     failing = held.each[:, index] < -TOLERANCE
     if not failing.any():
@@ -150,7 +145,9 @@ def _candidates(x0: Array, region: Mask, failing: Mask) -> list[Condition]:
         if len(values) <= FEW_VALUES:
             found.extend(Condition(column, "=", float(value)) for value in values)
             continue
-        cuts = _rounded(np.quantile(x0[region & failing, column], np.linspace(0, 1, 11)), np.ptp(x0[:, column]))
+        cuts = _rounded(
+            np.quantile(x0[region & failing, column], np.linspace(0, 1, 11)), np.ptp(x0[:, column])
+        )
         found.extend(Condition(column, ">=", cut) for cut in cuts[:-1])
         found.extend(Condition(column, "<=", cut) for cut in cuts[1:])
     return found
@@ -169,7 +166,9 @@ def _telling(x0: Array, failing: Mask, conditions: list[Condition]) -> tuple[int
     for condition in conditions:
         if condition.op == "=":
             focus &= condition.holds(x0)
-    many = [c for c in range(x0.shape[1]) if len(np.unique(x0[focus, c])) > FEW_VALUES] or list(range(x0.shape[1]))
+    many = [c for c in range(x0.shape[1]) if len(np.unique(x0[focus, c])) > FEW_VALUES] or list(
+        range(x0.shape[1])
+    )
     ranked = sorted(many, key=lambda c: -_separation(x0[focus, c], failing[focus]))
     first, second, *_ = [*dict.fromkeys([*used, *ranked]), *range(x0.shape[1]), 0, 0]
     return first, second
@@ -188,7 +187,9 @@ def _separation(values: Array, failing: Mask) -> float:
 # ----------------------------------------------------------------------- in words
 
 
-def region_text(conditions: tuple[Condition, ...], names: tuple[str, ...], signature: Signature | None = None) -> str:
+def region_text(
+    conditions: tuple[Condition, ...], names: tuple[str, ...], signature: Signature | None = None
+) -> str:
     """The region in the notation of specifications: `sign = stop, -2.1 <= x <= -1 [m]`."""
     return ", ".join(
         _column_text([c for c in conditions if c.column == column], names[column], signature)

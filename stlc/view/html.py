@@ -1,4 +1,4 @@
-"""HTML that cannot be broken from outside: text is escaped because it is not `Html`, not because someone remembered."""
+"""HTML that cannot be broken from outside: whatever is not `Html` is text and gets escaped."""
 
 from __future__ import annotations
 

@@ -1,18 +1,34 @@
-"""What was driven: the signals of chosen traces, the robustness of every requirement beneath, who decided when."""
+"""What was driven: signals of chosen traces, beneath them every requirement's robustness and who decided."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile.semantics import TOLERANCE
 from stlc.signature import Column
 from stlc.trace import Trace
-from stlc.view.judged import TOLERANCE, Judged
-from stlc.view.style import BLUE, FAINT, GREEN, INK, MUTED, ORANGE, RED, SKY, Picture, look, new_figure, quiet
+from stlc.view.margins import Margins
+from stlc.view.style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    RED,
+    SKY,
+    Picture,
+    look,
+    narrow_gaps,
+    new_figure,
+    quiet,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,40 +47,48 @@ class Choice:
     title: str
 
 
-def choose_traces(judged: Judged) -> tuple[Choice, ...]:
+def choose_traces(margins: Margins) -> tuple[Choice, ...]:
     """The worst trace and a typical one (median robustness); only one where there is only one."""
-    order = np.argsort(judged.least, kind="stable")
+    order = np.argsort(margins.least, kind="stable")
     worst, typical = int(order[0]), int(order[len(order) // 2])
     if worst == typical:
         return (Choice(worst, f"trace {worst}"),)
     return Choice(worst, f"worst: trace {worst}"), Choice(typical, f"typical: trace {typical}")
 
 
-def draw_signals(trace: Trace, judged: Judged, choices: Sequence[Choice]) -> Picture:
+def draw_signals(trace: Trace, margins: Margins, choices: Sequence[Choice]) -> Picture:
     """A column of panels per chosen trace."""
-    rows = _rows(trace, judged)
+    rows = _rows(trace, margins)
     heights = [_HEIGHTS[kind] for kind, _ in rows]
     with look():
         figure = new_figure(9, sum(heights) + 0.07 * len(rows) + 0.55)
-        figure.get_layout_engine().set(h_pad=0.02, w_pad=0.06, hspace=0.03, wspace=0.03)  # type: ignore[union-attr]
+        narrow_gaps(figure)
         grid = figure.subplots(
             len(rows), len(choices), squeeze=False, sharex=True, sharey="row", height_ratios=heights
         )
-        for column, choice in enumerate(choices):
-            grid[0][column].set_title(choice.title, pad=8)
-            for row, (kind, name) in enumerate(rows):
-                axes = grid[row][column]
-                _draw_row(axes, kind, name, trace, judged, choice.index)
-                if column == 0:
-                    _name_row(axes, kind, name, trace)
-            grid[-1][column].set_xlabel("time [s]")
-            grid[-1][column].tick_params(labelbottom=True)
+        for column, choice in zip(grid.T, choices, strict=True):
+            column[0].set_title(choice.title, pad=8)
+            for axes, (kind, name) in zip(column, rows, strict=True):
+                _draw_row(axes, kind, name, _Agent(trace, margins, choice.index))
+            column[-1].set_xlabel("time [s]")
+            column[-1].tick_params(labelbottom=True)
+        for axes, (kind, name) in zip(grid[:, 0], rows, strict=True):
+            _name_row(axes, kind, name, trace)
         grid[0][0].set_xlim(trace.times[0], trace.times[-1])
     shown = " and ".join(choice.title for choice in choices)
     return Picture(figure, f"Signals, decisions and robustness per requirement; {shown}.")
 
 
-def _rows(trace: Trace, judged: Judged) -> list[tuple[str, str]]:
+@dataclass(frozen=True, slots=True)
+class _Agent:
+    """One trace of a recording."""
+
+    trace: Trace
+    margins: Margins
+    index: int
+
+
+def _rows(trace: Trace, margins: Margins) -> list[tuple[str, str]]:
     """Numbers first, then what is discrete, who decided, and the requirements."""
     columns = trace.signature.columns
     rows = [("line", c.name) for c in columns if c.kind in ("real", "int")]
@@ -73,21 +97,21 @@ def _rows(trace: Trace, judged: Judged) -> list[tuple[str, str]]:
     rows += [("strip", c.name) for c in columns if c.kind in ("bool", "enum")]
     if _decisions(trace) is not None:
         rows.append(("decision", "decision"))
-    return rows + [("robustness", name) for name in judged.names]
+    return rows + [("robustness", name) for name in margins.names]
 
 
-def _draw_row(axes: Axes, kind: str, name: str, trace: Trace, judged: Judged, index: int) -> None:
+def _draw_row(axes: Axes, kind: str, name: str, agent: _Agent) -> None:
     match kind:
         case "line":
-            _draw_line(axes, trace, name, index)
+            _draw_line(axes, agent, name)
         case "strip":
-            _draw_strip(axes, trace, trace.signature[name], index)
+            _draw_strip(axes, agent, agent.trace.signature[name])
         case "decision":
-            _draw_decisions(axes, trace, index)
+            _draw_decisions(axes, agent)
         case _:
-            _draw_robustness(axes, trace, judged, name, index)
+            _draw_robustness(axes, agent, name)
     if kind != "decision":
-        _mark_backup(axes, trace, index)
+        _mark_backup(axes, agent)
 
 
 def _name_row(axes: Axes, kind: str, name: str, trace: Trace) -> None:
@@ -99,26 +123,27 @@ def _name_row(axes: Axes, kind: str, name: str, trace: Trace) -> None:
     axes.yaxis.set_label_coords(-0.085, 0.5)
 
 
-def _draw_line(axes: Axes, trace: Trace, name: str, index: int) -> None:
-    axes.plot(trace.times, _broken(trace.data[name][index]), color=INK, lw=1.1)
+def _draw_line(axes: Axes, agent: _Agent, name: str) -> None:
+    axes.plot(agent.trace.times, _broken(agent.trace.data[name][agent.index]), color=INK, lw=1.1)
     axes.locator_params(axis="y", nbins=3)
 
 
 def _broken(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`values` with a gap where they jump (a reset, the next junction), so that no line suggests a passage."""
-    span = float(np.nanmax(values) - np.nanmin(values)) if len(values) else 0.0
-    jumps = np.flatnonzero(np.abs(np.diff(values)) > 0.4 * span) + 1 if span > 0 else np.array([], dtype=int)
+    """`values` with a gap where they jump (a reset, the next junction); a staircase stays whole."""
     steps = np.abs(np.diff(values))
-    if len(jumps) > 0.1 * len(values) or (len(steps) and np.median(steps[steps > 0] if steps.any() else [0]) > 0.3 * span):
+    moves = steps[steps > 0]
+    span = float(np.ptp(values))
+    if not len(moves) or np.median(moves) > 0.3 * span:
         return values
     broken = values.copy()
-    broken[jumps] = np.nan
+    broken[1:][steps > 0.4 * span] = np.nan
     return broken
 
 
-def _draw_strip(axes: Axes, trace: Trace, column: Column, index: int) -> None:
+def _draw_strip(axes: Axes, agent: _Agent, column: Column) -> None:
     """A discrete signal as coloured stretches with its labels written into them."""
-    values = trace.data[column.name][index]
+    trace = agent.trace
+    values = trace.data[column.name][agent.index]
     labels = {value: label for label, value in column.labels} or {0.0: "", 1.0: "yes"}
     levels = sorted({*labels, *np.unique(values[np.isfinite(values)]).tolist()})
     tints = (FAINT, SKY, MUTED, BLUE, GREEN)
@@ -135,7 +160,7 @@ def _draw_strip(axes: Axes, trace: Trace, column: Column, index: int) -> None:
 def _stretches(values: NDArray[np.float64]) -> list[tuple[int, int, float]]:
     """(start, stop, value) of each run of equal values."""
     edges = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
-    return [(a, b, float(values[a])) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+    return [(a, b, float(values[a])) for a, b in pairwise(edges) if b > a]
 
 
 def _decisions(trace: Trace) -> NDArray[np.int64] | None:
@@ -146,38 +171,38 @@ def _decisions(trace: Trace) -> NDArray[np.int64] | None:
     return recorded.astype(np.int64)
 
 
-def _draw_decisions(axes: Axes, trace: Trace, index: int) -> None:
-    decisions = _decisions(trace)
+def _draw_decisions(axes: Axes, agent: _Agent) -> None:
+    trace, decisions = agent.trace, _decisions(agent.trace)
     assert decisions is not None
-    for start, stop, value in _stretches(decisions[index].astype(np.float64)):
+    for start, stop, value in _stretches(decisions[agent.index].astype(np.float64)):
         _, color = DECISIONS.get(int(value), ("", MUTED))
         axes.axvspan(trace.t0 + start * trace.dt, trace.t0 + stop * trace.dt, color=color, lw=0)
     axes.set_ylim(0, 1)
     quiet(axes)
 
 
-def _mark_backup(axes: Axes, trace: Trace, index: int) -> None:
+def _mark_backup(axes: Axes, agent: _Agent) -> None:
     """Faint uprights at the instants where the backup acted."""
-    decisions = _decisions(trace)
+    trace, decisions = agent.trace, _decisions(agent.trace)
     if decisions is None:
         return
-    for start, stop, value in _stretches(decisions[index].astype(np.float64)):
+    for start, stop, value in _stretches(decisions[agent.index].astype(np.float64)):
         if value != POLICY:
             _, color = DECISIONS.get(int(value), ("", MUTED))
             left, right = trace.t0 + start * trace.dt, trace.t0 + stop * trace.dt
             axes.axvspan(left, right, color=color, alpha=0.18, lw=0)
 
 
-def _draw_robustness(axes: Axes, trace: Trace, judged: Judged, name: str, index: int) -> None:
-    rho = judged.of(name)[index]
+def _draw_robustness(axes: Axes, agent: _Agent, name: str) -> None:
+    rho = agent.margins.of(name)[agent.index]
     rho = np.where(np.isposinf(rho), np.nan, rho)
-    times = trace.times[: len(rho)]
+    times = agent.trace.times[: len(rho)]
     axes.axhline(0, color=MUTED, lw=0.7)
     axes.fill_between(times, rho, 0, where=rho >= -TOLERANCE, step="post", color=BLUE, alpha=0.16, lw=0)
     axes.fill_between(times, rho, 0, where=rho < -TOLERANCE, step="post", color=RED, alpha=0.3, lw=0)
     axes.step(times, rho, where="post", color=BLUE, lw=1)
     axes.step(times, np.where(rho < -TOLERANCE, rho, np.nan), where="post", color=RED, lw=1.4)
-    axes.set_ylim(*_limits(judged.of(name)))
+    axes.set_ylim(*_limits(agent.margins.of(name)))
     axes.locator_params(axis="y", nbins=3)
 
 

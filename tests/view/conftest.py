@@ -103,7 +103,9 @@ def drive(agents=20, steps=150, seed=2):
         decisions.append(np.where(near, np.where(rng.random(agents) < 0.1, 2, 1), 0))
         actions.append(u)
         x = x + v * 0.1
-        tau = np.where(light, (tau + 0.1) % 8, np.where((x > -1) & (x < 0), tau + 0.1, np.where(x > 0, 0, tau)))
+        tau = np.where(
+            light, (tau + 0.1) % 8, np.where((x > -1) & (x < 0), tau + 0.1, np.where(x > 0, 0, tau))
+        )
         dx = np.where(dx >= 0, np.maximum(dx + (v_lead - v) * 0.1, 0.0), dx)
         v = np.clip(v + u * 0.1, -0.01, 10)
         gone = x > 8
@@ -186,3 +188,8 @@ def deployed(trained):
     """The same run with a recorded deployment."""
     save_trace(trained.path / "trace.npz", drive())
     return trained
+
+
+@pytest.fixture
+def signature():
+    return SIGNATURE

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-TOLERANCE = 1e-6
-
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class Margins:
     """Robustness per requirement.
 
     Attributes:
@@ -27,9 +25,11 @@ class Judged:
 
     def of(self, name: str) -> Array:
         """(traces, samples) of one requirement."""
-        return self.rho[self.names.index(name)]
+        values: Array = self.rho[self.names.index(name)]
+        return values
 
     @property
     def least(self) -> Array:
         """(traces,) the least value over requirements and instants; +inf where nothing was judged."""
-        return np.nan_to_num(self.rho, nan=np.inf).min(axis=(0, 2))
+        least: Array = np.nan_to_num(self.rho, nan=np.inf).min(axis=(0, 2))
+        return least

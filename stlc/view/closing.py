@@ -1,0 +1,79 @@
+"""The report's last sections: where plans fail, how to repeat the run, and what it was made from."""
+
+from __future__ import annotations
+
+import shlex
+
+from stlc.view.failures import draw_failures
+from stlc.view.highlight import spec_html, yaml_html
+from stlc.view.html import Html, classed, el, figure
+from stlc.view.material import Material
+from stlc.view.page import section
+
+Part = tuple[str, str, Html]
+
+_TITLES = {
+    "spec.stl": "The specification",
+    "system.yaml": "The system",
+    "compiled.txt": "The specification as compiled",
+    "config.resolved.yaml": "Every option, resolved",
+}
+
+
+def failures_section(material: Material) -> Part | None:
+    """Where in the initial set the policy's plans fail."""
+    if material.held_out is None:
+        return None
+    picture = draw_failures(material.held_out, material.signature)
+    title = "Where plans fail"
+    if picture is None:
+        text = f"None of the plans from {len(material.held_out.x0):,} held-out starts fails a requirement."
+        return "failures", title, section("failures", title, el("p", text))
+    caption = (
+        "Held-out starts over the two columns that tell most about failing; the dashed box is the region "
+        "named above. Right: how far the plans are from failing (counts on a logarithmic scale)."
+    )
+    body = figure(picture.data_uri(), picture.alt, caption)
+    return "failures", title, section("failures", title, el("p", picture.alt), body)
+
+
+def repeat_section(material: Material) -> Part:
+    """The commands that lead here again."""
+    title = "How to repeat it"
+    intro = el(
+        "p",
+        "The same seed and number of steps give the same weights on the same machine. The folder of the run "
+        "holds the specification and the system as they were.",
+    )
+    lines = "\n".join(_commands(material))
+    return "repeat", title, section("repeat", title, intro, el("pre", lines))
+
+
+def _commands(material: Material) -> list[str]:
+    record, run = material.record, shlex.quote(material.run.shown)
+    spec = str(record.get("spec_path") or f"{material.run.shown}/spec.stl")
+    system = str(record.get("system_path") or f"{material.run.shown}/system.yaml")
+    train = ["stlc", "train", spec, "--system", system]
+    for option in ("seed", "steps"):
+        if record.get(option) is not None:
+            train += [f"--{option}", str(record[option])]
+    commands = [shlex.join(train), f"stlc simulate {run} --backup"]
+    if material.trace is not None:
+        commands.append(f"stlc check {shlex.quote(f'{material.run.shown}/trace.npz')}")
+    return [*commands, f"stlc report {run}"]
+
+
+def texts_section(material: Material) -> Part | None:
+    """The specification and the system word by word; what was derived from them can be unfolded."""
+    if not material.texts:
+        return None
+    title = "What it was made from"
+    blocks = []
+    for name, text in material.texts.items():
+        shown = (
+            spec_html(text) if name.endswith(".stl") else yaml_html(text) if name.endswith(".yaml") else text
+        )
+        attrs = {"open": ""} if name == "spec.stl" else {}
+        summary = el("summary", _TITLES[name], " ", classed("span", "quiet", name))
+        blocks.append(el("details", summary, el("pre", shown), attrs=attrs))
+    return "texts", title, section("texts", title, blocks)

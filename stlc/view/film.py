@@ -1,0 +1,166 @@
+"""Films: something drawn frame by frame, and how it becomes a GIF or a still."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.files import write_atomic
+from stlc.trace import Trace
+from stlc.view.style import FAINT, INK, ORANGE, PAPER, look, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from PIL.Image import Image
+
+MAX_FRAMES = 150
+MAX_BYTES = 4_000_000
+COLOURS = 64
+_LONGER_SIDE = 760  # pixels
+
+Scene = Mapping[str, NDArray[Any]]
+DrawScene = Callable[[Any, Scene, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Film:
+    """Something that can be drawn frame by frame.
+
+    Attributes:
+        frames: how many instants there are.
+        dt: seconds between them.
+        size: of the picture in inches.
+        draw: draws one instant into an empty figure.
+        alt: what is seen, in words.
+    """
+
+    frames: int
+    dt: float
+    size: tuple[float, float]
+    draw: Callable[[Figure, int], None]
+    alt: str
+
+
+def scene_film(scene: Scene, draw: DrawScene, dt: float, *, title: str = "") -> Film:
+    """The film of a recorded scene (arrays (instants, …)), drawn by its world."""
+
+    def draw_frame(figure: Figure, index: int) -> None:
+        figure.set_layout_engine("none")
+        axes = figure.add_axes((0.0, 0.0, 1.0, 0.955))
+        draw(axes, scene, index)
+        figure.text(0.02, 0.972, title, color=INK, va="center", weight="bold")
+        figure.text(0.98, 0.972, f"{index * dt:.1f} s", color=INK, va="center", ha="right")
+
+    frames = min(len(values) for values in scene.values())
+    return Film(
+        frames, dt, _fitting_size(draw, scene), draw_frame, f"{title}: {frames * dt:.0f} s of deployment."
+    )
+
+
+def signal_film(trace: Trace, *, title: str = "") -> Film:
+    """The film of a trace without a world: every agent's signals, drawn up to now."""
+    names = [c.name for c in trace.signature.columns if c.kind in ("real", "int")][:6]
+    names = names or list(trace.signature.names[:6])
+
+    def draw_frame(figure: Figure, index: int) -> None:
+        grid = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, name in zip(grid, names, strict=True):
+            values = trace.data[name]
+            axes.plot(trace.times, values.T, color=FAINT, lw=0.8)
+            axes.plot(trace.times[: index + 1], values[:, : index + 1].T, color=INK, lw=0.8, alpha=0.7)
+            axes.plot(np.full(len(values), trace.times[index]), values[:, index], "o", color=ORANGE, ms=3)
+            unit = trace.signature[name].unit.text
+            axes.set_ylabel(f"{name} [{unit}]" if unit not in ("", "1") else name)
+        grid[0].set_title(f"{title}   {trace.times[index]:.1f} s")
+        grid[-1].set_xlabel("time [s]")
+
+    height = 0.7 + 0.8 * len(names)
+    return Film(
+        trace.samples, trace.dt, (6.4, height), draw_frame, f"{title}: signals of {trace.traces} agents."
+    )
+
+
+def save_gif(film: Film, path: Path, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_BYTES) -> Path:
+    """Write `film` to `path`, in real time, smaller in width where it would exceed `max_bytes`."""
+    stride = max(1, -(-film.frames // max_frames))
+    indices = range(0, film.frames, stride)
+    pictures = list(_frames(film, indices))
+    milliseconds = max(20, round(1000 * stride * film.dt))
+    data = _encoded(pictures, milliseconds)
+    while len(data) > max_bytes and pictures[0].width > 160:
+        factor = max(0.6, 0.95 * (max_bytes / len(data)) ** 0.5)
+        size = (round(pictures[0].width * factor), round(pictures[0].height * factor))
+        pictures = [picture.resize(size) for picture in pictures]
+        data = _encoded(pictures, milliseconds)
+    write_atomic(path, data)
+    return path
+
+
+def save_still(film: Film, path: Path, *, at: float = 0.5, dpi: int = 160) -> Path:
+    """Write the instant at the share `at` of `film` as PNG."""
+    index = min(film.frames - 1, int(at * film.frames))
+    with look():
+        figure = new_figure(*film.size)
+        film.draw(figure, index)
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=dpi, facecolor=PAPER)
+    write_atomic(path, buffer.getvalue())
+    return path
+
+
+def _fitting_size(draw: DrawScene, scene: Scene) -> tuple[float, float]:
+    """A size of 6.4 inches at the longer side with the proportions of what the world draws."""
+    with look():
+        axes = new_figure(4, 4).add_subplot()
+        draw(axes, scene, 0)
+        (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+        fixed = axes.get_aspect() != "auto"
+    ratio = float(abs((high - low) / (right - left))) if fixed and right != left else 0.6
+    ratio = min(max(ratio, 0.25), 1.6)
+    width, height = (6.4, 6.4 * ratio) if ratio <= 1 else (6.4 / ratio, 6.4)
+    return width, height / 0.955
+
+
+def _frames(film: Film, indices: range) -> Iterator[Image]:
+    """The instants as RGB images of `_LONGER_SIDE` along the longer side."""
+    from PIL import Image
+
+    with look():
+        figure = new_figure(*film.size)
+        figure.set_dpi(_LONGER_SIDE / max(film.size))
+        figure.set_facecolor(PAPER)
+        for index in indices:
+            figure.clear()
+            film.draw(figure, index)
+            canvas: Any = figure.canvas
+            canvas.draw()
+            yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+
+
+def _encoded(pictures: list[Image], milliseconds: int) -> bytes:
+    """`pictures` as a GIF with one palette for all, taken from a few of them."""
+    from PIL import Image
+
+    sample = pictures[:: max(1, len(pictures) // 6)][:6]
+    sheet = Image.new("RGB", (sample[0].width, sample[0].height * len(sample)))
+    for row, picture in enumerate(sample):
+        sheet.paste(picture, (0, row * picture.height))
+    palette = sheet.quantize(COLOURS, dither=Image.Dither.NONE)
+    frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    buffer = io.BytesIO()
+    frames[0].save(
+        buffer,
+        format="GIF",
+        save_all=True,
+        append_images=frames[1:],
+        duration=milliseconds,
+        loop=0,
+        optimize=True,
+    )
+    return buffer.getvalue()

@@ -1,0 +1,120 @@
+"""What a run's folder offers to a report; every part may be missing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from stlc.diagnostics import StlcError
+from stlc.dynamics.schema import load_system_decl
+from stlc.grammar import ast
+from stlc.grammar.parser import parse
+from stlc.rundir import RunDir
+from stlc.signature import Signature
+from stlc.source import Source
+from stlc.trace import Trace, load_trace
+from stlc.view.held_out import HeldOut, load_held_out
+
+Record = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Material:
+    """The parts of one run.
+
+    Attributes:
+        run: its folder.
+        record: of `run.json`.
+        rows: of `train.jsonl`.
+        requirements: name -> declaration, parsed from the run's specification.
+        texts: `spec.stl`, `system.yaml`, `compiled.txt`, `config.resolved.yaml`, as far as they are there.
+        signature: of the system, for units and labels.
+        held_out: starts and how their plans fared.
+        simulation: of `eval/simulate.json`.
+        trace: the recorded deployment.
+    """
+
+    run: RunDir
+    record: Record
+    rows: Sequence[Record]
+    requirements: Mapping[str, ast.Require]
+    texts: Mapping[str, str]
+    signature: Signature | None
+    held_out: HeldOut | None
+    simulation: Record | None
+    trace: Trace | None
+
+    @property
+    def result(self) -> Record:
+        """What training ended with; empty while it has not."""
+        result = self.record.get("result")
+        return result if isinstance(result, Mapping) else {}
+
+    @property
+    def spec(self) -> str:
+        """Name of the specification."""
+        return str(self.record.get("spec", "specification"))
+
+
+def gather(run: RunDir) -> Material:
+    """Read everything that a report can show.
+
+    Raises:
+        RunError: R101, the folder is no run.
+    """
+    texts = {name: text for name in TEXTS if (text := _text(run, name))}
+    return Material(
+        run=run,
+        record=run.record(),
+        rows=run.rows(),
+        requirements=_requirements(texts.get("spec.stl", "")),
+        texts=texts,
+        signature=_signature(run),
+        held_out=load_held_out(run.path / "eval/held_out.npz"),
+        simulation=_simulation(run),
+        trace=_trace(run),
+    )
+
+
+TEXTS = ("spec.stl", "system.yaml", "compiled.txt", "config.resolved.yaml")
+
+
+def _text(run: RunDir, name: str) -> str:
+    try:
+        return (run.path / name).read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
+
+
+def _requirements(text: str) -> dict[str, ast.Require]:
+    try:
+        spec = parse(Source("spec.stl", text))
+    except StlcError:
+        return {}
+    return {item.name: item for item in spec.items if isinstance(item, ast.Require)}
+
+
+def _signature(run: RunDir) -> Signature | None:
+    try:
+        return load_system_decl(run.path / "system.yaml").signature
+    except StlcError:
+        return None
+
+
+def _simulation(run: RunDir) -> Record | None:
+    try:
+        found = run.read_json("eval/simulate.json")
+    except StlcError:
+        return None
+    return found if isinstance(found, Mapping) else None
+
+
+def _trace(run: RunDir) -> Trace | None:
+    path = run.path / "trace.npz"
+    if not path.exists():
+        return None
+    try:
+        return load_trace(path)
+    except StlcError:
+        return None

@@ -1,0 +1,158 @@
+"""The report's first screen, and how the policy came to be."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from stlc.view.curves import draw_curves
+from stlc.view.highlight import spec_html
+from stlc.view.html import Child, Html, classed, el, facts, figure, join, table
+from stlc.view.material import Material
+from stlc.view.page import section
+from stlc.view.words import count, interval, number, seconds, share
+
+
+def headline(material: Material, tiles: list[tuple[str, str]]) -> Html:
+    """What came out, in one sentence and a few numbers; `tiles` adds those of the deployment."""
+    record, result = material.record, material.result
+    names = (material.spec, str(record.get("system", "")), f"run {material.run.name}")
+    return join(
+        classed("p", "eyebrow", " · ".join(name for name in names if name)),
+        el("h1", _verdict(material)),
+        el("p", _beside(result)) if result else None,
+        _tiles([*_training_tiles(result), *tiles]),
+    )
+
+
+def _verdict(material: Material) -> str:
+    accuracy = material.result.get("accuracy")
+    if accuracy is None:
+        return f"Training of {material.spec} is {material.record.get('status', 'not finished')}"
+    held_out = material.result.get("held_out")
+    starts = f"{held_out:,} held-out starts" if held_out else "held-out starts"
+    return f"The policy's plan satisfies {material.spec} from {share(accuracy)} of {starts}"
+
+
+def _beside(result: Mapping[str, Any]) -> str:
+    accuracy, feasible, ends = result.get("accuracy"), result.get("feasible"), result.get("interval")
+    parts = [f"The 95 % interval is {interval(ends)}." if ends else ""]
+    if feasible and accuracy is not None:
+        parts.append(
+            f"Some satisfying plan is known for {share(feasible)} of them; the policy finds "
+            f"{share(accuracy / feasible)} of what is known to be feasible."
+        )
+    return " ".join(part for part in parts if part)
+
+
+def _training_tiles(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    accuracy, feasible = result.get("accuracy"), result.get("feasible")
+    tiles = [(share(accuracy), "plan accuracy")]
+    if accuracy is not None and feasible:
+        tiles.append((share(accuracy / feasible), "of what is known feasible"))
+    tiles.append((seconds(result.get("seconds")), "of training"))
+    return [(value, name) for value, name in tiles if value]
+
+
+def _tiles(tiles: list[tuple[str, str]]) -> Html | None:
+    if not tiles:
+        return None
+    return classed(
+        "div", "tiles", [classed("div", "tile", el("b", value), el("span", name)) for value, name in tiles]
+    )
+
+
+def requirements_section(material: Material) -> tuple[str, str, Html] | None:
+    """Every requirement with its text and how often the policy's plans meet it."""
+    shares: Mapping[str, float] = material.result.get("requirements") or {}
+    names = list(shares) or list(material.requirements)
+    if not names:
+        return None
+    held_out = material.result.get("held_out")
+    worst = min(shares, key=shares.__getitem__) if shares else None
+    rows: list[tuple[Child, ...]] = []
+    for name in names:
+        value = shares.get(name)
+        fails = "" if value is None or not held_out else f"{round((1 - value) * held_out):,}"
+        kind = "bad" if name == worst and value is not None and value < 1 else "plain"
+        rows.append((_described(material, name), classed("span", kind, share(value)), fails))
+    header = ("requirement", "satisfied", f"fails of {held_out:,}" if held_out else "fails")
+    title = "Requirements"
+    intro = el("p", "Each is judged alone, on the plans from the held-out starts; all must hold together.")
+    return "requirements", title, section("requirements", title, intro, table(header, rows, numeric=(1, 2)))
+
+
+def _described(material: Material, name: str) -> Html:
+    declared = material.requirements.get(name)
+    if declared is None:
+        return el("strong", name)
+    tags = "".join(f" @{tag.name}" for tag in declared.tags)
+    return join(
+        el("strong", name),
+        classed("span", "quiet", tags),
+        el("small", declared.doc) if declared.doc else None,
+        el("pre", spec_html(declared.span.text.strip())),
+    )
+
+
+def training_section(material: Material) -> tuple[str, str, Html]:
+    """Curves, options, machine and versions."""
+    curves = draw_curves(material.rows)
+    title = "How it was trained"
+    picture = figure(curves.data_uri(), curves.alt, _CURVES) if curves else None
+    last = material.rows[-1] if material.rows else {}
+    search = None
+    if last.get("failing") is not None:
+        search = el(
+            "p",
+            f"In the last round the search repaired {last.get('repaired', 0)} of "
+            f"{count(int(last['failing']), 'failing start')}.",
+        )
+    return "training", title, section("training", title, picture, search, facts(_facts(material)))
+
+
+_CURVES = (
+    "Plan accuracy while training, with the share of starts for which some satisfying plan is known; "
+    "each requirement alone; the loss over the learning rate (shaded)."
+)
+
+
+def _facts(material: Material) -> list[tuple[str, Child]]:
+    record = material.record
+    hardware, git = record.get("hardware") or {}, record.get("git") or {}
+    versions = record.get("versions") or {}
+    budget = record.get("budget")
+    steps = record.get("steps")
+    taken = f"{steps:,} steps" if isinstance(steps, int) else ""
+    if budget:
+        taken += f" (a budget of {budget if isinstance(budget, str) else seconds(float(budget))})"
+    machine = (
+        str(hardware.get("processor") or hardware.get("machine") or ""),
+        count(int(hardware["cores"]), "core") if hardware.get("cores") else "",
+        f"{number(hardware['memory_gib'], 'GiB')}" if hardware.get("memory_gib") else "",
+        str(hardware.get("system", "")),
+    )
+    commit = str(git.get("commit", ""))[:12]
+    return [
+        ("steps", taken),
+        ("seed", str(record.get("seed", ""))),
+        ("device", _device(record)),
+        ("machine", ", ".join(part for part in machine if part)),
+        ("versions", ", ".join(f"{name} {version}" for name, version in versions.items())),
+        ("source", f"{commit}{', with uncommitted changes' if git.get('dirty') else ''}" if commit else ""),
+        ("started", str(record.get("started", ""))),
+        ("specification", _hashed(record, "spec")),
+        ("system", _hashed(record, "system")),
+    ]
+
+
+def _device(record: Mapping[str, Any]) -> str:
+    device, threads = str(record.get("device", "")), record.get("threads")
+    return f"{device}, {count(int(threads), 'thread')}" if threads else device
+
+
+def _hashed(record: Mapping[str, Any], what: str) -> Child:
+    path, digest = record.get(f"{what}_path") or record.get(what, ""), record.get(f"{what}_hash")
+    if not digest:
+        return str(path)
+    return join(str(path), " ", classed("span", "quiet", f"sha256 {str(digest)[:12]}"))

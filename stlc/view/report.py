@@ -1,0 +1,55 @@
+"""`report.html`: one page that says what a run achieved, how, where it fails and how to repeat it.
+
+The page is whole by itself: style and pictures stand inside it, it needs no script and no network, and it
+follows the reader's light or dark scheme. What a run does not have (a deployment, say) is left out.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from stlc import __version__
+from stlc.files import write_atomic
+from stlc.rundir import RunDir
+from stlc.view import require_drawing
+from stlc.view.closing import failures_section, repeat_section, texts_section
+from stlc.view.deployment import deployment_section, deployment_tiles, film_section
+from stlc.view.driven import driven_section
+from stlc.view.material import Material, gather
+from stlc.view.opening import headline, requirements_section, training_section
+from stlc.view.page import page
+
+REPORT = "report.html"
+
+
+def write_report(run: RunDir) -> Path:
+    """Write the report of `run` into its folder and return its path.
+
+    Raises:
+        MissingError: R301, matplotlib or Pillow is missing; R201, the file cannot be written.
+        RunError: R101, the folder is no run.
+    """
+    require_drawing()
+    path = run.path / REPORT
+    write_atomic(path, render_report(gather(run)))
+    return path
+
+
+def render_report(material: Material) -> str:
+    """The page of `material`."""
+    parts = (
+        requirements_section(material),
+        deployment_section(material),
+        film_section(material),
+        driven_section(material),
+        failures_section(material),
+        training_section(material),
+        repeat_section(material),
+        texts_section(material),
+    )
+    return page(
+        f"{material.spec} · {material.run.name}",
+        headline(material, deployment_tiles(material)),
+        [part for part in parts if part is not None],
+        f"Written by stlc {__version__} from {material.run.shown}",
+    )

@@ -1,0 +1,39 @@
+"""Numbers as a reader wants them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+def share(value: float | None, digits: int = 1) -> str:
+    """0.957 as `95.7 %`; nothing for None."""
+    return "" if value is None else f"{100 * value:.{digits}f} %"
+
+
+def interval(ends: Sequence[float] | None) -> str:
+    """(0.951, 0.962) as `95.1 to 96.2 %`."""
+    return "" if not ends else f"{100 * ends[0]:.1f} to {100 * ends[1]:.1f} %"
+
+
+def number(value: float | None, unit: str = "") -> str:
+    """Three significant digits, thousands set apart, then the unit."""
+    if value is None:
+        return ""
+    text = f"{value:,.0f}" if abs(value) >= 1000 or value == round(value) else f"{value:.3g}"
+    return f"{text} {unit}".rstrip()
+
+
+def seconds(value: float | None) -> str:
+    """A duration: `0.7 ms`, `61 s`, `5 min 12 s`."""
+    if value is None:
+        return ""
+    if value < 1:
+        return f"{1000 * value:.3g} ms"
+    if value < 120:
+        return f"{value:.3g} s"
+    return f"{int(value // 60)} min {round(value % 60)} s"
+
+
+def count(many: int, what: str) -> str:
+    """`1 trace`, `20 traces`."""
+    return f"{many:,} {what}{'' if many == 1 else 's'}"

@@ -1,0 +1,227 @@
+"""The live panel, its lines where there is no terminal, and the closing screen."""
+
+import io
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from stlc.cli.progress import (
+    BLOCKS,
+    Progress,
+    RunInfo,
+    Summary,
+    clock_text,
+    final_screen,
+    sparkline,
+)
+
+INFO = RunInfo("traffic", "car.yaml", "examples/car.yaml", "0001-quiet-heron", 0, 2)
+ROW = {
+    "step": 3120,
+    "steps": 5900,
+    "seconds": 32.0,
+    "loss": 0.1,
+    "accuracy": 0.957,
+    "requirements": {"no_collision": 0.996, "stop_sign": 0.971, "give_way": 0.999, "red_light": 0.984},
+    "feasible": 0.969,
+    "lr": 1e-3,
+    "repaired": 41,
+    "failing": 55,
+    "s_per_step": 0.0112,
+}
+SUMMARY = Summary(
+    accuracy=0.957,
+    interval=(0.951, 0.962),
+    held_out=5000,
+    requirements={"no_collision": 0.996, "stop_sign": 0.971},
+    feasible=0.969,
+    seconds=61.2,
+    folder="runs/traffic/0001-quiet-heron",
+    where="fails in 63 % of the starts with sign = stop",
+)
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+class Clock:
+    """Time that passes only when told."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+def piped(**options):
+    stream, clock = io.StringIO(), Clock()
+    console = Console(file=stream, width=120, **options)
+    return Progress(console, clock=clock), stream, clock
+
+
+def panel_of(progress, width=130):
+    stream = io.StringIO()
+    console = Console(file=stream, width=width)
+    progress.console = console
+    console.print(progress.panel())
+    return stream.getvalue().splitlines()
+
+
+def test_the_panel_has_the_layout_that_was_designed():
+    progress, _, _ = piped()
+    progress.start(INFO)
+    for accuracy in (0.5, 0.7, 0.9, 0.95, 0.957):
+        progress.update({**ROW, "accuracy": accuracy})
+    title, accuracy, requirements, search = panel_of(progress)
+    assert title.startswith(
+        "traffic · car.yaml (examples/car.yaml) · run 0001-quiet-heron · seed 0 · 2 threads   "
+    )
+    assert title.endswith("step 3,120 / 5,900   00:31 left")
+    assert len(title) == 130
+    assert accuracy == "  plan accuracy   ▁▄▇██  0.957     known feasible 0.969     share 98.8 %"
+    assert requirements == "  no_collision  0.996   stop_sign  0.971   give_way  0.999   red_light  0.984"
+    assert search == "  search repaired 41 of 55 failing starts in the last round"
+
+
+@pytest.mark.parametrize("width", [20, 40, 60, 80, 100, 200])
+def test_the_panel_never_exceeds_the_terminal(width):
+    progress, _, _ = piped()
+    progress.start(INFO)
+    progress.update(ROW)
+    lines = panel_of(progress, width)
+    assert max(map(len, lines)) <= width
+    assert any("step 3,120" in line for line in lines)
+
+
+def test_the_panel_before_the_first_row_says_what_happens():
+    progress, _, _ = piped()
+    progress.start(INFO)
+    text = "\n".join(panel_of(progress))
+    assert "measuring the speed of a step" in text
+    assert "left" not in text
+
+
+def test_a_bare_step_keeps_what_was_known():
+    progress, _, _ = piped()
+    progress.start(INFO)
+    progress.update(ROW)
+    progress.update({"step": 3500, "accuracy": None})
+    text = "\n".join(panel_of(progress))
+    assert "step 3,500 / 5,900" in text
+    assert "0.957" in text
+    assert "00:27 left" in text
+
+
+def test_time_left_runs_between_rows():
+    progress, _, clock = piped()
+    progress.start(INFO)
+    progress.update(ROW)
+    clock.now += 11
+    assert "00:20 left" in panel_of(progress)[0]
+    clock.now += 100
+    assert "00:00 left" in panel_of(progress)[0]
+
+
+def test_a_pipe_gets_a_line_every_30_seconds():
+    progress, stream, clock = piped()
+    progress.start(INFO)
+    for _ in range(61):
+        progress.update(ROW)
+        clock.now += 1.0
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == 3
+    assert lines[1] == (
+        "  step 3,120 / 5,900   00:31 left   plan accuracy 0.957  known feasible 0.969  share 98.8 %"
+        "   worst stop_sign 0.971"
+    )
+    assert "\x1b" not in stream.getvalue()
+
+
+def test_a_terminal_is_redrawn_in_place_and_left_clean():
+    stream = Terminal()
+    progress = Progress(Console(file=stream, width=100, force_terminal=True))
+    progress.start(INFO)
+    progress.update(ROW)
+    progress.stop()
+    progress.stop()
+    text = stream.getvalue()
+    assert "step 3,120 / 5,900" in text
+    assert text.count("\x1b[?25l") == text.count("\x1b[?25h") == 1
+    progress.finish(SUMMARY)
+    assert "Next:  stlc simulate --backup" in stream.getvalue()
+
+
+def test_no_colour_without_a_terminal_even_at_the_end():
+    progress, stream, _ = piped()
+    progress.start(INFO)
+    progress.finish(SUMMARY)
+    assert "\x1b" not in stream.getvalue()
+
+
+def test_the_closing_screen_says_all_that_matters():
+    lines = final_screen(SUMMARY)
+    assert lines == [
+        "plan accuracy   0.957   95 % interval [0.951, 0.962] on 5,000 held-out starts",
+        "known feasible  0.969   of which 98.8 % are satisfied",
+        "worst           stop_sign 0.971",
+        "                fails in 63 % of the starts with sign = stop",
+        "finished        61 s of training   runs/traffic/0001-quiet-heron",
+        "",
+        "Next:  stlc simulate --backup",
+    ]
+
+
+def test_the_closing_screen_can_go_elsewhere():
+    progress, stream, _ = piped()
+    progress.start(INFO)
+    elsewhere = io.StringIO()
+    progress.finish(SUMMARY, to=Console(file=elsewhere, width=200))
+    assert "Next:" in elsewhere.getvalue()
+    assert "Next:" not in stream.getvalue()
+
+
+def test_a_terminal_without_unicode_gets_ascii():
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    progress = Progress(Console(file=stream, width=120), clock=Clock())
+    progress.start(INFO)
+    progress.update(ROW)
+    progress.update({**ROW, "accuracy": 0.5})
+    progress.finish(SUMMARY)
+    stream.flush()
+    text = stream.buffer.getvalue().decode("ascii")
+    assert "traffic | car.yaml" in text
+    assert re.search(r"starts   #_", text)
+
+
+def test_hostile_names_are_shown_as_they_are():
+    progress, stream, _ = piped()
+    progress.start(RunInfo("[red]a[/]", "b[link=x]", "p", "r", 0, 1))
+    assert stream.getvalue() == "[red]a[/] · b[link=x] (p) · run r · seed 0 · 1 thread\n"
+
+
+@given(st.lists(st.floats(0, 1), min_size=1), st.integers(1, 40))
+def test_a_sparkline_keeps_order_and_width(values, width):
+    spark = sparkline(values, width=width)
+    assert len(spark) == min(width, len(values))
+    assert set(spark) <= set(BLOCKS)
+    ordered = [BLOCKS.index(block) for block in sparkline(sorted(values), width=width)]
+    assert ordered == sorted(ordered)
+    assert BLOCKS[-1] in spark
+
+
+def test_an_empty_sparkline():
+    assert sparkline([]) == ""
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0, "00:00"), (-3, "00:00"), (61.4, "01:01"), (3599.6, "1:00:00"), (7322, "2:02:02")],
+)
+def test_clock(seconds, text):
+    assert clock_text(seconds) == text

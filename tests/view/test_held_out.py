@@ -1,0 +1,117 @@
+"""Where a policy fails, as numbers and as a sentence."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stlc.view.failures import draw_failures
+from stlc.view.held_out import HeldOut, find_weakness, load_held_out, region_text, weakness_text
+
+
+def held(x0, each, names=None, requirements=None):
+    each = np.asarray(each, dtype=float)
+    names = names or tuple("abcdefg"[: x0.shape[1]])
+    return HeldOut(
+        names, requirements or tuple(f"r{i}" for i in range(each.shape[1])), x0, each.min(axis=1), each
+    )
+
+
+def boxed(seed=0, count=4000):
+    """Failing exactly where kind = 1 and 2 <= a <= 4; b is noise."""
+    rng = np.random.default_rng(seed)
+    kind = rng.integers(0, 2, count).astype(float)
+    a, b = rng.uniform(0, 10, count), rng.uniform(0, 1, count)
+    failing = (kind == 1) & (a >= 2) & (a <= 4)
+    return held(np.stack([kind, a, b], axis=1), np.where(failing, -1.0, 1.0)[:, None]), failing
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_box_is_found(seed):
+    data, failing = boxed(seed)
+    weakness = find_weakness(data)
+    assert weakness.failing == pytest.approx(failing.mean())
+    assert weakness.inside > 0.97
+    assert weakness.covered > 0.97
+    assert {(c.column, c.op) for c in weakness.conditions} == {(0, "="), (1, ">="), (1, "<=")}
+    assert weakness.axes[0] == 1
+
+
+def test_shares_are_those_of_the_region():
+    data, failing = boxed()
+    weakness = find_weakness(data)
+    region = np.logical_and.reduce([c.holds(data.x0) for c in weakness.conditions])
+    assert weakness.inside == pytest.approx(failing[region].mean())
+    assert weakness.covered == pytest.approx(region[failing].mean())
+
+
+def test_the_worst_requirement_is_taken():
+    x0 = np.random.default_rng(0).uniform(0, 1, (100, 2))
+    each = np.ones((100, 3))
+    each[:20, 2] = each[:5, 1] = -1
+    assert find_weakness(held(x0, each)).requirement == 2
+    assert find_weakness(held(x0, each), 0) is None
+
+
+def test_everything_failing_has_no_region():
+    x0 = np.random.default_rng(0).uniform(0, 1, (50, 2))
+    weakness = find_weakness(held(x0, -np.ones((50, 1))))
+    assert weakness.conditions == ()
+    assert "100.0 %" in weakness_text(weakness, held(x0, -np.ones((50, 1))))
+
+
+def test_ties_count_as_satisfied():
+    x0 = np.random.default_rng(0).uniform(0, 1, (50, 2))
+    assert find_weakness(held(x0, np.full((50, 1), -5e-7))) is None
+
+
+def test_words(signature):
+    data, _ = boxed()
+    data = HeldOut(("sign", "x", "v"), data.requirements, data.x0, data.rho, data.each)
+    weakness = find_weakness(data)
+    text = weakness_text(weakness, data, signature)
+    assert "sign = light" in text
+    assert "<= x <=" in text
+    assert " m" in text
+    assert "sign = 1" in region_text(weakness.conditions, data.names)
+
+
+def test_file_round_trip(trained):
+    data = load_held_out(trained.path / "eval/held_out.npz")
+    assert data.names[0] == "x"
+    assert data.each.shape == (5000, 4)
+    assert data.requirements[data.worst] == "stop_sign"
+
+
+def test_what_is_no_held_out_set_is_none(tmp_path):
+    path = tmp_path / "held_out.npz"
+    assert load_held_out(path) is None
+    path.write_bytes(b"no archive")
+    assert load_held_out(path) is None
+    meta = np.array(json.dumps({"names": ["a"], "requirements": ["r"]}))
+    np.savez(path, x0=np.zeros((3, 2)), rho=np.zeros(3), requirements=np.zeros((3, 1)), meta=meta)
+    assert load_held_out(path) is None
+    np.savez(path, x0=np.array([{}], dtype=object), rho=np.zeros(1), requirements=np.zeros((1, 1)), meta=meta)
+    assert load_held_out(path) is None
+
+
+def test_picture_shows_every_start_of_the_region(trained, signature):
+    data = load_held_out(trained.path / "eval/held_out.npz")
+    picture = draw_failures(data, signature)
+    starts, margins = picture.figure.axes
+    shown = sum(len(collection.get_offsets()) for collection in starts.collections)
+    assert shown == int((data.x0[:, 2] == 0).sum())
+    assert starts.get_xlabel() == "x [m]"
+    assert "stop_sign" in margins.get_title(loc="left")
+    assert picture.svg()
+
+
+def test_nothing_failing_draws_nothing():
+    assert draw_failures(held(np.zeros((10, 2)), np.ones((10, 1)))) is None
+
+
+def test_constant_columns_draw():
+    x0 = np.zeros((10, 1))
+    each = np.ones((10, 1))
+    each[0] = -np.inf
+    assert draw_failures(held(x0, each)).svg()
