@@ -1,0 +1,104 @@
+"""A coarse look at a text: lexemes and where declarations start.
+
+The parser reads one declaration at a time, so that an error in one says nothing about the next. Declaration
+keywords are reserved, hence a cut before one never falls into a valid declaration.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, ROLES, UNARY_TEMPORAL
+
+LexemeKind = Literal["word", "quoted", "number", "string", "sign"]
+
+_LEXEME = re.compile(
+    r"""
+    \s+ | (?:\#|//)[^\n]*
+    | (?P<string>"[^"\n]*")
+    | (?P<quoted>`[^`\n]+`)
+    | (?P<word>[^\W\d¹²³⁰⁴-⁹][^\W¹²³⁰⁴-⁹]*)
+    | (?P<number>(?:\d[\d_]*\.(?!\.)\d*|\.\d+|\d[\d_]*)(?:[eE][+-]?\d+)?)
+    | (?P<sign><->|<=>|->|=>|<=|>=|==|!=|\|\||&&|\.\.|.)
+    """,
+    re.VERBOSE | re.DOTALL,
+)
+_CLOSES = {"(": ")", "[": "]", "{": "}"}
+_TEMPORAL = UNARY_TEMPORAL.keys() | BINARY_TEMPORAL.keys()
+
+
+@dataclass(frozen=True, slots=True)
+class Lexeme:
+    """A word, number, text in quotes or sign, with its place in the text."""
+
+    kind: LexemeKind
+    text: str
+    start: int
+    end: int
+
+
+@dataclass(frozen=True, slots=True)
+class Bracket:
+    """An opening bracket and, if there is one, what closes it."""
+
+    opening: Lexeme
+    interval: bool
+    closing: Lexeme | None = None
+
+
+def lexemes(text: str, start: int = 0, end: int | None = None) -> Iterator[Lexeme]:
+    """The lexemes of a part of a text, without blanks and comments. Never fails."""
+    for match in _LEXEME.finditer(text, start, len(text) if end is None else end):
+        kind = match.lastgroup
+        if kind is not None:
+            yield Lexeme(kind, match[0], match.start(), match.end())  # type: ignore[arg-type]
+
+
+def declaration_starts(text: str) -> list[int]:
+    """Offsets of the declarations of a text, their tags and roles included; the first one is always 0."""
+    starts = [0]
+    tag: int | None = None
+    before: Lexeme | None = None
+    for lexeme in lexemes(text):
+        if before is not None and before.text == "@" and lexeme.kind in ("word", "quoted") and tag is None:
+            tag = before.start
+        if lexeme.kind == "word" and lexeme.text in DECLARATIONS:
+            own = lexeme.start
+            if before is not None and lexeme.text == "signal" and before.text in ROLES:
+                own = before.start
+            starts.append(own if tag is None else tag)
+            tag = None
+        before = lexeme
+    return starts
+
+
+def brackets(items: Sequence[Lexeme]) -> list[Bracket]:
+    """All brackets that open in `items`, in order.
+
+    An interval may be closed by either of `)` and `]`; any other bracket by its own kind.
+    """
+    found: list[Bracket] = []
+    still_open: list[int] = []
+    for i, lexeme in enumerate(items):
+        if lexeme.kind != "sign":
+            continue
+        if lexeme.text in _CLOSES:
+            still_open.append(len(found))
+            found.append(Bracket(lexeme, interval=i > 0 and opens_interval(items[i - 1])))
+        elif still_open and closes(found[still_open[-1]], lexeme.text):
+            index = still_open.pop()
+            found[index] = Bracket(found[index].opening, found[index].interval, lexeme)
+    return found
+
+
+def opens_interval(before: Lexeme) -> bool:
+    """Whether a bracket behind this lexeme may hold an interval."""
+    return before.text == "@" or (before.kind == "word" and before.text.rstrip("_") in _TEMPORAL)
+
+
+def closes(bracket: Bracket, text: str) -> bool:
+    """Whether `text` closes an open bracket."""
+    return text == _CLOSES[bracket.opening.text] or (bracket.interval and text in (")", "]"))

@@ -1,0 +1,74 @@
+# ruff: noqa: RUF001 - the characters are the subject
+"""Characters of papers and word processors, and how the language spells them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from stlc.grammar.scan import Lexeme
+
+
+@dataclass(frozen=True, slots=True)
+class Replacement:
+    """What to do about a character; `text` is what to write in its place, None if that depends."""
+
+    help: str
+    text: str | None = None
+
+
+_SPELLED = {
+    "always": "□◻☐▢",
+    "eventually": "◇◊♢⋄",
+    "until": "𝒰𝓤",
+    "and": "∧⋀",
+    "or": "∨⋁",
+    "not": "¬",
+    "xor": "⊕",
+    "->": "→⇒⟶⟹⊃",
+    "<->": "↔⇔⟷⟺≡",
+    "<=": "≤⩽≦",
+    ">=": "≥⩾≧",
+    "!=": "≠",
+    "in": "∈",
+    "not in": "∉",
+    "forall": "∀",
+    "exists": "∃",
+    "true": "⊤",
+    "false": "⊥",
+    "inf": "∞",
+    "*": "×·⋅∙",
+    "/": "÷",
+    "-": "−–—",
+    "^2": "²",
+    "^3": "³",
+    "sqrt": "√",
+    '"': "“”„",
+}
+_ADVICE: Mapping[str, Replacement] = MappingProxyType(
+    {
+        **{char: Replacement(f"write `{text}`", text) for text, chars in _SPELLED.items() for char in chars},
+        "'": Replacement('texts stand in double quotes: "…"'),
+        "‘": Replacement('texts stand in double quotes: "…"'),
+        "’": Replacement('texts stand in double quotes: "…"'),
+        "?": Replacement("write `if … then … else …`"),
+        "‖": Replacement("write `norm(…)`"),
+        "∥": Replacement("write `norm(…)`"),
+        "∪": Replacement("write `union(a, b)`"),
+        "∩": Replacement("write `intersect(a, b)`"),
+    }
+)
+_OF_THE_LANGUAGE = frozenset("()[]{}.,:;=<>!&|+-*/%^~@#")
+
+
+def replacement(char: str) -> Replacement | None:
+    """What to write instead of a character that the language does not have."""
+    return _ADVICE.get(char)
+
+
+def unexpected_character(lexeme: Lexeme) -> bool:
+    """Whether a lexeme begins with a character that no token begins with."""
+    if lexeme.kind == "sign":
+        return lexeme.text[0] not in _OF_THE_LANGUAGE
+    return lexeme.text[0] in _ADVICE and lexeme.kind == "word"

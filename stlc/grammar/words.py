@@ -1,0 +1,71 @@
+"""The vocabulary of the language: reserved words, aliases, and what tokens are called in messages."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from types import MappingProxyType
+
+from stlc.units import SYMBOLS
+
+UNARY_TEMPORAL = MappingProxyType(
+    {
+        "always": "always",
+        "globally": "always",
+        "alw": "always",
+        "G": "always",
+        "eventually": "eventually",
+        "finally": "eventually",
+        "ev": "eventually",
+        "F": "eventually",
+        "once": "once",
+        "historically": "historically",
+        "hist": "historically",
+    }
+)
+"""Every way to write a temporal operator with one operand, and its name."""
+
+BINARY_TEMPORAL = MappingProxyType(
+    {"until": "until", "U": "until", "release": "release", "unless": "unless", "since": "since"}
+)
+"""Every way to write a temporal operator with two operands, and its name."""
+
+DECLARATIONS = ("require", "assume", "def", "const", "param", "signal", "region", "enum", "extern", "import")
+ROLES = ("input", "output", "state", "env")
+PRAGMAS = ("spec", "system", "time")
+
+RESERVED = frozenset(
+    {
+        *("not", "and", "or", "xor", "iff", "implies", "in", "if", "then", "else", "true", "false", "inf"),
+        *("forall", "exists", "freeze"),
+        *UNARY_TEMPORAL,
+        *BINARY_TEMPORAL,
+        *DECLARATIONS,
+    }
+)
+"""Words that are a name only in backticks."""
+
+BUILT_IN = MappingProxyType(
+    {"T": "the planning horizon", "end": "the last sample", "dt": "the time between two samples"}
+)
+"""Names that have a meaning everywhere; as names of one's own they need backticks."""
+
+_BLANK = r"(?:\s|(?:#|\/\/)[^\n]*(?:\n|\Z))"
+
+
+def _choice(words: Iterable[str]) -> str:
+    return "(?:" + "|".join(sorted(map(re.escape, words), key=lambda word: (-len(word), word))) + ")"
+
+
+PATTERNS = MappingProxyType(
+    {
+        "BLANK": _BLANK,
+        "UNARY": _choice(UNARY_TEMPORAL),
+        "BINARY": _choice(BINARY_TEMPORAL),
+        "RESERVED": _choice(RESERVED),
+        "AFTER_PERCENT": _choice(RESERVED - {"true", "false", "inf"}),
+        "UNITS": _choice(SYMBOLS.keys() - {"%", "1"}),
+        "EXPONENT": r"(?:\^-?\d+(?!\.?\d)|⁻?[¹²³⁴])",
+    }
+)
+"""What stands for `{{NAME}}` in `stl.lark`."""
