@@ -1,0 +1,297 @@
+"""Documents are true because they are held against the program: commands, codes, files, links, code."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+from collections.abc import Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from stlc.cli.app import app, main
+from stlc.diagnostics import CODES
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+PROGRAM: Any = typer.main.get_command(app)
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+PLACEHOLDERS = re.compile(r"…|\.\.\.")
+
+
+def name_of(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+@pytest.fixture
+def regenerate(request) -> bool:
+    return bool(request.config.getoption("--regenerate"))
+
+
+def section(page: Path, marker: str) -> tuple[str, str, str]:
+    """The text before, between and after `<!-- marker -->` and `<!-- /marker -->`."""
+    text = page.read_text(encoding="utf-8")
+    start, end = f"<!-- {marker} -->\n", f"<!-- /{marker} -->"
+    head, found, rest = text.partition(start)
+    body, closed, tail = rest.partition(end)
+    assert found, f"{page} has no section {marker}"
+    assert closed, f"{page} does not close section {marker}"
+    return head + start, body, end + tail
+
+
+def hold(page: Path, marker: str, wanted: str, *, regenerate: bool) -> None:
+    head, body, tail = section(page, marker)
+    if regenerate:
+        page.write_text(head + wanted + tail, encoding="utf-8")
+    else:
+        assert body == wanted, f"run: pytest {name_of(Path(__file__))} --regenerate"
+
+
+# ---------------------------------------------------------------------- commands
+
+
+def test_the_reference_is_what_help_says(regenerate):
+    text = "\n".join(command_section(name, command) for name, command in PROGRAM.commands.items())
+    hold(ROOT / "docs/cli.md", "commands", text, regenerate=regenerate)
+
+
+def command_section(name: str, command: Any) -> str:
+    sentence, examples, *notes = command.help.split("\n\n")
+    typed = [line.strip() for line in examples.splitlines() if line.startswith("  ")]
+    usage = " ".join(
+        [f"stlc {name}", *(argument_usage(param) for param in command.params if is_argument(param))]
+    )
+    rows = [row(param) for param in command.params if param.name != "help"]
+    lines = [
+        f"### {usage}",
+        "",
+        sentence,
+        "",
+        "```console",
+        *(f"$ {line}" for line in typed),
+        "```",
+        "",
+        *(line for note in notes for line in (note, "")),
+        "| | default | |",
+        "|---|---|---|",
+        *rows,
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def is_argument(param: Any) -> bool:
+    return bool(param.param_type_name == "argument")
+
+
+def argument_usage(param: Any) -> str:
+    name = (param.metavar or param.name).upper()
+    dots = "…" if param.nargs == -1 else ""
+    return f"{name}{dots}" if param.required else f"[{name}{dots}]"
+
+
+def row(param: Any) -> str:
+    if is_argument(param):
+        shown = f"`{(param.metavar or param.name).upper()}`"
+    else:
+        shown = ", ".join(f"`{option}`" for option in (*param.opts, *param.secondary_opts))
+        shown += f" {param.metavar}" if param.metavar else ""
+    default = param.default if isinstance(param.default, str | int | float) else ""
+    default = "" if isinstance(default, bool) else default
+    text = (param.help or "").replace("|", "\\|")
+    return f"| {shown} | {default} | {text} |"
+
+
+# ---------------------------------------------------------------------- codes
+
+GROUPS = {
+    "E": "Specifications and traces",
+    "S": "System files",
+    "R": "Runs",
+    "U": "Usage",
+    "B": "stlc itself",
+}
+
+
+def test_every_code_is_listed(regenerate):
+    parts = []
+    for letter, title in GROUPS.items():
+        codes = sorted(code for code in CODES if code[0] in (letter, "W" if letter == "E" else letter))
+        rows = [f"| {code} | {CODES[code]} |" for code in sorted(codes, key=lambda code: code[1:])]
+        parts += [f"## {title}", "", "| code | what is wrong |", "|---|---|", *rows, ""]
+    hold(ROOT / "docs/errors.md", "codes", "\n".join(parts), regenerate=regenerate)
+    assert {code[0] for code in CODES} <= {*GROUPS, "W"}
+
+
+def test_every_code_that_is_raised_exists():
+    source = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "stlc").rglob("*.py"))
+    used = set(re.findall(r"[\"']([ESRUWB]\d{3})[\"']", source))
+    assert used <= set(CODES)
+
+
+# ---------------------------------------------------------------------- command lines in documents
+
+
+def command_lines() -> Iterator[Any]:
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for language, block in FENCE.findall(text):
+            if language in ("console", "sh", "bash", "text"):
+                for line in block.splitlines():
+                    yield from as_command(page, line.strip())
+        for inline in inline_commands(text):
+            if " " in inline:
+                yield from as_command(page, f"$ stlc {inline}")
+
+
+def inline_commands(text: str) -> list[str]:
+    """What follows `stlc` in running text; a single word only names a command."""
+    return re.findall(r"`(?:\$ )?stlc ([^`\n]+)`", FENCE.sub("", text))
+
+
+def as_command(page: Path, line: str) -> Iterator[Any]:
+    match = re.match(r"\$ (?:\.venv/bin/)?stlc\b(.*)", line)
+    if match and not PLACEHOLDERS.search(line):
+        words = shlex.split(match[1].partition(" | ")[0], comments=True)
+        yield pytest.param(words, id=f"{name_of(page)}: stlc {' '.join(words)}")
+
+
+LINES = list({line.id: line for line in command_lines()}.values())
+
+
+@pytest.mark.parametrize("words", LINES)
+def test_a_command_line_in_the_documents_can_be_parsed(words):
+    try:
+        with PROGRAM.make_context("stlc", list(words)) as context:
+            rest = [*context._protected_args, *context.args]
+            name, command, arguments = PROGRAM.resolve_command(context, rest)
+            with command.make_context(name, list(arguments), parent=context):
+                pass
+    except typer.Exit as stopped:  # --help and --version
+        if stopped.exit_code:
+            raise
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_running_text_names_commands_that_exist(page):
+    words = {inline.split()[0] for inline in inline_commands(page.read_text(encoding="utf-8"))}
+    assert {word for word in words if word.isidentifier()} <= set(PROGRAM.commands)
+
+
+def test_command_lines_were_found():
+    assert len(LINES) > 12
+
+
+QUICK = {"compile"}
+
+
+@pytest.mark.parametrize("words", [line for line in LINES if set(line.values[0]) & QUICK])
+def test_a_quick_command_line_runs(words, monkeypatch, tmp_path, capsys):
+    place = tmp_path if "cart.stl" in words else ROOT
+    write_examples(tmp_path)
+    monkeypatch.chdir(place)
+    assert main(words) == 0, capsys.readouterr().err
+    assert capsys.readouterr().out
+
+
+# ---------------------------------------------------------------------- examples in documents
+
+
+def write_examples(folder: Path) -> list[Path]:
+    """Write the files that the quickstart shows."""
+    text = (ROOT / "docs/quickstart.md").read_text(encoding="utf-8")
+    written = []
+    for name, body in re.findall(
+        r"<!-- example: ([\w.]+) -->\n```\w*\n(.*?)^```", text, re.MULTILINE | re.DOTALL
+    ):
+        (folder / name).write_text(body, encoding="utf-8")
+        written.append(folder / name)
+    return written
+
+
+def test_the_examples_of_the_quickstart_were_found(tmp_path):
+    assert [path.name for path in write_examples(tmp_path)] == ["cart.stl", "cart.yaml"]
+
+
+def python_blocks() -> Iterator[Any]:
+    for page in PAGES:
+        for language, block in FENCE.findall(page.read_text(encoding="utf-8")):
+            if language == "python":
+                yield pytest.param(block, id=name_of(page))
+
+
+@pytest.mark.parametrize("block", list(python_blocks()))
+def test_python_in_the_documents_names_what_exists(block):
+    import stlc
+
+    for node in ast.walk(ast.parse(block)):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "stlc":
+            assert hasattr(stlc, node.attr), node.attr
+
+
+def test_the_python_of_the_quickstart_runs(monkeypatch, capsys):
+    text = (ROOT / "docs/quickstart.md").read_text(encoding="utf-8")
+    (block,) = [body for language, body in FENCE.findall(text) if language == "python"]
+    monkeypatch.chdir(ROOT)
+    exec(compile(block, "quickstart.md", "exec"), {})
+    assert "2.5 s of signal decide a verdict" in capsys.readouterr().out
+
+
+def test_the_readme_shows_the_specification_as_it_is():
+    shown = next(
+        body for language, body in FENCE.findall((ROOT / "README.md").read_text()) if "require" in body
+    )
+    written = (ROOT / "specs/traffic.stl").read_text(encoding="utf-8").splitlines()
+    for line in filter(None, shown.splitlines()):
+        assert line in written
+
+
+# ---------------------------------------------------------------------- links and files
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_lead_somewhere(page):
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
+        if "://" not in target:
+            assert (page.parent / target).exists(), target
+
+
+def architecture_files() -> set[str]:
+    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    table = text.partition("## 2. Files")[2].partition("\n## 3.")[0]
+    files: set[str] = set()
+    for line in table.splitlines():
+        folder = ""
+        for name in re.findall(
+            r"`([\w/*.]+\.(?:py|lark))`", line.split("|")[1] if line.startswith("|") else ""
+        ):
+            folder = name.rpartition("/")[0] or folder
+            files.add(name if "/" in name or not folder else f"{folder}/{name}")
+    return files
+
+
+def test_the_architecture_names_every_file_and_no_other():
+    modules = {
+        path.relative_to(ROOT / "stlc").as_posix()
+        for path in (ROOT / "stlc").rglob("*.py")
+        if path.name not in ("__init__.py", "__main__.py")
+    }
+    named = architecture_files()
+    unnamed = sorted(module for module in modules if not any(fnmatch(module, name) for name in named))
+    gone = sorted(
+        name for name in named if name.endswith(".py") and not any(fnmatch(m, name) for m in modules)
+    )
+    assert not unnamed, f"not in docs/architecture.md: {unnamed}"
+    assert not gone, f"in docs/architecture.md, but not there: {gone}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_a_page_is_readable_in_a_terminal(page):
+    for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), start=1):
+        if not line.startswith("|"):
+            assert len(line) <= 150, f"{page.name}:{number}"
