@@ -160,6 +160,7 @@ CODES: dict[str, str] = {
     "S203": "a formula or a number in the wrong place",
     "S204": "a control without a range, or bounds in the wrong order",
     "S206": "a world or plugin that cannot be loaded",
+    "S207": "a world that fails while it runs",
     "S301": "initial states that are (nearly) all rejected",
     "S302": "dynamics that give NaN or infinity",
     "W601": "an acceptance rate of initial states below 1 %",
@@ -173,6 +174,7 @@ CODES: dict[str, str] = {
     "R301": "a package that is not installed",
     "R302": "a device that is not there",
     "R401": "training diverged",
+    "R402": "a policy whose plan is not a number",
     "U101": "a command line that cannot be understood",
     "U102": "a file that does not exist",
     # the tool itself
