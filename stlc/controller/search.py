@@ -82,7 +82,7 @@ class Searcher:
         return found
 
     def _keep_better(self, x0: Tensor, found: Repaired, still: Tensor, tried: Tensor) -> None:
-        """Judge the plans tried, (k, tries, T, m), for the states `still`, (k,), and update `found` in place."""
+        """Judge plans (k, tries, T, m) for the states `still`, (k,), and update `found` in place."""
         tries = tried.shape[1]
         judged = self.task.judge(x0[still].repeat_interleave(tries, 0), tried.flatten(0, 1))
         value, which = judged.rho.view(-1, tries).max(1)

@@ -1,0 +1,128 @@
+"""One sitting of training as a person sees it: the panel, Ctrl-C, pictures, the closing screen."""
+
+from __future__ import annotations
+
+import signal
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import typer
+
+from stlc.cli.errors import INTERRUPTED, TERMINATED
+from stlc.cli.output import console, emit_json, say
+from stlc.cli.progress import Progress, RunInfo, Summary
+from stlc.controller.train import Outcome, Watch
+
+if TYPE_CHECKING:
+    from types import FrameType, TracebackType
+
+    from stlc.rundir import RunDir
+
+
+@dataclass(slots=True)
+class Sitting:
+    """Shows progress while it is open; the first Ctrl-C or SIGTERM asks to save and stop, a second one stops.
+
+    Attributes:
+        folder: of the run.
+        outcome: what training gave, once it did.
+        progress: the panel.
+    """
+
+    folder: RunDir
+    outcome: Outcome | None = None
+    progress: Progress = field(default_factory=Progress)
+    _asked: list[int] = field(default_factory=list)
+    _before: dict[int, Any] = field(default_factory=dict)
+
+    @property
+    def watch(self) -> Watch:
+        """What training reports to."""
+        return Watch(row=self.progress.update, stop=lambda: bool(self._asked))
+
+    def __enter__(self) -> Self:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._ask)
+        self.progress.start(_info(self.folder))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.progress.stop()
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _ask(self, number: int, _frame: FrameType | None) -> None:
+        if self._asked:
+            raise KeyboardInterrupt
+        self._asked.append(number)
+
+    def conclude(self, *, pictures: bool, json: bool) -> None:
+        """Pictures, then the closing screen or the JSON document; raises `typer.Exit` with the exit code."""
+        outcome = self.outcome
+        assert outcome is not None
+        if outcome.score is None:
+            say(f"interrupted, saved: {self.folder.shown}")
+            say(f"go on with: stlc train --resume {self.folder.name}")
+            raise typer.Exit(TERMINATED if signal.SIGTERM in self._asked else INTERRUPTED)
+        if pictures:
+            draw_report(self.folder)
+        found = outcome.score.feasible > 0.0
+        code = 0 if found else 1
+        if json:
+            result = {"run": self.folder.shown, "seconds": outcome.seconds, **outcome.score.summary()}
+            emit_json("train/1", ok=found, exit_code=code, result=result)
+        else:
+            self.progress.finish(_summary(outcome), to=console())
+        raise typer.Exit(code)
+
+
+def _info(folder: RunDir) -> RunInfo:
+    record = folder.record()
+    path = str(record.get("system_path"))
+    return RunInfo(
+        spec=str(record.get("spec")),
+        system=Path(path).name,
+        system_path=path,
+        run=folder.name,
+        seed=int(record.get("seed", 0)),
+        threads=int(record.get("threads", 1)),
+        device=str(record.get("device", "cpu")),
+        steps=record.get("steps"),
+    )
+
+
+def _summary(outcome: Outcome) -> Summary:
+    from stlc.view.held_out import find_weakness, load_held_out, region_text
+
+    score, folder = outcome.score, outcome.run.dir
+    assert score is not None
+    held = load_held_out(folder.path / "eval" / "held_out.npz")
+    weakness = find_weakness(held) if held is not None else None
+    where = ""
+    if held is not None and weakness is not None:
+        where = region_text(weakness.conditions, held.names, outcome.run.task.system.signature)
+    return Summary(
+        accuracy=score.accuracy,
+        interval=score.interval,
+        held_out=score.states.shape[0],
+        requirements=score.requirements,
+        feasible=score.feasible,
+        seconds=outcome.seconds,
+        folder=folder.shown,
+        where=where,
+    )
+
+
+def draw_report(folder: RunDir) -> None:
+    """The report, where pictures can be drawn; nothing fails for their lack."""
+    from stlc.view import available
+
+    if not available():
+        say("no pictures: pip install 'stlc[plot]'")
+        return
+    from stlc.view.report import write_report
+
+    write_report(folder)
