@@ -1,0 +1,267 @@
+"""Functions applied to numbers: units agree, constants fold."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
+
+from stlc.compile import ir
+from stlc.compile.functions import FUNCTIONS, Function
+from stlc.compile.ranges import bounds
+from stlc.compile.scope import Scope
+from stlc.compile.values import Number, literal, unit_text
+from stlc.diagnostics import Diagnostic, Label
+from stlc.signature import Kind
+from stlc.source import Span
+from stlc.units import DIMENSIONLESS, Unit, same_dims
+
+_MAX_BITS = 512
+_MISSING = {
+    (1, 0, 0, 0, 0): ("length", "m"),
+    (0, 1, 0, 0, 0): ("mass", "kg"),
+    (0, 0, 1, 0, 0): ("time", "s"),
+}
+
+
+def apply(name: str, args: Sequence[Number], span: Span, scope: Scope) -> Number:
+    """`name(args)`, checked and folded.
+
+    Args:
+        name: of an entry of `FUNCTIONS`.
+        args: as many as the function takes.
+        span: of the whole, for findings.
+        scope: where findings go.
+
+    Raises:
+        Failed: units do not agree (E203), a division by zero (E401), or a value that does not exist (E205).
+    """
+    function = FUNCTIONS[name]
+    for arg in args:
+        _refuse_enum(function, arg, span, scope)
+    typed_args, shell = _units(function, args, span, scope)
+    if name in ("div", "mod"):
+        _check_divisor(function, typed_args[1], span, scope)
+    if function.fold is not None and all(arg.constant is not None for arg in typed_args):
+        return _fold(function, typed_args, shell, scope)
+    kind: Kind = "int" if function.whole and all(arg.kind == "int" for arg in typed_args) else "real"
+    if name == "bernoulli":
+        kind = "bool"
+    if name == "choice" and len({(arg.kind, arg.labels) for arg in typed_args}) == 1:
+        return replace(shell, num=_op(name, typed_args), kind=typed_args[0].kind, labels=typed_args[0].labels)
+    return replace(shell, num=_op(name, typed_args), kind=kind)
+
+
+def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[tuple[Number, ...], Number]:
+    """The arguments with bare numbers in the unit that is needed, and a blank of that unit.
+
+    Args:
+        args: numbers that must have one unit.
+        what: the headline's verb: "compare", "add", or `norm`.
+        span: of the finding.
+        scope: where findings go.
+    """
+    rigid = [arg for arg in args if not arg.flexible]
+    for other in rigid[1:]:
+        if not same_dims(rigid[0].unit, other.unit):
+            scope.fail(_mismatch(rigid[0], other, what, span))
+    known = rigid or [arg for arg in args if not arg.bare]
+    if not known:
+        return tuple(args), Number(ir.Lit(0.0), DIMENSIONLESS, True, True, span=span)
+    unit = known[0].unit
+    blank = Number(ir.Lit(0.0), unit, not rigid, span=span)
+    return tuple(in_unit(arg, unit) if arg.bare else arg for arg in args), blank
+
+
+def in_unit(number: Number, unit: Unit) -> Number:
+    """A bare number read in `unit`: 30 becomes 30 deg."""
+    if unit.ratio == 1:
+        return replace(number, unit=unit, bare=False, flexible=False)
+    exact = None if number.exact is None else number.exact * unit.ratio
+    value = number.constant
+    num: ir.Num = ir.Op("mul", (number.num, ir.Lit(unit.scale)))
+    if value is not None:
+        num = ir.Lit(float(exact) if exact is not None else value * unit.scale)
+    return replace(number, num=num, unit=unit, exact=exact, kind="real", bare=False, flexible=False)
+
+
+def _refuse_enum(function: Function, arg: Number, span: Span, scope: Scope) -> None:
+    if arg.kind != "enum" or function.name == "choice":
+        return
+    name = function.symbol or function.name
+    help_ = "compare it with one of its members: " + ", ".join(f"`{label}`" for label, _ in arg.labels)
+    scope.fail(Diagnostic("E205", f"`{name}` does not apply to an enum", arg.span or span, help=(help_,)))
+
+
+def _units(
+    function: Function, args: Sequence[Number], span: Span, scope: Scope
+) -> tuple[tuple[Number, ...], Number]:
+    """The arguments in the units that the rule asks for, and a blank with the result's unit."""
+    flexible, bare = any(arg.flexible for arg in args), all(arg.bare for arg in args)
+    match function.rule:
+        case "same":
+            return agree(args, _verb(function), span, scope)
+        case "ratio":
+            return agree(args, _verb(function), span, scope)[0], Number(ir.Lit(0.0), span=span)
+        case "mul":
+            unit = args[0].unit * args[1].unit
+        case "div":
+            unit = args[0].unit / args[1].unit
+        case "square":
+            unit = args[0].unit ** 2
+        case "sqrt":
+            unit = _root(args[0], span, scope)
+        case "pow":
+            unit = _power(args[0], args[1], span, scope)
+            flexible, bare = args[0].flexible, args[0].bare
+        case "plain" | "sign":
+            if function.rule == "plain":
+                _check_plain(function, args, scope)
+            unit, flexible = DIMENSIONLESS, bare
+    return tuple(args), Number(ir.Lit(0.0), unit, flexible, bare, span=span)
+
+
+def _root(arg: Number, span: Span, scope: Scope) -> Unit:
+    try:
+        return arg.unit ** Fraction(1, 2)
+    except ValueError:
+        if arg.flexible:
+            return DIMENSIONLESS
+    return scope.fail(
+        Diagnostic("E203", f"the square root of {unit_text(arg)} has no unit", arg.span or span)
+    )
+
+
+def _power(base: Number, exponent: Number, span: Span, scope: Scope) -> Unit:
+    if not exponent.flexible and not exponent.unit.dimensionless:
+        message = f"an exponent has no unit, this is {unit_text(exponent)}"
+        scope.fail(Diagnostic("E203", message, exponent.span or span))
+    if base.unit.dimensionless:
+        return DIMENSIONLESS
+    if exponent.constant is None:
+        message = f"{unit_text(base)} to a power that varies has no unit"
+        scope.fail(Diagnostic("E203", message, span, help=("use a constant exponent",)))
+    try:
+        return base.unit ** (exponent.exact if exponent.exact is not None else Fraction(exponent.constant))
+    except ValueError as error:
+        if base.flexible:
+            return DIMENSIONLESS
+        return scope.fail(Diagnostic("E203", str(error), span))
+
+
+def _check_plain(function: Function, args: Sequence[Number], scope: Scope) -> None:
+    angle = function.name in ("sin", "cos", "tan")
+    wants = "an angle or a plain number" if angle else "a plain number"
+    for arg in args:
+        if not arg.flexible and not arg.unit.dimensionless:
+            message = f"`{function.name}` takes {wants}, this is {unit_text(arg)}"
+            help_ = (f"divide by a reference first: `{function.name}(… / 1 {arg.unit})`",)
+            scope.fail(Diagnostic("E203", message, arg.span, help=help_))
+
+
+def _check_divisor(function: Function, divisor: Number, span: Span, scope: Scope) -> None:
+    what = "modulo" if function.name == "mod" else "division"
+    place = divisor.span or span
+    if divisor.constant == 0:
+        origin = divisor.origin
+        labels = () if origin is None or origin.span is None else (Label(origin.span, "from here"),)
+        amount = "0" if divisor.unit.dimensionless else f"0 {divisor.unit}"
+        scope.fail(Diagnostic("E401", f"{what} by zero", place, f"is {amount}", labels))
+    reach = bounds(divisor.num, scope.facts)
+    if divisor.constant is None and reach is not None and reach[0] <= 0 <= reach[1]:
+        low, high = (f"{end / divisor.unit.scale:g}" for end in reach)
+        unit = "" if divisor.unit.dimensionless and not divisor.unit.text else f" {divisor.unit}"
+        text = f"between {low} and {high}{unit}"
+        help_ = ("multiply by it instead, when its sign is known",)
+        scope.report(Diagnostic("W402", "the divisor's range contains 0", place, text, help=help_))
+
+
+def _op(name: str, args: Sequence[Number]) -> ir.Num:
+    """The node, with neutral elements left out."""
+    nums = tuple(arg.num for arg in args)
+    match name, nums:
+        case ("add", (num, ir.Lit(0.0))) | ("add", (ir.Lit(0.0), num)) | ("sub", (num, ir.Lit(0.0))):
+            return num
+        case ("mul", (num, ir.Lit(1.0))) | ("mul", (ir.Lit(1.0), num)) | ("div", (num, ir.Lit(1.0))):
+            return num
+        case ("min" | "max" | "choice", (num,)):
+            return num
+        case "pow", (base, ir.Lit(exponent)) if exponent in (0.5, 1.0, 2.0):
+            return base if exponent == 1.0 else ir.Op("sqrt" if exponent == 0.5 else "square", (base,))
+        case _:
+            return ir.Op(name, nums)
+
+
+def _fold(function: Function, args: Sequence[Number], shell: Number, scope: Scope) -> Number:
+    """The value of a function of constants; exact where all of them are and the function allows it."""
+    assert function.fold is not None
+    exacts = [arg.exact for arg in args]
+    rational = function.exact and all(exact is not None for exact in exacts)
+    try:
+        result = function.fold(*(exacts if rational else [arg.constant for arg in args]))
+        value = float(result)
+        if isinstance(result, complex) or not math.isfinite(value):
+            raise ValueError("no finite value")
+    except (ValueError, TypeError, OverflowError, ZeroDivisionError):
+        written = ", ".join(f"{arg.constant:g}" for arg in args)
+        name = function.symbol or function.name
+        return scope.fail(Diagnostic("E205", f"`{name}` has no value for {written}", shell.span))
+    exact = Fraction(result) if isinstance(result, Fraction | int) else None
+    if exact is not None and max(exact.numerator.bit_length(), exact.denominator.bit_length()) > _MAX_BITS:
+        exact = None
+    whole = function.whole and all(arg.kind == "int" for arg in args)
+    return replace(shell, num=ir.Lit(value), exact=exact, kind="int" if whole else "real")
+
+
+def _verb(function: Function) -> str:
+    verbs = {"add": "add", "sub": "subtract", "mod": "take the modulo of"}
+    return verbs.get(function.name, f"`{function.name}`")
+
+
+def _mismatch(left: Number, right: Number, what: str, span: Span) -> Diagnostic:
+    """E203, with both places and what would make the units agree."""
+    preposition = {"add": "and", "subtract": "and", "take the modulo of": "and"}.get(what, "with")
+    verb = f"cannot {what}" if not what.startswith("`") else f"{what} cannot combine"
+    labels = tuple(
+        Label(side.span, _sided(side))
+        for side in (left, right)
+        if side.span is not None and side.span != span
+    )
+    headline = f"{verb} [{left.unit}] {preposition} [{right.unit}]"
+    return Diagnostic("E203", headline, span, labels=labels, help=_repair(left, right, span))
+
+
+def _sided(side: Number) -> str:
+    declared = f", {side.origin.text}" if side.origin is not None else ""
+    return f"[{side.unit}]{declared}"
+
+
+def _repair(left: Number, right: Number, span: Span) -> tuple[str, ...]:
+    drop = "drop the units from the declarations"
+    if left.span is None or right.span is None:
+        return (drop,)
+    sign = span.text.strip()
+    for numerator, denominator, factor_right in ((left, right, True), (right, left, False)):
+        quotient = (numerator.unit.si / denominator.unit.si).dims
+        if quotient in _MISSING and sign in ("<", "<=", ">", ">=", "==", "!=", "+", "-"):
+            noun, symbol = _MISSING[quotient]
+            first, second = left.span.text, right.span.text
+            first, second = (
+                (first, f"{second} * 1 {symbol}") if factor_right else (f"{first} * 1 {symbol}", second)
+            )
+            return (f"a {noun} is missing: `{first} {sign} {second}`, or {drop}",)
+    return (drop,)
+
+
+def negated(number: Number, span: Span) -> Number:
+    """The number with its sign flipped."""
+    value = number.constant
+    num: ir.Num = ir.Lit(-value) if value is not None else ir.Op("neg", (number.num,))
+    exact = None if number.exact is None else -number.exact
+    return replace(number, num=num, exact=exact, span=span, origin=None)
+
+
+def half(span: Span) -> Number:
+    """The margin of a truth value: 1/2."""
+    return literal(Fraction(1, 2), span)

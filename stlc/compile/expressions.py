@@ -1,0 +1,289 @@
+"""From syntax to values: the one recursion over expressions.
+
+Everything else in the front half of the compiler works on values; here names are looked up, macros expand
+(an argument is a value, so nothing is captured), quantifiers unroll, and independent findings are gathered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from fractions import Fraction
+from types import MappingProxyType
+from typing import Any
+
+from stlc.compile import comparisons, moments, typed
+from stlc.compile.calls import builtin, unsupported
+from stlc.compile.macros import arguments, cycle, finished, too_large
+from stlc.compile.meter import Cost
+from stlc.compile.operations import OPERATIONS
+from stlc.compile.scope import TIME_WORDS, Definition, Failed, Scope
+from stlc.compile.sorts import Need, as_formula, as_number
+from stlc.compile.values import Number, Origin, Value, at, literal
+from stlc.diagnostics import Diagnostic, Label
+from stlc.grammar import ast
+from stlc.source import Span
+
+
+def evaluate(expr: ast.Expr, scope: Scope) -> Value:
+    """The value of an expression. Raises Failed, with all independent findings in the sink."""
+    meter = scope.meter
+    meter.enter()
+    try:
+        if meter.over:
+            scope.fail(too_large(meter, expr.span))
+        return at(_value(expr, scope), expr.span)
+    finally:
+        meter.leave()
+
+
+def _value(expr: ast.Expr, scope: Scope) -> Value:
+    operation = OPERATIONS.get(type(expr))
+    if operation is None:
+        return _HANDLERS[type(expr)](expr, scope)
+    return operation.value(expr, evaluate_all(operation.parts(expr), scope), scope)
+
+
+def evaluate_all(exprs: Sequence[ast.Expr], scope: Scope) -> list[Value]:
+    """The values of independent expressions; each is looked at even where another one failed."""
+    values: list[Value] = []
+    for expr in exprs:
+        try:
+            values.append(evaluate(expr, scope))
+        except Failed:
+            continue
+    if len(values) < len(exprs):
+        raise Failed
+    return values
+
+
+def formula(expr: ast.Expr, need: Need, scope: Scope) -> typed.Formula:
+    """The expression as a formula. Raises Failed."""
+    return as_formula(evaluate(expr, scope), expr, need, scope)
+
+
+def formulas(exprs: Sequence[tuple[ast.Expr, Need]], scope: Scope) -> list[typed.Formula]:
+    """Independent expressions as formulas. Raises Failed."""
+    found: list[typed.Formula] = []
+    for expr, need in exprs:
+        try:
+            found.append(formula(expr, need, scope))
+        except Failed:
+            continue
+    if len(found) < len(exprs):
+        raise Failed
+    return found
+
+
+# ------------------------------------------------------------------------ names
+
+
+def _name(expr: ast.Name, scope: Scope) -> Value:
+    if expr.name in scope.locals:
+        value, cost = scope.locals[expr.name]
+        _charge(cost, expr.span, scope)
+        return value
+    if scope.in_spec and expr.name in TIME_WORDS and not expr.quoted:
+        return moments.time_word(expr.name, expr.span)
+    entry = scope.entries.get(expr.name)
+    if entry is None:
+        return scope.unknown(expr)
+    if isinstance(entry, Definition):
+        if entry.formals:
+            help_ = (f"{entry.name}({', '.join(entry.formals)})",)
+            scope.fail(Diagnostic("E105", f"`{entry.name}` takes arguments", expr.span, help=help_))
+        value = _defined(entry, expr.span, scope)
+    else:
+        value = entry.value
+    if isinstance(value, Number) and entry.span is not None:
+        return replace(value, origin=Origin(entry.span, f"line {entry.span.line}"))
+    return value
+
+
+# --------------------------------------------------------------------- macros
+
+
+def _defined(entry: Definition, place: Span, scope: Scope) -> Value:
+    """The value of a definition without arguments: found once, charged at every use."""
+    if entry.name not in scope.cache:
+        if entry.name in scope.open:
+            scope.fail(cycle(entry, scope))
+        inner = replace(scope, locals={}, open=(*scope.open, entry.name))
+        scope.cache[entry.name] = None
+        with scope.meter.measured() as cost:
+            value = finished(entry, evaluate(entry.body, inner), inner)
+        scope.cache[entry.name] = (value, cost)
+    found = scope.cache[entry.name]
+    if found is None:
+        if entry.name in scope.open:
+            scope.fail(cycle(entry, scope))
+        raise Failed
+    _charge(found[1], place, scope)
+    return found[0]
+
+
+def _expanded(entry: Definition, call: ast.Call, scope: Scope) -> Value:
+    """A macro with its arguments put in."""
+    if entry.name in scope.open:
+        scope.fail(cycle(entry, scope))
+    bound: dict[str, tuple[Value, Cost]] = {}
+    failed = False
+    for formal, expr in arguments(entry, call, scope).items():
+        try:
+            with scope.meter.measured() as cost:
+                value = evaluate(expr, scope)
+            bound[formal] = (value, cost)
+        except Failed:
+            failed = True
+    if failed:
+        raise Failed
+    inner = replace(scope, locals=bound, open=(*scope.open, entry.name))
+    with _traced(entry, call, scope):
+        return finished(entry, evaluate(entry.body, inner), inner)
+
+
+@contextmanager
+def _traced(entry: Definition, call: ast.Call, scope: Scope) -> Iterator[None]:
+    """Findings inside a macro also show the use that brought them up."""
+    before = len(scope.sink)
+    try:
+        yield
+    except Failed:
+        label = Label(call.span, f"in this use of `{entry.name}`")
+        scope.sink[before:] = [
+            finding
+            if finding.labels and finding.labels[-1] == label
+            else replace(finding, labels=(*finding.labels, label))
+            for finding in scope.sink[before:]
+        ]
+        raise
+
+
+def _charge(cost: Cost, place: Span, scope: Scope) -> None:
+    scope.meter.charge(cost)
+    if scope.meter.over:
+        scope.fail(too_large(scope.meter, place))
+
+
+def _call(expr: ast.Call, scope: Scope) -> Value:
+    if not isinstance(expr.func, ast.Name):
+        if scope.in_spec:
+            scope.fail(unsupported("a call into an imported module", expr.span, scope))
+        note = ("expressions are parsed, never evaluated as Python; for Python dynamics use `plugin:`",)
+        message = "calls to attributes are not part of the expression language"
+        place = expr.func.span
+        if isinstance(expr.func, ast.Attr):
+            place = place.source.span(expr.func.base.span.end, place.end)
+        scope.fail(Diagnostic("S201", message, place, note=note))
+    entry = scope.entries.get(expr.func.name)
+    if isinstance(entry, Definition) and entry.formals:
+        return _expanded(entry, expr, scope)
+    values = evaluate_all([arg.value for arg in expr.args], scope)
+    return builtin(expr.func.name, expr, values, scope)
+
+
+# ------------------------------------------------------------------- formulas
+
+
+def _not(expr: ast.Not, scope: Scope) -> Value:
+    return typed.Not(
+        expr.span, formula(expr.operand, Need("`not`", span=_head(expr.span, expr.operand)), scope)
+    )
+
+
+def _logic(expr: ast.Logic, scope: Scope) -> Value:
+    """Chains of `and` and of `or` become one node, without recursion along the chain."""
+    operands: list[ast.Expr] = [expr.right]
+    left = expr.left
+    while expr.op in ("and", "or") and isinstance(left, ast.Logic) and left.op == expr.op:
+        operands.append(left.right)
+        left = left.left
+    operands.append(left)
+    need = Need(f"`{expr.op}`")
+    return typed.Logic(
+        expr.span, expr.op, tuple(formulas([(item, need) for item in reversed(operands)], scope))
+    )
+
+
+def _temporal(expr: ast.Temporal, scope: Scope) -> Value:
+    place = _head(expr.span, expr.interval or expr.body, len(expr.alias or expr.op))
+    return _timed(expr, [(expr.body, Need(f"`{expr.op}`", span=place))], place, scope)
+
+
+def _until(expr: ast.Until, scope: Scope) -> Value:
+    after = expr.interval.span if expr.interval is not None else expr.right.span
+    place = comparisons.sign_span(expr.alias or expr.op, expr.left.span, after)
+    sides = [(expr.left, Need(f"`{expr.op}`", span=place)), (expr.right, Need(f"`{expr.op}`", span=place))]
+    return _timed(expr, sides, place, scope)
+
+
+def _timed(
+    expr: ast.Temporal | ast.Until, operands: Sequence[tuple[ast.Expr, Need]], place: Span, scope: Scope
+) -> typed.Formula:
+    """Operands and interval of a temporal operator, each looked at even where the other failed."""
+    if not scope.temporal:
+        scope.fail(unsupported(f"`{expr.op}`", expr.span, scope))
+    window: typed.Interval | None = None
+    body = operands[-1][0]
+    try:
+        bounds = (
+            evaluate_all((expr.interval.lo, expr.interval.hi), scope) if expr.interval is not None else ()
+        )
+        window = moments.interval(expr.interval, bounds, (expr.op, place), body, scope)
+    finally:
+        inner = formulas(operands, scope)
+    if isinstance(expr, ast.Temporal):
+        return typed.Temporal(expr.span, expr.op, window, inner[0])
+    return typed.Until(expr.span, expr.op, window, inner[0], inner[1])
+
+
+def _head(span: Span, inner: ast.Node, length: int | None = None) -> Span:
+    """The operator that stands before its operand."""
+    end = min(inner.span.start, span.start + length) if length is not None else inner.span.start
+    text = span.source.text[span.start : end].rstrip(" \t\n(")
+    return span.source.span(span.start, span.start + max(1, len(text)))
+
+
+def _quantifier(expr: ast.Quantifier, scope: Scope) -> Value:
+    """The conjunction or disjunction over a finite domain."""
+    items: list[typed.Formula] = []
+    need = Need(f"`{expr.kind}`")
+    for value in _domain(expr, scope):
+        inner = replace(scope, locals={**scope.locals, expr.var: (value, Cost(1, 1))})
+        items.append(formula(expr.body, need, inner))
+    if not items:
+        return typed.Truth(expr.span, expr.kind == "forall")
+    if len(items) == 1:
+        return items[0]
+    return typed.Logic(expr.span, "and" if expr.kind == "forall" else "or", tuple(items))
+
+
+def _domain(expr: ast.Quantifier, scope: Scope) -> Iterator[Number]:
+    if isinstance(expr.domain, ast.SetLiteral):
+        values = evaluate_all(expr.domain.items, scope)
+        for item, value in zip(expr.domain.items, values, strict=True):
+            yield as_number(value, item, Need(f"`{expr.kind}` runs over numbers"), scope)
+        return
+    ends = []
+    for end, value in zip(expr.domain, evaluate_all(expr.domain, scope), strict=True):
+        number = as_number(value, end, Need(f"`{expr.kind}` runs over whole numbers"), scope)
+        if number.exact is None or number.exact.denominator != 1:
+            message = f"`{expr.kind}` runs over whole numbers that are known at compile time"
+            scope.fail(Diagnostic("E205", message, end.span))
+        ends.append(int(number.exact))
+    for value_ in range(ends[0], ends[1] + 1):
+        yield literal(Fraction(value_), expr.span)
+
+
+_HANDLERS: Mapping[type[ast.Node], Callable[[Any, Scope], Value]] = MappingProxyType(
+    {
+        ast.Name: _name,
+        ast.Call: _call,
+        ast.Not: _not,
+        ast.Logic: _logic,
+        ast.Temporal: _temporal,
+        ast.Until: _until,
+        ast.Quantifier: _quantifier,
+    }
+)

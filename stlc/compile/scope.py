@@ -1,0 +1,206 @@
+"""What names mean while an expression is resolved, and where its findings go."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from typing import Literal, NoReturn, TypeAlias
+
+from stlc.compile import ir
+from stlc.compile.functions import LATER, STEPPING, callable_names, sampler_names
+from stlc.compile.meter import Cost, Meter
+from stlc.compile.values import Label, Number, Origin, Value, Vector
+from stlc.diagnostics import Diagnostic, SpecError, StlcError, SystemFileError
+from stlc.grammar import ast
+from stlc.registry import closest
+from stlc.signature import Column
+from stlc.source import Span
+from stlc.units import DIMENSIONLESS, Unit
+
+TIME_WORDS = ("T", "end", "dt")
+
+_COMPONENT = re.compile(r"(?P<name>.+)\[(?P<index>\d+)\]")
+
+
+class Failed(Exception):  # noqa: N818 - control flow inside this room; the finding is in the sink already
+    """An expression could not be resolved, and its findings have been reported."""
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """A name with a value: a signal, a constant, a member of an enum.
+
+    Attributes:
+        value: in SI units.
+        about: what it is, for messages: "env signal, declared at line 14".
+        span: where it was declared.
+    """
+
+    value: Value
+    about: str = ""
+    span: Span | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Definition:
+    """A name with an expression: a macro, a constant, a region; resolved when it is first used.
+
+    Attributes:
+        name: of the definition.
+        body: the expression.
+        formals: names of the arguments.
+        unit: unit that the number must have, and that a bare number takes; None for any.
+        sort: what the body must be.
+        about: what it is, for messages.
+        span: where its name was declared.
+    """
+
+    name: str
+    body: ast.Expr
+    formals: tuple[str, ...] = ()
+    unit: Unit | None = None
+    sort: Literal["any", "constant", "region", "number", "formula"] = "any"
+    about: str = ""
+    span: Span | None = None
+
+
+Entry: TypeAlias = Known | Definition
+Bounds: TypeAlias = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Scope:
+    """Names and rules under which expressions are resolved.
+
+    Attributes:
+        entries: what the file knows, by name.
+        sink: findings are appended here.
+        error: what a public function raises: `SpecError`, or `SystemFileError` in a system file.
+        samplers: `uniform(…)` and its like are allowed.
+        temporal: temporal operators are allowed.
+        time_unit: unit of bare numbers in intervals; "" where no pragma says so.
+        facts: enforced ranges of columns, in stored units.
+        locals: arguments of the macro and quantifier variables at hand, with what they cost.
+    """
+
+    entries: Mapping[str, Entry] = field(default_factory=dict)
+    sink: list[Diagnostic] = field(default_factory=list)
+    error: type[StlcError] = SpecError
+    samplers: bool = False
+    temporal: bool = False
+    time_unit: str = ""
+    facts: Mapping[str, Bounds] = field(default_factory=dict)
+    locals: Mapping[str, tuple[Value, Cost]] = field(default_factory=dict)
+    meter: Meter = field(default_factory=Meter, compare=False, repr=False)
+    cache: dict[str, tuple[Value, Cost] | None] = field(default_factory=dict, compare=False, repr=False)
+    open: tuple[str, ...] = ()
+
+    @property
+    def in_spec(self) -> bool:
+        """Whether this is a specification, where `T`, `end` and `dt` are words of the language."""
+        return not issubclass(self.error, SystemFileError)
+
+    def extended(self, entries: Mapping[str, Entry], *, samplers: bool | None = None) -> Scope:
+        """The same scope with more names; `samplers` changes whether random draws are allowed."""
+        return replace(
+            self,
+            entries={**self.entries, **entries},
+            samplers=self.samplers if samplers is None else samplers,
+            cache={},
+        )
+
+    def report(self, finding: Diagnostic) -> None:
+        """Add a finding, once (a macro that is used twice has its faults once)."""
+        if finding not in self.sink:
+            self.sink.append(finding)
+
+    def fail(self, finding: Diagnostic) -> NoReturn:
+        """Report and give up on the expression at hand."""
+        self.report(finding)
+        raise Failed
+
+    def unknown(self, name: ast.Name, *, called: bool = False) -> NoReturn:
+        """Report a name that nothing declares (E101)."""
+        candidates = [*self.locals, *self.entries]
+        if called:
+            candidates += [*callable_names(), *(sampler_names() if self.samplers else ())]
+        near = closest(name.name, candidates)
+        what = "function" if called else "name"
+        help_ = () if near is None else (f"did you mean `{near}`?{self._about(near)}",)
+        note = () if called or not self.in_spec else ("parameters never default to 0",)
+        self.fail(Diagnostic("E101", f"unknown {what} `{name.name}`", name.span, help=help_, note=note))
+
+    def _about(self, name: str) -> str:
+        entry = self.entries.get(name)
+        return f"  ({entry.about})" if entry is not None and entry.about else ""
+
+
+def column_value(column: Column, origin: Origin | None = None) -> Number:
+    """The number that a column holds, in SI units."""
+    num: ir.Num = ir.Col(column.name)
+    if column.unit.ratio != 1:
+        num = ir.Op("mul", (num, ir.Lit(column.unit.scale)))
+    flexible = column.kind in ("real", "int") and not column.unit.text
+    return Number(num, column.unit, flexible, kind=column.kind, labels=column.labels, origin=origin)
+
+
+def column_entries(
+    columns: Iterable[Column], *, about: str = "", span: Span | None = None
+) -> dict[str, Known]:
+    """Entries for columns; `q[0]`, `q[1]`, … together become the vector `q`."""
+    entries: dict[str, Known] = {}
+    for column in columns:
+        value = column_value(column)
+        match = _COMPONENT.fullmatch(column.name)
+        if match is None:
+            entries[column.name] = Known(value, about, span)
+            continue
+        before = entries.get(match["name"])
+        items = before.value.items if before is not None and isinstance(before.value, Vector) else ()
+        entries[match["name"]] = Known(Vector((*items, value)), about, span)
+    return entries
+
+
+def member_entries(enums: Iterable[tuple[tuple[str, float], ...]]) -> dict[str, Known]:
+    """Entries for the members of enums; a member of several enums is told apart by what it meets."""
+    options: dict[str, list[tuple[tuple[str, float], ...]]] = {}
+    for labels in dict.fromkeys(enums):
+        for name, _ in labels:
+            options.setdefault(name, []).append(labels)
+    return {name: Known(Label(name, tuple(found)), "enum member") for name, found in options.items()}
+
+
+def constant_value(value: float, unit: Unit = DIMENSIONLESS) -> Number:
+    """A known number in SI units; without a written unit it is as good as a bare one."""
+    bare = not unit.text
+    exact = Fraction(repr(value))
+    kind: Literal["int", "real"] = "int" if bare and exact.denominator == 1 else "real"
+    return Number(ir.Lit(float(value)), unit, bare, bare, exact, kind)
+
+
+def constant_entries(
+    constants: Mapping[str, tuple[float, Unit]], *, about: str = "constant"
+) -> dict[str, Known]:
+    """Entries for constants given as (value in SI units, unit)."""
+    return {name: Known(constant_value(value, unit), about) for name, (value, unit) in constants.items()}
+
+
+def enforced(columns: Iterable[Column]) -> dict[str, Bounds]:
+    """Ranges that are facts: clamped columns, booleans, enums, and whatever else is marked so."""
+    facts: dict[str, Bounds] = {}
+    for column in columns:
+        if column.kind == "bool":
+            facts[column.name] = (0.0, 1.0)
+        elif column.labels:
+            values = [value for _, value in column.labels]
+            facts[column.name] = (min(values), max(values))
+        elif column.fact and column.low is not None and column.high is not None:
+            facts[column.name] = (column.low, column.high)
+    return facts
+
+
+def reserved(name: str) -> bool:
+    """Whether a call of `name` means a built-in function."""
+    return name in (*callable_names(), *sampler_names(), *STEPPING, *LATER)
