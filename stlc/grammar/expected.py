@@ -40,7 +40,7 @@ _SIGNS: Mapping[str, str] = MappingProxyType(
         **{"_FROM": "from", "_AS": "as"},
     }
 )
-_REPAIRS = ("COLON", "EQUAL", "COMMA", "RPAR", "RSQB", "RBRACE", "_DOTS", "_ARROW", "_IN", "_FN", "MULOP")
+_REPAIRS = ("COLON", "COMMA", "EQUAL", "RPAR", "RSQB", "RBRACE", "_DOTS", "_ARROW", "_IN", "_FN")
 _POSTFIX = frozenset({"LPAR", "LSQB", "DOT"})
 _BEFORE_FORMULA = frozenset(
     {":", "and", "&", "&&", "or", "|", "||", "xor", "->", "=>", "implies", "not", "!"}
@@ -54,8 +54,9 @@ def expected(stumble: Stumble) -> Diagnostic:
         return repair
     words = _words(stumble)
     message = f"expected {_joined(words)}{_context(stumble)}, found {_found(stumble)}"
-    label = "" if stumble.found is not None or not words else f"expected {words[0]} here"
-    return Diagnostic("E010", message, stumble.span, label, _labels(stumble), note=_notes(stumble))
+    label = "" if stumble.found is not None else f"expected {words[0]} here"
+    advice = _product(stumble)
+    return Diagnostic("E010", message, stumble.span, label, _labels(stumble), advice, _notes(stumble))
 
 
 def point(stumble: Stumble, lexeme: Lexeme) -> Span:
@@ -150,28 +151,32 @@ def _repair(stumble: Stumble) -> Diagnostic | None:
     previous, found = stumble.previous, stumble.found
     if previous is None:
         return None
+    definition = _definition_colon(stumble)
+    if definition is not None:
+        return definition
     for terminal in _REPAIRS:
         if terminal not in stumble.accepts:
             continue
-        sign = _SIGNS.get(terminal, "*")
-        inserted = sign if sign in ":,)]}" else f" {sign}"
+        sign = _SIGNS[terminal]
+        glued = sign in ":,)]}"
+        inserted = sign if glued else f" {sign}"
         if stumble.piece.repaired_by(previous.end, previous.end, inserted):
             return _missing(stumble, sign, (previous.end, previous.end, inserted))
         if found is not None and stumble.piece.repaired_by(found.start, found.end, sign):
-            return _missing(stumble, sign, (found.start, found.end, sign))
-    return _definition_colon(stumble)
+            start = previous.end if glued else found.start
+            return _missing(stumble, sign, (start, found.end, sign))
+    return None
 
 
 def _definition_colon(stumble: Stumble) -> Diagnostic | None:
     """`def name: …`, where `=` is due; the parser took what follows for a type."""
-    colon = next((i for i, lexeme in enumerate(stumble.before) if lexeme.text == ":"), None)
-    if colon is None or not stumble.piece.repaired_by(
-        stumble.before[colon].start, stumble.before[colon].end, " ="
-    ):
+    declared = _declared(stumble)
+    sign = next((lexeme for lexeme in stumble.before if lexeme.text == ":"), None)
+    if declared is None or sign is None or declared[1] not in ("definition", "constant", "region"):
         return None
-    sign = stumble.before[colon]
-    earlier = Stumble(stumble.piece, sign.start)
-    return _missing(earlier, "=", (sign.start, sign.end, " ="))
+    if not stumble.piece.repaired_by(sign.start, sign.end, " ="):
+        return None
+    return _missing(Stumble(stumble.piece, sign.start), "=", (sign.start, sign.end, " ="))
 
 
 def _missing(stumble: Stumble, sign: str, edit: tuple[int, int, str]) -> Diagnostic:
@@ -188,6 +193,16 @@ def _missing(stumble: Stumble, sign: str, edit: tuple[int, int, str]) -> Diagnos
     )
 
 
+def _product(stumble: Stumble) -> tuple[str, ...]:
+    """`2 (x + 1)`, `x y`: a product without its sign."""
+    previous = stumble.previous
+    if previous is None or "MULOP" not in stumble.accepts:
+        return ()
+    if not stumble.piece.repaired_by(previous.end, previous.end, " *"):
+        return ()
+    return (f"a product is written with a sign: {stumble.line_with((previous.end, previous.end, ' *'))}",)
+
+
 # ---------------------------------------------------------------------------- words
 
 
@@ -198,7 +213,7 @@ def _words(stumble: Stumble) -> list[str]:
         words.append(_operand(stumble))
     elif "NAME" in accepts:
         words.append("a type" if stumble.previous and stumble.previous.text == ":" else "a name")
-    optional = _POSTFIX if stumble.wants_operator else frozenset()
+    optional = _POSTFIX if stumble.wants_operator or "_REQUIRE" in accepts else frozenset()
     if not stumble.wants_operand:
         words += [
             f"`{sign}`" for name, sign in _SIGNS.items() if name in accepts - optional - {"_IN", "_SIGNAL"}
@@ -222,7 +237,7 @@ _CLASSES: Mapping[str, str] = MappingProxyType(
 
 def _operand(stumble: Stumble) -> str:
     if "UNARY" not in stumble.accepts:
-        return "a number"
+        return "a value"
     previous = stumble.previous
     if previous is None or previous.text in _BEFORE_FORMULA or previous.text in UNARY_TEMPORAL:
         return "a formula" if stumble.piece.rule == "start" else "an expression"
@@ -236,7 +251,7 @@ def _context(stumble: Stumble) -> str:
     if previous is None:
         return ""
     name = _declared(stumble)
-    if name is not None and name[0] is previous:
+    if name is not None and name[0] == previous:
         return f" after the {name[1]}'s name"
     return f" after `{_shortened(previous.text)}`"
 
@@ -251,7 +266,7 @@ def _declared(stumble: Stumble) -> tuple[Lexeme, str] | None:
 
 def _labels(stumble: Stumble) -> tuple[Label, ...]:
     name = _declared(stumble)
-    if name is None or name[0] is not stumble.previous:
+    if name is None or name[0] != stumble.previous:
         return ()
     return (Label(stumble.of(name[0]), f"the {name[1]}'s name"),)
 

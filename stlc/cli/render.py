@@ -1,0 +1,218 @@
+"""Diagnostics as text, with the source and carets under it, and as JSON.
+
+The primary place is underlined with `^`, the others with `-`, each label in a row of its own; then comes what
+to do (`help`, `fix`), then why (`note`).
+"""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from stlc.diagnostics import Diagnostic, Label
+from stlc.source import Source, Span
+
+TAB = 4
+MAX_COLUMNS = 160
+_LEAD = 40
+
+_RESET = "\x1b[0m"
+_STYLES = {
+    "error": "\x1b[1;31m",
+    "warning": "\x1b[1;33m",
+    "headline": "\x1b[1m",
+    "frame": "\x1b[1;34m",
+    "secondary": "\x1b[34m",
+    "help": "\x1b[1;36m",
+}
+
+# -------------------------------------------------------------------------- text
+
+
+@dataclass(frozen=True, slots=True)
+class _Paint:
+    """Puts text into a style, or leaves it alone."""
+
+    color: bool
+
+    def __call__(self, style: str, text: str) -> str:
+        return f"{_STYLES[style]}{text}{_RESET}" if self.color and text else text
+
+
+@dataclass(frozen=True, slots=True)
+class _Mark:
+    """A place to underline; the primary one comes first."""
+
+    span: Span
+    text: str
+    primary: bool
+
+
+def render_text(diagnostics: Iterable[Diagnostic], *, color: bool) -> str:
+    """All findings as text, with an empty line between them and a line break at the end."""
+    paint = _Paint(color)
+    blocks = ["\n".join(_block(diagnostic, paint)) for diagnostic in diagnostics]
+    return "\n\n".join(blocks) + "\n" if blocks else ""
+
+
+def _block(diagnostic: Diagnostic, paint: _Paint) -> Iterator[str]:
+    title = f"{diagnostic.severity}[{diagnostic.code}]"
+    yield f"{paint(diagnostic.severity, title)}{paint('headline', f': {_printable(diagnostic.message)}')}"
+    marks = _marks(diagnostic)
+    width = max((len(str(mark.span.line)) for mark in marks), default=1)
+    margin = " " * (width + 1)
+    if marks:
+        yield from _snippets(marks, width, paint, diagnostic.severity)
+    for word, entries in _advice(diagnostic):
+        for entry in entries:
+            first, *more = _printable(entry, keep="\n").split("\n")
+            yield f"{margin}{paint('frame', '=')} {paint('help', f'{word}:')} {first}"
+            yield from (f"{margin}  {' ' * len(word)}  {line}" for line in more)
+
+
+def _advice(diagnostic: Diagnostic) -> Iterator[tuple[str, tuple[str, ...]]]:
+    yield "help", diagnostic.help
+    if diagnostic.fix is not None and diagnostic.fix.text:
+        yield "fix", (diagnostic.fix.text,)
+    yield "note", diagnostic.note
+
+
+def _marks(diagnostic: Diagnostic) -> list[_Mark]:
+    if diagnostic.span is None:
+        return []
+    primary = _Mark(diagnostic.span, diagnostic.label, primary=True)
+    return [primary, *(_Mark(label.span, label.text, primary=False) for label in diagnostic.labels)]
+
+
+# ---------------------------------------------------------------------- snippets
+
+
+def _snippets(marks: Sequence[_Mark], width: int, paint: _Paint, severity: str) -> Iterator[str]:
+    """The lines of all sources that are marked; that of the primary mark comes first."""
+    margin = " " * width
+    for index, source in enumerate(dict.fromkeys(mark.span.source for mark in marks)):
+        own = [mark for mark in marks if mark.span.source is source]
+        place = own[0].span
+        arrow = "-->" if index == 0 else ":::"
+        name = _printable(source.name)
+        yield f"{margin}{paint('frame', arrow)} {name}:{place.line}:{place.column}"
+        yield f"{margin} {paint('frame', '|')}"
+        yield from _lines(source, own, width, paint, severity)
+    yield f"{margin} {paint('frame', '|')}"
+
+
+def _lines(source: Source, marks: Sequence[_Mark], width: int, paint: _Paint, severity: str) -> Iterator[str]:
+    previous: int | None = None
+    for number in sorted({mark.span.line for mark in marks}):
+        if previous is not None and number > previous + 1:
+            yield f"{' ' * width} {paint('frame', '...')}"
+        previous = number
+        row = _Row(source, number, [mark for mark in marks if mark.span.line == number])
+        yield f"{paint('frame', f'{number:>{width}} |')} {row.text}".rstrip()
+        for mark in row.marks:
+            style = severity if mark.primary else "secondary"
+            under = " " * row.column(mark.span.start) + paint(style, row.underline(mark))
+            label = f" {paint(style, _printable(mark.text))}" if mark.text else ""
+            yield f"{' ' * width} {paint('frame', '|')} {under}{label}"
+
+
+class _Row:
+    """One line of a source as it is shown: tabs expanded, control characters visible, cut if very long."""
+
+    def __init__(self, source: Source, number: int, marks: Sequence[_Mark]) -> None:
+        self.marks = marks
+        line = source.line(number)
+        first = source.line_starts[number - 1]
+        begin = 0
+        if len(line) > MAX_COLUMNS:
+            begin = max(0, min(mark.span.start for mark in marks) - first - _LEAD)
+        shown = line[begin : begin + MAX_COLUMNS]
+        self._first = first + begin
+        self._columns, self.text = _laid_out(shown, indent=1 if begin else 0)
+        if begin:
+            self.text = f"…{self.text}"
+        if begin + MAX_COLUMNS < len(line):
+            self.text += "…"
+
+    def column(self, offset: int) -> int:
+        """Display column of a character."""
+        return self._columns[min(max(offset - self._first, 0), len(self._columns) - 1)]
+
+    def underline(self, mark: _Mark) -> str:
+        """The carets or dashes under a mark; at least one, and only within this line."""
+        length = self.column(mark.span.end) - self.column(mark.span.start)
+        return ("^" if mark.primary else "-") * max(length, 1)
+
+
+def _laid_out(line: str, *, indent: int) -> tuple[list[int], str]:
+    """Display column of every character (and of the end), and the line as it is printed."""
+    columns: list[int] = []
+    shown: list[str] = []
+    column = indent
+    for char in line:
+        columns.append(column)
+        text = " " * (TAB - column % TAB) if char == "\t" else _printable(char)
+        shown.append(text)
+        column += sum(map(_width, text))
+    return [*columns, column], "".join(shown)
+
+
+def _width(char: str) -> int:
+    """Columns that a character takes in a terminal."""
+    if unicodedata.category(char) in ("Mn", "Me"):
+        return 0
+    return 2 if unicodedata.east_asian_width(char) in ("W", "F") else 1
+
+
+def _printable(text: str, *, keep: str = "") -> str:
+    """The text with control characters made visible: no file may steer the terminal."""
+    return "".join(char if char in keep else _visible(char) for char in text)
+
+
+def _visible(char: str) -> str:
+    code = ord(char)
+    if code < 0x20:
+        return chr(0x2400 + code)
+    if code == 0x7F:
+        return "\u2421"
+    return "\ufffd" if unicodedata.category(char) in ("Cc", "Cf", "Cs", "Zl", "Zp") else char
+
+
+# -------------------------------------------------------------------------- JSON
+
+
+def to_json(diagnostic: Diagnostic) -> dict[str, Any]:
+    """A finding as JSON values: `{code, severity, message, file, range, labels, help, note, fix}`.
+
+    Lines and columns count from 1, the end is exclusive; `file`, `range` and `fix` may be None.
+    """
+    span, fix = diagnostic.span, diagnostic.fix
+    edits = [] if fix is None else [{**_place(at), "replacement": text} for at, text in fix.edits]
+    return {
+        "code": diagnostic.code,
+        "severity": diagnostic.severity,
+        "message": diagnostic.message,
+        **({"file": None, "range": None} if span is None else _place(span)),
+        "label": diagnostic.label,
+        "labels": [_label(label) for label in diagnostic.labels],
+        "help": list(diagnostic.help),
+        "note": list(diagnostic.note),
+        "fix": None if fix is None else {"text": fix.text, "edits": edits},
+    }
+
+
+def _label(label: Label) -> dict[str, Any]:
+    return {**_place(label.span), "text": label.text}
+
+
+def _place(span: Span) -> dict[str, Any]:
+    start, end = span.source.position(span.start), span.source.position(span.end)
+    return {
+        "file": span.source.name,
+        "range": {
+            "start": {"line": start[0], "column": start[1]},
+            "end": {"line": end[0], "column": end[1]},
+        },
+    }
