@@ -1,0 +1,180 @@
+"""Closed loop: worlds advance seed by seed, decisions are taken for the agents of all seeds in one batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stlc.diagnostics import Diagnostic, RunError, StlcError, SystemFileError
+
+if TYPE_CHECKING:
+    from stlc.controller.deploy import Decision, Guard
+    from stlc.controller.task import Task
+    from stlc.controller.world import World, WorldType
+
+Tick = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """What happened to `agents` agents of each seed; rows are the agents of the first seed, then of the next.
+
+    Attributes:
+        agents: of one seed.
+        states: (rows, steps + 1, n).
+        actions: (rows, steps, m).
+        source: (rows, steps), index into `stlc.controller.deploy.SOURCES`.
+        t0: (rows, steps), length of the backup's prefix, 0 for the policy's own plan.
+        rho: (rows, steps), robustness of the plan that was followed.
+        policy_rho: (rows, steps), robustness of what the policy had planned.
+        safe: (rows, steps), whether the plan that was followed satisfies phi_safe.
+        progress: of each seed.
+        scene: snapshots of the first seed, stacked over time, and `decision` (frames, agents).
+    """
+
+    agents: int
+    states: NDArray[np.float64]
+    actions: NDArray[np.float64]
+    source: NDArray[np.int64]
+    t0: NDArray[np.int64]
+    rho: NDArray[np.float64]
+    policy_rho: NDArray[np.float64]
+    safe: NDArray[np.bool_]
+    progress: tuple[Mapping[str, float], ...]
+    scene: Mapping[str, NDArray[Any]]
+
+    @property
+    def steps(self) -> int:
+        """How many steps were taken."""
+        return int(self.actions.shape[1])
+
+
+@dataclass
+class Recorder:
+    """Gathers a recording step by step, so that what happened before a failure is not lost."""
+
+    agents: int
+    states: list[Tensor] = field(default_factory=list)
+    actions: list[Tensor] = field(default_factory=list)
+    decisions: list[Decision] = field(default_factory=list)
+    frames: list[Mapping[str, NDArray[Any]]] = field(default_factory=list)
+    progress: tuple[Mapping[str, float], ...] = ()
+
+    def start(self, x: Tensor, world: World) -> None:
+        """The first sample."""
+        self.states.append(x)
+        self.frames.append(world.snapshot())
+
+    def step(self, decision: Decision, action: Tensor, x: Tensor, world: World) -> None:
+        """One more step, and the sample behind it."""
+        self.decisions.append(decision)
+        self.actions.append(action)
+        self.start(x, world)
+
+    def recording(self) -> Recording | None:
+        """What there is so far; None before the first step."""
+        if not self.actions:
+            return None
+        columns = {
+            name: torch.stack([getattr(decision, name) for decision in self.decisions], 1).numpy(force=True)
+            for name in ("source", "t0", "rho", "policy_rho", "safe")
+        }
+        scene = {name: np.stack([frame[name] for frame in self.frames]) for name in self.frames[0]}
+        decided = columns["source"][: self.agents].T
+        scene["decision"] = np.concatenate((decided, decided[-1:])).astype(np.int8)
+        return Recording(
+            self.agents,
+            torch.stack(self.states, 1).numpy(force=True),
+            torch.stack(self.actions, 1).numpy(force=True),
+            **columns,
+            progress=self.progress,
+            scene=scene,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A deployment: which seeds, how many agents each, how long, and how often they plan anew."""
+
+    seeds: tuple[int, ...]
+    agents: int
+    steps: int
+    replan: int = 1
+
+
+class _Worlds:
+    """The worlds of all seeds, as one."""
+
+    def __init__(self, task: Task, make: WorldType, setting: Setting) -> None:
+        self.size = (len(setting.seeds) * setting.agents, len(task.names))
+        self.parts = [setting.agents] * len(setting.seeds)
+        self.worlds = [
+            make(task.system, setting.agents, torch.Generator().manual_seed(seed)) for seed in setting.seeds
+        ]
+
+    def reset(self) -> Tensor:
+        """The first states, (rows, n)."""
+        with _blame("begin"):
+            states = [world.reset() for world in self.worlds]
+        return self._checked(states, 0)
+
+    def advance(self, x: Tensor, action: Tensor, step: int) -> Tensor:
+        """(rows, n), (rows, m) -> the (rows, n) states after step number `step`."""
+        each = zip(self.worlds, torch.split(x, self.parts), torch.split(action, self.parts), strict=True)
+        with _blame(f"take step {step}"):
+            states = [world.advance(before, act) for world, before, act in each]
+        return self._checked(states, step)
+
+    def _checked(self, states: list[Tensor], step: int) -> Tensor:
+        with _blame(f"give states at step {step}"):
+            x = torch.cat(states).to(torch.float64)
+        if x.shape != self.size:
+            message = f"the world gives states of shape {tuple(x.shape)}, not {self.size}"
+            raise SystemFileError(Diagnostic("S207", message))
+        if not bool(torch.isfinite(x).all()):
+            raise SystemFileError(Diagnostic("S302", f"the world gives NaN or infinity at step {step}"))
+        return x
+
+
+@contextmanager
+def _blame(what: str) -> Iterator[None]:
+    """Whatever a world raises becomes S207."""
+    try:
+        yield
+    except StlcError:
+        raise
+    except Exception as error:
+        note = f"{type(error).__name__}: {error}"
+        raise SystemFileError(Diagnostic("S207", f"the world cannot {what}", note=(note,))) from error
+
+
+def drive(
+    guard: Guard, make: WorldType, setting: Setting, recorder: Recorder, tick: Tick | None = None
+) -> None:
+    """Deploy in fresh worlds, one a seed, into `recorder`.
+
+    Raises:
+        SystemFileError: S207, a world fails; S302, it gives states that are no numbers.
+        RunError: R402, a plan that is no number would have to be executed.
+    """
+    worlds = _Worlds(guard.task, make, setting)
+    x = worlds.reset()
+    recorder.start(x, worlds.worlds[0])
+    for step in range(setting.steps):
+        if step % setting.replan == 0:
+            decision = guard.decide(x)
+        action = decision.plan[:, step % setting.replan]
+        if not bool(torch.isfinite(action).all()):
+            raise RunError(Diagnostic("R402", f"the policy's plan at step {step} is not a number"))
+        x = worlds.advance(x, action, step + 1)
+        recorder.step(decision, action, x, worlds.worlds[0])
+        recorder.progress = tuple(dict(world.progress()) for world in worlds.worlds)
+        if tick is not None:
+            tick(step + 1, setting.steps)

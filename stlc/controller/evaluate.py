@@ -1,0 +1,179 @@
+"""A deployment over several seeds: what was planned, driven and decided, and how fast."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from stlc.compile.semantics import TOLERANCE
+from stlc.controller.deploy import SOURCES, Guard, Mode
+from stlc.controller.drive import Recorder, Recording, Setting, Tick, drive
+from stlc.controller.executed import Executed, judge_executed
+from stlc.controller.intervals import Interval
+from stlc.controller.world import world_type
+
+if TYPE_CHECKING:
+    from stlc.controller.policy import Policy
+    from stlc.controller.task import Task
+
+LATENCY_SAMPLES = 200
+
+METRICS = {
+    "plan_accuracy": "share of followed plans that satisfy the specification",
+    "policy_accuracy": "share of plans that the policy proposed and that satisfy it",
+    "plan_safety": "share of followed plans that satisfy the safety requirements",
+    "executed": "share of agents that satisfied it at every start",
+    "executed_safe": "share of agents that satisfied the safety requirements at every start",
+    "executed_starts": "share of starts from which what was driven satisfies it",
+    "executed_safe_starts": "share of starts from which it satisfies the safety requirements",
+    "foreseen": "share of starts from which the world did as the model says, through the window",
+    "foreseen_starts": "share of those from which what was driven satisfies the specification",
+}
+"""What the shares mean; one of nothing is left out."""
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """Seconds a decision for one agent alone, over states that were visited."""
+
+    median: float
+    p99: float
+    samples: int
+
+
+@dataclass(frozen=True, slots=True)
+class Deployment:
+    """One guard in all seeds.
+
+    Attributes:
+        guard: which.
+        recording: what happened.
+        metrics: name -> mean over seeds with its interval; see `METRICS`. Further there are `holds.NAME`, the
+            share of starts that satisfy one requirement, and the progress of the world.
+        decisions: share of decisions by source, and those of the backup by T0 ("backup T0=1").
+        latency: of one decision.
+    """
+
+    guard: Mode
+    recording: Recording
+    metrics: Mapping[str, Interval]
+    decisions: Mapping[str, float]
+    latency: Latency
+
+
+class InterruptedDeploymentError(Exception):
+    """A deployment ended early; carries what happened until then."""
+
+    def __init__(self, recording: Recording | None) -> None:
+        super().__init__("the deployment ended early")
+        self.recording = recording
+
+
+def deploy(
+    task: Task, policy: Policy, setting: Setting, guard: Mode, *, tick: Tick | None = None
+) -> Deployment:
+    """Deploy a policy in the world of its system.
+
+    Raises:
+        InterruptedDeploymentError: from a SystemFileError or RunError of `drive`, which is its `__cause__`.
+        SystemFileError: S206, the world cannot be loaded.
+    """
+    make = world_type(task.system.decl)
+    guarded, recorder = Guard(task, policy, guard), Recorder(setting.agents)
+    try:
+        drive(guarded, make, setting, recorder, tick)
+    except BaseException as error:
+        raise InterruptedDeploymentError(recorder.recording()) from error
+    recording = recorder.recording()
+    assert recording is not None
+    return Deployment(
+        guard,
+        recording,
+        measure(recording, judge_executed(task, recording)),
+        decided(recording),
+        latency(guarded, recording),
+    )
+
+
+def measure(recording: Recording, executed: Executed) -> dict[str, Interval]:
+    """All metrics over the seeds."""
+    each = [_of_seed(recording, executed, seed) for seed in range(len(recording.progress))]
+    names = [name for name in each[0] if all(not math.isnan(values[name]) for values in each)]
+    return {name: Interval.of([values[name] for values in each]) for name in names}
+
+
+def _of_seed(recording: Recording, executed: Executed, seed: int) -> dict[str, float]:
+    rows = slice(seed * recording.agents, (seed + 1) * recording.agents)
+    names, safety = tuple(executed.rules), executed.safety
+    starts, foreseen = executed.starts(names)[:, rows], executed.foreseen[:, rows]
+    shares = {
+        "plan_accuracy": recording.rho[rows] >= -TOLERANCE,
+        "policy_accuracy": recording.policy_rho[rows] >= -TOLERANCE,
+        "plan_safety": recording.safe[rows],
+        "executed": executed.agents(names)[rows],
+        "executed_safe": executed.agents(safety)[rows],
+        "executed_starts": starts,
+        "executed_safe_starts": executed.starts(safety)[:, rows],
+        "foreseen": foreseen,
+        "foreseen_starts": starts[foreseen],
+    }
+    shares |= {f"holds.{name}": held[:, rows] for name, held in executed.rules.items()}
+    found = {name: float(mask.mean()) if mask.size else math.nan for name, mask in shares.items()}
+    return found | {name: float(value) for name, value in recording.progress[seed].items()}
+
+
+def decided(recording: Recording) -> dict[str, float]:
+    """Who decided, as shares of all decisions."""
+    found = {name: float((recording.source == index).mean()) for index, name in enumerate(SOURCES)}
+    backup = recording.source == SOURCES.index("backup")
+    for length in np.unique(recording.t0[backup]).tolist():
+        found[f"backup T0={length}"] = float((backup & (recording.t0 == length)).mean())
+    return found
+
+
+def latency(guard: Guard, recording: Recording, samples: int = LATENCY_SAMPLES) -> Latency:
+    """Time decisions for one agent alone in states drawn evenly from those that were visited."""
+    visited = recording.states[:, :-1].reshape(-1, recording.states.shape[-1])
+    picked = visited[np.linspace(0, len(visited) - 1, min(samples, len(visited))).astype(int)]
+    seconds = []
+    for x in torch.from_numpy(np.concatenate([picked[:3], picked]))[:, None]:
+        begin = perf_counter()
+        guard.decide(x)
+        seconds.append(perf_counter() - begin)
+    timed = np.array(seconds[3:] or seconds)
+    return Latency(float(np.median(timed)), float(np.quantile(timed, 0.99)), len(timed))
+
+
+def as_json(
+    deployments: Mapping[str, Deployment], setting: Setting, facts: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The document of `eval/simulate.json`."""
+    return {
+        **facts,
+        "seeds": list(setting.seeds),
+        "agents": setting.agents,
+        "steps": setting.steps,
+        "replan": setting.replan,
+        "interval": "95 %, Student's t over the deployment seeds",
+        "guards": {
+            name: {
+                "metrics": {
+                    key: {"mean": m.mean, "low": m.low, "high": m.high, "values": list(m.values)}
+                    for key, m in found.metrics.items()
+                },
+                "decisions": dict(found.decisions),
+                "latency": {
+                    "median": found.latency.median,
+                    "p99": found.latency.p99,
+                    "samples": found.latency.samples,
+                },
+            }
+            for name, found in deployments.items()
+        },
+    }
