@@ -1,0 +1,164 @@
+"""Many steps: columns of shape (time, batch), as few array operations as the dynamics allow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from stlc.compile.arith import Program
+from stlc.compile.ops_torch import TORCH
+from stlc.compile.switch import Switch
+from stlc.dynamics.algebra import names_in
+from stlc.dynamics.schedule import Accumulate, AtOnce, Loop, Stage, blocks, schedule
+from stlc.dynamics.step import Step
+
+Columns = dict[str, Tensor]
+
+
+@dataclass
+class _Film:
+    """What is known so far: states at all T+1 samples, and numbers at the T steps.
+
+    `now` maps every name to its values at the T steps, shape (T, B), or (B,) where it never changes.
+    """
+
+    states: Columns
+    now: Columns
+    steps: int
+    batch: int
+    switch: Switch
+
+    def run(self, program: Program) -> Columns:
+        """All outputs of a program, as tensors."""
+        like = next(iter(self.states.values()))
+        outputs = program(self.now, TORCH, self.switch)
+        return {
+            name: torch.as_tensor(out, dtype=like.dtype, device=like.device) for name, out in outputs.items()
+        }
+
+    def enter(self, name: str, column: Tensor) -> None:
+        """A state whose T+1 samples are known."""
+        self.states[name] = column
+        self.now[name] = column[:-1]
+
+    def full(self, values: Tensor) -> Tensor:
+        """Values at every step, shape (T, B)."""
+        return values.expand(self.steps, self.batch)
+
+    def sliced(self, names: Iterable[str]) -> tuple[dict[str, Tensor], list[tuple[str, Sequence[Tensor]]]]:
+        """What stays through the loop, and what changes from step to step."""
+        fixed: dict[str, Tensor] = {}
+        timed: list[tuple[str, Sequence[Tensor]]] = []
+        for name in names:
+            values = self.now[name]
+            if values.dim() == 2 and values.shape[0] == self.steps and self.steps != 1:
+                timed.append((name, values.unbind(0)))
+            else:
+                fixed[name] = values[0] if values.dim() == 2 else values
+        return fixed, timed
+
+
+class _AtOnceRunner:
+    """Runs `AtOnce`."""
+
+    def __init__(self, stage: AtOnce) -> None:
+        self.stage = stage
+        self.program = Program(stage.outputs) if stage.outputs else None
+
+    def __call__(self, film: _Film) -> None:
+        if self.program is not None:
+            film.now.update(film.run(self.program))
+        for state, source in self.stage.columns.items():
+            start = film.states[state]
+            film.enter(state, torch.cat((start[None], film.full(film.now[source]))))
+
+
+class _AccumulateRunner:
+    """Runs `Accumulate`."""
+
+    def __init__(self, stage: Accumulate) -> None:
+        self.column = stage.column
+        self.program = Program({"increment": stage.increment})
+
+    def __call__(self, film: _Film) -> None:
+        increments = film.full(film.run(self.program)["increment"])
+        start = film.states[self.column]
+        film.enter(self.column, torch.cumsum(torch.cat((start[None], increments)), 0))
+
+
+class _LoopRunner:
+    """Runs `Loop`."""
+
+    def __init__(self, stage: Loop) -> None:
+        self.stage = stage
+        self.early = Program(stage.early) if stage.early else None
+        self.blocks = tuple(Program(block) for block in stage.blocks)
+        inside = stage.columns.keys() | {name for block in stage.blocks for name in block}
+        read = {name for block in stage.blocks for num in block.values() for name in names_in(num)}
+        self.outside = tuple(sorted(read - inside))
+
+    def __call__(self, film: _Film) -> None:
+        if self.early is not None:
+            film.now.update(film.run(self.early))
+        env, timed = film.sliced(self.outside)
+        kept = (*self.stage.columns.values(), *self.stage.lets)
+        history: dict[str, list[Tensor]] = {name: [] for name in kept}
+        env.update((state, film.states[state]) for state in self.stage.columns)
+        for step in range(film.steps):
+            env.update((name, values[step]) for name, values in timed)
+            for block in self.blocks:
+                env.update(block(env, TORCH, film.switch))
+            for name in kept:
+                history[name].append(env[name])
+            env.update((state, env[source]) for state, source in self.stage.columns.items())
+        for state, source in self.stage.columns.items():
+            start = film.states[state]
+            film.enter(state, torch.stack([start, *(value.expand(film.batch) for value in history[source])]))
+        film.now.update((name, torch.stack(history[name])) for name in self.stage.lets)
+
+
+_Runner = _AtOnceRunner | _AccumulateRunner | _LoopRunner
+
+
+def _runner(stage: Stage) -> _Runner:
+    match stage:
+        case AtOnce():
+            return _AtOnceRunner(stage)
+        case Accumulate():
+            return _AccumulateRunner(stage)
+        case Loop():
+            return _LoopRunner(stage)
+
+
+class Stepper:
+    """A step, ready to run: once on (B,) columns, or over time on (T, B) controls."""
+
+    def __init__(self, step: Step) -> None:
+        self.next = dict(step.next)
+        numbers = dict(step.lets) | {f"{name}'": num for name, num in step.next.items()}
+        self.once = tuple(Program(block) for block in blocks(numbers))
+        self.stages = tuple(_runner(stage) for stage in schedule(step))
+
+    def step(self, state: Mapping[str, Tensor], controls: Mapping[str, Tensor], switch: Switch) -> Columns:
+        """The columns one step later; those that do not move are the same tensors."""
+        env = {**state, **controls}
+        for block in self.once:
+            env.update(block(env, TORCH, switch))
+        like = next(iter(state.values()))
+        moved = {
+            name: torch.as_tensor(env[f"{name}'"], dtype=like.dtype, device=like.device) for name in self.next
+        }
+        return {**state, **{name: value.expand_as(like) for name, value in moved.items()}}
+
+    def rollout(self, start: Columns, controls: Columns, steps: int, switch: Switch) -> Columns:
+        """From (B,) columns and (T, B) controls to (T+1, B) columns; constant ones are expanded views."""
+        batch = next(iter(start.values())).shape[0]
+        steady = {name: column for name, column in start.items() if name not in self.next}
+        film = _Film(dict(start), {**steady, **controls}, steps, batch, switch)
+        for stage in self.stages:
+            stage(film)
+        film.states.update((name, column.expand(steps + 1, batch)) for name, column in steady.items())
+        return film.states

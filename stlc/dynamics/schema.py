@@ -1,0 +1,148 @@
+"""A system file as a declaration: every section read, every finding reported at once, with its place. No torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping as MappingType
+from pathlib import Path
+from types import MappingProxyType
+
+from stlc.dynamics.decl import ScenarioDecl, SystemDecl
+from stlc.dynamics.schema_flow import read_flow, read_jumps, read_timers
+from stlc.dynamics.schema_init import read_init
+from stlc.dynamics.schema_names import (
+    Clockwork,
+    Names,
+    empty,
+    later,
+    read_constants,
+    read_controls,
+    read_definitions,
+    read_states,
+    read_time,
+)
+from stlc.dynamics.schema_overrides import overridden
+from stlc.dynamics.schema_reader import Reader
+from stlc.dynamics.schema_settings import read_backup, read_objective, read_policy, read_train
+from stlc.dynamics.schema_test import read_test
+from stlc.dynamics.yaml_nodes import Mapping, Node, load_yaml
+from stlc.files import read_source
+from stlc.source import Source
+
+VERSION = 1
+TOP_KEYS = ["stlc", "name", "doc", "extends", "spec", "time", "const", "param", "state", "control", "def", "flow", "jump", "init", "objective", "policy", "train", "backup", "test", "scenario", "functions", "plugin", "plot"]
+LATER = {
+    "extends": "one system file extending another",
+    "param": "parameters that are drawn for every trajectory",
+    "functions": "functions from outside",
+    "plugin": "dynamics from a plugin",
+}
+
+
+def load_system_decl(path: Path | str, overrides: MappingType[str, str] | None = None) -> SystemDecl:
+    """The declaration that a system file holds.
+
+    Args:
+        path: of the file.
+        overrides: values by dotted key (`train.lr`), or by the name of a constant; a plain name that is no constant
+            of this file is left to the specification.
+
+    Raises:
+        UsageError: there is no such file.
+        SpecError: the file is not text.
+        SystemFileError: with all findings.
+    """
+    return parse_system(read_source(path), Path(path), overrides or {})
+
+
+def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | None = None) -> SystemDecl:
+    """The declaration that a text holds; `path` says what its relative paths start from."""
+    reader = Reader(source)
+    root = load_yaml(source, sink=reader.findings)
+    root = overridden(root, overrides or {}, reader)
+    found = reader.fields(root, "a system file", TOP_KEYS, required=("stlc", "name", "time"))
+    _version(found.get("stlc"), reader)
+    for key, what in LATER.items():
+        if not empty(found.get(key)):
+            later(reader, found[key], what)
+    decl = _declaration(found, reader, source, path, overrides or {})
+    reader.close()
+    return decl
+
+
+def _version(node: Node | None, reader: Reader) -> None:
+    version = reader.integer(node, "`stlc`")
+    if node is not None and version is not None and version != VERSION:
+        reader.report(
+            "S103",
+            f"schema version {version} is not known",
+            node.span,
+            f"this release reads `stlc: {VERSION}`",
+        )
+
+
+def _declaration(
+    found: dict[str, Node], reader: Reader, source: Source, path: Path, overrides: MappingType[str, str]
+) -> SystemDecl:
+    """All sections, in the order in which names are declared."""
+    names = Names()
+    read_constants(found.get("const"), reader, names)
+    clock = read_time(found.get("time"), reader, names) if "time" in found else Clockwork()
+    states = read_states(found.get("state"), reader, names)
+    read_controls(found.get("control"), reader, names)
+    read_definitions(found.get("def"), reader, names)
+    timer_flow, timer_jumps = read_timers(states, reader, names, clock)
+    flow = read_flow(found.get("flow"), reader, names, clock)
+    spec = reader.text(found.get("spec"), "`spec`")
+    return SystemDecl(
+        name=reader.text(found.get("name"), "`name`") or path.stem,
+        doc=" ".join((reader.text(found.get("doc"), "`doc`") or "").split()),
+        path=path,
+        source=source,
+        spec=path.parent / spec if spec else None,
+        dt=clock.dt,
+        horizon=clock.horizon,
+        substeps=clock.substeps,
+        integrator=clock.integrator,
+        discrete=clock.discrete,
+        constants=MappingProxyType(names.constants),
+        signature=names.signature,
+        controls=tuple(names.controls),
+        flow=(*timer_flow, *flow),
+        jumps=(*read_jumps(found.get("jump"), reader, names), *timer_jumps),
+        clamps=MappingProxyType(
+            {
+                c.name: (c.low, c.high)
+                for c in names.columns
+                if c.kind == "real" and c.fact and c.low is not None and c.high is not None
+            }
+        ),
+        init=read_init(found.get("init"), reader, names),
+        objective=read_objective(found.get("objective"), reader, names),
+        policy=read_policy(found.get("policy"), reader, names),
+        train=read_train(found.get("train"), reader, names),
+        backup=read_backup(found.get("backup"), reader, clock.horizon),
+        test=read_test(found.get("test"), reader, names, clock.dt),
+        scenarios=_scenarios(found.get("scenario"), reader),
+        overrides=MappingProxyType(dict(overrides)),
+        places=MappingProxyType(names.places),
+        warnings=tuple(finding for finding in reader.findings if finding.severity == "warning"),
+    )
+
+
+def _scenarios(node: Node | None, reader: Reader) -> tuple[ScenarioDecl, ...]:
+    """Names of overlays; one that changes anything is refused by this version."""
+    found = []
+    for entry in reader.entries(node, "`scenario`"):
+        where = f"the scenario `{entry.key.text}`"
+        if isinstance(entry.value, Mapping):
+            keys = ("doc", "expect", "const", "override", "events", "disturb", "noise", "model_mismatch")
+            fields = reader.fields(entry.value, where, keys)
+            for key in keys[2:]:
+                if not empty(fields.get(key)):
+                    later(reader, fields[key], f"`{key}` of {where}")
+            doc = reader.text(fields.get("doc"), f"`doc` of {where}") or ""
+        else:
+            reader.entries(entry.value, where)
+            doc = ""
+        found.append(ScenarioDecl(entry.key.text, doc))
+    return tuple(found)

@@ -1,0 +1,228 @@
+"""Expressions inside a system file: parsed where they stand, typed by the compiler, findings in YAML terms."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any
+
+from stlc.compile import ir
+from stlc.compile.formulas import resolve_state_formula
+from stlc.compile.numbers import resolve_number
+from stlc.compile.scope import Entry, Scope
+from stlc.compile.values import Number
+from stlc.diagnostics import Diagnostic, StlcError
+from stlc.dynamics.algebra import names_in, names_in_formula
+from stlc.dynamics.schema_reader import Reader
+from stlc.dynamics.yaml_nodes import Node, Scalar
+from stlc.grammar import ast
+from stlc.grammar.parser import parse_expr
+from stlc.source import Span
+from stlc.units import Unit, parse_unit, same_dims
+
+SECOND = parse_unit("s")
+_ATTRIBUTE = re.compile(r"(?<=[\w)\]\"'])(?<!\d)\.\s*([A-Za-z_]\w*)")
+_NOT_FINITE = frozenset(
+    {".nan", ".NaN", ".NAN", "nan", "NaN", ".inf", "-.inf", ".Inf", "-.Inf", "inf", "-inf"}
+)
+_SORTS = {"E201": "S203", "E202": "S203"}
+
+
+@dataclass(frozen=True, slots=True)
+class Expressions:
+    """Compiles the values of fields.
+
+    Attributes:
+        reader: where findings go.
+        scope: what names mean.
+        ready: columns that have a value here; None where all of them do.
+    """
+
+    reader: Reader
+    scope: Scope
+    ready: frozenset[str] | None = None
+
+    def extended(
+        self, entries: Mapping[str, Entry], *, samplers: bool = False, ready: frozenset[str] | None = None
+    ) -> Expressions:
+        """The same with more names."""
+        return Expressions(self.reader, self.scope.extended(entries, samplers=samplers), ready)
+
+    # ------------------------------------------------------------------ parsing
+
+    def parse(self, node: Node | None, where: str) -> ast.Expr | None:
+        """The syntax tree of a field."""
+        if not isinstance(node, Scalar) or node.is_null:
+            if node is not None:
+                self.reader.wrong(node, where, "an expression")
+            return None
+        if node.text in _NOT_FINITE and node.style == "plain":
+            self.reader.wrong(node, where, "a finite number", "write a value, or leave the key out")
+            return None
+        span = node.inside
+        if node.escaped:
+            self.reader.report("S201", "an expression has no escapes", span, "write it without quotes")
+            return None
+        attribute = _ATTRIBUTE.search(span.text)
+        if attribute:
+            self._attribute(span, attribute)
+            return None
+        try:
+            return parse_expr(span.source, span.start, span.end)
+        except StlcError as error:
+            self.reader.add(*(replace(finding, code="S201") for finding in error.diagnostics))
+            return None
+
+    def _attribute(self, span: Span, found: re.Match[str]) -> None:
+        """Report something that Python would take for an attribute."""
+        place = Span(span.source, span.start + found.start(1), span.start + found.end(1))
+        finding = Diagnostic(
+            "S201",
+            "attributes and their calls are not part of the expression language",
+            place,
+            note=("expressions are parsed, never evaluated as Python",),
+        )
+        self.reader.add(finding)
+
+    # -------------------------------------------------------------------- typing
+
+    def number(self, node: Node | None, where: str) -> Number | None:
+        """The number that a field holds, in SI units."""
+        expr = self.parse(node, where)
+        if expr is None:
+            return None
+        number = self._typed(resolve_number, expr)
+        if number is not None and not self._known(names_in(number.num), expr.span):
+            return None
+        return number
+
+    def formula(self, node: Node | None, where: str) -> ir.Formula | None:
+        """The state formula that a field holds."""
+        expr = self.parse(node, where)
+        return None if expr is None else self.formula_of(expr)
+
+    def formula_of(self, expr: ast.Expr) -> ir.Formula | None:
+        """The state formula that an expression is."""
+        formula = self._typed(resolve_state_formula, expr)
+        if formula is not None and not self._known(names_in_formula(formula), expr.span):
+            return None
+        return formula
+
+    def _typed(self, resolve: Any, expr: ast.Expr) -> Any:
+        """What a resolver of the compiler makes of an expression, or None with its findings reported."""
+        sink: list[Diagnostic] = []
+        try:
+            return resolve(expr, replace(self.scope, sink=sink))
+        except StlcError as error:
+            sink.extend(finding for finding in error.diagnostics if finding not in sink)
+            return None
+        finally:
+            self.reader.add(
+                *(replace(finding, code=_SORTS.get(finding.code, finding.code)) for finding in sink)
+            )
+
+    def _known(self, names: frozenset[str], span: Span) -> bool:
+        """Whether all columns have a value here."""
+        early = sorted(names - self.ready) if self.ready is not None else []
+        if early:
+            listed = ", ".join(f"`{name}`" for name in early)
+            self.reader.report("S202", f"{listed} has no value yet", span, "draw it on an earlier line")
+        return not early
+
+    # --------------------------------------------------------------------- values
+
+    def stored(self, node: Node | None, where: str, unit: Unit) -> ir.Num | None:
+        """A number as it is stored in a column of `unit`."""
+        number = self.number(node, where)
+        if number is None or node is None:
+            return None
+        if not self._fits(number, unit):
+            self.reader.report(
+                "E203",
+                f"{where} is in [{unit}], this is in [{number.unit}]",
+                node.span,
+                label=f"[{number.unit}]",
+            )
+            return None
+        return in_stored_unit(number, unit)
+
+    def truth(self, node: Node | None, where: str) -> ir.Num | None:
+        """A number or a formula as the 0 or 1 of a bool column."""
+        expr = self.parse(node, where)
+        match expr:
+            case None:
+                return None
+            case ast.Bool(_, value):
+                return ir.Lit(float(value))
+            case ast.Compare() | ast.Not() | ast.Logic() | ast.Member():
+                formula = self.formula_of(expr)
+                return None if formula is None else ir.Ind(formula)
+            case _:
+                return self.stored(node, where, Unit())
+
+    def constant(self, node: Node | None, where: str, unit: Unit) -> float | None:
+        """A number that is known now, as it is stored in a column of `unit`."""
+        value = self.stored(node, where, unit)
+        if value is None or node is None:
+            return None
+        if not isinstance(value, ir.Lit):
+            self.reader.wrong(node, where, "a constant", "use numbers and the names under `const`")
+            return None
+        return value.value
+
+    def duration(self, node: Node | None, where: str) -> Fraction | None:
+        """Seconds, exactly; a bare number counts as seconds."""
+        number = self.number(node, where)
+        if number is None or node is None:
+            return None
+        if number.exact is None or not self._fits(number, SECOND) or number.exact <= 0:
+            self.reader.wrong(node, where, "a positive time", "for example `0.1 s`")
+            return None
+        return number.exact
+
+    def steps(self, node: Node | None, where: str, dt: Fraction) -> int | None:
+        """A whole number of steps, given as `25 steps`, `25` or a time."""
+        if node is None:
+            return None
+        expr = self.parse(node, where)
+        match expr:
+            case None:
+                return None
+            case ast.Quantity(_, value, unit) if unit in ("", "steps", "step"):
+                count = value
+            case _:
+                seconds = self.duration(node, where)
+                if seconds is None:
+                    return None
+                count = seconds / dt
+        if count.denominator != 1 or count < 1:
+            self.reader.wrong(
+                node,
+                where,
+                "a positive whole number of steps",
+                f"one step is {float(dt):g} s: write `25 steps` or a multiple",
+            )
+            return None
+        return int(count)
+
+    @staticmethod
+    def _fits(number: Number, unit: Unit) -> bool:
+        """Whether a number may be stored in a column of `unit`; an undeclared unit takes anything."""
+        return number.flexible or number.bare or not unit.text or same_dims(number.unit, unit)
+
+
+def in_stored_unit(number: Number, unit: Unit) -> ir.Num:
+    """SI to the unit of a column; a bare number is in that unit already."""
+    if number.bare or unit.ratio == 1:
+        return number.num
+    if isinstance(number.num, ir.Lit):
+        exact = number.exact
+        return ir.Lit(float(exact / unit.ratio) if exact is not None else number.num.value / unit.scale)
+    return ir.Op("div", (number.num, ir.Lit(unit.scale)))
+
+
+def written(node: Node | None) -> str:
+    """The text of a field, on one line, for tables."""
+    return " ".join(node.text.split()) if isinstance(node, Scalar) else ""

@@ -1,0 +1,69 @@
+"""`--set key=value`: fields replaced before anything is read, so that they are checked like written ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping as MappingType
+
+from stlc.diagnostics import SystemFileError
+from stlc.dynamics.schema_reader import Reader
+from stlc.dynamics.yaml_nodes import Mapping, Node, Scalar, Sequence, load_node
+from stlc.registry import closest
+from stlc.source import Source
+
+
+def overridden(root: Mapping, overrides: MappingType[str, str], reader: Reader) -> Mapping:
+    """The document with the fields that `overrides` names replaced.
+
+    A dotted key names a field (`train.lr`, `init.mixture.0.weight`); a plain one a constant, or a field at the top
+    that holds a single value. Other plain names are left to the specification.
+    """
+    constants = root.get("const")
+    known = {e.key.text for e in constants.entries} if isinstance(constants, Mapping) else set()
+    for key, text in overrides.items():
+        value = _value(key, text, reader)
+        path = key.split(".")
+        if value is None:
+            continue
+        if len(path) == 1:
+            if key in known:
+                path = ["const", key]
+            elif not isinstance(root.get(key), Scalar):
+                continue
+        changed = _replaced(root, path, value, key, reader)
+        root = changed if isinstance(changed, Mapping) else root
+    return root
+
+
+def _value(key: str, text: str, reader: Reader) -> Node | None:
+    """The value of an override, as a node of its own little text."""
+    source = Source(f"--set {key}", text)
+    try:
+        return load_node(source, sink=reader.findings)
+    except SystemFileError as error:
+        reader.add(*error.diagnostics)
+        return None
+
+
+def _replaced(node: Node, path: list[str], value: Node, key: str, reader: Reader) -> Node:
+    """`node` with the value at `path` replaced; keys that are not there are added, and checked like any others."""
+    head, rest = path[0], path[1:]
+    match node:
+        case Sequence(items=items) if head.isdigit() and int(head) < len(items):
+            index = int(head)
+            inner = _replaced(items[index], rest, value, key, reader) if rest else value
+            return Sequence(node.span, (*items[:index], inner, *items[index + 1 :]), node.size + value.size)
+        case Mapping():
+            old = node.get(head) or Mapping(value.span, (), 1)
+            inner = _replaced(old, rest, value, key, reader) if rest else value
+            return node.replaced(Scalar(value.span, head), inner)
+        case _:
+            return _missing(node, head, value, key, reader)
+
+
+def _missing(node: Node, head: str, value: Node, key: str, reader: Reader) -> Node:
+    """Report a path that leads nowhere."""
+    keys = [entry.key.text for entry in node.entries] if isinstance(node, Mapping) else []
+    near = closest(head, keys)
+    guess = f"did you mean `{near}`?" if near else f"keys here: {', '.join(keys)}" if keys else ""
+    reader.report("S101", f"`--set {key}`: there is no `{head}` in the system file", value.span, guess)
+    return node

@@ -1,0 +1,106 @@
+"""The sections that say how a system is trained and guarded: objective, policy, train, backup."""
+
+from __future__ import annotations
+
+from stlc.compile import ir
+from stlc.compile.scope import Known
+from stlc.compile.values import Number
+from stlc.dynamics.decl import BackupDecl, ObjectiveDecl, PolicyDecl, Term, TrainDecl
+from stlc.dynamics.schema_expressions import SECOND, Expressions, written
+from stlc.dynamics.schema_names import Names
+from stlc.dynamics.schema_reader import Reader
+from stlc.dynamics.yaml_nodes import Node, Scalar
+
+OBJECTIVE_KEYS = ("gamma", "smoothing", "lambda", "terms")
+TERM_KEYS = ("name", "weight", "expr")
+POLICY_KEYS = ("type", "hidden", "observe")
+POLICIES = ("mlp",)
+TRAIN_KEYS = ("budget", "steps", "seed", "lr", "batch", "samples", "method")
+METHODS = ("guided", "gradient")
+BACKUP_KEYS = ("bins", "T0", "batch")
+OUTCOME = {
+    "sat": "1 where the trajectory satisfies the specification",
+    "rho": "robustness of the trajectory",
+    "k": "number of the step",
+}
+
+
+def read_objective(node: Node | None, reader: Reader, names: Names) -> ObjectiveDecl:
+    """The section `objective`; terms may read `sat`, `rho`, `k` and `t`."""
+    found = reader.fields(node, "`objective`", OBJECTIVE_KEYS)
+    default = ObjectiveDecl()
+    entries = {name: Known(Number(ir.Col(name), flexible=True), about) for name, about in OUTCOME.items()}
+    entries["t"] = Known(Number(ir.Col("t"), SECOND), "seconds since the start of the plan")
+    here = names.expressions(reader).extended({n: e for n, e in entries.items() if n not in names.entries})
+    gamma = reader.number(found.get("gamma"), "`gamma`")
+    smoothing = reader.number(found.get("smoothing"), "`smoothing`", low=1e-9)
+    weight = reader.number(found.get("lambda"), "`lambda`")
+    return ObjectiveDecl(
+        default.gamma if gamma is None else gamma,
+        default.smoothing if smoothing is None else smoothing,
+        default.stl_weight if weight is None else weight,
+        tuple(term for item in reader.items(found.get("terms"), "`terms`") for term in _term(item, here)),
+    )
+
+
+def _term(node: Node, here: Expressions) -> tuple[Term, ...]:
+    """One performance term."""
+    reader = here.reader
+    found = reader.fields(node, "a term", TERM_KEYS, required=("expr",))
+    name = reader.text(found.get("name"), "`name` of a term") or written(found.get("expr"))
+    weight = reader.number(found.get("weight"), "`weight`")
+    value = here.number(found.get("expr"), f"the term `{name}`")
+    return () if value is None else (Term(name, 1.0 if weight is None else weight, value.num),)
+
+
+def read_policy(node: Node | None, reader: Reader, names: Names) -> PolicyDecl:
+    """The section `policy`."""
+    found = reader.fields(node, "`policy`", POLICY_KEYS)
+    default = PolicyDecl()
+    here = names.expressions(reader)
+    seen = reader.items(found.get("observe"), "`observe`")
+    numbers = [here.truth(item, "an observation") for item in seen]
+    return PolicyDecl(
+        reader.option(found.get("type"), "`type` of the policy", POLICIES) or default.type,
+        _integers(found.get("hidden"), "`hidden`", reader) or default.hidden,
+        tuple(number for number in numbers if number is not None),
+        tuple(written(item) for item in seen),
+    )
+
+
+def read_train(node: Node | None, reader: Reader, names: Names) -> TrainDecl:
+    """The section `train`: defaults that the command line overrides."""
+    found = reader.fields(node, "`train`", TRAIN_KEYS)
+    budget = names.expressions(reader).duration(found["budget"], "`budget`") if "budget" in found else None
+    return TrainDecl(
+        None if budget is None else float(budget),
+        reader.integer(found.get("steps"), "`steps`"),
+        reader.integer(found.get("seed"), "`seed`", low=0) or 0,
+        reader.number(found.get("lr"), "`lr`", low=1e-12),
+        reader.integer(found.get("batch"), "`batch`"),
+        reader.integer(found.get("samples"), "`samples`"),
+        reader.option(found.get("method"), "`method`", METHODS),
+    )
+
+
+def read_backup(node: Node | None, reader: Reader, horizon: int) -> BackupDecl:
+    """The section `backup`."""
+    found = reader.fields(node, "`backup`", BACKUP_KEYS)
+    default = BackupDecl()
+    lengths = _integers(found.get("T0"), "`T0`", reader) or default.lengths
+    if "T0" in found and max(lengths) > horizon:
+        reader.report("S103", f"`T0` goes beyond the horizon of {horizon} steps", found["T0"].span)
+    return BackupDecl(
+        reader.integer(found.get("bins"), "`bins`", low=2) or default.bins,
+        tuple(length for length in lengths if length <= horizon),
+        reader.integer(found.get("batch"), "`batch`") or default.batch,
+    )
+
+
+def _integers(node: Node | None, where: str, reader: Reader) -> tuple[int, ...]:
+    """A list of positive whole numbers; one alone counts as a list."""
+    if isinstance(node, Scalar):
+        only = reader.integer(node, where)
+        return () if only is None else (only,)
+    found = [reader.integer(item, f"an entry of {where}") for item in reader.items(node, where)]
+    return tuple(value for value in found if value is not None)

@@ -1,0 +1,99 @@
+"""The section `test`: a deployment, its events, and the world that may take their place."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Literal
+
+from stlc.compile import ir
+from stlc.compile.scope import Known
+from stlc.compile.values import Number
+from stlc.dynamics.decl import EventDecl, TestDecl, WorldRef
+from stlc.dynamics.schema_expressions import SECOND, Expressions, written
+from stlc.dynamics.schema_flow import read_sets
+from stlc.dynamics.schema_names import Names
+from stlc.dynamics.schema_reader import Reader
+from stlc.dynamics.yaml_nodes import Node
+from stlc.grammar import ast
+
+TEST_KEYS = ("steps", "agents", "replan", "events", "metrics", "world")
+EVENT_KEYS = ("name", "when", "at", "every", "set")
+METRICS = ("stl_accuracy", "safety", "progress", "latency")
+Edge = Literal["rise", "fall"]
+
+
+def read_test(node: Node | None, reader: Reader, names: Names, dt: Fraction) -> TestDecl:
+    """The section `test`."""
+    found = reader.fields(node, "`test`", TEST_KEYS)
+    default = TestDecl()
+    clock = Known(Number(ir.Col("t"), SECOND), "seconds since the start of the deployment")
+    here = names.expressions(reader).extended({"t": clock} if "t" not in names.places else {}, samplers=True)
+    steps = here.steps(found["steps"], "`steps`", dt) if "steps" in found else None
+    metrics = [
+        reader.option(item, "a metric", METRICS) for item in reader.items(found.get("metrics"), "`metrics`")
+    ]
+    items = reader.items(found.get("events"), "`events`")
+    return TestDecl(
+        steps or default.steps,
+        reader.integer(found.get("agents"), "`agents`") or default.agents,
+        reader.integer(found.get("replan"), "`replan`") or default.replan,
+        tuple(_event(item, index, here, names, dt) for index, item in enumerate(items)),
+        tuple(metric for metric in metrics if metric),
+        _world(found.get("world"), reader),
+    )
+
+
+def _event(node: Node, index: int, here: Expressions, names: Names, dt: Fraction) -> EventDecl:
+    """One event: exactly one of `when`, `at` and `every`."""
+    reader = here.reader
+    found = reader.fields(node, "an event", EVENT_KEYS, required=("set",))
+    name = reader.text(found.get("name"), "`name` of an event") or f"event {index + 1}"
+    triggers = [key for key in ("when", "at", "every") if key in found]
+    if len(triggers) != 1:
+        first = node.span.source.span(node.span.start, node.span.start + max(node.span.text.find("\n"), 1))
+        reader.report("S102", f"the event `{name}` needs one of `when`, `at` and `every`", first)
+    when, edge = _condition(found.get("when"), here)
+    return EventDecl(
+        name,
+        read_sets(found.get("set"), "`set`", here, names),
+        when,
+        edge,
+        _moment(found.get("at"), here, dt),
+        here.steps(found["every"], "`every`", dt) if "every" in found else None,
+    )
+
+
+def _moment(node: Node | None, here: Expressions, dt: Fraction) -> int | None:
+    """A step of the deployment; 0 is its start."""
+    if node is None:
+        return None
+    if written(node) in {"0", "0 s", "0 steps"}:
+        return 0
+    return here.steps(node, "`at`", dt)
+
+
+def _condition(node: Node | None, here: Expressions) -> tuple[ir.Formula | None, Edge | None]:
+    """A state formula, or `rise(…)`, `fall(…)` of one."""
+    expr = here.parse(node, "`when`") if node is not None else None
+    match expr:
+        case None:
+            return None, None
+        case ast.Call(_, ast.Name(_, "rise"), (ast.Arg(_, None, value),)):
+            return here.formula_of(value), "rise"
+        case ast.Call(_, ast.Name(_, "fall"), (ast.Arg(_, None, value),)):
+            return here.formula_of(value), "fall"
+        case _:
+            return here.formula_of(expr), None
+
+
+def _world(node: Node | None, reader: Reader) -> WorldRef | None:
+    """`file.py:Class`, relative to the system file."""
+    text = reader.text(node, "`world`")
+    if node is None or text is None:
+        return None
+    file, _, name = text.rpartition(":")
+    if not file.endswith(".py") or not name.isidentifier():
+        reader.wrong(node, "`world`", "a Python file and a class", "write `traffic_grid.py:TrafficGrid`")
+        return None
+    return WorldRef(Path(node.span.source.name).parent / file, name, node.span)

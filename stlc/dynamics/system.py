@@ -1,0 +1,268 @@
+"""A declaration becomes something that steps: states as tensors, hybrid dynamics, initial states, objective."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from stlc.compile import ir
+from stlc.compile.arith import Program
+from stlc.compile.ops_torch import TORCH
+from stlc.compile.switch import Hard, Switch
+from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.dynamics.algebra import add, multiply, names_in
+from stlc.dynamics.decl import ControlDecl, SystemDecl
+from stlc.dynamics.rollout import Columns, Stepper
+from stlc.dynamics.samplers import InitialStates
+from stlc.dynamics.schema import load_system_decl
+from stlc.dynamics.step import build_step
+from stlc.files import find_system
+from stlc.signature import Signature
+
+HARD = Hard()
+
+
+class System:
+    """A controlled hybrid system in discrete time (the paper's Eq. 1 and 6).
+
+    Tensors are float32 or float64 on any device; dtype and device follow the input. `B` is the batch, `T` the
+    number of steps, `n` the number of states, `m` the number of controls.
+
+    Attributes:
+        decl: the declaration.
+    """
+
+    def __init__(self, decl: SystemDecl) -> None:
+        self.decl = decl
+        self.initial = InitialStates(decl.init, decl.signature.names)
+        self._steppers: dict[bool, Stepper] = {}
+
+    @classmethod
+    def load(cls, path: Path | str, overrides: Mapping[str, str] | None = None) -> System:
+        """The system of a file, or of the name of one that `stlc.files.find_system` finds.
+
+        Raises UsageError where there is none, SystemFileError where it is invalid.
+        """
+        return cls(load_system_decl(find_system(str(path)), overrides or {}))
+
+    # ---------------------------------------------------------------- description
+
+    @property
+    def name(self) -> str:
+        """As written in the file."""
+        return self.decl.name
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of the file's text and of what was overridden."""
+        return self.decl.hash
+
+    @property
+    def signature(self) -> Signature:
+        """The state columns, in order."""
+        return self.decl.signature
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the state columns."""
+        return self.decl.signature.names
+
+    @cached_property
+    def dt(self) -> float:
+        """Length of a step in seconds."""
+        return float(self.decl.dt)
+
+    @property
+    def horizon(self) -> int:
+        """Steps of a plan."""
+        return self.decl.horizon
+
+    @property
+    def controls(self) -> tuple[ControlDecl, ...]:
+        """The inputs."""
+        return self.decl.controls
+
+    @cached_property
+    def control_names(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return tuple(control.name for control in self.controls)
+
+    @cached_property
+    def control_low(self) -> Tensor:
+        """Lower ends of the control ranges, (m,)."""
+        return torch.tensor([control.low for control in self.controls], dtype=torch.float32)
+
+    @cached_property
+    def control_high(self) -> Tensor:
+        """Upper ends of the control ranges, (m,)."""
+        return torch.tensor([control.high for control in self.controls], dtype=torch.float32)
+
+    @property
+    def observed_count(self) -> int:
+        """Numbers that the policy sees."""
+        return len(self.decl.policy.observe) or len(self.names)
+
+    # -------------------------------------------------------------------- motion
+
+    def step(self, x: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
+        """One step: (B, n), (B, m) -> (B, n)."""
+        moved = self._stepper(switch).step(self._named(x), self._inputs(u), switch)
+        return torch.stack([moved[name] for name in self.names], 1)
+
+    def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
+        """Many steps: (B, n), (B, T, m) -> (B, T+1, n), the initial state first."""
+        columns = self.rollout_columns(x0, u, switch)
+        return torch.stack([columns[name].t() for name in self.names], 2)
+
+    def rollout_columns(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Columns:
+        """The same as (T+1, B) columns by name; columns that never change are expanded views."""
+        if x0.shape[1:] != (len(self.names),) or u.shape[2:] != (len(self.controls),) or len(x0) != len(u):
+            raise ValueError(
+                f"{self.name} takes x0 (B, {len(self.names)}) and u (B, T, {len(self.controls)}),"
+                f" not {tuple(x0.shape)} and {tuple(u.shape)}"
+            )
+        start = dict(zip(self.names, x0.t().contiguous().unbind(0), strict=True))
+        inputs = dict(zip(self.control_names, u.permute(2, 1, 0).contiguous().unbind(0), strict=True))
+        return self._stepper(switch).rollout(start, inputs, u.shape[1], switch)
+
+    def _stepper(self, switch: Switch) -> Stepper:
+        soft = not switch.exact
+        if soft not in self._steppers:
+            self._steppers[soft] = Stepper(build_step(self.decl, soft=soft))
+        return self._steppers[soft]
+
+    def _named(self, x: Tensor) -> Columns:
+        return dict(zip(self.names, x.unbind(-1), strict=True))
+
+    def _inputs(self, u: Tensor) -> Columns:
+        return dict(zip(self.control_names, u.unbind(-1), strict=True))
+
+    # ------------------------------------------------------------------- sampling
+
+    def sample(
+        self,
+        n: int,
+        *,
+        seed: int | None = None,
+        generator: torch.Generator | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
+    ) -> Tensor:
+        """Initial states, (n, dim). The same seed gives the same states, whatever the dtype.
+
+        Raises SystemFileError (S301) where `where` rejects (nearly) everything.
+        """
+        if generator is None:
+            generator = torch.Generator()
+            if seed is None:
+                generator.seed()
+            else:
+                generator.manual_seed(seed)
+        return self.initial.sample(n, generator).to(device=device, dtype=dtype)
+
+    # -------------------------------------------------------------- policy, objective
+
+    def observe(self, x: Tensor) -> Tensor:
+        """What the policy sees: (…, n) -> (…, k)."""
+        if self._observation is None:
+            return x
+        seen = self._observation(self._named(x), TORCH, HARD)
+        return torch.stack([seen[str(i)].expand(x.shape[:-1]) for i in range(self.observed_count)], -1)
+
+    @cached_property
+    def _observation(self) -> Program | None:
+        observe = self.decl.policy.observe
+        return Program({str(i): num for i, num in enumerate(observe)}) if observe else None
+
+    def performance(
+        self,
+        columns: Mapping[str, Tensor],
+        sat: Tensor,
+        rho: Tensor | None = None,
+        u: Tensor | None = None,
+        switch: Switch = HARD,
+    ) -> Tensor:
+        """The weighted performance terms of the objective, mean over time: (B,), differentiable.
+
+        Args:
+            columns: states over time, (T+1, B) each.
+            sat: 1 where the trajectory satisfies the specification, (B,); its gradient is not followed.
+            rho: robustness, (B,), for terms that name it; 0 if left out.
+            u: controls, (B, T, m), for terms that name one; such a term is the mean over the T steps.
+            switch: how `ind(…)` in a term becomes a number.
+        """
+        like = next(iter(columns.values()))
+        sat = sat.detach().to(like.dtype)
+        rho = torch.zeros_like(sat) if rho is None else rho
+        states, controlled = self._terms
+        total = self._mean(states, columns, sat, rho, switch)
+        if controlled is None:
+            return total
+        if u is None:
+            raise ValueError(f"the objective of {self.name} needs the controls")
+        inputs = dict(zip(self.control_names, u.permute(2, 1, 0), strict=True))
+        before = {name: column[:-1] for name, column in columns.items()}
+        return total + self._mean(controlled, {**before, **inputs}, sat, rho, switch)
+
+    def _mean(
+        self, program: Program | None, columns: Mapping[str, Tensor], sat: Tensor, rho: Tensor, switch: Switch
+    ) -> Tensor:
+        """Mean over time of a program's output, (B,)."""
+        if program is None:
+            return torch.zeros_like(sat)
+        like = next(iter(columns.values()))
+        k = torch.arange(len(like), dtype=like.dtype, device=like.device)[:, None]
+        env = {"k": k, "t": k * self.dt, "sat": sat, "rho": rho, **columns}
+        cost: Tensor = program(env, TORCH, switch)["cost"]
+        return cost.expand(len(like), len(sat)).mean(0)
+
+    @cached_property
+    def _terms(self) -> tuple[Program | None, Program | None]:
+        """The sum of the terms over states, and of those that read a control."""
+        sums: list[ir.Num | None] = [None, None]
+        for term in self.decl.objective.terms:
+            if term.weight:
+                kind = bool(names_in(term.value) & set(self.control_names))
+                value = multiply(ir.Lit(term.weight), term.value)
+                before = sums[kind]
+                sums[kind] = value if before is None else add(before, value)
+        states, controlled = (None if total is None else Program({"cost": total}) for total in sums)
+        return states, controlled
+
+    # -------------------------------------------------------------------- health
+
+    def require_finite(self, x: Tensor) -> None:
+        """Raise SystemFileError (S302) where states (…, n) hold NaN or infinity."""
+        bad = ~torch.isfinite(x.detach())
+        if not bool(bad.any()):
+            return
+        hit = [name for name, column in zip(self.names, bad.unbind(-1), strict=True) if bool(column.any())]
+        place = self.decl.places.get(hit[0])
+        listed = ", ".join(f"`{name}`" for name in hit)
+        raise SystemFileError(
+            Diagnostic(
+                "S302",
+                f"the dynamics of {self.name} give NaN or infinity in {listed}",
+                place,
+                label="declared here",
+                help=("clamp the state, shorten the step, or keep divisors away from 0",),
+            )
+        )
+
+    def probe(self, n: int = 256, *, seed: int = 0) -> tuple[Diagnostic, ...]:
+        """Try the system: initial states, random plans, their gradients; warnings come back.
+
+        Raises SystemFileError where states cannot be drawn (S301) or are not finite (S302).
+        """
+        x0 = self.sample(n, seed=seed, dtype=torch.float64)
+        self.require_finite(x0)
+        generator = torch.Generator().manual_seed(seed)
+        shape = (n, self.horizon, len(self.controls))
+        low, high = self.control_low.double(), self.control_high.double()
+        u = low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
+        self.require_finite(self.rollout(x0, u))
+        return (*self.decl.warnings, *self.initial.warnings())

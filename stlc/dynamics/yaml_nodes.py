@@ -1,0 +1,339 @@
+"""YAML with marks, strict and safe: every key and value knows where it stands in the file.
+
+Built on the event stream of PyYAML, so no object is ever constructed from a tag, aliases share one
+node instead of being copied, and depth and size are bounded while reading. Scalars stay text: what a
+text means is decided by whoever reads the field, with the rules of YAML 1.2 (`1e-3` is a number, `on`
+and `yes` are words, `012` is twelve, `12:30` is a word).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
+
+import yaml
+
+from stlc.diagnostics import Diagnostic, Label, SystemFileError
+from stlc.source import Source, Span
+
+MAX_DEPTH = 40
+MAX_NODES = 20_000
+MERGE_KEY = "<<"
+
+Style: TypeAlias = Literal["plain", "single", "double", "block"]
+_STYLES: dict[str | None, Style] = {
+    None: "plain",
+    "": "plain",
+    "'": "single",
+    '"': "double",
+    "|": "block",
+    ">": "block",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Scalar:
+    """A text.
+
+    Attributes:
+        span: of the text as it stands in the file, quotes included.
+        text: the value, quotes and escapes undone.
+        style: how it was written.
+    """
+
+    span: Span
+    text: str
+    style: Style = "plain"
+    size: int = field(default=1, compare=False, repr=False)
+
+    @property
+    def inside(self) -> Span:
+        """Where the characters of the value stand: the span without quotes or block header."""
+        match self.style:
+            case "plain":
+                return self.span
+            case "block":
+                header = self.span.text.find("\n") + 1
+                return Span(self.span.source, self.span.start + header, self.span.end)
+            case _:
+                return Span(self.span.source, self.span.start + 1, self.span.end - 1)
+
+    @property
+    def escaped(self) -> bool:
+        """Whether the value is spelled differently from what stands between the quotes."""
+        inside = self.inside.text
+        return "\\" in inside if self.style == "double" else self.style == "single" and "''" in inside
+
+    @property
+    def is_null(self) -> bool:
+        """Whether this is nothing at all: an empty value, `~` or `null`."""
+        return self.style == "plain" and self.text in {"", "~", "null", "Null", "NULL"}
+
+
+@dataclass(frozen=True, slots=True)
+class Sequence:
+    """A list, in block or flow style."""
+
+    span: Span
+    items: tuple[Node, ...]
+    size: int = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One `key: value`."""
+
+    key: Scalar
+    value: Node
+
+
+@dataclass(frozen=True, slots=True)
+class Mapping:
+    """Keys and values in order, merge keys (`<<`) resolved."""
+
+    span: Span
+    entries: tuple[Entry, ...]
+    size: int = field(compare=False, repr=False)
+
+    def get(self, key: str) -> Node | None:
+        """The value of `key`, or None."""
+        return next((entry.value for entry in self.entries if entry.key.text == key), None)
+
+    def replaced(self, key: Scalar, value: Node) -> Mapping:
+        """The same mapping with `key` set to `value` (appended when it is new)."""
+        entry = Entry(key, value)
+        if self.get(key.text) is None:
+            entries = (*self.entries, entry)
+        else:
+            entries = tuple(entry if old.key.text == key.text else old for old in self.entries)
+        return Mapping(self.span, entries, self.size + value.size)
+
+
+Node: TypeAlias = Scalar | Sequence | Mapping
+
+# ------------------------------------------------------------- meaning of plain scalars
+
+_TRUE = frozenset({"true", "True", "TRUE"})
+_FALSE = frozenset({"false", "False", "FALSE"})
+_INT = re.compile(r"[-+]?[0-9]+\Z")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\Z")
+
+
+def as_bool(node: Scalar) -> bool | None:
+    """`true` or `false`, else None."""
+    if node.style != "plain":
+        return None
+    return True if node.text in _TRUE else False if node.text in _FALSE else None
+
+
+def as_int(node: Scalar) -> int | None:
+    """A decimal whole number, else None."""
+    return int(node.text) if node.style == "plain" and _INT.match(node.text) else None
+
+
+def as_float(node: Scalar) -> float | None:
+    """A finite decimal number, else None (`.nan` and `.inf` are refused)."""
+    return float(node.text) if node.style == "plain" and _FLOAT.match(node.text) else None
+
+
+# ---------------------------------------------------------------------------- reading
+
+
+def load_yaml(source: Source, *, sink: list[Diagnostic]) -> Mapping:
+    """The one document of `source`, which must be a mapping.
+
+    Keys that are given twice are appended to `sink` as S102; the first one counts.
+    Raises SystemFileError (S100) where there is no such document, or one that is not safe to read.
+    """
+    node = load_node(source, sink=sink)
+    if node is None or (isinstance(node, Scalar) and node.is_null):
+        raise SystemFileError(
+            Diagnostic(
+                "S100",
+                f"`{source.name}` is empty",
+                source.span(0, min(1, len(source.text))),
+                help=("a system file starts with `stlc: 1` and `name: …`",),
+            )
+        )
+    if not isinstance(node, Mapping):
+        start = node.span.start
+        stop = min(node.span.end, source.text.find("\n", start) % (len(source.text) + 1))
+        raise SystemFileError(
+            Diagnostic(
+                "S100",
+                f"`{source.name}` is not a mapping of keys to values",
+                source.span(start, max(stop, start + 1)),
+                help=("a system file consists of lines `key: value`",),
+            )
+        )
+    return node
+
+
+def load_node(source: Source, *, sink: list[Diagnostic]) -> Node | None:
+    """The one node of `source`, of any kind; None when there is no document."""
+    builder = _Builder(source, sink)
+    try:
+        return builder.document()
+    except yaml.MarkedYAMLError as error:
+        raise SystemFileError(_syntax(source, error)) from None
+    except yaml.reader.ReaderError as error:
+        offset = min(int(error.position), len(source.text))
+        char = source.text[offset : offset + 1]
+        raise SystemFileError(
+            Diagnostic(
+                "S100",
+                f"a character that YAML does not allow: U+{ord(char or chr(0)):04X}",
+                source.span(offset, offset + 1),
+            )
+        ) from None
+
+
+def _syntax(source: Source, error: yaml.MarkedYAMLError) -> Diagnostic:
+    """PyYAML's complaint as a diagnostic."""
+    mark = error.problem_mark or error.context_mark
+    offset = min(mark.index if mark else 0, max(len(source.text) - 1, 0))
+    labels: tuple[Label, ...] = ()
+    if error.context and error.context_mark and error.context_mark.index < offset:
+        start = error.context_mark.index
+        labels = (Label(source.span(start, start + 1), error.context),)
+    problem = (error.problem or error.context or "cannot be read").replace("'\\t'", "a tab")
+    helps = ("indent with blanks",) if "\t" in source.text[offset : offset + 1] else ()
+    return Diagnostic(
+        "S100", f"not YAML: {problem}", source.span(offset, offset + 1), labels=labels, help=helps
+    )
+
+
+class _Builder:
+    """Events to nodes, one document, bounded."""
+
+    def __init__(self, source: Source, sink: list[Diagnostic]) -> None:
+        self.source = source
+        self.sink = sink
+        self.events: Iterator[Any] = iter(yaml.parse(source.text, Loader=yaml.SafeLoader))
+        self.anchors: dict[str, Node | None] = {}
+        self.read = 0
+
+    def document(self) -> Node | None:
+        """The node of the only document."""
+        root: Node | None = None
+        documents = 0
+        for event in self.events:
+            if isinstance(event, yaml.DocumentStartEvent):
+                documents += 1
+                if documents > 1:
+                    raise self.refuse(event, "a second YAML document in one file")
+                root = self.node(next(self.events), 0)
+        return root
+
+    def refuse(self, event: Any, message: str, *help_: str) -> SystemFileError:
+        """An S100 at the place of an event."""
+        return SystemFileError(Diagnostic("S100", message, self.span(event), help=help_))
+
+    def span(self, event: Any) -> Span:
+        """Where an event stands, trailing blanks cut off."""
+        start, end = event.start_mark.index, event.end_mark.index
+        end = start + len(self.source.text[start:end].rstrip())
+        return self.source.span(start, max(end, min(start + 1, len(self.source.text))))
+
+    def node(self, event: Any, depth: int) -> Node:
+        """The node that starts with `event`."""
+        self.read += 1
+        if depth > MAX_DEPTH:
+            raise self.refuse(event, f"nested more than {MAX_DEPTH} levels deep")
+        if self.read > MAX_NODES:
+            raise self.refuse(event, f"more than {MAX_NODES} values in one file")
+        if isinstance(event, yaml.AliasEvent):
+            return self.alias(event)
+        if event.tag is not None:
+            raise self.refuse(event, f"a tag, `{event.tag}`: tags are not read", "write plain values")
+        if event.anchor is not None:
+            self.anchors[event.anchor] = None
+        node = self.collection(event, depth)
+        if node.size > MAX_NODES:
+            raise self.refuse(event, f"aliases that expand to more than {MAX_NODES} values")
+        if event.anchor is not None:
+            self.anchors[event.anchor] = node
+        return node
+
+    def collection(self, event: Any, depth: int) -> Node:
+        """A scalar, a sequence or a mapping."""
+        if isinstance(event, yaml.ScalarEvent):
+            span = self.span(event) if event.value or event.style else self.here(event)
+            return Scalar(span, event.value, _STYLES[event.style])
+        if isinstance(event, yaml.SequenceStartEvent):
+            return self.sequence(event, depth)
+        return self.mapping(event, depth)
+
+    def here(self, event: Any) -> Span:
+        """The empty place of a value that is not there."""
+        index = event.start_mark.index
+        return self.source.span(index, index)
+
+    def alias(self, event: Any) -> Node:
+        """The node that an alias names."""
+        node = self.anchors.get(event.anchor)
+        if node is None:
+            inside = event.anchor in self.anchors
+            problem = "stands inside the value that it names" if inside else "names no anchor"
+            raise self.refuse(event, f"the alias `*{event.anchor}` {problem}")
+        return node
+
+    def sequence(self, start: Any, depth: int) -> Sequence:
+        """Items up to the end of the sequence."""
+        items: list[Node] = []
+        while not isinstance(event := next(self.events), yaml.SequenceEndEvent):
+            items.append(self.node(event, depth + 1))
+        span = self.whole(start, event)
+        return Sequence(span, tuple(items), 1 + sum(item.size for item in items))
+
+    def mapping(self, start: Any, depth: int) -> Mapping:
+        """Entries up to the end of the mapping; merged ones behind the ones written here."""
+        written: dict[str, Entry] = {}
+        merged: dict[str, Entry] = {}
+        while not isinstance(event := next(self.events), yaml.MappingEndEvent):
+            key = self.node(event, depth + 1)
+            if not isinstance(key, Scalar):
+                raise self.refuse(event, "a key that is not a word")
+            value = self.node(next(self.events), depth + 1)
+            if key.text == MERGE_KEY and key.style == "plain":
+                for entry in self.merge(key, value):
+                    merged.setdefault(entry.key.text, entry)
+            elif key.text in written:
+                self.duplicate(key, written[key.text].key)
+            else:
+                written[key.text] = Entry(key, value)
+        kept = tuple(written.get(name, entry) for name, entry in merged.items())
+        entries = (*kept, *(entry for name, entry in written.items() if name not in merged))
+        size = 1 + sum(1 + entry.value.size for entry in entries)
+        return Mapping(self.whole(start, event), entries, size)
+
+    def merge(self, key: Scalar, value: Node) -> tuple[Entry, ...]:
+        """The entries that `<<` brings in."""
+        if isinstance(value, Mapping):
+            return value.entries
+        if isinstance(value, Sequence) and all(isinstance(item, Mapping) for item in value.items):
+            return tuple(entry for item in value.items if isinstance(item, Mapping) for entry in item.entries)
+        raise SystemFileError(
+            Diagnostic("S100", "`<<` merges mappings; this is none", key.span.to(value.span))
+        )
+
+    def duplicate(self, key: Scalar, first: Scalar) -> None:
+        """Remember a key that stands twice in one mapping."""
+        self.sink.append(
+            Diagnostic(
+                "S102",
+                f"the key `{key.text}` is given twice",
+                key.span,
+                label="given again",
+                labels=(Label(first.span, "given first"),),
+                help=("remove one of the two",),
+            )
+        )
+
+    def whole(self, start: Any, end: Any) -> Span:
+        """From the start event to the end event of a collection, trailing blanks cut off."""
+        first, last = start.start_mark.index, end.end_mark.index
+        last = first + len(self.source.text[first:last].rstrip())
+        return self.source.span(first, max(last, first + 1))
