@@ -27,7 +27,7 @@ class Time:
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """Bounds of a temporal operator; `hi` None means to the end of the trace (`end`, `inf`, nothing written)."""
+    """Bounds of a temporal operator; `hi` None means to the end of the trace (`end`, `inf` or nothing)."""
 
     lo: Time
     hi: Time | None
@@ -53,10 +53,11 @@ class Truth(Node):
 
 @dataclass(frozen=True, slots=True)
 class Pred(Node):
-    """`num > 0` (`strict`) or `num >= 0`."""
+    """`num > 0` (`strict`) or `num >= 0`; a `guard` decides truth and never limits the margin."""
 
     num: ir.Num
     strict: bool
+    guard: bool = False
 
 
 @dataclass(frozen=True, slots=True)
