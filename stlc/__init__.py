@@ -20,6 +20,7 @@ from stlc.version import __version__
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from stlc.controller.launch import train_here as train
     from stlc.controller.run import Run
     from stlc.controller.task import Task
     from stlc.diagnostics import SpecError, StlcError
@@ -50,20 +51,22 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Monitor": "stlc.monitor.verdict",
-    "Run": "stlc.controller.run",
-    "SpecError": "stlc.diagnostics",
-    "StlcError": "stlc.diagnostics",
-    "System": "stlc.dynamics.system",
-    "Task": "stlc.controller.task",
-    "Trace": "stlc.trace",
+    "Monitor": "stlc.monitor.verdict:Monitor",
+    "Run": "stlc.controller.run:Run",
+    "SpecError": "stlc.diagnostics:SpecError",
+    "StlcError": "stlc.diagnostics:StlcError",
+    "System": "stlc.dynamics.system:System",
+    "Task": "stlc.controller.task:Task",
+    "Trace": "stlc.trace:Trace",
+    "train": "stlc.controller.launch:train_here",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'stlc' has no attribute '{name}'")
-    value = getattr(import_module(_HOMES[name]), name)
+    module, _, attribute = _HOMES[name].partition(":")
+    value = getattr(import_module(module), attribute)
     globals()[name] = value
     return value
 

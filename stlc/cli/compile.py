@@ -1,0 +1,123 @@
+"""`stlc compile`: what the solver sees of a specification."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from stlc.cli.options import JsonOption, SetOption, SystemOption, describe, parse_overrides
+from stlc.cli.output import emit, emit_json, say, show_diagnostics
+
+if TYPE_CHECKING:
+    from stlc.compile.pipeline import Compiled, Rule
+    from stlc.dynamics.decl import SystemDecl
+
+Part = Literal["all", "steps", "states", "ir"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command(
+        "compile",
+        help=describe(
+            "Show what the solver sees of a specification.",
+            "stlc compile specs/traffic.stl",
+            "stlc compile specs/traffic.stl --system car.yaml --set T_red=3s --show ir",
+            note="Each interval in seconds and in steps, added states, the safety part, the horizon.",
+        ),
+    )(compile_)
+
+
+def compile_(
+    spec: Annotated[Path, typer.Argument(metavar="SPEC", help="The specification, a .stl file.")],
+    system: SystemOption = None,
+    set_: SetOption = None,
+    show: Annotated[Part, typer.Option("--show", help="One part only.")] = "all",
+    as_json: JsonOption = False,
+) -> None:
+    """Compile `spec` for a system and print the result."""
+    from stlc.compile.dump import dump
+
+    compiled, decl = _compiled(spec, system, parse_overrides(set_))
+    if as_json:
+        result = _result(compiled, decl)
+        emit_json("compile/1", ok=True, exit_code=0, diagnostics=compiled.warnings, result=result)
+        return
+    say(f"system {decl.path}")
+    show_diagnostics(compiled.warnings)
+    emit(dump(compiled, show).rstrip("\n"))
+
+
+def _compiled(path: Path, system: str | None, overrides: Mapping[str, str]) -> tuple[Compiled, SystemDecl]:
+    """Read both files and run the compiler; torch is not needed."""
+    from stlc.compile.interface import Grid
+    from stlc.compile.pipeline import compile_spec
+    from stlc.diagnostics import Diagnostic, UsageError
+    from stlc.dynamics.schema import load_system_decl
+    from stlc.files import find_system, read_source
+    from stlc.grammar.parser import parse
+
+    spec = parse(read_source(path))
+    wanted = system or spec.system
+    if wanted is None:
+        raise UsageError(
+            Diagnostic(
+                "U101",
+                f"`{path}` names no system",
+                help=(f"stlc compile {path} --system FILE", 'or a line `system "FILE"` in the specification'),
+            )
+        )
+    decl = load_system_decl(find_system(wanted, path), overrides)
+    grid = Grid(decl.dt, decl.horizon)
+    return compile_spec(spec, grid=grid, interface=decl.interface(), overrides=overrides), decl
+
+
+def _result(compiled: Compiled, decl: SystemDecl) -> dict[str, Any]:
+    from stlc.provenance import sha256
+
+    steps = compiled.grid.horizon or 0
+    source = compiled.spec.source
+    return {
+        "spec": source.name,
+        "spec_sha256": sha256(source.text),
+        "system": str(decl.path),
+        "dt": float(decl.dt),
+        "horizon": {"seconds": float(decl.dt * steps), "steps": steps},
+        "states": [*decl.signature.names, *(timer.name for timer in compiled.timers)],
+        "added": [{"name": timer.name, "saturation": timer.saturation} for timer in compiled.timers],
+        "safety": [rule.name for rule in compiled.safety],
+        "requirements": [_requirement(rule, float(decl.dt)) for rule in compiled.requirements],
+    }
+
+
+def _requirement(rule: Rule, dt: float) -> dict[str, Any]:
+    return {
+        "name": rule.name,
+        "doc": rule.doc,
+        "tags": sorted(rule.tags),
+        "weight": rule.weight,
+        "scale": rule.scale,
+        "reach": {"seconds": rule.reach * dt, "steps": rule.reach},
+        "intervals": list(_intervals(rule, dt)),
+    }
+
+
+def _intervals(rule: Rule, dt: float) -> Iterator[dict[str, Any]]:
+    """The windows of a compiled formula; an upper end of None is the end of the trace."""
+    from stlc.compile import ir
+    from stlc.compile.horizon import nodes
+
+    for node in nodes(rule.formula):
+        if not isinstance(node, ir.Over | ir.Past | ir.Until | ir.Since):
+            continue
+        steps = (node.window.lo, node.window.hi)
+        yield {
+            "operator": node.op,
+            "steps": steps,
+            "seconds": [None if step is None else step * dt for step in steps],
+            "written": node.span.text if node.span else "",
+            "line": node.span.line if node.span else None,
+        }
