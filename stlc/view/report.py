@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stlc import __version__
 from stlc.files import write_atomic
 from stlc.rundir import RunDir
+from stlc.version import __version__
 from stlc.view import require_drawing
 from stlc.view.closing import failures_section, repeat_section, texts_section
 from stlc.view.deployment import deployment_section, deployment_tiles, film_section
