@@ -8,120 +8,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from fractions import Fraction
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
-from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar import ast
-from stlc.grammar.words import BINARY_TEMPORAL, BUILT_IN, UNARY_TEMPORAL
-from stlc.registry import closest
-from stlc.source import Source, Span
-from stlc.units import SYMBOLS, parse_unit
+from stlc.grammar.tokens import Context, Leaf, name_of, number_of, own_name, unit_of
+from stlc.grammar.words import BINARY_TEMPORAL, UNARY_TEMPORAL
+from stlc.source import Span
 
-MAX_DIGITS = 400
-_LARGEST = Fraction(1.7976931348623157e308)
-_MANTISSA = re.compile(r"([^eE]*)(?:[eE]([+-]?\d+))?")
 _WORD = re.compile(r"[A-Za-z]+")
 
-
-@dataclass(frozen=True, slots=True)
-class Leaf:
-    """A token: the name of its terminal, its text and its place."""
-
-    kind: str
-    text: str
-    span: Span
-
-
-@dataclass(slots=True)
-class Context:
-    """What a rule may need besides its children.
-
-    Attributes:
-        source: the whole text.
-        findings: what is wrong with well-formed text (a number too large, an unknown unit).
-        documented: offset up to which `##` comments are spoken for.
-    """
-
-    source: Source
-    findings: list[Diagnostic] = field(default_factory=list)
-    documented: int = 0
-
-
 Rule: TypeAlias = Callable[[Context, Span, Sequence[Any]], Any]
-
-# ------------------------------------------------------------------------- tokens
-
-
-def name_of(leaf: Leaf) -> str:
-    """The name that a NAME token writes, without its backticks."""
-    return leaf.text[1:-1] if leaf.text.startswith("`") else leaf.text
-
-
-def own_name(context: Context, leaf: Leaf) -> str:
-    """The name that a declaration gives; `T`, `end` and `dt` only in backticks."""
-    if leaf.text in BUILT_IN:
-        context.findings.append(
-            Diagnostic(
-                "E010",
-                f"`{leaf.text}` is {BUILT_IN[leaf.text]}, not a name of your own",
-                leaf.span,
-                help=(f"choose another name, or write it in backticks: `` `{leaf.text}` ``",),
-                fix=Fix(((leaf.span, f"`{leaf.text}`"),)),
-            )
-        )
-    return name_of(leaf)
-
-
-def unit_of(context: Context, leaf: Leaf | None) -> str:
-    """The unit that a UNIT or UNIT_BRACKET token writes; "" if there is none."""
-    if leaf is None:
-        return ""
-    text = re.sub(r"\s+", "", leaf.text.strip("[]"))
-    if text in ("step", "steps"):
-        return "steps"
-    try:
-        parse_unit(text)
-    except ValueError as error:
-        context.findings.append(_bad_unit(leaf, text, str(error)))
-    return text
-
-
-def _bad_unit(leaf: Leaf, text: str, reason: str) -> Diagnostic:
-    if "," in text:
-        advice: tuple[str, ...] = (f"a range is written `in {leaf.text}`",)
-    else:
-        near = next((found for word in _WORD.findall(text) if (found := _near_unit(word))), None)
-        advice = (f"did you mean `{near}`?",) if near else ()
-    return Diagnostic(
-        "E101", reason, leaf.span, help=advice, note=("a unit is a product of powers: [m/s^2], [1/s], [%]",)
-    )
-
-
-def _near_unit(word: str) -> str | None:
-    return None if word in SYMBOLS else closest(word, SYMBOLS)
-
-
-def number_of(context: Context, leaf: Leaf) -> Fraction:
-    """The exact value of a NUMBER token; E005 and 0 if it is beyond double precision."""
-    match = _MANTISSA.fullmatch(leaf.text)
-    assert match is not None
-    digits, exponent = match[1].replace("_", ""), match[2] or "0"
-    if len(digits) <= MAX_DIGITS and len(exponent) <= 4 and abs(int(exponent)) <= MAX_DIGITS:
-        value = Fraction(digits.rstrip(".") or "0") * Fraction(10) ** int(exponent)
-        if value <= _LARGEST:
-            return value
-    context.findings.append(
-        Diagnostic(
-            "E005",
-            "this number is beyond double precision",
-            leaf.span,
-            note=("the largest is about 1.8e308",),
-        )
-    )
-    return Fraction(0)
 
 
 # -------------------------------------------------------------------------- atoms

@@ -10,10 +10,11 @@ from typing import Any, TypeAlias
 
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
-from stlc.grammar.builder import Context, Leaf, Rule, name_of, number_of, own_name, unit_of
+from stlc.grammar.builder import Rule
+from stlc.grammar.tokens import Context, Leaf, name_of, number_of, own_name, unit_of
 from stlc.source import Source, Span
 
-_DOC = re.compile(r"^[ \t]*##[ \t]?(.*?)[ \t\r]*$", re.MULTILINE)
+_DOC = re.compile(r"^[ \t]*##(?!#)[ \t]?(.*?)[ \t\r]*$", re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True)

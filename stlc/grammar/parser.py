@@ -17,10 +17,11 @@ from lark import Lark, Token, Tree, UnexpectedInput
 
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar import ast, hints
-from stlc.grammar.builder import EXPRESSIONS, Context, Leaf, Rule
+from stlc.grammar.builder import EXPRESSIONS, Rule
 from stlc.grammar.declarations import DECLARATIONS, Item, assemble
 from stlc.grammar.scan import declaration_starts
 from stlc.grammar.stumble import Piece
+from stlc.grammar.tokens import Context, Leaf
 from stlc.grammar.words import PATTERNS
 from stlc.source import Source
 
