@@ -33,18 +33,16 @@ LENGTH_CAR, WIDTH_CAR = 1.0, 0.6
 SIGHT = 10.0  # m: further than this a car sees neither the line nor a leader
 BRAKE = 10.0  # m/s^2
 ALL_RED = 1.5  # s, the c above
-START_SPEED = 5.0
+START_SPEED = 5.0  # m/s
 DIRECTIONS = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])  # east, north, west, south
 LEFT, STRAIGHT, RIGHT = 1, 0, -1
 RADIUS = {LEFT: 0.75 * WIDTH, RIGHT: 0.25 * WIDTH}
 SPAN = {STRAIGHT: WIDTH, LEFT: math.pi / 2 * RADIUS[LEFT], RIGHT: math.pi / 2 * RADIUS[RIGHT]}
 STEP = 0.1  # m: resolution of the conflict tables
 BEFORE = 2.0  # m before the box where the tables begin
-DECIDED = ("policy", "backup", "safest")
-COLOURS: dict[int | str, str] = {
-    **{"road": "#e3e5e8", "line": "#ffffff", "policy": "#2563a8", "backup": "#e08a00", "safest": "#c0267e"},
-    **{-1: "#4a4f57", 0: "#d43d3d", 1: "#2f9e57"},
-}
+ROAD, MARKING = "#e3e5e8", "#ffffff"
+SHOWN = {-1: "#4a4f57", 0: "#d43d3d", 1: "#2f9e57"}  # stop sign, red, green
+DECIDED = ("#2563a8", "#e08a00", "#c0267e")  # policy, backup, safest
 
 
 def right_of(direction: int) -> np.ndarray:
@@ -224,13 +222,17 @@ class TrafficGrid:
         return self._observe()
 
     def progress(self) -> Mapping[str, float]:
-        """Mean speed (m/s), junctions passed, pairs of cars that ever overlapped, smallest gap (m)."""
+        """Mean speed, junctions passed, pairs of cars that ever overlapped, smallest gap."""
         return {
             "mean_speed": self.speeds / max(self.clock * self.agents, 1),
             "junctions_passed": float(sum(car.passed for car in self.cars)),
             "overlapping_pairs": float(len(self.touched)),
             "min_gap": self.min_gap,
         }
+
+    def units(self) -> Mapping[str, str]:
+        """Of entries of `progress`."""
+        return {"mean_speed": "m/s", "min_gap": "m"}
 
     def snapshot(self) -> Mapping[str, np.ndarray]:
         """Poses (agents, 3), junctions (20, 2), and what they show (20, 2) to east-west and north-south cars.
@@ -252,21 +254,21 @@ class TrafficGrid:
         roads += [((left, y), (right, y)) for y in set(places[:, 1])]
         for road in np.array(roads):
             corner, extent = road[0] - WIDTH / 2, road[1] - road[0] + WIDTH
-            axes.add_patch(Rectangle(corner, *extent, color=COLOURS["road"], lw=0))
-            axes.plot(*road.T, color=COLOURS["line"], lw=0.6, dashes=(4, 4), zorder=2)
+            axes.add_patch(Rectangle(corner, *extent, color=ROAD, lw=0))
+            axes.plot(*road.T, color=MARKING, lw=0.6, dashes=(4, 4), zorder=2)
         for place, state in zip(places, shows, strict=True):
-            axes.add_patch(Rectangle(place - WIDTH / 2, WIDTH, WIDTH, color=COLOURS["road"], lw=0, zorder=3))
+            axes.add_patch(Rectangle(place - WIDTH / 2, WIDTH, WIDTH, color=ROAD, lw=0, zorder=3))
             for direction, forward in enumerate(DIRECTIONS):
                 x, y = place - WIDTH * forward
                 if left - 1 < x < right + 1 and bottom - 1 < y < top + 1:
                     line = place - WIDTH / 2 * forward + np.outer((0.06, 0.44), WIDTH * right_of(direction))
-                    axes.plot(*line.T, color=COLOURS[int(state[direction % 2])], lw=2, zorder=4)
+                    axes.plot(*line.T, color=SHOWN[int(state[direction % 2])], lw=2, zorder=4)
         decided = scene["decision"][index] if "decision" in scene else np.zeros(len(scene["pose"][index]))
         for (x, y, angle), source in zip(scene["pose"][index], decided, strict=True):
             cos, sin = math.cos(angle), math.sin(angle)
             turned = np.array([(cos, sin), (-sin, cos)]) * (np.array([[LENGTH_CAR], [WIDTH_CAR]]) * 0.7)
             corners = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) @ turned + (x, y)
-            axes.add_patch(Polygon(corners, color=COLOURS[DECIDED[int(source)]], lw=0, zorder=5))
+            axes.add_patch(Polygon(corners, color=DECIDED[int(source)], lw=0, zorder=5))
         axes.set(xlim=(left - 4, right + 4), ylim=(bottom - 4, top + 4), aspect="equal")
         axes.set_axis_off()
 

@@ -96,8 +96,8 @@ class Backup:
     def search(self, x: Tensor, plan: Tensor) -> Found:
         """Better plans for states whose own plan was found wanting.
 
-        Among plans of the same rank robustness decides, then the performance terms of the objective (robustness
-        is flat where a deadline cannot be met), then closeness to the policy.
+        Among plans of the same rank robustness decides, then the performance terms of the objective, because
+        robustness is flat where a deadline cannot be met, and then closeness to the policy.
 
         Args:
             x: (agents, n) float64.
@@ -140,7 +140,9 @@ class Backup:
         tail = finite(self.policy.plan(reached).to(x.dtype), self.task)
         plans = torch.cat((head, tail[:, : self.task.horizon - head.shape[1]]), 1)
         judged = self.task.judge(x, plans)
-        cost = self.task.system.performance(judged.columns, torch.ones_like(judged.rho))
+        cost = self.task.system.performance(
+            judged.columns, torch.ones_like(judged.rho), rho=judged.rho, u=plans
+        )
         return plans, judged.rho, judged.safe >= -TOLERANCE, cost
 
     def _parts(self, rows: Tensor) -> list[Tensor]:

@@ -36,6 +36,7 @@ class Recording:
         policy_rho: (rows, steps), robustness of what the policy had planned.
         safe: (rows, steps), whether the plan that was followed satisfies phi_safe.
         progress: of each seed.
+        units: of entries of `progress`.
         scene: snapshots of the first seed, stacked over time, and `decision` (frames, agents).
     """
 
@@ -48,6 +49,7 @@ class Recording:
     policy_rho: NDArray[np.float64]
     safe: NDArray[np.bool_]
     progress: tuple[Mapping[str, float], ...]
+    units: Mapping[str, str]
     scene: Mapping[str, NDArray[Any]]
 
     @property
@@ -66,6 +68,7 @@ class Recorder:
     decisions: list[Decision] = field(default_factory=list)
     frames: list[Mapping[str, NDArray[Any]]] = field(default_factory=list)
     progress: tuple[Mapping[str, float], ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def start(self, x: Tensor, world: World) -> None:
         """The first sample."""
@@ -95,6 +98,7 @@ class Recorder:
             torch.stack(self.actions, 1).numpy(force=True),
             **columns,
             progress=self.progress,
+            units=self.units,
             scene=scene,
         )
 
@@ -167,6 +171,7 @@ def drive(
     worlds = _Worlds(guard.task, make, setting)
     x = worlds.reset()
     recorder.start(x, worlds.worlds[0])
+    recorder.units = dict(worlds.worlds[0].units())
     for step in range(setting.steps):
         if step % setting.replan == 0:
             decision = guard.decide(x)

@@ -151,7 +151,7 @@ def latency(guard: Guard, recording: Recording, samples: int = LATENCY_SAMPLES) 
 
 
 def as_json(
-    deployments: Mapping[str, Deployment], setting: Setting, facts: Mapping[str, Any]
+    deployments: Mapping[Mode, Deployment], setting: Setting, facts: Mapping[str, Any]
 ) -> dict[str, Any]:
     """The document of `eval/simulate.json`."""
     return {
@@ -167,6 +167,7 @@ def as_json(
                     key: {"mean": m.mean, "low": m.low, "high": m.high, "values": list(m.values)}
                     for key, m in found.metrics.items()
                 },
+                "units": dict(found.recording.units),
                 "decisions": dict(found.decisions),
                 "latency": {
                     "median": found.latency.median,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
@@ -43,6 +43,9 @@ class World(Protocol):
     def snapshot(self) -> Scene:
         """What a picture of this instant needs: arrays that keep their shape through a deployment."""
 
+    def units(self) -> Mapping[str, str]:
+        """Units of entries of `progress` that have one."""
+
     @staticmethod
     def draw(axes: Any, scene: Scene, index: int) -> None:
         """Draw frame `index` of snapshots stacked over time, with `decision` (frames, agents) beside them."""
@@ -50,6 +53,8 @@ class World(Protocol):
 
 class WorldType(Protocol):
     """How a world is made: everything random in it comes from `generator`."""
+
+    draw: Callable[[Any, Scene, int], None]
 
     def __call__(self, system: System, agents: int, generator: torch.Generator) -> World: ...
 
@@ -82,6 +87,10 @@ class ModelWorld:
         """How often each event that waits for a state has happened, over all agents."""
         return dict(self._counts)
 
+    def units(self) -> Mapping[str, str]:
+        """Counts have none."""
+        return {}
+
     def snapshot(self) -> Scene:
         """The states and the names of their columns."""
         return {"state": self._x.numpy(force=True), "names": np.array(self._system.names)}
@@ -107,7 +116,7 @@ class ModelWorld:
         return self._x
 
 
-_METHODS = ("reset", "advance", "progress", "snapshot", "draw")
+_METHODS = ("reset", "advance", "progress", "units", "snapshot", "draw")
 
 
 def world_type(decl: SystemDecl) -> WorldType:
@@ -116,7 +125,7 @@ def world_type(decl: SystemDecl) -> WorldType:
     Raises:
         SystemFileError: S206, the file or the class cannot be loaded or is no world.
     """
-    return ModelWorld if decl.test.world is None else _load(decl.test.world)
+    return cast(WorldType, ModelWorld) if decl.test.world is None else _load(decl.test.world)
 
 
 def _load(reference: WorldRef) -> WorldType:

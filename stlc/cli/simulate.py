@@ -1,0 +1,242 @@
+"""`stlc simulate`: a trained policy in closed loop, in the world of its system."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+
+import typer
+
+from stlc.cli.options import JsonOption, describe
+from stlc.diagnostics import Diagnostic, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from stlc.controller.deploy import Mode
+    from stlc.controller.drive import Setting, Tick
+    from stlc.controller.evaluate import Deployment
+    from stlc.controller.run import Run
+
+Record: TypeAlias = "dict[str, Any]"
+
+GUARDS: dict[Mode, tuple[Mode, ...]] = {"none": ("none",), "paper": ("none", "paper")}
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command(
+        "simulate",
+        help=describe(
+            "Deploy a trained policy in the world of its system, with or without the backup policy.",
+            "stlc simulate --backup",
+            "stlc simulate latest --backup --seeds 20 --record trace.npz",
+            note="The newest run unless one is named. With a guard, the same seeds are driven without it too, "
+            "to compare. Trace, scene and figures go into the run's folder. Numbers are means over seeds with "
+            "95 % intervals (Student's t).",
+        ),
+    )(simulate)
+
+
+def simulate(
+    run: Annotated[
+        str, typer.Argument(metavar="RUN", help="A run's folder, number, words, spec, or latest.")
+    ] = "latest",
+    backup: Annotated[
+        bool | None, typer.Option("--backup/--no-backup", help="The paper's backup policy.")
+    ] = None,
+    guard: Annotated[str | None, typer.Option(metavar="none|paper", help="What guards the policy.")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="How many deployments.")] = 10,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the first; the others follow.")] = 0,
+    steps: Annotated[int | None, typer.Option(min=1, help="Of each; by default the system's.")] = None,
+    agents: Annotated[int | None, typer.Option(min=1, help="In each; by default the system's.")] = None,
+    record: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the trace there too (.npz or .csv).")
+    ] = None,
+    fail_under: Annotated[
+        float | None, typer.Option(metavar="SHARE", help="Exit with 1 if the plan accuracy is less.")
+    ] = None,
+    pictures: Annotated[bool, typer.Option(help="Draw the animation and the report.")] = True,
+    json: JsonOption = False,
+) -> None:
+    """Deploy the policy of a run, record it, and say how it did."""
+    chosen = _guard(backup, guard)
+    from stlc.controller.drive import Setting
+    from stlc.controller.run import Run
+
+    opened = Run.open(run)
+    test = opened.task.system.decl.test
+    setting = Setting(
+        tuple(range(seed, seed + seeds)), agents or test.agents, steps or test.steps, test.replan
+    )
+    found = {mode: _deploy(opened, setting, mode, record) for mode in GUARDS[chosen]}
+    document = _save(opened, setting, found, record)
+    drawn = _draw(opened) if pictures else {}
+    accuracy = found[chosen].metrics["plan_accuracy"].mean
+    code = 1 if fail_under is not None and accuracy < fail_under else 0
+    if json:
+        from stlc.cli.output import emit_json
+
+        emit_json("simulate/1", ok=code == 0, exit_code=code, result=document | drawn)
+    else:
+        from stlc.cli.output import emit
+
+        for line in _screen(document, drawn, record):
+            emit(line)
+    if code:
+        raise typer.Exit(code)
+
+
+def _guard(backup: bool | None, guard: str | None) -> Mode:
+    if guard not in (None, *GUARDS):
+        raise UsageError(
+            Diagnostic("U101", f"there is no guard `{guard}`", help=("--guard none or --guard paper",))
+        )
+    if backup is not None and guard is not None and backup != (guard == "paper"):
+        option = "--backup" if backup else "--no-backup"
+        raise UsageError(Diagnostic("U101", f"`{option}` and `--guard {guard}` contradict each other"))
+    return "paper" if backup or guard == "paper" else "none"
+
+
+def _deploy(run: Run, setting: Setting, mode: Mode, record: Path | None) -> Deployment:
+    """One deployment with a progress bar; what was driven before a failure is saved."""
+    from stlc.cli.output import say
+    from stlc.controller.archive import save_trace_of
+    from stlc.controller.evaluate import InterruptedDeploymentError, deploy
+
+    try:
+        with _bar("no guard" if mode == "none" else "paper's guard") as tick:
+            return deploy(run.task, run.policy, setting, mode, tick=tick)
+    except InterruptedDeploymentError as error:
+        if error.recording is not None:
+            paths = save_trace_of(run, error.recording, setting, record)
+            say(f"the first {error.recording.steps} steps are in {paths[0]}")
+        raise (error.__cause__ or error) from None
+
+
+@contextmanager
+def _bar(title: str) -> Iterator[Tick]:
+    """A progress bar on the standard error, if that is a terminal."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from stlc.cli.output import console
+
+    talk = console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=talk, transient=True, disable=not talk.is_terminal) as progress:
+        bar = progress.add_task(title, total=None)
+        yield lambda step, total: progress.update(bar, completed=step, total=total)
+
+
+def _save(run: Run, setting: Setting, found: Mapping[Mode, Deployment], record: Path | None) -> Record:
+    """Write trace, scene and figures into the run's folder; returns what was measured."""
+    from stlc.controller.archive import RESULT, SCENE, save_scene, save_trace_of
+    from stlc.controller.evaluate import as_json
+
+    last = list(found.values())[-1]
+    save_trace_of(run, last.recording, setting, record)
+    save_scene(run.dir.path / SCENE, last.recording.scene)
+    world = run.task.system.decl.test.world
+    facts = {
+        "spec": run.task.compiled.name,
+        "system": run.task.system.name,
+        "run": run.dir.name,
+        "world": world.path.name if world is not None else None,
+        "trace": f"{run.dir.shown}/trace.npz",
+    }
+    document = as_json(found, setting, facts)
+    run.dir.write_json(RESULT, document)
+    return document
+
+
+def _draw(run: Run) -> dict[str, str]:
+    """The animation and the report, where matplotlib is there."""
+    from stlc.cli.output import say
+    from stlc.view import available
+
+    if not available():
+        say("no pictures: they need matplotlib and pillow (pip install 'stlc[plot]')")
+        return {}
+    from stlc.view.animate import write_gif
+    from stlc.view.report import write_report
+
+    gif = write_gif(run.dir)
+    write_report(run.dir)
+    drawn = {"report": f"{run.dir.shown}/report.html"}
+    return drawn if gif is None else {"animation": f"{run.dir.shown}/{gif.name}", **drawn}
+
+
+ROWS = {
+    "plan accuracy": "plan_accuracy",
+    "plan safety": "plan_safety",
+    "executed, agents": "executed",
+    "executed, starts": "executed_starts",
+    "executed, as foreseen": "foreseen_starts",
+    "executed safety, starts": "executed_safe_starts",
+}
+
+
+def _screen(document: Record, drawn: Mapping[str, str], record: Path | None) -> Iterator[str]:
+    """The result as a person reads it; the last line is the next command."""
+    from stlc.cli.output import table
+
+    guards = document["guards"]
+    seeds, agents, steps = len(document["seeds"]), document["agents"], document["steps"]
+    size = f"{seeds} seed{'s' * (seeds > 1)} x {agents} agents x {steps} steps"
+    world = document["world"] or f"{document['system']} and its events"
+    yield " · ".join((document["spec"], f"run {document['run']}", f"world {world}", size))
+    header = ("", *({"none": "no guard", "paper": "paper's guard"}[name] for name in guards))
+    yield table([*_shares(guards), *_progress(guards), *_times(guards)], header=header)
+    for name, guard in guards.items():
+        if name != "none":
+            yield f"  guard acted in {_acted(guard['decisions'])}"
+    yield ""
+    yield f"  trace      {document['trace']}"
+    for what, path in drawn.items():
+        yield f"  {what:<10} {path}"
+    yield f"  next       stlc check {record or 'trace.npz'}"
+
+
+def _shares(guards: Record) -> Iterator[tuple[str, ...]]:
+    for label, name in ROWS.items():
+        found = [guard["metrics"].get(name) for guard in guards.values()]
+        if any(found):
+            yield (label, *("" if metric is None else _number(metric, "", 3) for metric in found))
+
+
+def _progress(guards: Record) -> Iterator[tuple[str, ...]]:
+    """What the world tells of itself: every metric that is not one of ours."""
+    from stlc.controller.evaluate import METRICS
+
+    first = next(iter(guards.values()))
+    for name in first["metrics"]:
+        if name not in METRICS and not name.startswith("holds."):
+            unit = first["units"].get(name, "")
+            cells = (_number(guard["metrics"][name], unit, 2) for guard in guards.values())
+            yield (name.replace("_", " "), *cells)
+
+
+def _times(guards: Record) -> Iterator[tuple[str, ...]]:
+    from stlc.view.words import seconds
+
+    for label, name in (("decision, median", "median"), ("decision, 99 %", "p99")):
+        yield (label, *(seconds(guard["latency"][name]) for guard in guards.values()))
+
+
+def _number(metric: Record, unit: str, digits: int) -> str:
+    """A mean and half its interval: `0.957 ± 0.012`, `4.10 ± 0.20 m/s`."""
+    mean, high = metric["mean"], metric["high"]
+    text = f"{mean:.{digits}f}" if high is None else f"{mean:.{digits}f} ± {high - mean:.{digits}f}"
+    return f"{text} {unit}".rstrip()
+
+
+def _acted(decisions: Mapping[str, float]) -> str:
+    """`3.1 % of decisions (T0=1 71 %, T0=2 22 %, longest safe prefix 7 %)`."""
+    total = 1.0 - decisions["policy"]
+    if total <= 0.0:
+        return "0 % of decisions"
+    kinds = {name.removeprefix("backup "): share for name, share in decisions.items() if "T0=" in name}
+    kinds["longest safe prefix"] = decisions["safest"]
+    parts = ", ".join(f"{name} {share / total:.0%}" for name, share in kinds.items() if share)
+    return f"{total:.1%} of decisions ({parts})"

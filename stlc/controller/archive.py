@@ -1,0 +1,89 @@
+"""A deployment on disk: `trace.npz`, `scene.npz` and `eval/simulate.json` in the folder of its run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from stlc.controller.run import SPEC, SYSTEM
+from stlc.files import atomic_path, read_source
+from stlc.provenance import sha256
+from stlc.trace import Trace, TraceMeta, save_trace
+from stlc.version import __version__
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from stlc.controller.drive import Recording, Setting
+    from stlc.controller.run import Run
+
+TRACE = "trace.npz"
+SCENE = "scene.npz"
+RESULT = "eval/simulate.json"
+
+
+def trace_of(run: Run, recording: Recording, setting: Setting) -> Trace:
+    """All agents of all seeds as traces, decisions beside them.
+
+    Extras, each (traces, steps): `action.NAME` for every control, `decision` (0 policy, 1 backup, 2 safest),
+    `t0`, `plan_rho` of the plan that was followed, `policy_rho` of what the policy proposed; and (traces,):
+    `seed`, `agent`.
+    """
+    system = run.task.system
+    states = np.moveaxis(recording.states, -1, 0)
+    actions = zip(system.control_names, np.moveaxis(recording.actions, -1, 0), strict=True)
+    rows = np.arange(len(recording.states))
+    return Trace(
+        signature=system.signature,
+        dt=run.task.dt,
+        data=dict(zip(run.task.names, states, strict=True)),
+        extras={
+            **{f"action.{name}": action for name, action in actions},
+            "decision": recording.source,
+            "t0": recording.t0,
+            "plan_rho": recording.rho,
+            "policy_rho": recording.policy_rho,
+            "seed": np.array(setting.seeds)[rows // recording.agents],
+            "agent": rows % recording.agents,
+        },
+        meta=_meta(run, setting),
+    )
+
+
+def save_trace_of(run: Run, recording: Recording, setting: Setting, also: Path | None = None) -> list[Path]:
+    """Write the trace into the folder of the run, and to `also`; returns where. Raises MissingError."""
+    trace = trace_of(run, recording, setting)
+    paths = [run.dir.path / TRACE, *([also] if also is not None else [])]
+    for path in paths:
+        save_trace(path, trace)
+    return paths
+
+
+def _meta(run: Run, setting: Setting) -> TraceMeta:
+    record, spec = run.dir.record(), read_source(run.dir.path / SPEC).text
+    return TraceMeta(
+        spec_name=run.task.compiled.name,
+        spec_path=str(record.get("spec_path", "")),
+        spec_text=spec,
+        spec_hash=sha256(spec),
+        system_name=run.task.system.name,
+        system_path=str(record.get("system_path", "")),
+        system_text=read_source(run.dir.path / SYSTEM).text,
+        system_hash=run.task.system.hash,
+        run=run.dir.name,
+        seed=setting.seeds[0],
+        horizon=run.task.horizon,
+        dt=run.task.dt,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        stlc_version=__version__,
+    )
+
+
+def save_scene(path: Path, scene: Mapping[str, NDArray[Any]]) -> None:
+    """Write stacked snapshots as `.npz`; what is not a plain array is refused. Raises MissingError (R201)."""
+    with atomic_path(path) as temporary:
+        np.savez_compressed(temporary, allow_pickle=False, **scene)
