@@ -21,7 +21,7 @@ STILL = "scene.png"
 def film_of(run: RunDir) -> Film | None:
     """What there is to see of the run's deployment; None where nothing was recorded.
 
-    A world draws its own scene; it is loaded from the run's folder. Without one, or where it cannot be loaded,
+    A world draws its own scene and is loaded from the folder. Without one, or where it cannot be loaded,
     the signals of the trace are shown.
     """
     return _scene_film(run) or _signal_film(run)

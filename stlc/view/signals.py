@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from stlc.compile.semantics import TOLERANCE
 from stlc.signature import Column
 from stlc.trace import Trace
-from stlc.view.margins import Margins
 from stlc.view.style import (
     BLUE,
     FAINT,
@@ -33,6 +32,8 @@ from stlc.view.style import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+Margins: TypeAlias = Mapping[str, NDArray[np.float64]]
+
 POLICY, BACKUP, SAFEST = 0, 1, 2
 DECISIONS = {POLICY: ("policy", FAINT), BACKUP: ("backup", ORANGE), SAFEST: ("safest prefix", RED)}
 MOST_LINES = 8  # panels of numbers; beyond that those that move come first
@@ -47,17 +48,24 @@ class Choice:
     title: str
 
 
-def choose_traces(margins: Margins) -> tuple[Choice, ...]:
-    """The worst trace and a typical one (median robustness); only one where there is only one."""
-    order = np.argsort(margins.least, kind="stable")
-    worst, typical = int(order[0]), int(order[len(order) // 2])
+def choose_traces(least: NDArray[np.float64], names: Sequence[str] = ()) -> tuple[Choice, ...]:
+    """The worst trace and a typical one (median); only one where there is only one.
+
+    Args:
+        least: robustness per trace, (traces,); NaN where it is not known.
+        names: how traces are called; by default by their number.
+    """
+    order = np.argsort(least, kind="stable")
+    known = max(1, int(np.isfinite(least).sum()))
+    worst, typical = int(order[0]), int(order[known // 2])
+    called = names or [f"trace {index}" for index in range(len(least))]
     if worst == typical:
-        return (Choice(worst, f"trace {worst}"),)
-    return Choice(worst, f"worst: trace {worst}"), Choice(typical, f"typical: trace {typical}")
+        return (Choice(worst, called[worst]),)
+    return Choice(worst, f"worst: {called[worst]}"), Choice(typical, f"typical: {called[typical]}")
 
 
 def draw_signals(trace: Trace, margins: Margins, choices: Sequence[Choice]) -> Picture:
-    """A column of panels per chosen trace."""
+    """A column of panels per chosen trace; `margins` holds (traces, samples) per requirement, NaN: undefined."""
     rows = _rows(trace, margins)
     heights = [_HEIGHTS[kind] for kind, _ in rows]
     with look():
@@ -97,7 +105,7 @@ def _rows(trace: Trace, margins: Margins) -> list[tuple[str, str]]:
     rows += [("strip", c.name) for c in columns if c.kind in ("bool", "enum")]
     if _decisions(trace) is not None:
         rows.append(("decision", "decision"))
-    return rows + [("robustness", name) for name in margins.names]
+    return rows + [("robustness", name) for name in margins]
 
 
 def _draw_row(axes: Axes, kind: str, name: str, agent: _Agent) -> None:
@@ -194,7 +202,7 @@ def _mark_backup(axes: Axes, agent: _Agent) -> None:
 
 
 def _draw_robustness(axes: Axes, agent: _Agent, name: str) -> None:
-    rho = agent.margins.of(name)[agent.index]
+    rho = agent.margins[name][agent.index]
     rho = np.where(np.isposinf(rho), np.nan, rho)
     times = agent.trace.times[: len(rho)]
     axes.axhline(0, color=MUTED, lw=0.7)
@@ -202,7 +210,7 @@ def _draw_robustness(axes: Axes, agent: _Agent, name: str) -> None:
     axes.fill_between(times, rho, 0, where=rho < -TOLERANCE, step="post", color=RED, alpha=0.3, lw=0)
     axes.step(times, rho, where="post", color=BLUE, lw=1)
     axes.step(times, np.where(rho < -TOLERANCE, rho, np.nan), where="post", color=RED, lw=1.4)
-    axes.set_ylim(*_limits(agent.margins.of(name)))
+    axes.set_ylim(*_limits(agent.margins[name]))
     axes.locator_params(axis="y", nbins=3)
 
 

@@ -193,3 +193,9 @@ def deployed(trained):
 @pytest.fixture
 def signature():
     return SIGNATURE
+
+
+@pytest.fixture(scope="session")
+def recording():
+    """A deployment of 20 agents over 150 steps."""
+    return drive()

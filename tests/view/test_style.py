@@ -50,9 +50,9 @@ def test_data_uri_holds_the_svg():
 
 def test_png_stands_on_white(tmp_path):
     path = draw().save_png(tmp_path / "a.png", dpi=50)
-    image = Image.open(path).convert("RGB")
-    assert image.size == (150, 100)
-    assert image.getpixel((0, 0)) == (255, 255, 255)
+    with Image.open(path) as image:
+        assert image.size == (150, 100)
+        assert image.convert("RGB").getpixel((0, 0)) == (255, 255, 255)
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.png"]
 
 

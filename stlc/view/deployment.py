@@ -1,0 +1,182 @@
+"""What the policy did in its world: with and without the backup, over all deployment seeds."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from stlc.view.animate import STILL, current_gif
+from stlc.view.html import Child, Html, classed, el, figure, join, table
+from stlc.view.material import Material
+from stlc.view.page import section
+from stlc.view.words import count, number, seconds, share
+
+Part = tuple[str, str, Html]
+Record = Mapping[str, Any]
+
+GUARDS = {"none": "no guard", "paper": "with the backup"}
+SHARES = {
+    "plan_accuracy": ("plan accuracy", "of the plans that were followed, the share that satisfies the specification"),
+    "policy_accuracy": ("policy's plan accuracy", "the same of what the policy proposed"),
+    "plan_safety": ("plan safety", "of the plans that were followed, the share that satisfies what is tagged @safety"),
+    "executed": ("executed, agents", "agents whose drive satisfied everything from every start"),
+    "executed_safe": ("executed safely, agents", "agents whose drive satisfied what is tagged @safety from every start"),
+    "executed_starts": ("executed, starts", "starts from which what was driven satisfies the specification"),
+    "executed_safe_starts": ("executed safely, starts", "the same for what is tagged @safety"),
+    "foreseen": ("as foreseen", "starts from which the world did what the model said, through the whole window"),
+    "foreseen_starts": ("executed, as foreseen", "of those starts, the share that satisfies the specification"),
+}
+HOLDS = "holds."
+
+
+def deployment_tiles(material: Material) -> list[tuple[str, str]]:
+    """The numbers of the deployment for the first screen."""
+    guards = _guards(material)
+    if not guards:
+        return []
+    name, guard = list(guards.items())[-1]
+    metrics = guard.get("metrics") or {}
+    beside = "with the backup" if name == "paper" else "without a guard"
+    tiles = [
+        (share(_mean(metrics, "plan_accuracy")), f"of plans in deployment, {beside}"),
+        (share(_mean(metrics, "executed_safe_starts")), "of driven windows safe"),
+    ]
+    return [tile for tile in tiles if tile[0]]
+
+
+def deployment_section(material: Material) -> Part | None:
+    """The table of metrics, one column per guard; who decided; how fast."""
+    guards = _guards(material)
+    if not guards:
+        return None
+    title = "How it drives"
+    header = ["", *(GUARDS.get(name, name) for name in guards)]
+    numeric = range(1, len(header))
+    body = (
+        el("p", _setting(material.simulation or {})),
+        table(header, _share_rows(guards), numeric=numeric),
+        _titled("Progress", table(header, rows, numeric=numeric)) if (rows := _progress_rows(guards)) else None,
+        _titled("Decisions", table(header, _decision_rows(guards), numeric=numeric)),
+    )
+    return "deployment", title, section("deployment", title, body_of(body))
+
+
+def body_of(parts: Sequence[Child]) -> Html:
+    """`parts` one after the other, None left out."""
+    return join(*parts)
+
+
+def film_section(material: Material) -> Part | None:
+    """The animation of the first seed."""
+    if material.trace is None:
+        return None
+    path = current_gif(material.run)
+    if path is None:
+        return None
+    uri = "data:image/gif;base64," + base64.b64encode(path.read_bytes()).decode()
+    caption = join(
+        "In real time. Who decided: ",
+        _key("#2563a8", "policy"),
+        _key("#e08a00", "backup"),
+        _key("#c0267e", "safest prefix"),
+    )
+    title = "What it looks like"
+    film = figure(uri, f"Animation of the deployment; a still is in {STILL}.", caption, kind="film")
+    return "film", title, section("film", title, film)
+
+
+def _key(color: str, name: str) -> Html:
+    return join(el("span", attrs={"class": "key", "style": f"background:{color}"}), f"{name}  ")
+
+
+def _titled(title: str, content: Html) -> Html:
+    return join(el("h3", title), content)
+
+
+def _guards(material: Material) -> dict[str, Record]:
+    guards = (material.simulation or {}).get("guards")
+    return dict(guards) if isinstance(guards, Mapping) else {}
+
+
+def _setting(simulation: Record) -> str:
+    seeds, agents, steps = simulation.get("seeds") or (), simulation.get("agents"), simulation.get("steps")
+    size = f"{count(len(seeds), 'seed')} of {count(agents or 0, 'agent')}, {count(steps or 0, 'step')} each"
+    spread = f", {simulation['interval']}" if simulation.get("interval") else ""
+    return f"{size}. Means over the seeds with their interval ({spread.lstrip(', ')})." if spread else f"{size}."
+
+
+def _mean(metrics: Record, name: str) -> float | None:
+    found = metrics.get(name)
+    return float(found["mean"]) if found else None
+
+
+def _names(guards: Mapping[str, Record]) -> list[str]:
+    """All metrics, in the order of the first guard that has them."""
+    return list(dict.fromkeys(name for guard in guards.values() for name in guard.get("metrics") or {}))
+
+
+def _share_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
+    rows: list[tuple[Child, ...]] = []
+    for name in _names(guards):
+        if name in SHARES:
+            label, meaning = SHARES[name]
+        elif name.startswith(HOLDS):
+            label, meaning = name.removeprefix(HOLDS), "starts from which what was driven satisfies it"
+        else:
+            continue
+        cells = [_share_cell((guard.get("metrics") or {}).get(name)) for guard in guards.values()]
+        rows.append((join(label, el("small", meaning)), *cells))
+    return rows
+
+
+def _progress_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
+    rows: list[tuple[Child, ...]] = []
+    for name in _names(guards):
+        if name in SHARES or name.startswith(HOLDS):
+            continue
+        cells = []
+        for guard in guards.values():
+            unit = str((guard.get("units") or {}).get(name, ""))
+            cells.append(_number_cell((guard.get("metrics") or {}).get(name), unit))
+        rows.append((name.replace("_", " "), *cells))
+    return rows
+
+
+def _share_cell(metric: Record | None) -> Child:
+    if metric is None:
+        return ""
+    spread = _half(metric)
+    return join(share(metric["mean"]), classed("span", "quiet", f" ± {100 * spread:.1f}") if spread is not None else "")
+
+
+def _number_cell(metric: Record | None, unit: str) -> Child:
+    if metric is None:
+        return ""
+    spread = _half(metric)
+    return join(
+        number(metric["mean"]),
+        classed("span", "quiet", f" ± {number(spread)}") if spread is not None else "",
+        f" {unit}" if unit else "",
+    )
+
+
+def _half(metric: Record) -> float | None:
+    return None if metric.get("high") is None else float(metric["high"]) - float(metric["mean"])
+
+
+def _decision_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
+    names = list(dict.fromkeys(name for guard in guards.values() for name in guard.get("decisions") or {}))
+    rows: list[tuple[Child, ...]] = []
+    for name in names:
+        shares = [(guard.get("decisions") or {}).get(name) for guard in guards.values()]
+        rows.append((_decided(name), *(share(value, 2) for value in shares)))
+    latencies = [guard.get("latency") or {} for guard in guards.values()]
+    for key, label in (("median", "time for one decision, median"), ("p99", "99th percentile")):
+        rows.append((label, *(seconds(latency.get(key)) for latency in latencies)))
+    return rows
+
+
+def _decided(name: str) -> Child:
+    words = {"policy": "the policy decided", "backup": "the backup decided", "safest": "the safest prefix was taken"}
+    return words.get(name, classed("span", "quiet", f"of which {name.removeprefix('backup ')}"))
