@@ -1,4 +1,4 @@
-"""Rewriting of IR numbers: which names they read, what happens when a name is replaced, what can be done early."""
+"""Rewriting of IR numbers: which names they read, replacing names, and what can be computed early."""
 
 from __future__ import annotations
 

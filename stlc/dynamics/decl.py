@@ -1,4 +1,4 @@
-"""What a system file says, as data: names bound, units checked, expressions in the IR, places kept. No torch."""
+"""What a system file says, as data: names bound, units checked, expressions in the IR. No torch."""
 
 from __future__ import annotations
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from stlc.compile.arith import Program
 from stlc.compile.ops_torch import TORCH
@@ -85,8 +87,30 @@ class _AccumulateRunner:
 
     def __call__(self, film: _Film) -> None:
         increments = film.full(film.run(self.program)["increment"])
-        start = film.states[self.column]
-        film.enter(self.column, torch.cumsum(torch.cat((start[None], increments)), 0))
+        column: Tensor = _Accumulated.apply(film.states[self.column], increments)  # type: ignore[no-untyped-call]
+        film.enter(self.column, column)
+
+
+class _Accumulated(torch.autograd.Function):
+    """(B,) and (T, B) -> (T+1, B): every row is the one above plus an increment. Faster than `cumsum`."""
+
+    @staticmethod
+    def forward(ctx: Any, start: Tensor, increments: Tensor) -> Tensor:  # noqa: ARG004
+        out = increments.new_empty(len(increments) + 1, increments.shape[1])
+        rows = out.unbind(0)
+        rows[0].copy_(start)
+        for before, after, increment in zip(rows, rows[1:], increments.unbind(0), strict=False):
+            torch.add(before, increment, out=after)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:  # noqa: ARG004
+        below = grad.clone(memory_format=torch.contiguous_format)
+        rows = below.unbind(0)
+        for step in range(len(rows) - 2, -1, -1):
+            rows[step].add_(rows[step + 1])
+        return rows[0], below[1:]
 
 
 class _LoopRunner:

@@ -61,7 +61,7 @@ def schedule(step: Step) -> tuple[Stage, ...]:
     reads = {name: names_in(num) & (numbers.keys() | step.next.keys()) for name, num in numbers.items()}
     reads |= {name: frozenset((_next(name),)) for name in step.next}
     components = _components(reads)
-    used = {name: set() for name in numbers} | {name: set() for name in step.next}
+    used: dict[str, set[str]] = {name: set() for name in reads}
     for reader, names in reads.items():
         for name in names:
             used[name].add(reader)
@@ -93,7 +93,7 @@ def _stage(
     reads: Mapping[str, frozenset[str]],
     used: Mapping[str, set[str]],
 ) -> tuple[Stage, ...]:
-    """The stage of one strongly connected group of names; none for a state that only follows its next value."""
+    """The stage of one strongly connected group of names."""
     inside = frozenset(group)
     states = {name: _next(name) for name in group if name not in numbers}
     if len(group) == 1:

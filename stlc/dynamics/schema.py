@@ -1,4 +1,4 @@
-"""A system file as a declaration: every section read, every finding reported at once, with its place. No torch."""
+"""A system file as a declaration: every section read, every finding reported at once. No torch."""
 
 from __future__ import annotations
 
@@ -29,7 +29,31 @@ from stlc.files import read_source
 from stlc.source import Source
 
 VERSION = 1
-TOP_KEYS = ["stlc", "name", "doc", "extends", "spec", "time", "const", "param", "state", "control", "def", "flow", "jump", "init", "objective", "policy", "train", "backup", "test", "scenario", "functions", "plugin", "plot"]
+TOP_KEYS = [
+    "stlc",
+    "name",
+    "doc",
+    "extends",
+    "spec",
+    "time",
+    "const",
+    "param",
+    "state",
+    "control",
+    "def",
+    "flow",
+    "jump",
+    "init",
+    "objective",
+    "policy",
+    "train",
+    "backup",
+    "test",
+    "scenario",
+    "functions",
+    "plugin",
+    "plot",
+]
 LATER = {
     "extends": "one system file extending another",
     "param": "parameters that are drawn for every trajectory",
@@ -43,8 +67,8 @@ def load_system_decl(path: Path | str, overrides: MappingType[str, str] | None =
 
     Args:
         path: of the file.
-        overrides: values by dotted key (`train.lr`), or by the name of a constant; a plain name that is no constant
-            of this file is left to the specification.
+        overrides: values by dotted key (`train.lr`), or by the name of a constant; a plain name that is no
+            constant of this file is left to the specification.
 
     Raises:
         UsageError: there is no such file.

@@ -1,12 +1,12 @@
-"""Expressions inside a system file: parsed where they stand, typed by the compiler, findings in YAML terms."""
+"""Expressions inside a system file: parsed where they stand, typed by the compiler."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any
+from typing import TypeVar
 
 from stlc.compile import ir
 from stlc.compile.formulas import resolve_state_formula
@@ -22,6 +22,7 @@ from stlc.grammar.parser import parse_expr
 from stlc.source import Span
 from stlc.units import Unit, parse_unit, same_dims
 
+_T = TypeVar("_T")
 SECOND = parse_unit("s")
 _ATTRIBUTE = re.compile(r"(?<=[\w)\]\"'])(?<!\d)\.\s*([A-Za-z_]\w*)")
 _NOT_FINITE = frozenset(
@@ -110,7 +111,7 @@ class Expressions:
             return None
         return formula
 
-    def _typed(self, resolve: Any, expr: ast.Expr) -> Any:
+    def _typed(self, resolve: Callable[[ast.Expr, Scope], _T], expr: ast.Expr) -> _T | None:
         """What a resolver of the compiler makes of an expression, or None with its findings reported."""
         sink: list[Diagnostic] = []
         try:

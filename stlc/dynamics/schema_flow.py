@@ -111,10 +111,8 @@ def read_sets(node: Node | None, where: str, here: Expressions, names: Names) ->
 def column_assign(column: Column, node: Node, here: Expressions) -> Assign | None:
     """A value for a column: members by name for an enum, formulas for a bool, units checked."""
     where = f"`{column.name}`"
-    if column.kind == "bool":
-        value = here.truth(node, where)
-    else:
-        value = here.stored(node, where, column.unit)
+    boolean = column.kind == "bool"
+    value = here.truth(node, where) if boolean else here.stored(node, where, column.unit)
     return None if value is None else Assign(column.name, value, written(node))
 
 

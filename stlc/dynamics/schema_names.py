@@ -22,7 +22,7 @@ from stlc.dynamics.decl import ControlDecl, Squash
 from stlc.dynamics.schema_expressions import SECOND, Expressions
 from stlc.dynamics.schema_reader import Reader
 from stlc.dynamics.yaml_nodes import Mapping, Node, Scalar, Sequence, as_int
-from stlc.signature import Column, Signature
+from stlc.signature import Column, Role, Signature
 from stlc.source import Span
 from stlc.units import Unit, parse_unit
 
@@ -153,7 +153,7 @@ def _column(name: str, found: dict[str, Node], where: str, reader: Reader, names
     unit = read_unit(found.get("unit"), reader)
     role = reader.option(found.get("role"), f"`role` of {where}", ("state", "env")) or "state"
     clamp = bool(reader.flag(found.get("clamp"), f"`clamp` of {where}"))
-    shown = "env" if role == "env" else "state"
+    shown: Role = "env" if role == "env" else "state"
     if "enum" in found:
         labels = _members(found["enum"], where, reader)
         values = [value for _, value in labels] or [0.0]

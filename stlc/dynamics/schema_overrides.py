@@ -14,8 +14,8 @@ from stlc.source import Source
 def overridden(root: Mapping, overrides: MappingType[str, str], reader: Reader) -> Mapping:
     """The document with the fields that `overrides` names replaced.
 
-    A dotted key names a field (`train.lr`, `init.mixture.0.weight`); a plain one a constant, or a field at the top
-    that holds a single value. Other plain names are left to the specification.
+    A dotted key names a field (`train.lr`, `init.mixture.0.weight`); a plain one a constant, or a field at
+    the top that holds a single value. Other plain names are left to the specification.
     """
     constants = root.get("const")
     known = {e.key.text for e in constants.entries} if isinstance(constants, Mapping) else set()
@@ -45,7 +45,7 @@ def _value(key: str, text: str, reader: Reader) -> Node | None:
 
 
 def _replaced(node: Node, path: list[str], value: Node, key: str, reader: Reader) -> Node:
-    """`node` with the value at `path` replaced; keys that are not there are added, and checked like any others."""
+    """`node` with the value at `path` replaced; keys that are not there are added."""
     head, rest = path[0], path[1:]
     match node:
         case Sequence(items=items) if head.isdigit() and int(head) < len(items):

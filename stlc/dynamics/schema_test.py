@@ -14,7 +14,7 @@ from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import read_sets
 from stlc.dynamics.schema_names import Names
 from stlc.dynamics.schema_reader import Reader
-from stlc.dynamics.yaml_nodes import Node
+from stlc.dynamics.yaml_nodes import Node, Scalar
 from stlc.grammar import ast
 
 TEST_KEYS = ("steps", "agents", "replan", "events", "metrics", "world")
@@ -89,8 +89,10 @@ def _condition(node: Node | None, here: Expressions) -> tuple[ir.Formula | None,
 
 def _world(node: Node | None, reader: Reader) -> WorldRef | None:
     """`file.py:Class`, relative to the system file."""
+    if node is None or (isinstance(node, Scalar) and node.is_null):
+        return None
     text = reader.text(node, "`world`")
-    if node is None or text is None:
+    if text is None:
         return None
     file, _, name = text.rpartition(":")
     if not file.endswith(".py") or not name.isidentifier():

@@ -1,8 +1,8 @@
-"""A declaration becomes something that steps: states as tensors, hybrid dynamics, initial states, objective."""
+"""A declaration becomes something that steps: tensors in, hybrid dynamics, initial states, objective."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -13,15 +13,17 @@ from stlc.compile import ir
 from stlc.compile.arith import Program
 from stlc.compile.ops_torch import TORCH
 from stlc.compile.switch import Hard, Switch
+from stlc.compile.timers import Timer
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.algebra import add, multiply, names_in
 from stlc.dynamics.decl import ControlDecl, SystemDecl
+from stlc.dynamics.describe import describe
+from stlc.dynamics.draws import Rows
 from stlc.dynamics.rollout import Columns, Stepper
 from stlc.dynamics.samplers import InitialStates
 from stlc.dynamics.schema import load_system_decl
 from stlc.dynamics.step import build_step
 from stlc.files import find_system
-from stlc.signature import Signature
 
 HARD = Hard()
 
@@ -34,10 +36,15 @@ class System:
 
     Attributes:
         decl: the declaration.
+        timers: states that a specification adds, the last columns.
+        signature: the state columns, in order.
+        initial: the distribution of initial states, timers apart.
     """
 
-    def __init__(self, decl: SystemDecl) -> None:
+    def __init__(self, decl: SystemDecl, timers: Sequence[Timer] = ()) -> None:
         self.decl = decl
+        self.timers = tuple(timers)
+        self.signature = decl.signature.extended(*(timer.column for timer in timers))
         self.initial = InitialStates(decl.init, decl.signature.names)
         self._steppers: dict[bool, Stepper] = {}
 
@@ -48,6 +55,14 @@ class System:
         Raises UsageError where there is none, SystemFileError where it is invalid.
         """
         return cls(load_system_decl(find_system(str(path)), overrides or {}))
+
+    def augmented(self, timers: Sequence[Timer]) -> System:
+        """The same system with timers as its last columns.
+
+        A timer grows by its rate every step up to its saturation; initial states draw it evenly from all
+        its values, so that a policy learns every moment of the mission.
+        """
+        return System(self.decl, (*self.timers, *timers))
 
     # ---------------------------------------------------------------- description
 
@@ -61,15 +76,10 @@ class System:
         """SHA-256 of the file's text and of what was overridden."""
         return self.decl.hash
 
-    @property
-    def signature(self) -> Signature:
-        """The state columns, in order."""
-        return self.decl.signature
-
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the state columns."""
-        return self.decl.signature.names
+        return self.signature.names
 
     @cached_property
     def dt(self) -> float:
@@ -104,7 +114,12 @@ class System:
     @property
     def observed_count(self) -> int:
         """Numbers that the policy sees."""
-        return len(self.decl.policy.observe) or len(self.names)
+        observe = self.decl.policy.observe
+        return len(observe) + len(self.timers) if observe else len(self.names)
+
+    def describe(self) -> str:
+        """States, controls, flow, jumps and initial situations, as a table of text."""
+        return describe(self.decl)
 
     # -------------------------------------------------------------------- motion
 
@@ -132,7 +147,7 @@ class System:
     def _stepper(self, switch: Switch) -> Stepper:
         soft = not switch.exact
         if soft not in self._steppers:
-            self._steppers[soft] = Stepper(build_step(self.decl, soft=soft))
+            self._steppers[soft] = Stepper(build_step(self.decl, self.timers, soft=soft))
         return self._steppers[soft]
 
     def _named(self, x: Tensor) -> Columns:
@@ -162,12 +177,17 @@ class System:
                 generator.seed()
             else:
                 generator.manual_seed(seed)
-        return self.initial.sample(n, generator).to(device=device, dtype=dtype)
+        states = self.initial.sample(n, generator)
+        rows = Rows(n, generator)
+        clocks = [torch.floor(rows.uniforms() * (timer.saturation + 1.0)) for timer in self.timers]
+        if clocks:
+            states = torch.cat((states, torch.stack(clocks, 1)), 1)
+        return states.to(device=device, dtype=dtype)
 
     # -------------------------------------------------------------- policy, objective
 
     def observe(self, x: Tensor) -> Tensor:
-        """What the policy sees: (…, n) -> (…, k)."""
+        """What the policy sees, timers last: (…, n) -> (…, k)."""
         if self._observation is None:
             return x
         seen = self._observation(self._named(x), TORCH, HARD)
@@ -176,7 +196,8 @@ class System:
     @cached_property
     def _observation(self) -> Program | None:
         observe = self.decl.policy.observe
-        return Program({str(i): num for i, num in enumerate(observe)}) if observe else None
+        seen = (*observe, *(ir.Col(timer.name) for timer in self.timers))
+        return Program({str(i): num for i, num in enumerate(seen)}) if observe else None
 
     def performance(
         self,
