@@ -50,24 +50,22 @@ class _StraightThrough(torch.autograd.Function):
 
 
 class _SmoothMax(torch.autograd.Function):
-    """`log(sum(exp(k x))) / k` over axis 0; infinite entries carry no gradient and make no NaN."""
+    """`log(sum(exp(k x))) / k` over axis 0; infinite values carry no gradient and make no NaN."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, k: float) -> Tensor:
         top = x.amax(dim=0, keepdim=True) if k > 0 else x.amin(dim=0, keepdim=True)
-        finite = torch.nan_to_num(top, nan=torch.nan, posinf=0.0, neginf=0.0)
-        total = torch.exp(((x - finite) * k).clamp_max_(0.0)).sum(dim=0, keepdim=True)
-        out = top + total.clamp_min_(1.0).log_() / k
-        ctx.save_for_backward(x, out)
-        ctx.k = k
-        return out
+        unbounded = torch.isinf(top)
+        shares = ((x - top.masked_fill(unbounded, 0.0)) * k).clamp_max_(0.0).exp_()
+        total = shares.sum(dim=0, keepdim=True).clamp_min_(1.0)
+        ctx.save_for_backward(shares.div_(total.masked_fill(unbounded, torch.inf)))
+        return top + total.log_() / k
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        x, out = ctx.saved_tensors
-        weights = torch.exp((x - out) * ctx.k)
-        return torch.where(torch.isfinite(x), grad * weights, 0.0), None
+        (shares,) = ctx.saved_tensors
+        return grad * shares, None
 
 
 class _SmoothMax2(torch.autograd.Function):
@@ -76,19 +74,17 @@ class _SmoothMax2(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor, k: float) -> Tensor:
         top = torch.maximum(a, b) if k > 0 else torch.minimum(a, b)
-        gap = torch.where(torch.isfinite(top), (a - b).abs_(), torch.inf)
-        out = top + torch.log1p(torch.exp(gap * -abs(k))) / k
-        ctx.save_for_backward(a, b, out)
-        ctx.k = k
-        return out
+        unbounded = torch.isinf(top)
+        gap = (a - b).masked_fill_(unbounded, torch.inf)
+        share = torch.sigmoid(gap * k)
+        ctx.save_for_backward(share.masked_fill(unbounded, 0.0), (1.0 - share).masked_fill_(unbounded, 0.0))
+        return top + torch.log1p(torch.exp(gap.abs_() * -abs(k))) / k
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
-        a, b, out = ctx.saved_tensors
-        left = torch.where(torch.isfinite(a), grad * torch.exp((a - out) * ctx.k), 0.0)
-        right = torch.where(torch.isfinite(b), grad * torch.exp((b - out) * ctx.k), 0.0)
-        return left, right, None
+        left, right = ctx.saved_tensors
+        return grad * left, grad * right, None
 
 
 def _pair(a: Tensor | float, b: Tensor | float) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,131 @@
+"""Random numbers, formulas and traces for hypothesis."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+from hypothesis import strategies as st
+
+from stlc.compile import ir, typed
+from stlc.compile.interface import Grid
+from stlc.source import Source, Span
+
+SPAN: Span = Source("random", "").span(0, 0)
+NAMES = ("x", "y", "z")
+GRID = Grid(Fraction(1, 10), 6)
+
+_values = st.integers(-40, 40).map(lambda n: n / 8)
+_columns = st.sampled_from(NAMES).map(ir.Col)
+
+
+def _op(name: str, *args: st.SearchStrategy[ir.Num]) -> st.SearchStrategy[ir.Num]:
+    return st.tuples(*args).map(lambda parts: ir.Op(name, parts))
+
+
+def state_formulas(numbers: st.SearchStrategy[ir.Num]) -> st.SearchStrategy[ir.Formula]:
+    """Formulas of the IR without temporal operators."""
+    atoms = st.builds(ir.Atom, numbers, sign=st.sampled_from([1, -1]), strict=st.booleans())
+    joins = st.builds(ir.Join, st.sampled_from(["and", "or"]), st.tuples(atoms, atoms))
+    return atoms | joins
+
+
+def _grown(inner: st.SearchStrategy[ir.Num]) -> st.SearchStrategy[ir.Num]:
+    binary = st.sampled_from(["add", "sub", "mul", "min", "max"])
+    unary = st.sampled_from(["neg", "abs", "square", "relu", "sin", "tanh_free"]).map(
+        lambda name: "atan" if name == "tanh_free" else name
+    )
+    return (
+        st.builds(lambda name, a, b: ir.Op(name, (a, b)), binary, inner, inner)
+        | st.builds(lambda name, a: ir.Op(name, (a,)), unary, inner)
+        | _op("clip", inner, _values.map(ir.Lit), st.integers(5, 9).map(lambda n: ir.Lit(float(n))))
+        | _op("mod", inner, st.sampled_from([ir.Lit(2.0), ir.Lit(0.75)]))
+        | _op("div", inner, st.sampled_from([ir.Lit(2.0), ir.Lit(-0.5)]))
+        | _op("pow", inner, st.sampled_from([ir.Lit(2.0), ir.Lit(3.0)]))
+        | _op("norm", inner, inner)
+        | _op("norm1", inner, inner)
+        | _op("norminf", inner, inner)
+        | st.builds(ir.Ind, state_formulas(inner))
+        | st.builds(ir.Where, state_formulas(inner), inner, inner)
+    )
+
+
+numbers: st.SearchStrategy[ir.Num] = st.recursive(_columns | _values.map(ir.Lit), _grown, max_leaves=8)
+
+_linear = st.builds(
+    lambda a, b, c: ir.Op("sub", (ir.Op("add", (a, ir.Op("mul", (b, ir.Lit(0.5))))), ir.Lit(c))),
+    _columns,
+    _columns,
+    _values,
+)
+_predicates = st.builds(
+    typed.Pred,
+    st.just(SPAN),
+    _columns | _linear,
+    strict=st.booleans(),
+    guard=st.sampled_from([False] * 7 + [True]),
+)
+
+
+def _interval(*, bounded_only: bool) -> st.SearchStrategy[typed.Interval]:
+    def build(lo: int, width: int | None, opened: tuple[bool, bool], unit: str) -> typed.Interval:
+        lo_open, hi_open = opened
+        if width is not None and width <= lo_open + hi_open:
+            lo_open = hi_open = False
+        if unit == "steps":
+            make = lambda k: typed.Time(steps=Fraction(k))  # noqa: E731
+        else:
+            make = lambda k: typed.Time(seconds=Fraction(k, 10))  # noqa: E731
+        hi = None if width is None else make(lo + width)
+        return typed.Interval(make(lo), hi, lo_open, hi_open and hi is not None)
+
+    widths = st.integers(0, 9)
+    return st.builds(
+        build,
+        st.integers(0, 4),
+        widths if bounded_only else st.none() | widths | widths,
+        st.tuples(st.booleans(), st.booleans()),
+        st.sampled_from(["steps", "seconds"]),
+    )
+
+
+def _logic(inner: st.SearchStrategy[typed.Formula]) -> st.SearchStrategy[typed.Formula]:
+    many = st.lists(inner, min_size=2, max_size=3).map(tuple)
+    return st.builds(typed.Logic, st.just(SPAN), st.sampled_from(["and", "or"]), many) | st.builds(
+        typed.Logic, st.just(SPAN), st.sampled_from(["->", "<->", "xor"]), st.tuples(inner, inner)
+    )
+
+
+def formulas(*, bounded_only: bool = False, truth: bool = True) -> st.SearchStrategy[typed.Formula]:
+    """Typed formulas with every operator, bounds on the grid of `GRID`."""
+    interval = _interval(bounded_only=bounded_only)
+    span = st.just(SPAN)
+    leaves: st.SearchStrategy[typed.Formula] = _predicates
+    if truth:
+        leaves = leaves | st.builds(typed.Truth, span, st.booleans())
+
+    def grown(inner: st.SearchStrategy[typed.Formula]) -> st.SearchStrategy[typed.Formula]:
+        unary = st.sampled_from(["always", "eventually", "once", "historically"])
+        binary = st.sampled_from(["until", "release", "unless", "since"])
+        return (
+            st.builds(typed.Not, span, inner)
+            | _logic(inner)
+            | st.builds(typed.Temporal, span, unary, interval, inner)
+            | st.builds(typed.Temporal, span, unary, interval, inner)
+            | st.builds(typed.Until, span, binary, interval, inner, inner)
+            | st.builds(typed.Until, span, binary, interval, inner, inner)
+            | st.builds(typed.Shift, span, st.sampled_from([-1, 1]), inner)
+            | st.builds(typed.Edge, span, st.sampled_from(["rise", "fall"]), inner)
+        )
+
+    return st.recursive(leaves, grown, max_leaves=5)
+
+
+def traces(low: int = 1, high: int = 14, batch: int = 2) -> st.SearchStrategy[dict[str, np.ndarray]]:
+    """Columns `(time, batch)` of numbers with many ties."""
+
+    def build(samples: int, seed: int) -> dict[str, np.ndarray]:
+        rng = np.random.default_rng(seed)
+        return {name: rng.integers(-24, 24, size=(samples, batch)) / 8 for name in NAMES}
+
+    return st.builds(build, st.integers(low, high), st.integers(0, 2**32 - 1))

@@ -1,0 +1,345 @@
+"""Slow evaluators written from the definitions, to hold the compiler to.
+
+Nothing here is clever: recursion over the typed formula at one instant, plain Python floats, exact fractions
+for time. `robustness` gives an interval (low, high) over all continuations of the trace; where the trace is
+known or windows are cut both ends are equal. `holds` is the Boolean semantics.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Literal
+
+from stlc.compile import ir, typed
+from stlc.compile.interface import Grid
+
+Interval = tuple[float, float]
+UNKNOWN: Interval = (-math.inf, math.inf)
+TRUE: Interval = (math.inf, math.inf)
+FALSE: Interval = (-math.inf, -math.inf)
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One trace. Windows beyond its end are undefined ("strict"), cut ("truncate") or unknown ("open")."""
+
+    columns: Mapping[str, Sequence[float]]
+    grid: Grid
+    end: Literal["strict", "truncate", "open"] = "strict"
+
+    @property
+    def samples(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+    def row(self, t: int) -> dict[str, float]:
+        return {name: float(values[t]) for name, values in self.columns.items()}
+
+
+# ---------------------------------------------------------------------- numbers
+
+_PLAIN = {
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": lambda a, b: a / b,
+    "mod": lambda a, b: a - math.floor(a / b) * b,
+    "pow": lambda a, b: a**b,
+    "neg": lambda a: -a,
+    "square": lambda a: a * a,
+    "abs": abs,
+    "min": min,
+    "max": max,
+    "sqrt": math.sqrt,
+    "exp": math.exp,
+    "log": math.log,
+    "sin": math.sin,
+    "cos": math.cos,
+    "tan": math.tan,
+    "asin": math.asin,
+    "acos": math.acos,
+    "atan": math.atan,
+    "atan2": math.atan2,
+    "sign": lambda a: (a > 0) - (a < 0),
+    "floor": math.floor,
+    "ceil": math.ceil,
+    "round": round,
+    "clip": lambda a, low, high: min(max(a, low), high),
+    "relu": lambda a: max(a, 0.0),
+    "norm": lambda *a: math.sqrt(sum(x * x for x in a)),
+    "norm1": lambda *a: sum(map(abs, a)),
+    "norminf": lambda *a: max(map(abs, a)),
+}
+
+
+def number(num: ir.Num, row: Mapping[str, float]) -> float:
+    """A number at one instant, conditions switched exactly."""
+    match num:
+        case ir.Lit(value):
+            return value
+        case ir.Col(name):
+            return row[name]
+        case ir.Op(name, args):
+            return float(_PLAIN[name](*[number(arg, row) for arg in args]))
+        case ir.Ind(cond):
+            return 1.0 if true(cond, row) else 0.0
+        case ir.Where(cond, yes, no):
+            return number(yes if true(cond, row) else no, row)
+    raise TypeError(num)
+
+
+def true(cond: ir.Formula, row: Mapping[str, float]) -> bool:
+    """The truth of a state formula of the IR."""
+    match cond:
+        case ir.Truth(value):
+            return value
+        case ir.Atom(num, sign, strict):
+            value = sign * number(num, row)
+            return value > 0 if strict else value >= 0
+        case ir.Join(op, items):
+            return (all if op == "and" else any)(true(item, row) for item in items)
+    raise TypeError(cond)
+
+
+# ------------------------------------------------------------------------- time
+
+
+def _steps(time: typed.Time, grid: Grid) -> Fraction:
+    seconds = time.seconds / grid.dt if grid.dt else Fraction(0)
+    return seconds + time.steps + time.horizons * (grid.horizon or 0)
+
+
+def distances(interval: typed.Interval, grid: Grid, most: int, *, outward: bool) -> list[int]:
+    """Distances in steps, up to `most`, of the samples that an interval covers."""
+    low = _steps(interval.lo, grid)
+    high = None if interval.hi is None else _steps(interval.hi, grid)
+    inside = [
+        k
+        for k in range(most + 1)
+        if (k > low if interval.lo_open else k >= low)
+        and (high is None or (k < high if interval.hi_open else k <= high))
+    ]
+    if outward:
+        if low.denominator != 1:
+            inside = [math.floor(low), *inside]
+        if high is not None and high.denominator != 1 and math.ceil(high) <= most:
+            inside = [*inside, math.ceil(high)]
+    return inside
+
+
+# ------------------------------------------------------------------- robustness
+
+
+def _most(values: Sequence[Interval | None], pick: Literal["min", "max"]) -> Interval | None:
+    if any(value is None for value in values):
+        return None
+    known = [value for value in values if value is not None]
+    if not known:
+        return TRUE if pick == "min" else FALSE
+    choose = min if pick == "min" else max
+    return choose(low for low, _ in known), choose(high for _, high in known)
+
+
+def _negated(value: Interval | None) -> Interval | None:
+    return None if value is None else (-value[1], -value[0])
+
+
+class Robustness:
+    """Robustness of typed formulas on one trace, remembered per node and instant."""
+
+    def __init__(self, trace: Trace) -> None:
+        self.trace = trace
+        self._known: dict[tuple[int, int, bool], Interval | None] = {}
+        self._alive: list[typed.Formula] = []
+
+    def at(self, node: typed.Formula, t: int, positive: bool = True) -> Interval | None:
+        """The value at `t`, or None where it is undefined. `positive`: under an even number of negations."""
+        key = (id(node), t, positive)
+        if key not in self._known:
+            self._alive.append(node)
+            self._known[key] = self._at(node, t, positive)
+        return self._known[key]
+
+    def _at(self, node: typed.Formula, t: int, positive: bool) -> Interval | None:
+        match node:
+            case typed.Truth(_, value):
+                return TRUE if value else FALSE
+            case typed.Pred(_, num, strict, guard):
+                return self._pred(num, strict, guard, t)
+            case typed.Not(_, body):
+                return _negated(self.at(body, t, not positive))
+            case typed.Logic():
+                return self._logic(node, t, positive)
+            case typed.Temporal():
+                return self._temporal(node, t, positive)
+            case typed.Until():
+                return self._until(node, t, positive)
+            case typed.Shift(_, steps, body):
+                return self._shift(body, t + steps, positive)
+            case typed.Edge(_, op, body):
+                if t == 0:
+                    return FALSE if self.at(body, t, positive) is not None else None
+                now = self.at(body, t, positive if op == "rise" else not positive)
+                before = self.at(body, t - 1, not positive if op == "rise" else positive)
+                return _most([now, _negated(before)] if op == "rise" else [_negated(now), before], "min")
+        raise TypeError(node)
+
+    def _pred(self, num: ir.Num, strict: bool, guard: bool, t: int) -> Interval:
+        if t >= self.trace.samples:
+            return UNKNOWN
+        value = number(num, self.trace.row(t))
+        if guard:
+            return TRUE if (value > 0 if strict else value >= 0) else FALSE
+        return value, value
+
+    def _logic(self, node: typed.Logic, t: int, positive: bool) -> Interval | None:
+        if node.op in ("and", "or"):
+            return _most([self.at(i, t, positive) for i in node.items], "min" if node.op == "and" else "max")
+        left, right = node.items
+        if node.op == "->":
+            return _most([_negated(self.at(left, t, not positive)), self.at(right, t, positive)], "max")
+        if node.op == "xor":
+            return _negated(self.at(typed.Logic(node.span, "<->", node.items), t, not positive))
+        there = self.at(typed.Logic(node.span, "->", (left, right)), t, positive)
+        back = self.at(typed.Logic(node.span, "->", (right, left)), t, positive)
+        return _most([there, back], "min")
+
+    def _window(self, interval: typed.Interval, t: int, outward: bool) -> list[int] | None:
+        """Instants of a window of the future; None: it leaves a strict trace; [-1]: nobody knows."""
+        samples = self.trace.samples
+        most = 4 * samples + 64
+        if interval.hi is None:
+            found = [
+                t + k for k in distances(interval, self.trace.grid, most, outward=outward) if t + k < samples
+            ]
+            if found or self.trace.end == "truncate":
+                return found
+            return None if self.trace.end == "strict" else [-1]
+        found = [t + k for k in distances(interval, self.trace.grid, most, outward=outward)]
+        if self.trace.end == "strict" and any(k >= samples for k in found):
+            return None
+        return found if self.trace.end == "open" else [k for k in found if k < samples]
+
+    def _before(self, interval: typed.Interval, t: int, outward: bool) -> list[int]:
+        return [t - k for k in distances(interval, self.trace.grid, t, outward=outward)]
+
+    def _temporal(self, node: typed.Temporal, t: int, positive: bool) -> Interval | None:
+        every = node.op in ("always", "historically")
+        future = node.op in ("always", "eventually")
+        instants = (self._window if future else self._before)(node.interval, t, every is positive)
+        if instants is None:
+            return None
+        if instants == [-1]:
+            return UNKNOWN
+        return _most([self.at(node.body, k, positive) for k in instants], "min" if every else "max")
+
+    def _until(self, node: typed.Until, t: int, positive: bool) -> Interval | None:
+        match node.op:
+            case "until":
+                instants = self._window(node.interval, t, not positive)
+                return self._met(node.left, node.right, (t, instants), positive)
+            case "release":
+                dual = self._met(
+                    typed.Not(node.span, node.left),
+                    typed.Not(node.span, node.right),
+                    (t, self._window(node.interval, t, positive)),
+                    not positive,
+                )
+                return _negated(dual)
+            case "since":
+                instants = self._before(node.interval, t, not positive)
+                return self._met(node.left, node.right, (t, instants), positive)
+            case "unless":
+                whole = typed.Interval(typed.Time(), node.interval.hi, False, node.interval.hi_open)
+                held = self.at(typed.Temporal(node.span, "always", whole, node.left), t, positive)
+                met = self.at(
+                    typed.Until(node.span, "until", node.interval, node.left, node.right), t, positive
+                )
+                return _most([held, met], "max")
+
+    def _met(
+        self, left: typed.Formula, right: typed.Formula, when: tuple[int, list[int] | None], positive: bool
+    ) -> Interval | None:
+        """sup over t' of min(right(t'), inf of left between now and t', both included)."""
+        t, instants = when
+        if instants is None:
+            return None
+        if instants == [-1]:
+            return UNKNOWN
+        values = []
+        for k in instants:
+            between = [self.at(left, i, positive) for i in range(min(t, k), max(t, k) + 1)]
+            values.append(_most([self.at(right, k, positive), *between], "min"))
+        return _most(values, "max")
+
+    def _shift(self, body: typed.Formula, t: int, positive: bool) -> Interval | None:
+        if 0 <= t < self.trace.samples or (t >= 0 and self.trace.end == "open"):
+            return self.at(body, t, positive)
+        return {"strict": None, "truncate": FALSE, "open": UNKNOWN}[self.trace.end]
+
+
+def robustness(formula: typed.Formula, trace: Trace, t: int = 0) -> Interval | None:
+    """Robustness of `formula` at sample `t`; None where it is undefined."""
+    return Robustness(trace).at(formula, t)
+
+
+# ------------------------------------------------------------- Boolean semantics
+
+
+def holds(formula: typed.Formula, trace: Trace, t: int = 0) -> bool:  # noqa: C901 - one case a node
+    """Truth of `formula` at sample `t`, windows cut to the trace, bounds on the grid."""
+    match formula:
+        case typed.Truth(_, value):
+            return value
+        case typed.Pred(_, num, strict):
+            value = number(num, trace.row(t))
+            return value > 0 if strict else value >= 0
+        case typed.Not(_, body):
+            return not holds(body, trace, t)
+        case typed.Logic(_, op, items):
+            values = [holds(item, trace, t) for item in items]
+            match op:
+                case "and":
+                    return all(values)
+                case "or":
+                    return any(values)
+                case "->":
+                    return not values[0] or values[1]
+                case "<->":
+                    return values[0] is values[1]
+                case "xor":
+                    return values[0] is not values[1]
+        case typed.Temporal(_, op, interval, body):
+            ahead = distances(interval, trace.grid, trace.samples, outward=False)
+            sign = 1 if op in ("always", "eventually") else -1
+            instants = [t + sign * k for k in ahead if 0 <= t + sign * k < trace.samples]
+            quantifier = all if op in ("always", "historically") else any
+            return quantifier(holds(body, trace, k) for k in instants)
+        case typed.Until():
+            return _until_holds(formula, trace, t)
+        case typed.Shift(_, steps, body):
+            return 0 <= t + steps < trace.samples and holds(body, trace, t + steps)
+        case typed.Edge(_, op, body):
+            now, before = holds(body, trace, t), t > 0 and holds(body, trace, t - 1)
+            return t > 0 and ((now and not before) if op == "rise" else (before and not now))
+    raise TypeError(formula)
+
+
+def _until_holds(formula: typed.Until, trace: Trace, t: int) -> bool:
+    left, right = formula.left, formula.right
+    ahead = distances(formula.interval, trace.grid, trace.samples, outward=False)
+    sign = -1 if formula.op == "since" else 1
+    instants = [t + sign * k for k in ahead if 0 <= t + sign * k < trace.samples]
+
+    def between(k: int) -> range:
+        return range(min(t, k), max(t, k) + 1)
+
+    if formula.op == "release":
+        return all(holds(right, trace, k) or any(holds(left, trace, i) for i in between(k)) for k in instants)
+    met = any(holds(right, trace, k) and all(holds(left, trace, i) for i in between(k)) for k in instants)
+    if formula.op == "unless" and not met:
+        whole = typed.Interval(typed.Time(), formula.interval.hi, False, formula.interval.hi_open)
+        return holds(typed.Temporal(formula.span, "always", whole, left), trace, t)
+    return met
