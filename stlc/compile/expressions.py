@@ -125,6 +125,8 @@ def _defined(entry: Definition, place: Span, scope: Scope) -> Value:
 
 def _expanded(entry: Definition, call: ast.Call, scope: Scope) -> Value:
     """A macro with its arguments put in."""
+    if scope.cache.get(entry.name, entry) is None:
+        raise Failed
     if entry.name in scope.open:
         scope.fail(cycle(entry, scope))
     bound: dict[str, tuple[Value, Cost]] = {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from stlc.compile import typed
 from stlc.compile.algebra import in_unit
 from stlc.compile.functions import REGIONS
 from stlc.compile.meter import MAX_LEVELS, MAX_NODES, Meter
@@ -61,7 +62,7 @@ def _check_constant(entry: Definition, value: Value, scope: Scope) -> None:
     items = value.items if isinstance(value, Vector) else (value,)
     for item in items:
         known = isinstance(item, Number) and item.constant is not None
-        if known or (isinstance(item, Moment) and not item.end):
+        if known or isinstance(item, typed.Truth) or (isinstance(item, Moment) and not item.end):
             continue
         message = f"`const {entry.name}` must be a number that is known at compile time"
         help_ = (f"def {entry.name} = {entry.body.span.text}",)

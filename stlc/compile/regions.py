@@ -1,7 +1,7 @@
 """Regions and their signed distance, positive inside.
 
 Ball, box, half-space and polygon are exact Euclidean distances. A union is the max of its parts, an
-intersection the min: exact in sign, and a lower bound of the distance inside a union or outside an intersection.
+intersection the min: exact in sign, a lower bound of the distance inside a union or outside an intersection.
 """
 
 from __future__ import annotations

@@ -28,6 +28,9 @@ class Failed(Exception):  # noqa: N818 - control flow inside this room; the find
     """An expression could not be resolved, and its findings have been reported."""
 
 
+Sort: TypeAlias = Literal["any", "constant", "region", "number", "formula"]
+
+
 @dataclass(frozen=True, slots=True)
 class Known:
     """A name with a value: a signal, a constant, a member of an enum.
@@ -61,7 +64,7 @@ class Definition:
     body: ast.Expr
     formals: tuple[str, ...] = ()
     unit: Unit | None = None
-    sort: Literal["any", "constant", "region", "number", "formula"] = "any"
+    sort: Sort = "any"
     about: str = ""
     span: Span | None = None
 
@@ -113,7 +116,8 @@ class Scope:
 
     def report(self, finding: Diagnostic) -> None:
         """Add a finding, once (a macro that is used twice has its faults once)."""
-        if finding not in self.sink:
+        key = (finding.code, finding.span, finding.message)
+        if all((known.code, known.span, known.message) != key for known in self.sink):
             self.sink.append(finding)
 
     def fail(self, finding: Diagnostic) -> NoReturn:

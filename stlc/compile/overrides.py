@@ -1,0 +1,52 @@
+"""`--set NAME=VALUE`: constants that the command line changes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from stlc.compile.interface import Interface
+from stlc.diagnostics import Diagnostic, SpecError, UsageError
+from stlc.grammar import ast
+from stlc.grammar.parser import parse_expr
+from stlc.registry import closest
+from stlc.source import Source
+
+
+def read_overrides(
+    overrides: Mapping[str, str], spec: ast.Spec, interface: Interface | None
+) -> dict[str, ast.Expr]:
+    """Constant of the specification -> the expression that replaces its value.
+
+    A constant that only the system has is left to it, and so is a dotted key.
+
+    Raises:
+        UsageError: U101, a name that neither has, or a value that is not an expression.
+    """
+    own = {item.name for item in spec.items if isinstance(item, ast.Const)}
+    systems = set() if interface is None else set(interface.constants)
+    found: dict[str, ast.Expr] = {}
+    faults: list[Diagnostic] = []
+    for name, text in overrides.items():
+        if name in own:
+            try:
+                found[name] = parse_expr(Source(f"--set {name}", text))
+            except SpecError as error:
+                faults.append(_unreadable(name, text, error))
+        elif name not in systems and "." not in name:
+            faults.append(_unknown(name, own | systems))
+    if faults:
+        raise UsageError(*faults)
+    return found
+
+
+def _unreadable(name: str, text: str, error: SpecError) -> Diagnostic:
+    first = error.diagnostics[0]
+    message = f"`--set {name}={text}`: {first.message}"
+    return Diagnostic("U101", message, first.span, help=(f"write a value with its unit: `--set {name}=3s`",))
+
+
+def _unknown(name: str, names: set[str]) -> Diagnostic:
+    near = closest(name, names)
+    known = f"constants: {', '.join(sorted(names))}" if names else "the specification has no constant"
+    asks = f"did you mean `{near}`?  " if near is not None else ""
+    return Diagnostic("U101", f"`--set {name}=…`: there is no constant `{name}`", help=(f"{asks}{known}",))

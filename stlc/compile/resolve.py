@@ -1,0 +1,229 @@
+"""From syntax to a typed specification: names bound, sorts and units checked, all findings at once.
+
+    ast.Spec --declare--> entries --evaluate--> typed.Spec
+
+Formulas keep their negations, implications and places; times stay in seconds, steps and horizons.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import PurePath
+from typing import TypeVar
+
+from stlc.compile import typed
+from stlc.compile.declare import Declared, declare
+from stlc.compile.expressions import evaluate
+from stlc.compile.formulas import resolve_formula
+from stlc.compile.interface import Interface
+from stlc.compile.names import check_names
+from stlc.compile.overrides import read_overrides
+from stlc.compile.scope import Definition, Failed, Scope, enforced
+from stlc.compile.signals import ranged
+from stlc.compile.tags import read_tags
+from stlc.compile.vacuity import toothless, vacuous
+from stlc.compile.values import Number, Value, Vector
+from stlc.diagnostics import Diagnostic, Label, SpecError
+from stlc.grammar import ast
+from stlc.signature import Column, Signature
+from stlc.units import same_dims
+
+Item = TypeVar("Item")
+
+MAX_ERRORS = 20
+
+
+def resolve(
+    spec: ast.Spec,
+    *,
+    interface: Interface | None = None,
+    overrides: Mapping[str, str] | None = None,
+    sink: list[Diagnostic],
+) -> typed.Spec:
+    """Bind names, check sorts and units, expand macros.
+
+    Args:
+        spec: as parsed.
+        interface: what the system offers; signals and constants are matched with it.
+        overrides: constant -> expression that replaces its value (`--set`).
+        sink: warnings are appended here.
+
+    Raises:
+        SpecError: with every independent error of the file, in source order, at most `MAX_ERRORS`.
+        UsageError: an override of a constant that does not exist.
+    """
+    values = read_overrides(overrides or {}, spec, interface)
+    findings: list[Diagnostic] = []
+    scope = Scope(sink=findings, temporal=True, time_unit=spec.time_unit)
+    found = declare(spec, interface, values, scope)
+    scope = replace(scope, entries=found.entries, cache=dict.fromkeys(found.broken))
+    _adopt_units(spec, values, found, scope)
+    signature = _signature(found, scope)
+    scope = replace(scope, facts=enforced(signature.columns))
+    constants = _constants(spec, interface, scope)
+    _check_definitions(spec, scope)
+    requirements = _requirements(spec, ast.Require, scope)
+    assumptions = _requirements(spec, ast.Assume, scope)
+    _finish(findings, spec, sink)
+    for requirement, item in zip(requirements, _items(spec, ast.Require), strict=True):
+        sink.extend(_warnings(requirement, item, signature, scope))
+    name = spec.name or PurePath(spec.source.name).stem
+    return typed.Spec(name, signature, constants, requirements, assumptions, spec)
+
+
+def _finish(findings: Sequence[Diagnostic], spec: ast.Spec, sink: list[Diagnostic]) -> None:
+    """Warnings to the sink; errors raised together, in the order of the text."""
+
+    def place(finding: Diagnostic) -> tuple[bool, int]:
+        span = finding.span
+        return (span is not None and span.source == spec.source, 0 if span is None else span.start)
+
+    ordered = sorted(findings, key=place)
+    sink.extend(finding for finding in ordered if finding.severity == "warning")
+    errors = [finding for finding in ordered if finding.severity == "error"]
+    if len(errors) > MAX_ERRORS:
+        more = f"{len(errors) - MAX_ERRORS} more errors are not shown"
+        errors = [*errors[: MAX_ERRORS - 1], errors[MAX_ERRORS - 1].with_note(more)]
+    if errors:
+        raise SpecError(*errors)
+
+
+# ----------------------------------------------------------------- declarations
+
+
+def _signature(found: Declared, scope: Scope) -> Signature:
+    """The declared columns with their ranges."""
+    columns: list[Column] = []
+    for decl, plain in found.columns:
+        try:
+            columns.extend(ranged(plain, decl, scope))
+        except Failed:
+            columns.extend(plain)
+    return Signature(tuple(columns))
+
+
+def _adopt_units(spec: ast.Spec, overrides: Mapping[str, ast.Expr], found: Declared, scope: Scope) -> None:
+    """An override without a unit takes the unit of the value that it replaces."""
+    for item in spec.items:
+        entry = found.entries.get(item.name)
+        if not isinstance(item, ast.Const) or item.name not in overrides or not isinstance(entry, Definition):
+            continue
+        if entry.unit is None:
+            try:
+                original = evaluate(item.value, replace(scope, sink=[], cache=dict(scope.cache)))
+            except Failed:
+                continue
+            if isinstance(original, Number) and not original.flexible:
+                found.entries[item.name] = replace(entry, unit=original.unit)
+
+
+def _constants(spec: ast.Spec, interface: Interface | None, scope: Scope) -> tuple[tuple[str, float], ...]:
+    """Every constant in SI units, vectors by component; compared with those of the system (E104)."""
+    values: list[tuple[str, float]] = []
+    for item in _items(spec, ast.Const):
+        try:
+            with scope.meter.fresh():
+                value = evaluate(ast.Name(item.name_span, item.name, quoted=True), scope)
+        except Failed:
+            continue
+        values.extend(_scalars(item.name, value))
+        if interface is not None and isinstance(value, Number):
+            _compare(item, value, interface, scope)
+    return tuple(values)
+
+
+def _scalars(name: str, value: Value) -> list[tuple[str, float]]:
+    match value:
+        case Number() if value.constant is not None:
+            return [(name, value.constant)]
+        case Vector(items):
+            return [(f"{name}[{i}]", item.constant or 0.0) for i, item in enumerate(items)]
+        case typed.Truth(_, truth):
+            return [(name, float(truth))]
+        case _:
+            return []
+
+
+def _compare(item: ast.Const, value: Number, interface: Interface, scope: Scope) -> None:
+    """E104: one constant, two values."""
+    if item.name not in interface.constants or value.constant is None:
+        return
+    theirs, unit = interface.constants[item.name]
+    free = value.flexible or not unit.text
+    if math.isclose(value.constant, theirs, rel_tol=1e-9) and (free or same_dims(value.unit, unit)):
+        return
+    place = interface.places.get(item.name)
+    labels = () if place is None else (Label(place, "declared here"),)
+    here = _amount(value.constant / value.unit.scale, str(value.unit) if value.unit.text else "")
+    there = _amount(theirs / unit.scale, unit.text)
+    message = f"`{item.name}` is {here} here and {there} in {interface.where}"
+    help_ = (f"make them agree, or change both at once: `--set {item.name}={here.replace(' ', '')}`",)
+    scope.report(Diagnostic("E104", message, item.name_span, here, labels, help=help_))
+
+
+def _amount(value: float, unit: str) -> str:
+    return f"{value:.12g} {unit}".rstrip()
+
+
+def _check_definitions(spec: ast.Spec, scope: Scope) -> None:
+    """Look at every definition, used or not."""
+    for item in spec.items:
+        entry = scope.entries.get(item.name)
+        if not isinstance(item, ast.Def | ast.Region) or not isinstance(entry, Definition):
+            continue
+        if entry.formals:
+            check_names(entry, scope)
+            continue
+        try:
+            with scope.meter.fresh():
+                evaluate(ast.Name(item.name_span, item.name, quoted=True), scope)
+        except Failed:
+            continue
+
+
+# ----------------------------------------------------------------- requirements
+
+
+def _items(spec: ast.Spec, kind: type[Item]) -> list[Item]:
+    return [item for item in spec.items if isinstance(item, kind)]
+
+
+def _requirements(
+    spec: ast.Spec, kind: type[ast.Require | ast.Assume], scope: Scope
+) -> tuple[typed.Requirement, ...]:
+    """The requirements (or assumptions) that can be typed."""
+    found: list[typed.Requirement] = []
+    for item in _items(spec, kind):
+        tags = read_tags(item.tags, scope)
+        what = f"`{'require' if kind is ast.Require else 'assume'} {item.name}`"
+        try:
+            formula = resolve_formula(item.formula, scope, what=what)
+        except Failed:
+            continue
+        found.append(
+            typed.Requirement(
+                name=item.name,
+                doc=item.doc,
+                tags=tags.marks,
+                weight=tags.weight,
+                scale=tags.scale,
+                id=tags.id,
+                group=tags.group,
+                formula=formula,
+                written=item.formula,
+                span=item.span,
+            )
+        )
+    return tuple(found)
+
+
+def _warnings(
+    requirement: typed.Requirement, item: ast.Require, signature: Signature, scope: Scope
+) -> list[Diagnostic]:
+    """W502 and W503."""
+    tag = next((tag for tag in item.tags if tag.name == "safety"), None)
+    found = list(vacuous(requirement.formula, signature, scope.facts))
+    weak = toothless(requirement, tag)
+    return found if weak is None else [*found, weak]
