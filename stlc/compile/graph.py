@@ -166,15 +166,18 @@ class RobustnessGraph:
 
     def columns(self, env: Mapping[str, Array], *, ops: Ops, smoothing: float | None = None) -> Array:
         """`robustness` on columns `(time, batch)`; only those that the requirements read are needed."""
-        semantics = _semantics(smoothing)
+        return self.overall(self.per_requirement_columns(env, ops=ops, smoothing=smoothing), smoothing)
+
+    def overall(self, each: Array, smoothing: float | None = None) -> Array:
+        """`robustness` from what `per_requirement` gave: (batch, rules) -> (batch,); +inf without rules."""
+        ops, rows = ops_of(each), each.T
+        if not self.rules:
+            return ops.full((each.shape[0],), math.inf, each)
         weighed = [
-            value if rule.weight == rule.scale else value * (rule.weight / rule.scale)
-            for rule, value in zip(self.rules, self._rows(env, ops, semantics), strict=True)
+            rows[i : i + 1] if rule.weight == rule.scale else rows[i : i + 1] * (rule.weight / rule.scale)
+            for i, rule in enumerate(self.rules)
         ]
-        if not weighed:
-            like = next(iter(env.values()))
-            return ops.full(tuple(like.shape[1:]), math.inf, like)
-        return semantics.join(weighed, "min", ops)[0]
+        return _semantics(smoothing).join(weighed, "min", ops)[0]
 
     def per_requirement_columns(
         self, env: Mapping[str, Array], *, ops: Ops, smoothing: float | None = None

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from stlc.compile.ops_torch import TORCH
 from stlc.compile.switch import StraightThrough, Switch, Tanh
 from stlc.controller.task import satisfied
 
@@ -89,13 +90,13 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Loss:
         Losses per plan.
     """
     columns = task.system.rollout_columns(x0, u, objective.switch)
-    rho = task.graph.overall(task.graph.columns(columns, objective.smoothing), objective.smoothing)
-    exact = rho if objective.smoothing is None else task.graph.overall(task.graph.columns(columns))
+    rho = task.graph.columns(columns, ops=TORCH, smoothing=objective.smoothing)
+    exact = rho if objective.smoothing is None else task.graph.columns(columns, ops=TORCH)
     good = satisfied(exact.detach())
     hinge = (objective.margin - rho).clamp(min=0.0)
     if objective.saturation is not None:
         hinge = objective.saturation * torch.log1p(hinge / objective.saturation)
-    cost = task.system.performance(columns, torch.ones_like(rho), rho=rho.detach())
+    cost = task.system.performance(columns, torch.ones_like(rho), rho.detach(), u)
     total = objective.stl_weight * hinge + objective.performance_weight * torch.where(
         good, cost, torch.zeros_like(cost)
     )

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from stlc.compile.graph import RobustnessGraph
 from stlc.compile.interface import Grid
+from stlc.compile.ops_torch import TORCH
 from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics import TOLERANCE
 from stlc.compile.switch import Hard, Switch
@@ -35,12 +36,14 @@ class Judged:
         rho: robustness of the whole specification, (batch,).
         safe: robustness of phi_safe, (batch,); +inf where nothing is tagged `@safety`.
         requirements: robustness per requirement, before weight and scale, (batch, requirements).
+        plans: what was judged, (batch, T, m).
         columns: the predicted states, name -> (time, batch).
     """
 
     rho: Tensor
     safe: Tensor
     requirements: Tensor
+    plans: Tensor
     columns: Mapping[str, Tensor]
 
 
@@ -151,8 +154,9 @@ class Task:
             The verdicts, in the dtype of `x0`. A plan that holds NaN counts as violated (robustness -inf).
         """
         with torch.no_grad():
-            columns = self.system.rollout_columns(x0, u.to(x0.dtype), HARD)
-            each = self.graph.columns(columns)
+            u = u.to(x0.dtype)
+            columns = self.system.rollout_columns(x0, u, HARD)
+            each = self.graph.per_requirement_columns(columns, ops=TORCH)
             rho = self.graph.overall(each)
             safe = self.safety.overall(each[:, self._safe_indices])
         broken = ~torch.isfinite(u).all(2).all(1) | torch.isnan(rho)
@@ -160,12 +164,13 @@ class Task:
             lost = torch.full_like(rho, -torch.inf)
             rho, safe = torch.where(broken, lost, rho), torch.where(broken, lost, safe)
             each = torch.where(broken[:, None], lost[:, None], each)
-        return Judged(rho, safe, each, columns)
+        return Judged(rho, safe, each, u, columns)
 
     def cost(self, judged: Judged) -> Tensor:
         """Performance terms of judged plans, as if every one were satisfying, without gradient: (batch,)."""
         with torch.no_grad():
-            return self.system.performance(judged.columns, torch.ones_like(judged.rho), rho=judged.rho)
+            ones = torch.ones_like(judged.rho)
+            return self.system.performance(judged.columns, ones, judged.rho, judged.plans)
 
 
 def rank(rho: Tensor, cost: Tensor) -> Tensor:
