@@ -1,0 +1,85 @@
+"""What `T` and `dt` mean for a monitor: from its arguments, the trace, or the system that the spec names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+from stlc.compile.interface import Grid, Interface
+from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.files import find_system
+from stlc.grammar import ast
+from stlc.trace import Trace, as_fraction
+
+_SLACK = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Times:
+    """A time step and a horizon, both in seconds and exact; None where nobody said."""
+
+    dt: Fraction | None = None
+    horizon: Fraction | None = None
+
+    def or_else(self, other: Times) -> Times:
+        """What is unknown here is taken from `other`."""
+        dt = self.dt if self.dt is not None else other.dt
+        return Times(dt, self.horizon if self.horizon is not None else other.horizon)
+
+    @property
+    def complete(self) -> bool:
+        """Whether both are known."""
+        return self.dt is not None and self.horizon is not None
+
+    def grid(self) -> Grid:
+        """The same in steps. Raises UsageError (U101) where the horizon is not a whole number of steps."""
+        if self.dt is None or self.horizon is None:
+            return Grid(self.dt, None)
+        steps = self.horizon / self.dt
+        whole = round(steps)
+        if abs(steps - whole) > _SLACK * max(whole, 1):
+            horizon, dt = float(self.horizon), float(self.dt)
+            message = f"the horizon {horizon:g} s is not a whole number of steps of {dt:g} s"
+            raise UsageError(Diagnostic("U101", message))
+        return Grid(self.dt, whole)
+
+
+def given_times(dt: float | Fraction | None, horizon: float | Fraction | None) -> Times:
+    """The arguments of a monitor. Raises UsageError (U101) where they are not positive times."""
+    for name, value in (("dt", dt), ("horizon", horizon)):
+        if value is not None and not 0 < value < float("inf"):
+            raise UsageError(Diagnostic("U101", f"{name} is a time in seconds above 0, not {value}"))
+    return Times(None if dt is None else as_fraction(dt), None if horizon is None else as_fraction(horizon))
+
+
+def system_of(name: str, spec: ast.Spec) -> tuple[Times, Interface]:
+    """Times and interface of a system file. Raises UsageError (U102) or SystemFileError."""
+    from stlc.dynamics.schema import load_system_decl
+
+    decl = load_system_decl(find_system(name, Path(spec.source.name)))
+    return Times(decl.dt, decl.dt * decl.horizon), decl.interface()
+
+
+def named_times(spec: ast.Spec) -> Times:
+    """Times of the system that the specification names; unknown where its file is not there."""
+    from stlc.dynamics.schema import load_system_decl
+
+    if spec.system is None:
+        return Times()
+    try:
+        path = find_system(spec.system, Path(spec.source.name))
+    except UsageError:
+        return Times()
+    decl = load_system_decl(path)
+    return Times(decl.dt, decl.dt * decl.horizon)
+
+
+def recorded_times(trace: Trace, asked: Times) -> Times:
+    """Times of a trace. Raises TraceError (E602) where the monitor was told another time step."""
+    dt = as_fraction(trace.dt)
+    if asked.dt is not None and abs(asked.dt - dt) > Fraction(1, 1000) * dt:
+        message = f"`{trace.name}` has dt {float(dt):g} s, the monitor was told {float(asked.dt):g} s"
+        raise TraceError(Diagnostic("E602", message))
+    horizon = trace.meta.horizon
+    return Times(dt, None if horizon is None else horizon * dt)

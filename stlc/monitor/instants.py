@@ -1,0 +1,142 @@
+"""At which instants a requirement is judged, and its values there.
+
+A requirement that mentions `T` speaks about every planning window: it is judged at each start whose window
+fits, with `end` at the end of the window. One that does not, or that has an interval on the mission clock, is
+judged once, at the start of the trace.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal, TypeAlias
+
+from stlc.compile.defined import defined
+from stlc.compile.graph import robustness_signal
+from stlc.compile.ops import Array
+from stlc.compile.pipeline import Rule
+from stlc.compile.schedule import End
+from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.monitor.values import Ends, Record, bounds, window_bounds
+
+At: TypeAlias = int | Literal["all"] | None
+"""A sample; every start at which the requirement has a value; or what the requirement itself asks for."""
+
+
+def starts_of(rule: Rule, samples: int, horizon: int | None, at: At) -> range:
+    """The instants at which a requirement is judged on a trace of so many samples.
+
+    Raises:
+        UsageError: U101, `at` is not a sample of the trace.
+    """
+    if isinstance(at, int):
+        if not 0 <= at < samples:
+            message = f"there is no sample {at}: the trace has {samples}, counted from 0"
+            raise UsageError(Diagnostic("U101", message))
+        return range(at, at + 1)
+    if rule.absolute:
+        return range(1)
+    if rule.windowed and horizon is not None:
+        return range(max(samples - horizon, 1))
+    if at == "all":
+        return range(max(samples - rule.reach, 1))
+    return range(1)
+
+
+def window_of(rule: Rule, horizon: int | None) -> int | None:
+    """How many samples after its instant `end` is, where that depends on the instant."""
+    return horizon if rule.windowed and rule.uses_end else None
+
+
+def rule_bounds(
+    rule: Rule, record: Record, starts: range, horizon: int | None, ends: Ends
+) -> tuple[Array, Array]:
+    """Both ends of the values at the judged instants, each `(count, batch)`; one array where all is known."""
+    window = window_of(rule, horizon)
+    if window is None:
+        return bounds(rule.formula, record, starts, ends)
+    return window_bounds(rule.formula, record, starts, window, ends)
+
+
+def rule_signal(rule: Rule, record: Record, horizon: int | None, end: End) -> Array:
+    """Values at every sample, `(samples, batch)`; NaN where `end` "strict" leaves them undefined.
+
+    A requirement on the mission clock has one value, whatever the sample.
+    """
+    if rule.absolute:
+        (value,) = rules_at([rule], record, 0, horizon, end)
+        return record.ops.cat([value] * record.samples)
+    if window_of(rule, horizon) is None:
+        return robustness_signal(
+            rule.formula, record.env, ops=record.ops, semantics=record.semantics, end=end
+        )
+    return _window_signal(rule, record, horizon or 0, end)
+
+
+def _window_signal(rule: Rule, record: Record, window: int, end: End) -> Array:
+    """The same where `end` moves along: windows that do not fit are NaN under "strict"."""
+    whole = max(record.samples - window, 0)
+    starts = range(whole if end == "strict" else record.samples)
+    ends: Ends = "truncate" if end == "truncate" else "open"
+    parts = []
+    if starts:
+        low, high = window_bounds(rule.formula, record, starts, window, ends)
+        parts.append(high if end == "upper" else low)
+    if len(starts) < record.samples:
+        like = next(iter(record.env.values()))
+        parts.append(record.ops.full((record.samples - len(starts), like.shape[1]), math.nan, like))
+    return record.ops.cat(parts)
+
+
+def rules_at(rules: Sequence[Rule], record: Record, at: int, horizon: int | None, end: End) -> list[Array]:
+    """Values at one sample, `(1, batch)` each; NaN where `end` "strict" leaves one undefined."""
+    starts_of_all = [starts_of(rule, record.samples, horizon, 0 if rule.absolute else at) for rule in rules]
+    together = [
+        rule.formula
+        for rule, starts in zip(rules, starts_of_all, strict=True)
+        if starts.start == at and window_of(rule, horizon) is None and _has_value(rule, record, at, end)
+    ]
+    values = dict(zip(together, record.values(together, at, 1, end), strict=True)) if together else {}
+    return [
+        values[rule.formula] if rule.formula in values else _alone(rule, record, starts.start, horizon, end)
+        for rule, starts in zip(rules, starts_of_all, strict=True)
+    ]
+
+
+def _has_value(rule: Rule, record: Record, at: int, end: End) -> bool:
+    return end != "strict" or bool(defined(rule.formula, record.samples)[at])
+
+
+def _alone(rule: Rule, record: Record, at: int, horizon: int | None, end: End) -> Array:
+    window = window_of(rule, horizon)
+    inner = record if window is None else record.cut(at + window + 1)
+    whole = window is None or at + window < record.samples
+    if end == "strict" and not (whole and _has_value(rule, inner, at, end)):
+        like = next(iter(record.env.values()))
+        return record.ops.full((1, like.shape[1]), math.nan, like)
+    return inner.values([rule.formula], at, 1, end)[0]
+
+
+def check_length(rule: Rule, samples: int, starts: range, dt: float | None) -> Diagnostic | None:
+    """E306 where a value at `starts` needs more samples than there are."""
+    if defined(rule.formula, samples)[starts.start : starts.stop].all():
+        return None
+    unit, step = ("samples", 1.0) if dt is None else ("s", dt)
+    needed, length = (starts.stop - 1 + rule.reach) * step, (samples - 1) * step
+    return Diagnostic(
+        "E306",
+        f"this needs {needed:.6g} {unit} of signal; the trace has {length:.6g} {unit}",
+        rule.typed.written.span,
+        help=(
+            f"record {needed - length:.6g} {unit} more, or shorten the intervals",
+            "`--end truncate` evaluates on what there is",
+        ),
+    )
+
+
+def require_length(rules_and_starts: list[tuple[Rule, range]], samples: int, dt: float | None) -> None:
+    """Raise TraceError (E306) where a requirement needs more samples than there are."""
+    findings = [check_length(rule, samples, starts, dt) for rule, starts in rules_and_starts]
+    found = [finding for finding in findings if finding is not None]
+    if found:
+        raise TraceError(*found)

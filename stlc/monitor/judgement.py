@@ -1,0 +1,209 @@
+"""What a monitor says: per requirement and over all, per trace and over all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.pipeline import Rule
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.monitor.prepared import Prepared
+from stlc.registry import closest
+
+Status: TypeAlias = Literal["satisfied", "violated", "inconclusive"]
+Floats: TypeAlias = NDArray[np.float64]
+Bools: TypeAlias = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """One requirement on one or many traces.
+
+    Attributes:
+        rule: the requirement.
+        start: the first judged sample; the others follow one by one.
+        low: least robustness over all continuations of the traces, (instants, traces).
+        high: greatest robustness; the array `low` itself where nothing is unknown.
+        holds: certainly satisfied, (instants, traces).
+        fails: certainly violated, (instants, traces).
+        shape: of the signals before their time axis; () for a single trace.
+    """
+
+    rule: Rule
+    start: int
+    low: Floats = field(repr=False)
+    high: Floats = field(repr=False)
+    holds: Bools = field(repr=False)
+    fails: Bools = field(repr=False)
+    shape: tuple[int, ...]
+
+    @property
+    def name(self) -> str:
+        """Of the requirement."""
+        return self.rule.name
+
+    @property
+    def statuses(self) -> list[Status]:
+        """One for each trace."""
+        violated, satisfied = self.fails.any(axis=0).tolist(), self.holds.all(axis=0).tolist()
+        return [_status(v, s) for v, s in zip(violated, satisfied, strict=True)]
+
+    @property
+    def status(self) -> Any:
+        """`satisfied`, `violated` or `inconclusive`; an array of them for a batch."""
+        return _shaped(np.array(self.statuses), self.shape)
+
+    @property
+    def overall(self) -> Status:
+        """Over all traces: violated if one is, satisfied if all are."""
+        return _status(bool(self.fails.any()), bool(self.holds.all()))
+
+    @property
+    def satisfied(self) -> bool | None:
+        """Over all traces: True, False, or None where that is not known."""
+        return _known(self.overall)
+
+    @property
+    def bounds(self) -> tuple[Any, Any]:
+        """Both ends of the robustness over all continuations, the least over the judged instants."""
+        return _shaped(self.low.min(axis=0), self.shape), _shaped(self.high.min(axis=0), self.shape)
+
+    @property
+    def robustness(self) -> Any:
+        """The least over the judged instants; a float, or an array for a batch.
+
+        Where a trace is too short to say: the known bound if the verdict follows from it, else NaN.
+        """
+        return _shaped(self.least, self.shape)
+
+    @property
+    def least(self) -> Floats:
+        """`robustness` as an array (traces,)."""
+        low, high = self.low.min(axis=0), self.high.min(axis=0)
+        known = np.where(self.holds.all(axis=0), low, np.nan)
+        known = np.where(self.fails.any(axis=0), high, known)
+        return np.where(low == high, low, known)
+
+    @property
+    def share(self) -> float:
+        """Share of the judged instants of all traces at which it certainly holds."""
+        return float(self.holds.mean())
+
+    @property
+    def instants(self) -> int:
+        """How many instants were judged in each trace."""
+        return len(self.low)
+
+    @property
+    def worst(self) -> tuple[int, int]:
+        """(trace, sample) of the least robustness; of a violation where there is one."""
+        values = self.high if self.fails.any() else self.low
+        instant, trace = np.unravel_index(int(np.argmin(values)), values.shape)
+        return int(trace), self.start + int(instant)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """All requirements of a specification on one or many traces.
+
+    Attributes:
+        requirements: one judgement each, in the order of the specification.
+        subject: what was judged.
+    """
+
+    requirements: tuple[Judgement, ...]
+    subject: Prepared = field(repr=False)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the signals before their time axis; () for a single trace."""
+        return self.subject.signals.shape
+
+    def __getitem__(self, name: str) -> Judgement:
+        """The judgement of one requirement. Raises UsageError (U101) for an unknown name."""
+        for judgement in self.requirements:
+            if judgement.name == name:
+                return judgement
+        raise unknown_requirement(name, [judgement.name for judgement in self.requirements])
+
+    def __iter__(self) -> Iterator[Judgement]:
+        return iter(self.requirements)
+
+    @property
+    def traces(self) -> int:
+        """How many traces were judged."""
+        return self.subject.signals.batch
+
+    @property
+    def statuses(self) -> list[Status]:
+        """One for each trace: violated if a requirement is, satisfied if all are."""
+        rows = [judgement.statuses for judgement in self.requirements]
+        return [
+            _status("violated" in column, {*column} <= {"satisfied"}) for column in zip(*rows, strict=True)
+        ]
+
+    @property
+    def status(self) -> Any:
+        """`satisfied`, `violated` or `inconclusive`; an array of them for a batch."""
+        return _shaped(np.array(self.statuses), self.shape)
+
+    @property
+    def overall(self) -> Status:
+        """Over all traces and requirements."""
+        found = {judgement.overall for judgement in self.requirements}
+        return _status("violated" in found, found <= {"satisfied"})
+
+    @property
+    def satisfied(self) -> bool | None:
+        """Over all traces and requirements: True, False, or None where that is not known."""
+        return _known(self.overall)
+
+    @property
+    def robustness(self) -> Any:
+        """The least `weight * robustness / scale` over the requirements; a float, or an array for a batch."""
+        rows = [j.least * (j.rule.weight / j.rule.scale) for j in self.requirements]
+        return _shaped(np.min(rows, axis=0), self.shape)
+
+    @property
+    def share(self) -> float:
+        """Share of the instants of all traces at which all requirements certainly hold.
+
+        Requirements that are judged once hold, or not, at every instant.
+        """
+        most = max(judgement.instants for judgement in self.requirements)
+        holds = np.ones((most, self.traces), dtype=bool)
+        for judgement in self.requirements:
+            if judgement.instants == most:
+                holds &= judgement.holds
+            else:
+                holds &= judgement.holds.all(axis=0)
+        return float(holds.mean())
+
+    @property
+    def satisfied_traces(self) -> int:
+        """How many traces satisfy every requirement at all its instants."""
+        return self.statuses.count("satisfied")
+
+
+def unknown_requirement(name: str, names: list[str]) -> UsageError:
+    """U101: no requirement is called `name`."""
+    near = closest(name, names)
+    help_ = (f"did you mean `{near}`?",) if near else ()
+    note = (f"requirements: {', '.join(names)}",)
+    return UsageError(Diagnostic("U101", f"there is no requirement `{name}`", help=help_, note=note))
+
+
+def _status(violated: bool, satisfied: bool) -> Status:
+    return "violated" if violated else "satisfied" if satisfied else "inconclusive"
+
+
+def _known(status: Status) -> bool | None:
+    return None if status == "inconclusive" else status == "satisfied"
+
+
+def _shaped(values: NDArray[Any], shape: tuple[int, ...]) -> Any:
+    return values.reshape(shape) if shape else values.reshape(()).item()

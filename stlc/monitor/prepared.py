@@ -1,0 +1,44 @@
+"""Signals and requirements that fit together: what there is to judge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from stlc.compile.pipeline import Compiled, Rule
+from stlc.monitor.signals import Signals
+from stlc.monitor.values import Record
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """Signals laid out for a specification that was compiled for their time step.
+
+    Attributes:
+        compiled: the specification.
+        rules: its requirements that are to be judged.
+        signals: where the columns come from.
+        record: the columns, and how to compute with them.
+    """
+
+    compiled: Compiled
+    rules: tuple[Rule, ...]
+    signals: Signals
+    record: Record
+
+    @property
+    def horizon(self) -> int | None:
+        """What `T` means, in steps; None where nothing said so."""
+        return self.compiled.grid.horizon
+
+    @property
+    def dt(self) -> float | None:
+        """Time step in seconds; None where nothing said so."""
+        return None if self.compiled.grid.dt is None else float(self.compiled.grid.dt)
+
+    def time(self, sample: int) -> float:
+        """Time of a sample in seconds; its number where the time step is unknown."""
+        return float(sample) if self.dt is None else self.signals.t0 + sample * self.dt
+
+    def moment(self, sample: int) -> str:
+        """The same in words: `t = 4.6 s`."""
+        return f"sample {sample}" if self.dt is None else f"t = {self.time(sample):.6g} s"

@@ -1,0 +1,158 @@
+"""Values of one requirement on a record, at the instants at which it is judged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias, assert_never
+
+import numpy as np
+
+from stlc.compile import ir
+from stlc.compile.defined import defined
+from stlc.compile.graph import evaluate
+from stlc.compile.ops import Array, Ops
+from stlc.compile.schedule import End
+from stlc.compile.semantics import Exact, Semantics
+
+Ends: TypeAlias = Literal["open", "truncate"]
+"""`open`: the trace may go on, values are bounds over all continuations; `truncate`: windows are cut."""
+
+_CHUNK = 1 << 22
+"""Numbers of one column that windows are unrolled into at a time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """Columns `(samples, batch)` and how to compute with them."""
+
+    env: Mapping[str, Array]
+    ops: Ops
+    semantics: Semantics = Exact()  # noqa: RUF009 - frozen
+
+    @property
+    def samples(self) -> int:
+        """Length of the record."""
+        return len(next(iter(self.env.values())))
+
+    def cut(self, stop: int) -> Record:
+        """The first `stop` samples."""
+        return self if stop >= self.samples else replace(self, env={n: x[:stop] for n, x in self.env.items()})
+
+    def values(self, formulas: Sequence[ir.Formula], start: int, count: int, end: End) -> list[Array]:
+        """Values `(count, batch)` of each formula at `count` instants from `start`."""
+        ops, semantics = self.ops, self.semantics
+        return evaluate(formulas, self.env, ops=ops, semantics=semantics, start=start, count=count, end=end)
+
+
+def bounds(formula: ir.Formula, record: Record, starts: range, ends: Ends) -> tuple[Array, Array]:
+    """Both ends of the values at consecutive instants, each `(count, batch)`.
+
+    Where nothing is unknown, both are one and the same array.
+    """
+
+    def at(end: End) -> Array:
+        return record.values([formula], starts.start, len(starts), end)[0]
+
+    if ends == "truncate" or defined(formula, record.samples)[starts.start : starts.stop].all():
+        value = at("truncate" if ends == "truncate" else "strict")
+        return value, value
+    return at("lower"), at("upper")
+
+
+def window_bounds(
+    formula: ir.Formula, record: Record, starts: range, window: int, ends: Ends
+) -> tuple[Array, Array]:
+    """The same where `end` is `window` samples after each instant: `(count, batch)`.
+
+    Every instant sees its own record, from what the past operators look back at to its own end. Many of them
+    are evaluated at once: they become columns.
+    """
+    back = history(formula)
+    early = range(starts.start, max(min(back, starts.stop), starts.start))
+    pairs = [bounds(formula, record.cut(k + window + 1), range(k, k + 1), ends) for k in early]
+    for inner, count in _unrolled(record, range(early.stop, starts.stop), back, window):
+        low, high = bounds(formula, inner, range(back, back + 1), ends)
+        same = low is high
+        low = low.reshape(count, -1)
+        pairs.append((low, low if same else high.reshape(count, -1)))
+    low = record.ops.cat([pair[0] for pair in pairs])
+    if all(pair[0] is pair[1] for pair in pairs):
+        return low, low
+    return low, record.ops.cat([pair[1] for pair in pairs])
+
+
+def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator[tuple[Record, int]]:
+    """Records whose columns are the surroundings of instants, some instants at a time."""
+    length = back + window + 1
+    whole = max(min(starts.stop, record.samples - window), starts.start)
+    batch = next(iter(record.env.values())).shape[1]
+    step = max(_CHUNK // (length * batch), 1)
+    for begin in range(starts.start, whole, step):
+        chosen = np.arange(begin, min(begin + step, whole))
+        rows = np.arange(-back, window + 1)[:, None] + chosen
+        env = {name: x[rows].reshape(length, len(chosen) * batch) for name, x in record.env.items()}
+        yield replace(record, env=env), len(chosen)
+    for k in range(whole, starts.stop):
+        yield replace(record, env={name: x[k - back :] for name, x in record.env.items()}), 1
+
+
+def history(formula: ir.Formula) -> int:
+    """How many samples before its instant a formula looks at where they exist."""
+    match formula:
+        case ir.Truth() | ir.Atom():
+            return 0
+        case ir.Join(items=items):
+            return max(map(history, items))
+        case ir.Over(window=window, body=body):
+            return max(history(body) - window.lo, 0)
+        case ir.Until(left=left, right=right):
+            return max(history(left), history(right))
+        case ir.Past(window=window, body=body):
+            return history(body) + _back(window)
+        case ir.Since(window=window, left=left, right=right):
+            return max(history(left), history(right)) + _back(window)
+        case ir.Shift(steps=steps, body=body):
+            return max(history(body) - steps, 0)
+    assert_never(formula)
+
+
+def _back(window: ir.Window) -> int:
+    """More than any record has where the window is unbounded."""
+    return 1 << 40 if window.hi is None else window.hi
+
+
+# ------------------------------------------------------------------ strict predicates
+
+
+def by_truth(formulas: Sequence[ir.Formula], record: Record) -> tuple[list[ir.Formula], Record]:
+    """The formulas over columns that hold the truth of their predicates: +inf (true) and -inf (false).
+
+    `a > b` is true above 0 and `a >= b` from 0 on, without any tolerance.
+    """
+    names: dict[ir.Atom, str] = {}
+    replaced = [_abstract(formula, names) for formula in formulas]
+    if not names:
+        return replaced, record
+    values = evaluate(list(names), record.env, ops=record.ops, start=0, count=record.samples)
+    ops = record.ops
+    env = {
+        name: ops.infinite(ops.gt(value, 0.0) if atom.strict else ops.ge(value, 0.0), value)
+        for (atom, name), value in zip(names.items(), values, strict=True)
+    }
+    return replaced, replace(record, env=env)
+
+
+def _abstract(formula: ir.Formula, names: dict[ir.Atom, str]) -> ir.Formula:
+    match formula:
+        case ir.Atom():
+            return ir.Atom(ir.Col(names.setdefault(formula, f"#{len(names)}")), span=formula.span)
+        case ir.Truth():
+            return formula
+        case ir.Join(items=items):
+            return replace(formula, items=tuple(_abstract(item, names) for item in items))
+        case ir.Over(body=body) | ir.Past(body=body) | ir.Shift(body=body):
+            return replace(formula, body=_abstract(body, names))
+        case ir.Until(left=left, right=right) | ir.Since(left=left, right=right):
+            return replace(formula, left=_abstract(left, names), right=_abstract(right, names))
+    assert_never(formula)

@@ -1,0 +1,240 @@
+"""A specification made ready to judge recorded signals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+from stlc.compile.interface import Grid
+from stlc.compile.ops import Array
+from stlc.compile.pipeline import Compiled, Rule, compile_spec
+from stlc.compile.schedule import End
+from stlc.compile.semantics import TOLERANCE, Exact, LogSumExp
+from stlc.diagnostics import SpecError
+from stlc.files import read_source
+from stlc.grammar import ast
+from stlc.grammar.parser import parse
+from stlc.monitor.grid import Times, given_times, named_times, recorded_times, system_of
+from stlc.monitor.instants import At, require_length, rule_bounds, rule_signal, rules_at, starts_of
+from stlc.monitor.judgement import Judgement, Status, Verdict, unknown_requirement
+from stlc.monitor.needs import needs_of
+from stlc.monitor.prepared import Prepared
+from stlc.monitor.signals import Given, arrange
+from stlc.monitor.values import Ends, Record, by_truth
+from stlc.source import Source
+from stlc.trace import Trace, load_trace
+
+__all__ = ["Judgement", "Monitor", "Status", "Verdict"]
+
+Subject: TypeAlias = Given | Trace | Path | str
+"""Signals by name, a trace, or the path of one."""
+
+Seconds: TypeAlias = float | Fraction
+
+_SUFFIXES = (".stl", ".stlc")
+
+
+class Monitor:
+    """Judges recorded signals: exact, per requirement, without torch unless the signals are torch tensors.
+
+    Args:
+        spec: a specification, its text, or the path of its file.
+        dt: time step of the signals in seconds; by default that of the trace, or of the system.
+        horizon: what `T` means, in seconds; by default that of the trace, or of the system.
+        system: path or name of a system file; the specification is then checked against it. By default
+            the system that the specification names says what is missing of `dt` and `T`.
+
+    Signals are NumPy arrays or torch tensors, (time,) or (…, time), by name; a vector is (…, time, k) or one
+    signal per component, `q[0]`. Results are float64 for NumPy; for torch, dtype, device and gradients stay.
+
+    Raises:
+        SpecError: the specification is invalid; E311 where `dt` or `T` is needed and nobody says what it is.
+    """
+
+    def __init__(
+        self,
+        spec: ast.Spec | str | Path,
+        dt: Seconds | None = None,
+        horizon: Seconds | None = None,
+        system: str | Path | None = None,
+    ) -> None:
+        self.spec = spec if isinstance(spec, ast.Spec) else parse(_source(spec))
+        self._asked = given_times(dt, horizon)
+        self._system, self._interface = Times(), None
+        if system is not None:
+            self._system, self._interface = system_of(str(system), self.spec)
+        self._compiled: dict[Grid, Compiled] = {}
+        try:
+            self._compile(Times(self._asked.dt, self._asked.horizon).or_else(self._system))
+        except SpecError as error:
+            if any(finding.code != "E311" for finding in error.diagnostics):
+                raise
+
+    @property
+    def requirements(self) -> tuple[str, ...]:
+        """Names of the requirements, in order."""
+        return tuple(item.name for item in self.spec.items if isinstance(item, ast.Require))
+
+    @property
+    def compiled(self) -> Compiled:
+        """The specification as it was compiled for the time step and the horizon that are known here."""
+        return self._ready(Times())
+
+    @property
+    def horizon(self) -> float:
+        """Seconds of signal that a verdict at time 0 needs; windows to the end take what there is."""
+        return float(self.compiled.reach * (self.compiled.grid.dt or 0))
+
+    # -------------------------------------------------------------------- judging
+
+    def check(
+        self,
+        signals: Subject,
+        *,
+        at: At = None,
+        end: Literal["open", "strict", "truncate"] = "open",
+        tolerance: float = TOLERANCE,
+        require: Sequence[str] = (),
+    ) -> Verdict:
+        """Judge every requirement at the instants at which it speaks (`stlc.monitor.instants`).
+
+        Args:
+            signals: by name, or a trace, or the path of one.
+            at: judge at this sample, or at "all" starts; None takes what each requirement asks for.
+            end: where a trace is too short: "open" takes bounds over all its continuations and may be
+                inconclusive, "strict" refuses, "truncate" cuts windows.
+            tolerance: a robustness of at least minus this is satisfied; 0 makes strictness count.
+            require: names of the requirements to judge; none means all.
+
+        Raises:
+            TraceError: signals are missing (E601), not finite (E604), or do not fit (E605); with `end`
+                "strict" the trace is too short (E306).
+            UsageError: U101, an unknown requirement, or no such sample.
+        """
+        ready = self._prepare(signals, require, plain=True)
+        samples = ready.signals.samples
+        starts = [starts_of(rule, samples, ready.horizon, at) for rule in ready.rules]
+        if end == "strict":
+            require_length(list(zip(ready.rules, starts, strict=True)), samples, ready.dt)
+        judgements = [
+            _judge(rule, ready, its, "truncate" if end == "truncate" else "open", tolerance)
+            for rule, its in zip(ready.rules, starts, strict=True)
+        ]
+        return Verdict(tuple(judgements), ready)
+
+    def robustness(
+        self,
+        signals: Subject,
+        *,
+        end: Literal["strict", "truncate"] = "strict",
+        at: int | None = None,
+        smoothing: float | None = None,
+    ) -> Array:
+        """Robustness of the whole: the least `weight * robustness / scale` over the requirements.
+
+        Args:
+            signals: as in `check`; (time,) or (…, time).
+            end: "strict" leaves NaN where a window is not whole, "truncate" cuts windows.
+            at: at this sample only.
+            smoothing: scale k of the log-sum-exp; None is exact.
+
+        Returns:
+            The shape of the signals, or with `at` that shape without the time axis.
+        """
+        ready = self._prepare(signals, ())
+        semantics = Exact() if smoothing is None else LogSumExp(smoothing)
+        ready = replace(ready, record=replace(ready.record, semantics=semantics))
+        rows = _rows(ready, end, at)
+        weighed = [row * (rule.weight / rule.scale) for rule, row in zip(ready.rules, rows, strict=True)]
+        whole = semantics.join(weighed, "min", ready.signals.ops)
+        return ready.signals.like_given(whole) if at is None else ready.signals.at_one(whole)
+
+    def requirement_robustness(
+        self, signals: Subject, *, end: Literal["strict", "truncate"] = "strict", at: int | None = None
+    ) -> dict[str, Array]:
+        """Robustness of each requirement, before weight and scale; shapes as in `robustness`."""
+        ready = self._prepare(signals, ())
+        laid = ready.signals.like_given if at is None else ready.signals.at_one
+        rows = _rows(ready, end, at)
+        return {rule.name: laid(row) for rule, row in zip(ready.rules, rows, strict=True)}
+
+    def bounds(self, signals: Subject, *, at: int | None = None) -> tuple[Array, Array]:
+        """Least and greatest robustness of the whole over all continuations of the signals.
+
+        Samples that are not there may be anything, predicate by predicate. Shapes as in `robustness`.
+        """
+        ready = self._prepare(signals, ())
+        ends = []
+        for end in ("lower", "upper"):
+            rows = _rows(ready, end, at)
+            weighed = [row * (rule.weight / rule.scale) for rule, row in zip(ready.rules, rows, strict=True)]
+            whole = Exact().join(weighed, "min", ready.signals.ops)
+            ends.append(ready.signals.like_given(whole) if at is None else ready.signals.at_one(whole))
+        return ends[0], ends[1]
+
+    # ------------------------------------------------------------------- compiling
+
+    def _prepare(self, subject: Subject, require: Sequence[str], *, plain: bool = False) -> Prepared:
+        given = load_trace(subject) if isinstance(subject, (str, Path)) else subject
+        recorded = recorded_times(given, self._asked) if isinstance(given, Trace) else Times()
+        compiled = self._ready(recorded)
+        rules = _chosen(compiled.requirements, require)
+        signals = arrange(given, needs_of(compiled, rules), plain=plain)
+        return Prepared(compiled, rules, signals, Record(signals.env, signals.ops))
+
+    def _ready(self, recorded: Times) -> Compiled:
+        """Compiled for what the arguments, the trace and the given system say; at last the named system."""
+        step = Times(recorded.dt).or_else(Times(self._asked.dt)).or_else(Times(self._system.dt))
+        whole = Times(None, self._asked.horizon).or_else(self._system).or_else(recorded)
+        known = Times(step.dt, whole.horizon)
+        try:
+            return self._compile(known)
+        except SpecError as error:
+            if self.spec.system is None or all(finding.code != "E311" for finding in error.diagnostics):
+                raise
+            return self._compile(known.or_else(named_times(self.spec)))
+
+    def _compile(self, times: Times) -> Compiled:
+        grid = times.grid()
+        if grid not in self._compiled:
+            self._compiled[grid] = compile_spec(
+                self.spec, grid=grid, interface=self._interface, purpose="check"
+            )
+        return self._compiled[grid]
+
+
+def _source(spec: str | Path) -> Source:
+    """A path where it looks like one; everything else is the text itself."""
+    if isinstance(spec, Path) or (spec.endswith(_SUFFIXES) and "\n" not in spec):
+        return read_source(spec)
+    return Source("<text>", spec)
+
+
+def _chosen(rules: Sequence[Rule], names: Sequence[str]) -> tuple[Rule, ...]:
+    known = [rule.name for rule in rules]
+    for name in names:
+        if name not in known:
+            raise unknown_requirement(name, known)
+    return tuple(rule for rule in rules if not names or rule.name in names)
+
+
+def _rows(ready: Prepared, end: End, at: int | None) -> list[Array]:
+    """Values of every requirement, (samples, batch), or (1, batch) at one sample."""
+    if at is None:
+        return [rule_signal(rule, ready.record, ready.horizon, end) for rule in ready.rules]
+    return rules_at(ready.rules, ready.record, at, ready.horizon, end)
+
+
+def _judge(rule: Rule, ready: Prepared, starts: range, ends: Ends, tolerance: float) -> Judgement:
+    low, high = rule_bounds(rule, ready.record, starts, ready.horizon, ends)
+    if tolerance > 0:
+        holds = low >= -tolerance
+        fails = high < -tolerance
+    else:
+        (formula,), record = by_truth([rule.formula], ready.record)
+        least, most = rule_bounds(replace(rule, formula=formula), record, starts, ready.horizon, ends)
+        holds, fails = least > 0, most < 0
+    return Judgement(rule, starts.start, low, high, holds, fails, ready.signals.shape)
