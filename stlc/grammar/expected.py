@@ -9,12 +9,12 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from stlc.diagnostics import Diagnostic, Fix, Label
-from stlc.grammar.scan import Lexeme, closes
+from stlc.grammar.scan import Lexeme, brackets, closes
 from stlc.grammar.stumble import Stumble
+from stlc.grammar.tokens import near_unit
 from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, RESERVED, ROLES, UNARY_TEMPORAL
 from stlc.registry import closest
 from stlc.source import Span
-from stlc.units import SYMBOLS
 
 MAX_WORDS = 4
 
@@ -74,7 +74,7 @@ def unknown_unit(stumble: Stumble) -> Diagnostic | None:
         return None
     if found.text in RESERVED or "UNIT" not in stumble.accepts or _begins_line(stumble, found):
         return None
-    near = closest(found.text, SYMBOLS)
+    near = near_unit(found.text)
     advice = (f"did you mean `{near}`?",) if near else ()
     product = f"a product is written with a sign: `{previous.text} * {found.text}`"
     return Diagnostic("E101", f"unknown unit `{found.text}`", stumble.of(found), help=(*advice, product))
@@ -155,7 +155,7 @@ def _repair(stumble: Stumble) -> Diagnostic | None:
     if definition is not None:
         return definition
     for terminal in _REPAIRS:
-        if terminal not in stumble.accepts:
+        if terminal not in stumble.accepts or (terminal == "_IN" and stumble.wants_operator):
             continue
         sign = _SIGNS[terminal]
         glued = sign in ":,)]}"
@@ -195,8 +195,8 @@ def _missing(stumble: Stumble, sign: str, edit: tuple[int, int, str]) -> Diagnos
 
 def _product(stumble: Stumble) -> tuple[str, ...]:
     """`2 (x + 1)`, `x y`: a product without its sign."""
-    previous = stumble.previous
-    if previous is None or "MULOP" not in stumble.accepts:
+    previous, found = stumble.previous, stumble.found
+    if previous is None or found is None or "MULOP" not in stumble.accepts or "UNIT" in stumble.accepts:
         return ()
     if not stumble.piece.repaired_by(previous.end, previous.end, " *"):
         return ()
@@ -253,6 +253,8 @@ def _context(stumble: Stumble) -> str:
     name = _declared(stumble)
     if name is not None and name[0] == previous:
         return f" after the {name[1]}'s name"
+    if any(bracket.interval and bracket.closing == previous for bracket in brackets(stumble.before)):
+        return " after the interval"
     return f" after `{_shortened(previous.text)}`"
 
 
@@ -280,12 +282,12 @@ def _found(stumble: Stumble) -> str:
 
 
 def _notes(stumble: Stumble) -> tuple[str, ...]:
-    previous = stumble.previous
-    if previous is not None and previous.text in ("F", "G", "U") and stumble.wants_operand:
-        meaning = UNARY_TEMPORAL.get(previous.text) or BINARY_TEMPORAL[previous.text]
-        return (
-            f"`{previous.text}` means `{meaning}`; a name of your own is written `` `{previous.text}` ``",
-        )
+    if not stumble.wants_operand:
+        return ()
+    for lexeme in (stumble.found, stumble.previous):
+        if lexeme is not None and lexeme.text in ("F", "G", "U"):
+            name, meaning = lexeme.text, UNARY_TEMPORAL.get(lexeme.text, "until")
+            return (f"`{name}` means `{meaning}`; a name of your own is written `` `{name}` ``",)
     return ()
 
 

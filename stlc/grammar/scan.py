@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, ROLES, UNARY_TEMPORAL
+from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, PRAGMAS, RESERVED, ROLES, UNARY_TEMPORAL
 
 LexemeKind = Literal["word", "quoted", "number", "string", "sign"]
 
@@ -26,6 +26,7 @@ _LEXEME = re.compile(
     """,
     re.VERBOSE | re.DOTALL,
 )
+_NO_PRAGMA = RESERVED | {"from", "as", *ROLES}
 _CLOSES = {"(": ")", "[": "]", "{": "}"}
 _TEMPORAL = UNARY_TEMPORAL.keys() | BINARY_TEMPORAL.keys()
 
@@ -63,6 +64,8 @@ def declaration_starts(text: str) -> list[int]:
     tag: int | None = None
     before: Lexeme | None = None
     for lexeme in lexemes(text):
+        if before is not None and _is_pragma(text, before, lexeme):
+            starts.append(before.start)
         if before is not None and before.text == "@" and lexeme.kind in ("word", "quoted") and tag is None:
             tag = before.start
         if lexeme.kind == "word" and lexeme.text in DECLARATIONS:
@@ -73,6 +76,14 @@ def declaration_starts(text: str) -> list[int]:
             tag = None
         before = lexeme
     return starts
+
+
+def _is_pragma(text: str, word: Lexeme, behind: Lexeme) -> bool:
+    """Whether `spec name`, `system "path"` or `time unit` begins a line; no expression has such a pair."""
+    if word.text not in PRAGMAS or (word.start and text[word.start - 1] != "\n"):
+        return False
+    named = behind.kind in ("word", "quoted", "string") and behind.text not in _NO_PRAGMA
+    return named and "\n" not in text[word.end : behind.start]
 
 
 def brackets(items: Sequence[Lexeme]) -> list[Bracket]:

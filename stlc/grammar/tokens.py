@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 
 from stlc.diagnostics import Diagnostic, Fix
-from stlc.grammar.words import BUILT_IN
+from stlc.grammar.words import BUILT_IN, UNIT_NAMES
 from stlc.registry import closest
 from stlc.source import Source, Span
 from stlc.units import SYMBOLS, parse_unit
@@ -80,15 +80,16 @@ def _bad_unit(leaf: Leaf, text: str, reason: str) -> Diagnostic:
     if "," in text:
         advice: tuple[str, ...] = (f"a range is written `in {leaf.text}`",)
     else:
-        near = next((found for word in _WORD.findall(text) if (found := _near_unit(word))), None)
+        near = next((found for word in _WORD.findall(text) if (found := near_unit(word))), None)
         advice = (f"did you mean `{near}`?",) if near else ()
     return Diagnostic(
         "E101", reason, leaf.span, help=advice, note=("a unit is a product of powers: [m/s^2], [1/s], [%]",)
     )
 
 
-def _near_unit(word: str) -> str | None:
-    return None if word in SYMBOLS else closest(word, SYMBOLS)
+def near_unit(word: str) -> str | None:
+    """The unit that somebody means who writes `word`, if it is none."""
+    return None if word in SYMBOLS else UNIT_NAMES.get(word.lower()) or closest(word, SYMBOLS)
 
 
 def number_of(context: Context, leaf: Leaf) -> Fraction:

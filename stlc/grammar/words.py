@@ -50,6 +50,21 @@ BUILT_IN = MappingProxyType(
 )
 """Names that have a meaning everywhere; as names of one's own they need backticks."""
 
+UNIT_NAMES = MappingProxyType(
+    {
+        **dict.fromkeys(("metre", "metres", "meter", "meters"), "m"),
+        **dict.fromkeys(("second", "seconds", "sec", "secs"), "s"),
+        **dict.fromkeys(("minute", "minutes", "mins"), "min"),
+        **dict.fromkeys(("hour", "hours", "hr", "hrs"), "h"),
+        **dict.fromkeys(("degree", "degrees"), "deg"),
+        **dict.fromkeys(("radian", "radians"), "rad"),
+        **dict.fromkeys(("kilogram", "kilograms", "kgs"), "kg"),
+        **dict.fromkeys(("kmh", "kph"), "km/h"),
+        **{"hertz": "Hz", "newton": "N", "volt": "V", "watt": "W", "percent": "%", "sample": "steps"},
+    }
+)
+"""Units written out, and what the language calls them."""
+
 _BLANK = r"(?:\s|(?:#|\/\/)[^\n]*(?:\n|\Z))"
 
 
