@@ -95,7 +95,7 @@ def conflicts(relative: int, mine: int, other: int) -> tuple[tuple[float, ...], 
     def first(hit: np.ndarray) -> tuple[float, ...]:
         return tuple(np.where(hit.any(0), own[hit.argmax(0)], np.inf).tolist())
 
-    swept = np.logical_or.accumulate(overlap(a, b, grow=0.15)[:, ::-1], axis=1)[:, ::-1]
+    swept = np.logical_or.accumulate(overlap(a, b, grow=0.05)[:, ::-1], axis=1)[:, ::-1]
     return first(swept), first(overlap(a, b))
 
 
@@ -289,9 +289,8 @@ class TrafficGrid:
         poses = self._poses()
         first, second = np.triu_indices(len(poses), 1)
         near = np.abs(poses[first, :2] - poses[second, :2]).max(-1) < 2 * LENGTH_CAR
-        first, second = first[near], second[near]
-        hit = overlap(poses[first], poses[second])
-        self.touched.update(zip(first[hit].tolist(), second[hit].tolist(), strict=True))
+        pairs = np.stack((first[near], second[near]), 1)
+        self.touched.update(map(tuple, pairs[overlap(*poses[pairs.T])].tolist()))
 
     def _to_line(self, car: Car) -> float:
         """Metres to the next stop line."""
@@ -381,8 +380,7 @@ class TrafficGrid:
 
     def _inside(self, car: Car, other: Car, way: tuple[int, int, int], mine: float) -> Lead | None:
         """Gap to and speed of `other` in the junction of `way`, seen from `mine` metres into it."""
-        past, here, onward = way
-        theirs = other.s if other.inside else 0.0
+        (past, here, onward), theirs = way, other.s if other.inside else 0.0
         if other.past == past:
             clear = other.onward != onward and self._meet(way, other, theirs)[1] == math.inf
             ahead = other.inside and theirs > mine and not clear

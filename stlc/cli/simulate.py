@@ -32,8 +32,8 @@ def register(app: typer.Typer) -> None:
             "Deploy a trained policy in the world of its system, with or without the backup policy.",
             "stlc simulate --backup",
             "stlc simulate latest --backup --seeds 20 --record trace.npz",
-            note="The newest run unless one is named. With a guard, the same seeds are driven without it too, "
-            "to compare. Trace, scene and figures go into the run's folder. Numbers are means over seeds with "
+            note="The newest run unless one is named. With a guard the same seeds are driven without it too, "
+            "to compare. Trace, scene and figures go into the run's folder. Means over seeds come with "
             "95 % intervals (Student's t).",
         ),
     )(simulate)
