@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping as MappingType
 from pathlib import Path
 from types import MappingProxyType
@@ -122,7 +123,7 @@ def _declaration(
         doc=" ".join((reader.text(found.get("doc"), "`doc`") or "").split()),
         path=path,
         source=source,
-        spec=path.parent / spec if spec else None,
+        spec=Path(os.path.normpath(path.parent / spec)) if spec else None,
         dt=clock.dt,
         horizon=clock.horizon,
         substeps=clock.substeps,

@@ -203,7 +203,7 @@ class Expressions:
                 node,
                 where,
                 "a positive whole number of steps",
-                f"one step is {float(dt):g} s: write `25 steps` or a multiple",
+                f"one step is {float(dt):g} s: give a multiple of it, or a number of steps",
             )
             return None
         return int(count)

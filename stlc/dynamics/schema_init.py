@@ -13,9 +13,8 @@ from stlc.dynamics.decl import Assign, InitDecl, Situation
 from stlc.dynamics.schema_expressions import Expressions, in_stored_unit, written
 from stlc.dynamics.schema_flow import column_assign, state_of
 from stlc.dynamics.schema_names import Names, later
-from stlc.dynamics.schema_reader import Reader
+from stlc.dynamics.schema_reader import Reader, first_line
 from stlc.dynamics.yaml_nodes import Entry, Mapping, Node
-from stlc.source import Span
 
 INIT_KEYS = ("mixture", "where", "grid", "from")
 SITUATION_KEYS = ("name", "weight", "draw", "choose", "let", "also")
@@ -49,12 +48,15 @@ def read_init(node: Node | None, reader: Reader, names: Names) -> InitDecl:
     items = reader.items(found.get("mixture"), "`mixture`")
     if not items and not {"grid", "from"} & found.keys():
         reader.report(
-            "S102", "`init` lacks a `mixture` of situations", head(node), "mixture: [{draw: {x: 0}}]"
+            "S102",
+            "`init` lacks a `mixture` of situations",
+            first_line(node.span),
+            "mixture: [{draw: {x: 0}}]",
         )
     mixture = _mixture(items, _Drawn(), reader, names)
     where, texts = _conditions(found.get("where"), names.expressions(reader))
     span = found["where"].span if "where" in found else node.span
-    return InitDecl(mixture, where, texts, _first_item(span))
+    return InitDecl(mixture, where, texts, first_line(span))
 
 
 def _conditions(node: Node | None, here: Expressions) -> tuple[tuple[ir.Formula, ...], tuple[str, ...]]:
@@ -68,7 +70,7 @@ def _mixture(items: tuple[Node, ...], drawn: _Drawn, reader: Reader, names: Name
     """Situations, with weights that are not all 0."""
     situations = [_situation(item, drawn, reader, names) for item in items]
     if items and not any(situation.weight > 0 for situation in situations):
-        reader.report("S103", "the weights of a mixture are all 0", head(items[0]))
+        reader.report("S103", "the weights of a mixture are all 0", first_line(items[0].span))
     return tuple(situations)
 
 
@@ -86,7 +88,10 @@ def _situation(node: Node, drawn: _Drawn, reader: Reader, names: Names) -> Situa
         listed = ", ".join(f"`{column}`" for column in missing)
         called = f"the situation `{name}`" if name else "this situation"
         reader.report(
-            "S102", f"{called} draws no value for {listed}", head(node), "every state needs a first value"
+            "S102",
+            f"{called} draws no value for {listed}",
+            first_line(node.span),
+            "every state needs a first value",
         )
     return Situation(name, 1.0 if weight is None else weight, tuple(draws.found), branches)
 
@@ -104,6 +109,11 @@ class _Draws:
 
     def read(self, found: dict[str, Node]) -> None:
         """`let`, `draw` and `also`, in the order in which they can be worked out."""
+        before = len(self.reader.findings)
+        self._read(found)
+        self.failed = len(self.reader.findings) > before
+
+    def _read(self, found: dict[str, Node]) -> None:
         for entry in self.reader.entries(found.get("let"), "`let`"):
             if entry.key.text in self.names.places:
                 self.reader.report(
@@ -123,13 +133,10 @@ class _Draws:
         """One state."""
         column = state_of(entry, where, self.reader, self.names)
         if column is None:
-            self.failed = True
             return
         self._needed(entry.value)
         assign = column_assign(column, entry.value, self.drawn.expressions(self.names, self.reader))
-        if assign is None:
-            self.failed = True
-        else:
+        if assign is not None:
             self.found.append(assign)
         self.drawn = replace(self.drawn, states=self.drawn.states | {column.name})
 
@@ -148,19 +155,8 @@ class _Draws:
         self._needed(node)
         number = self.drawn.expressions(self.names, self.reader).number(node, f"`{name}`")
         if number is None:
-            self.failed = True
             number = Number(ir.Lit(0.0), flexible=True)
         else:
             self.found.append(Assign(name, in_stored_unit(number, number.unit.si), written(node)))
         known = replace(number, num=ir.Col(name), exact=None, span=None, origin=None)
         self.drawn = replace(self.drawn, locals=(*self.drawn.locals, (name, known)))
-
-
-def head(node: Node) -> Span:
-    """The first line of a node."""
-    return _first_item(node.span)
-
-
-def _first_item(span: Span) -> Span:
-    length = span.text.find("\n")
-    return span if length < 0 else Span(span.source, span.start, span.start + length)

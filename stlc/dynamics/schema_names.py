@@ -20,7 +20,7 @@ from stlc.compile.scope import (
 from stlc.diagnostics import Label, SystemFileError
 from stlc.dynamics.decl import ControlDecl, Squash
 from stlc.dynamics.schema_expressions import SECOND, Expressions
-from stlc.dynamics.schema_reader import Reader
+from stlc.dynamics.schema_reader import Reader, first_line
 from stlc.dynamics.yaml_nodes import Mapping, Node, Scalar, Sequence, as_int
 from stlc.signature import Column, Role, Signature
 from stlc.source import Span
@@ -35,10 +35,10 @@ BOOL_LABELS = ()
 
 @dataclass(frozen=True, slots=True)
 class Clockwork:
-    """The section `time`."""
+    """The section `time`; a horizon of 0 is not known."""
 
     dt: Fraction = Fraction(1, 10)
-    horizon: int = 1
+    horizon: int = 0
     substeps: int = 1
     integrator: str = "euler"
     discrete: bool = False
@@ -119,7 +119,7 @@ def read_constants(node: Node | None, reader: Reader, names: Names) -> None:
             continue
         number = names.expressions(reader).number(entry.value, f"the constant `{name}`")
         if number is None:
-            names.entries[name] = Known(constant_value(0.0), "constant")
+            names.entries[name] = Known(constant_value(1.0), "constant")
         elif number.constant is None:
             reader.wrong(entry.value, f"the constant `{name}`", "a number that is known now")
         else:
@@ -135,8 +135,7 @@ def read_states(node: Node | None, reader: Reader, names: Names) -> dict[str, di
         reader.report("S102", "the file lacks `state`", reader.source.span(0, 1), "state: {x: {unit: m}}")
     described: dict[str, dict[str, Node]] = {}
     for entry in reader.entries(node, "`state`"):
-        if not names.declare(entry.key, "state", reader):
-            continue
+        names.declare(entry.key, "state", reader)
         where = f"the state `{entry.key.text}`"
         found = reader.fields(entry.value, where, STATE_KEYS)
         described[entry.key.text] = found
@@ -191,7 +190,7 @@ def read_unit(node: Node | None, reader: Reader) -> Unit:
     try:
         return parse_unit(text)
     except ValueError as error:
-        reader.report("S103", f"`{text}` is not a unit", node.span, str(error))
+        reader.report("S103", str(error), node.span, "a unit is a product of powers, for example `m/s^2`")
         return Unit()
 
 
@@ -223,8 +222,7 @@ def read_controls(node: Node | None, reader: Reader, names: Names) -> None:
             "S102", "the file lacks `control`", reader.source.span(0, 1), "control: {u: {range: [-1, 1]}}"
         )
     for entry in reader.entries(node, "`control`"):
-        if not names.declare(entry.key, "control", reader):
-            continue
+        names.declare(entry.key, "control", reader)
         name = entry.key.text
         where = f"the control `{name}`"
         found = reader.fields(entry.value, where, CONTROL_KEYS)
@@ -278,11 +276,9 @@ def read_definitions(node: Node | None, reader: Reader, names: Names) -> None:
 
 def later(reader: Reader, node: Node, what: str) -> None:
     """Report a key whose meaning this version does not act on."""
-    span = node.span
-    length = span.text.find("\n")
-    first = span if length < 0 else Span(span.source, span.start, span.start + length)
+    place = first_line(node.span)
     reader.report(
-        "E015", f"{what} is not supported by this version", first, label="not acted on, so it is refused"
+        "E015", f"{what} is not supported by this version", place, label="not acted on, so it is refused"
     )
 
 

@@ -75,7 +75,7 @@ class Reader:
         missing = [key for key in required if key not in found]
         if missing and (node is None or isinstance(node, Mapping)):
             listed = " and ".join(f"`{key}`" for key in missing)
-            span = _first_line(node.span) if node else self.source.span(0, 1)
+            span = first_line(node.span) if node else self.source.span(0, 1)
             self.report("S102", f"{where} lacks {listed}", span, f"keys of {where}: {', '.join(known)}")
         return found
 
@@ -136,9 +136,7 @@ class Reader:
 
     def wrong(self, node: Node, where: str, wanted: str, *help_: str) -> None:
         """Report a value of the wrong kind."""
-        self.report(
-            "S103", f"{where} must be {wanted}, this is {_kind(node)}", _first_line(node.span), *help_
-        )
+        self.report("S103", f"{where} must be {wanted}, this is {_kind(node)}", first_line(node.span), *help_)
 
     def text(self, node: Node | None, where: str) -> str | None:
         """A text."""
@@ -204,7 +202,7 @@ def _kind(node: Node) -> str:
             return f"`{node.text if len(node.text) <= 40 else node.text[:39] + '…'}`"
 
 
-def _first_line(span: Span) -> Span:
+def first_line(span: Span) -> Span:
     """The part of a span on its first line: what carets can underline."""
     length = span.text.find("\n")
     return span if length < 0 else Span(span.source, span.start, span.start + max(length, 1))

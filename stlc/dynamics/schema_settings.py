@@ -9,7 +9,7 @@ from stlc.dynamics.decl import BackupDecl, ObjectiveDecl, PolicyDecl, Term, Trai
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_names import Names
 from stlc.dynamics.schema_reader import Reader
-from stlc.dynamics.yaml_nodes import Node, Scalar
+from stlc.dynamics.yaml_nodes import Node, Scalar, Sequence, as_int
 
 OBJECTIVE_KEYS = ("gamma", "smoothing", "lambda", "terms")
 TERM_KEYS = ("name", "weight", "expr")
@@ -88,19 +88,18 @@ def read_backup(node: Node | None, reader: Reader, horizon: int) -> BackupDecl:
     found = reader.fields(node, "`backup`", BACKUP_KEYS)
     default = BackupDecl()
     lengths = _integers(found.get("T0"), "`T0`", reader) or default.lengths
-    if "T0" in found and max(lengths) > horizon:
+    if "T0" in found and 0 < horizon < max(lengths):
         reader.report("S103", f"`T0` goes beyond the horizon of {horizon} steps", found["T0"].span)
     return BackupDecl(
         reader.integer(found.get("bins"), "`bins`", low=2) or default.bins,
-        tuple(length for length in lengths if length <= horizon),
+        tuple(length for length in lengths if length <= horizon) or (1,),
         reader.integer(found.get("batch"), "`batch`") or default.batch,
     )
 
 
 def _integers(node: Node | None, where: str, reader: Reader) -> tuple[int, ...]:
     """A list of positive whole numbers; one alone counts as a list."""
-    if isinstance(node, Scalar):
-        only = reader.integer(node, where)
-        return () if only is None else (only,)
+    if isinstance(node, Scalar) and as_int(node) is not None:
+        node = Sequence(node.span, (node,), 1)
     found = [reader.integer(item, f"an entry of {where}") for item in reader.items(node, where)]
     return tuple(value for value in found if value is not None)

@@ -13,7 +13,7 @@ from stlc.dynamics.decl import EventDecl, TestDecl, WorldRef
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import read_sets
 from stlc.dynamics.schema_names import Names
-from stlc.dynamics.schema_reader import Reader
+from stlc.dynamics.schema_reader import Reader, first_line
 from stlc.dynamics.yaml_nodes import Node, Scalar
 from stlc.grammar import ast
 
@@ -51,8 +51,8 @@ def _event(node: Node, index: int, here: Expressions, names: Names, dt: Fraction
     name = reader.text(found.get("name"), "`name` of an event") or f"event {index + 1}"
     triggers = [key for key in ("when", "at", "every") if key in found]
     if len(triggers) != 1:
-        first = node.span.source.span(node.span.start, node.span.start + max(node.span.text.find("\n"), 1))
-        reader.report("S102", f"the event `{name}` needs one of `when`, `at` and `every`", first)
+        place = first_line(node.span)
+        reader.report("S102", f"the event `{name}` needs exactly one of `when`, `at` and `every`", place)
     when, edge = _condition(found.get("when"), here)
     return EventDecl(
         name,

@@ -21,6 +21,7 @@ from stlc.source import Source, Span
 MAX_DEPTH = 40
 MAX_NODES = 20_000
 MERGE_KEY = "<<"
+_PLAIN_WORDS = (("character '\\t'", "a tab"), ("'<stream end>'", "the end of the file"), ("'", "`"))
 
 Style: TypeAlias = Literal["plain", "single", "double", "block"]
 _STYLES: dict[str | None, Style] = {
@@ -198,7 +199,9 @@ def _syntax(source: Source, error: yaml.MarkedYAMLError) -> Diagnostic:
     if error.context and error.context_mark and error.context_mark.index < offset:
         start = error.context_mark.index
         labels = (Label(source.span(start, start + 1), error.context),)
-    problem = (error.problem or error.context or "cannot be read").replace("'\\t'", "a tab")
+    problem = error.problem or error.context or "cannot be read"
+    for ugly, plain in _PLAIN_WORDS:
+        problem = problem.replace(ugly, plain)
     helps = ("indent with blanks",) if "\t" in source.text[offset : offset + 1] else ()
     return Diagnostic(
         "S100", f"not YAML: {problem}", source.span(offset, offset + 1), labels=labels, help=helps
