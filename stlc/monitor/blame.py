@@ -1,8 +1,8 @@
 """Why a formula fails at an instant: the least tree of sub-formulas, instants and signals that explains it.
 
-A conjunction fails because of one part, a disjunction because of all; `always` fails at one instant, `eventually`
-at every one, of which the closest is shown. Where there is a choice, the part that decides the robustness is taken,
-so that the values at the leaf are those behind the number.
+A conjunction fails because of one part, a disjunction because of all; `always` fails at one instant,
+`eventually` at every one, of which the closest is shown. Where there is a choice, the part that decides the
+robustness is taken, so that the values at the leaf are those behind the number.
 """
 
 from __future__ import annotations

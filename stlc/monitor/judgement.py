@@ -49,8 +49,10 @@ class Judgement:
     @property
     def statuses(self) -> list[Status]:
         """One for each trace."""
-        violated, satisfied = self.fails.any(axis=0).tolist(), self.holds.all(axis=0).tolist()
-        return [_status(v, s) for v, s in zip(violated, satisfied, strict=True)]
+        return [_status(bool(fails.any()), bool(holds.all())) for fails, holds in self._per_trace()]
+
+    def _per_trace(self) -> Iterator[tuple[Bools, Bools]]:
+        return zip(self.fails.T, self.holds.T, strict=True)
 
     @property
     def status(self) -> Any:

@@ -1,0 +1,237 @@
+"""A violation in the words of the specification: the sub-formula, the instant, the signal and its value."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+from stlc.compile import typed
+from stlc.compile.timers import recorded
+from stlc.diagnostics import Label
+from stlc.grammar import ast
+from stlc.monitor.blame import Blame, Blamer
+from stlc.monitor.instants import window_of
+from stlc.monitor.judgement import Judgement, Verdict
+from stlc.monitor.prepared import Prepared
+from stlc.monitor.values import Record
+from stlc.signature import Column
+from stlc.source import Span
+
+_MOST_LABELS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What a signal was.
+
+    Attributes:
+        signal: its name.
+        value: in its unit.
+        text: `x = 0.27 m`, `sign = stop`.
+    """
+
+    signal: str
+    value: float
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """Why one requirement is violated, at the worst start of the worst trace.
+
+    Attributes:
+        judgement: of the requirement.
+        trace: which trace.
+        start: sample at which the requirement was judged.
+        sample: sample of the predicate that decides.
+        time: of that sample in seconds.
+        predicate: its text.
+        span: of the predicate.
+        readings: the signals that it reads, at that sample.
+        place: what to underline in the requirement, and what to say there.
+        labels: what else to underline.
+        because: one line in words.
+        tree: the whole explanation.
+    """
+
+    judgement: Judgement
+    trace: int
+    start: int
+    sample: int
+    time: float
+    predicate: str
+    span: Span
+    readings: tuple[Reading, ...]
+    place: Label
+    labels: tuple[Label, ...]
+    because: str
+    tree: Blame
+
+
+def explain(verdict: Verdict, name: str) -> Cause | None:
+    """The cause of a violated requirement; None where it is not violated.
+
+    Raises:
+        UsageError: U101, there is no such requirement.
+    """
+    judgement = verdict[name]
+    if judgement.overall != "violated":
+        return None
+    trace, start = judgement.worst
+    return _cause(judgement, verdict.subject, trace, start)
+
+
+def _cause(judgement: Judgement, subject: Prepared, trace: int, start: int) -> Cause:
+    rule = judgement.rule
+    record = Record(
+        {name: column[:, trace : trace + 1] for name, column in subject.record.env.items()},
+        subject.record.ops,
+    )
+    window = window_of(rule, subject.horizon)
+    record = record if window is None else record.cut(start + window + 1)
+    formula = recorded(rule.typed.formula, []) if rule.absolute else rule.typed.formula
+    tree = Blamer(record, subject.compiled.grid).blame(formula, start)
+    words = _Words(subject, record, rule.typed.written, _definitions(subject.compiled.spec))
+    leaf = tree.leaf
+    place, *labels = words.labels(tree)
+    return Cause(
+        judgement=judgement,
+        trace=trace,
+        start=start,
+        sample=leaf.sample,
+        time=subject.time(leaf.sample),
+        predicate=_flat(leaf.span.text),
+        span=leaf.span,
+        readings=words.readings(leaf),
+        place=place,
+        labels=tuple(labels[: _MOST_LABELS - 1]),
+        because=words.because(leaf),
+        tree=tree,
+    )
+
+
+# -------------------------------------------------------------------------- words
+
+
+@dataclass(frozen=True, slots=True)
+class _Words:
+    subject: Prepared
+    record: Record
+    written: ast.Expr
+    definitions: dict[str, ast.Expr]
+
+    def readings(self, blame: Blame) -> tuple[Reading, ...]:
+        """The signals that the predicates below read, each at its instant."""
+        seen: dict[tuple[str, int], Reading] = {}
+        for leaf in blame.leaves:
+            for name in leaf.signals:
+                value = float(self.record.env[name][leaf.sample, 0])
+                text = f"{name} = {shown(value, self.subject.compiled.signature[name])}"
+                seen.setdefault((name, leaf.sample), Reading(name, value, text))
+        return tuple(seen.values())
+
+    def labels(self, tree: Blame) -> list[Label]:
+        """What to underline: the predicate that decides first."""
+        found: dict[Span, str] = {}
+        for blame in _told(tree):
+            found.setdefault(self.site(blame.span), self.told(blame))
+        first = self.site(_telling(tree).span)
+        spans = sorted(found, key=lambda span: (span != first, span.start))
+        return [Label(span, found[span]) for span in spans]
+
+    def told(self, blame: Blame) -> str:
+        """What is said beside an underlined part."""
+        word = "true" if blame.holds else "false"
+        if blame.until is not None:
+            window = f"from {self.subject.moment(blame.sample)} to {self.subject.moment(blame.until)}"
+            return f"{'always' if blame.holds else 'never'} true {window}"
+        moment = self.subject.moment(blame.sample)
+        if not blame.premise:
+            return f"{word} at {moment}"
+        values = ", ".join(reading.text for reading in self.readings(blame))
+        return f"{word} at {moment} ({values})" if values else f"{word} at {moment}"
+
+    def because(self, leaf: Blame) -> str:
+        """`before_junction means x < x_inter / 2, and x = 0.27 m at t = 4.6 s (line 17)`."""
+        values = " and ".join(reading.text for reading in self.readings(leaf))
+        moment = self.subject.moment(leaf.sample)
+        measured = f"{values} at {moment}" if values else f"it does so at {moment}"
+        chain = self.chain(self.written, leaf.span)
+        if not chain:
+            return f"{measured}, where `{_flat(leaf.span.text)}` is {'true' if leaf.holds else 'false'}"
+        name = chain[-1]
+        body = _flat(self.definitions[name.name].span.text)
+        return f"{name.name} means {body}, and {measured} (line {leaf.span.line})"
+
+    def site(self, span: Span) -> Span:
+        """The place in the requirement that brings `span` in, be it by a definition."""
+        chain = self.chain(self.written, span)
+        return chain[0].span if chain else span
+
+    def chain(self, expr: ast.Expr, span: Span) -> tuple[ast.Name, ...] | None:
+        """The names by which `expr` comes to the definition that holds `span`; None if it does not."""
+        if _within(span, expr.span):
+            return ()
+        for name in names_in(expr):
+            body = self.definitions.get(name.name)
+            rest = None if body is None else self.chain(body, span)
+            if rest is not None:
+                return (name, *rest)
+        return None
+
+
+def _told(tree: Blame) -> Iterator[Blame]:
+    """The nodes that get a label: premises as a whole, windows without success, predicates."""
+    if tree.premise or tree.until is not None or not tree.parts:
+        yield replace(tree, formula=_body(tree.formula)) if tree.until is not None else tree
+        return
+    for part in tree.parts:
+        yield from _told(part)
+
+
+def _telling(tree: Blame) -> Blame:
+    """The one among them that decides."""
+    if tree.until is not None:
+        return replace(tree, formula=_body(tree.formula))
+    return _telling(tree.parts[tree.main]) if tree.parts else tree
+
+
+def _body(formula: typed.Formula) -> typed.Formula:
+    match formula:
+        case typed.Temporal(body=body):
+            return body
+        case typed.Until(right=right):
+            return right
+    return formula
+
+
+def shown(value: float, column: Column) -> str:
+    """A value as one reads it: the label of an enum, a number with its unit."""
+    for label, number in column.labels:
+        if number == value:
+            return label
+    return f"{value:.6g} {column.unit.text}".rstrip()
+
+
+def names_in(expr: object) -> Iterator[ast.Name]:
+    """All names in an expression, from left to right."""
+    if isinstance(expr, ast.Name):
+        yield expr
+    elif isinstance(expr, tuple):
+        for item in expr:
+            yield from names_in(item)
+    elif isinstance(expr, ast.Node):
+        for part in fields(expr):
+            yield from names_in(getattr(expr, part.name))
+
+
+def _definitions(spec: ast.Spec) -> dict[str, ast.Expr]:
+    return {item.name: item.value for item in spec.items if isinstance(item, (ast.Def, ast.Region))}
+
+
+def _within(inner: Span, outer: Span) -> bool:
+    return inner.source is outer.source and outer.start <= inner.start and inner.end <= outer.end
+
+
+def _flat(text: str) -> str:
+    return " ".join(text.split())
