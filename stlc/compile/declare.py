@@ -11,10 +11,12 @@ from stlc.compile.interface import Interface
 from stlc.compile.scope import Definition, Entry, Failed, Known, Scope, Sort, column_entries, member_entries
 from stlc.compile.signals import Labels, check_type, columns_of, declared_unit
 from stlc.compile.tags import refuse_tags
+from stlc.compile.values import Number, Value, Vector
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
 from stlc.signature import Column
 from stlc.source import Span
+from stlc.units import Unit
 
 _SORTS: Mapping[str, Sort] = {"real": "number", "int": "number", "bool": "formula", "formula": "formula"}
 
@@ -26,13 +28,13 @@ class Declared:
     Attributes:
         entries: value namespace.
         enums: type namespace.
-        columns: of signals and parameters, by declaration, ranges not yet known.
+        columns: of signals and parameters, ranges not yet known, with the unit that was declared.
         broken: names whose declaration has been reported; their uses are not reported again.
     """
 
     entries: dict[str, Entry] = field(default_factory=dict)
     enums: dict[str, Labels] = field(default_factory=dict)
-    columns: list[tuple[ast.Signal | ast.Param, tuple[Column, ...]]] = field(default_factory=list)
+    columns: list[tuple[ast.Signal | ast.Param, tuple[Column, ...], Unit]] = field(default_factory=list)
     broken: set[str] = field(default_factory=set)
 
 
@@ -152,13 +154,21 @@ def _column_entry(
     item: ast.Signal | ast.Param, found: Declared, interface: Interface | None, scope: Scope
 ) -> Known:
     columns = columns_of(item, found.enums, interface, scope)
-    found.columns.append((item, columns))
+    unit = declared_unit(item.unit, item, scope)
+    found.columns.append((item, columns, unit))
     role = f"{item.role} signal" if isinstance(item, ast.Signal) and item.role else _keyword(item)
     about = f"{role}, declared at line {item.name_span.line}"
     if interface is not None:
         about += f"; also a state of {interface.where}"
     (entry,) = column_entries(columns, about=about, span=item.name_span).values()
-    return entry
+    return replace(entry, value=_read_in(entry.value, unit)) if unit.text else entry
+
+
+def _read_in(value: Value, unit: Unit) -> Value:
+    """A signal whose bare numbers are in the unit that the file declares, whatever the system stores."""
+    if isinstance(value, Vector):
+        return replace(value, items=tuple(replace(item, unit=unit) for item in value.items))
+    return replace(value, unit=unit) if isinstance(value, Number) else value
 
 
 def _macro(item: ast.Def, about: str, found: Declared, scope: Scope) -> Definition:

@@ -18,7 +18,7 @@ from stlc.compile.calls import builtin, unsupported
 from stlc.compile.macros import arguments, cycle, finished, too_large
 from stlc.compile.meter import Cost
 from stlc.compile.operations import OPERATIONS
-from stlc.compile.scope import TIME_WORDS, Definition, Failed, Scope
+from stlc.compile.scope import TIME_WORDS, Definition, Failed, Scope, reserved
 from stlc.compile.sorts import Need, as_formula, as_number
 from stlc.compile.values import Number, Origin, Value, at, literal
 from stlc.diagnostics import Diagnostic, Label
@@ -181,6 +181,10 @@ def _call(expr: ast.Call, scope: Scope) -> Value:
     entry = scope.entries.get(expr.func.name)
     if isinstance(entry, Definition) and entry.formals:
         return _expanded(entry, expr, scope)
+    if entry is not None and not reserved(expr.func.name):
+        if scope.cache.get(expr.func.name, entry) is not None:
+            scope.report(Diagnostic("E105", f"`{expr.func.name}` is not a function", expr.func.span))
+        raise Failed
     values = evaluate_all([arg.value for arg in expr.args], scope)
     return builtin(expr.func.name, expr, values, scope)
 

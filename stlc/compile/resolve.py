@@ -56,7 +56,7 @@ def resolve(
     """
     values = read_overrides(overrides or {}, spec, interface)
     findings: list[Diagnostic] = []
-    scope = Scope(sink=findings, temporal=True, time_unit=spec.time_unit)
+    scope = Scope(sink=findings, temporal=True, time_unit=spec.time_unit, elsewhere=_elsewhere(interface))
     found = declare(spec, interface, values, scope)
     scope = replace(scope, entries=found.entries, cache=dict.fromkeys(found.broken))
     _adopt_units(spec, values, found, scope)
@@ -96,12 +96,26 @@ def _finish(findings: Sequence[Diagnostic], spec: ast.Spec, sink: list[Diagnosti
 def _signature(found: Declared, scope: Scope) -> Signature:
     """The declared columns with their ranges."""
     columns: list[Column] = []
-    for decl, plain in found.columns:
+    for decl, plain, unit in found.columns:
         try:
-            columns.extend(ranged(plain, decl, scope))
+            columns.extend(ranged(plain, unit, decl, scope))
         except Failed:
             columns.extend(plain)
     return Signature(tuple(columns))
+
+
+def _elsewhere(interface: Interface | None) -> dict[str, str]:
+    """What to write for a name that only the system knows."""
+    if interface is None:
+        return {}
+    found = {}
+    for column in interface.signature.columns:
+        unit = f" [{column.unit}]" if column.unit.text else ""
+        found[column.name] = f"{interface.where} has it; declare it here too: `signal {column.name}{unit}`"
+    for name, (value, unit_) in interface.constants.items():
+        amount = _amount(value / unit_.scale, unit_.text)
+        found[name] = f"{interface.where} has it; declare it here too: `const {name} = {amount}`"
+    return found
 
 
 def _adopt_units(spec: ast.Spec, overrides: Mapping[str, ast.Expr], found: Declared, scope: Scope) -> None:

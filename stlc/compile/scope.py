@@ -85,6 +85,7 @@ class Scope:
         temporal: temporal operators are allowed.
         time_unit: unit of bare numbers in intervals; "" where no pragma says so.
         facts: enforced ranges of columns, in stored units.
+        elsewhere: names that only the system knows, with the advice to give.
         locals: arguments of the macro and quantifier variables at hand, with what they cost.
     """
 
@@ -95,6 +96,7 @@ class Scope:
     temporal: bool = False
     time_unit: str = ""
     facts: Mapping[str, Bounds] = field(default_factory=dict)
+    elsewhere: Mapping[str, str] = field(default_factory=dict)
     locals: Mapping[str, tuple[Value, Cost]] = field(default_factory=dict)
     meter: Meter = field(default_factory=Meter, compare=False, repr=False)
     cache: dict[str, tuple[Value, Cost] | None] = field(default_factory=dict, compare=False, repr=False)
@@ -133,6 +135,8 @@ class Scope:
         near = closest(name.name, candidates)
         what = "function" if called else "name"
         help_ = () if near is None else (f"did you mean `{near}`?{self._about(near)}",)
+        if name.name in self.elsewhere:
+            help_ = (self.elsewhere[name.name],)
         note = () if called or not self.in_spec else ("parameters never default to 0",)
         self.fail(Diagnostic("E101", f"unknown {what} `{name.name}`", name.span, help=help_, note=note))
 

@@ -54,7 +54,7 @@ def columns_of(
     """The columns of a declaration, ranges not yet known; matched with the system's where there is one.
 
     Raises:
-        Failed: E101 an unknown type, E103 a signal that the system lacks, E104 or E203 one that it has otherwise.
+        Failed: E101 an unknown type, E103 a signal that the system lacks, E104 or E203 one that differs.
     """
     check_type(decl.type, enums, scope)
     name = decl.column or decl.name if isinstance(decl, ast.Signal) else decl.name
@@ -131,13 +131,15 @@ def _absent(column: Column, decl: ast.Signal | ast.Param, interface: Interface) 
     )
 
 
-def ranged(columns: Sequence[Column], decl: ast.Signal | ast.Param, scope: Scope) -> tuple[Column, ...]:
+def ranged(
+    columns: Sequence[Column], unit: Unit, decl: ast.Signal | ast.Param, scope: Scope
+) -> tuple[Column, ...]:
     """The columns with their range, in stored units; ranges of the environment are facts, others are nominal.
 
     Raises:
         Failed: an end that is not a constant number (E205), of another unit (E203), or an empty range (E205).
     """
-    ends = None if decl.domain is None else _ends(decl.domain, columns[0], scope)
+    ends = None if decl.domain is None else _ends(decl.domain, (columns[0], unit), scope)
     found = []
     for column in columns:
         if column.labels:
@@ -152,31 +154,32 @@ def ranged(columns: Sequence[Column], decl: ast.Signal | ast.Param, scope: Scope
 
 
 def _ends(
-    domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral | ast.Expr, column: Column, scope: Scope
+    domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral | ast.Expr, target: tuple[Column, Unit], scope: Scope
 ) -> tuple[float | None, float | None] | None:
     """Least and largest value that a domain allows; None for a distribution, and for an end that is `inf`."""
     if isinstance(domain, tuple):
-        low, high = _stored(domain, column, scope)
+        low, high = _stored(domain, target, scope)
         if low is not None and high is not None and low > high:
             message = "this range is empty: its lower end is above its upper end"
             scope.fail(Diagnostic("E205", message, domain[0].span.to(domain[1].span)))
         return (low, high)
     if isinstance(domain, ast.SetLiteral):
-        values = [value for value in _stored(domain.items, column, scope) if value is not None]
+        values = [value for value in _stored(domain.items, target, scope) if value is not None]
         return (min(values), max(values)) if values else None
     evaluate_all((domain,), scope.extended({}, samplers=True))
     return None
 
 
-def _stored(exprs: Sequence[ast.Expr], column: Column, scope: Scope) -> Iterator[float | None]:
-    """Constants in the unit of the column."""
+def _stored(exprs: Sequence[ast.Expr], target: tuple[Column, Unit], scope: Scope) -> Iterator[float | None]:
+    """Constants in the unit of the column; bare numbers are read in the unit that was declared."""
+    column, unit = target
     for expr, value in zip(exprs, evaluate_all(exprs, scope), strict=True):
         if isinstance(value, Moment) and value.end:
             yield None
             continue
         number = as_number(value, expr, Need("the ends of a range are numbers"), scope)
         if number.bare:
-            number = in_unit(number, column.unit)
+            number = in_unit(number, unit if unit.text else column.unit)
         elif not number.flexible and column.unit.text and not same_dims(number.unit, column.unit):
             message = f"`{column.name}` is in [{column.unit}], this is in [{number.unit}]"
             scope.fail(Diagnostic("E203", message, expr.span, f"[{number.unit}]"))
