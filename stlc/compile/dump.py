@@ -1,0 +1,94 @@
+"""A compiled specification as text: what the solver sees, and what became of time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+from typing import Literal, TypeAlias
+
+from stlc.compile import ir
+from stlc.compile.bounds import in_words
+from stlc.compile.horizon import nodes
+from stlc.compile.interface import Grid
+from stlc.compile.ir_text import show_formula
+from stlc.compile.pipeline import Compiled, Rule
+from stlc.grammar.printer import show
+
+Part: TypeAlias = Literal["all", "steps", "states", "ir"]
+"""What to show: everything, what became of time, the states, or the formulas."""
+
+
+def dump(compiled: Compiled, part: Part = "all") -> str:
+    """The text of `part`. It depends on nothing but the specification and the system's grid."""
+    blocks = ["\n".join(_head(compiled))]
+    if part != "states":
+        blocks += ["\n".join(_rule(rule, compiled.grid, part)) for rule in compiled.requirements]
+        blocks += ["\n".join(_rule(rule, compiled.grid, part, "assume")) for rule in compiled.assumptions]
+    if part in ("all", "states"):
+        blocks.append("\n".join(_states(compiled)))
+    return "\n\n".join(blocks) + "\n"
+
+
+def _head(compiled: Compiled) -> Iterator[str]:
+    grid = compiled.grid
+    facts = [compiled.name]
+    if grid.dt is not None:
+        facts.append(f"dt {in_words(Fraction(1), grid)}")
+    if grid.horizon is not None:
+        facts.append(f"horizon {_both(grid.horizon, grid)}")
+    facts.append(f"formula horizon {_both(compiled.reach, grid)}")
+    yield " · ".join(facts)
+
+
+def _both(steps: int, grid: Grid) -> str:
+    """In seconds and in steps."""
+    count = f"{steps} step{'' if steps == 1 else 's'}"
+    return count if grid.dt is None else f"{in_words(Fraction(steps), grid)} = {count}"
+
+
+def _rule(rule: Rule, grid: Grid, part: Part, kind: str = "") -> Iterator[str]:
+    tags = [f"@{tag}" for tag in sorted(rule.tags)]
+    if rule.weight != 1:
+        tags.append(f"@weight({rule.weight:g})")
+    if rule.scale != 1:
+        tags.append(f"@scale({rule.scale:g})")
+    yield "  ".join(["", *([kind] if kind else []), rule.name, *tags]).rstrip()
+    if part == "all":
+        yield f"    written   {show(rule.typed.written)}"
+    if part in ("all", "ir"):
+        yield f"    compiled  {show_formula(rule.formula)}"
+    if part in ("all", "steps"):
+        lines = list(_times(rule, grid)) or ["the first sample alone"]
+        for label, line in zip(["time", *[""] * len(lines)], lines, strict=False):
+            yield f"    {label:<8}  {line}"
+
+
+def _times(rule: Rule, grid: Grid) -> Iterator[str]:
+    """Every interval once: operator, seconds, samples."""
+    seen: set[str] = set()
+    for node in nodes(rule.formula):
+        if isinstance(node, (ir.Over, ir.Past, ir.Until, ir.Since)):
+            line = _interval(node.op, node.window, grid, back=isinstance(node, (ir.Past, ir.Since)))
+            if line not in seen:
+                seen.add(line)
+                yield line
+
+
+def _interval(op: str, window: ir.Window, grid: Grid, *, back: bool) -> str:
+    end = "start" if back else "end"
+    last = end if window.hi is None else in_words(Fraction(window.hi), grid)
+    samples = f"samples {window.lo}..{end if window.hi is None else window.hi}{' back' if back else ''}"
+    if grid.dt is None:
+        return f"{op}  {samples}"
+    return f"{op}  [{in_words(Fraction(window.lo), grid)}, {last}] = {samples}"
+
+
+def _states(compiled: Compiled) -> Iterator[str]:
+    added = [timer.name for timer in compiled.timers]
+    read = [name for name in compiled.signature.names if name not in added]
+    yield "  columns   " + " ".join(read) + (f" | {' '.join(added)}" if added else "")
+    for timer in compiled.timers:
+        most = _both(timer.saturation, compiled.grid)
+        yield f"  + {timer.name:<8}counts the samples of the mission, up to {most}"
+    safe = ", ".join(rule.name for rule in compiled.safety)
+    yield f"  phi_safe  {safe or '(no requirement is tagged @safety)'}"

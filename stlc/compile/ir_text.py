@@ -1,0 +1,102 @@
+"""IR -> text for people: predicates as comparisons, windows in samples."""
+
+from __future__ import annotations
+
+from typing import assert_never
+
+from stlc.compile import ir
+
+_INFIX = {
+    "add": ("+", 1),
+    "sub": ("-", 1),
+    "mul": ("*", 2),
+    "div": ("/", 2),
+    "mod": ("%", 2),
+    "pow": ("^", 4),
+}
+_UNARY = 3
+_TOP = 5
+_FLIPPED = {">": "<", ">=": "<=", "<": ">", "<=": ">="}
+
+
+def show_window(window: ir.Window, end: str = "end") -> str:
+    """Samples from now on, or back to the `end` "start": `[0..25]`, `[5..end]`."""
+    return f"[{window.lo}..{end if window.hi is None else window.hi}]"
+
+
+def show_formula(formula: ir.Formula) -> str:
+    """A formula with the parentheses that it needs."""
+    match formula:
+        case ir.Truth(value):
+            return "true" if value else "false"
+        case ir.Atom():
+            return _atom(formula)
+        case ir.Join(op, items):
+            return f" {op} ".join(map(_operand, items))
+        case ir.Over(op, window, body):
+            return f"{op}{show_window(window)} {_operand(body)}"
+        case ir.Past(op, window, body):
+            return f"{op}{show_window(window, 'start')} {_operand(body)}"
+        case ir.Until(op, window, left, right):
+            return f"{_operand(left)} {op}{show_window(window)} {_operand(right)}"
+        case ir.Since(op, window, left, right):
+            return f"{_operand(left)} {op}{show_window(window, 'start')} {_operand(right)}"
+        case ir.Shift(steps, body):
+            name = {1: "next", -1: "prev"}.get(steps, f"shift[{steps}]")
+            return f"{name}({show_formula(body)})"
+        case _:
+            assert_never(formula)
+
+
+def _operand(formula: ir.Formula) -> str:
+    """In parentheses where it holds two formulas."""
+    text = show_formula(formula)
+    return f"({text})" if isinstance(formula, (ir.Join, ir.Until, ir.Since)) else text
+
+
+def _atom(atom: ir.Atom) -> str:
+    """A comparison; `0.5 >= abs(s - 1)` is written from the side that varies."""
+    sign = {(1, True): ">", (1, False): ">=", (-1, True): "<", (-1, False): "<="}[atom.sign, atom.strict]
+    left, right = _sides(atom.num)
+    if isinstance(left, ir.Lit) and not isinstance(right, ir.Lit):
+        left, right, sign = right, left, _FLIPPED[sign]
+    return f"{show_number(left)} {sign} {show_number(right)}"
+
+
+def _sides(num: ir.Num) -> tuple[ir.Num, ir.Num]:
+    match num:
+        case ir.Op("sub", (left, right)):
+            return left, right
+        case _:
+            return num, ir.Lit(0.0)
+
+
+def show_number(num: ir.Num, level: int = 0) -> str:
+    """A number in infix notation; `level` is how tightly its surroundings bind."""
+    text, own = _number(num)
+    return f"({text})" if own < level else text
+
+
+def _number(num: ir.Num) -> tuple[str, int]:
+    match num:
+        case ir.Lit(value):
+            return f"{value:g}", _TOP if value >= 0 else _UNARY
+        case ir.Col(name):
+            return name, _TOP
+        case ir.Op("neg", (arg,)):
+            return f"-{show_number(arg, _UNARY)}", _UNARY
+        case ir.Op("sub", (left, ir.Lit(value))) if value < 0:
+            return f"{show_number(left, 1)} + {-value:g}", 1
+        case ir.Op("square", (arg,)):
+            return f"{show_number(arg, _TOP)}^2", 4
+        case ir.Op(name, (left, right)) if name in _INFIX:
+            sign, own = _INFIX[name]
+            return f"{show_number(left, own)} {sign} {show_number(right, own + 1)}", own
+        case ir.Op(name, args) | ir.Extern(name, args):
+            return f"{name}({', '.join(map(show_number, args))})", _TOP
+        case ir.Ind(cond):
+            return f"ind({show_formula(cond)})", _TOP
+        case ir.Where(cond, yes, no):
+            return f"if {show_formula(cond)} then {show_number(yes)} else {show_number(no)}", 0
+        case _:
+            assert_never(num)
