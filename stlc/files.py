@@ -176,8 +176,14 @@ def find_system(name: str, spec_path: Path | None = None) -> Path:
         for suffix in _SYSTEM_SUFFIXES:
             path = folder / f"{name}{suffix}"
             if path.is_file():
-                return path
+                return _straight(path)
     raise UsageError(_no_such("system", name, folders))
+
+
+def _straight(path: Path) -> Path:
+    """`specs/../examples/car.yaml` as `examples/car.yaml`, unless a link makes that another file."""
+    short = Path(os.path.normpath(path))
+    return short if short.is_file() and short.samefile(path) else path
 
 
 def find_trace(name: str, runs: Path = Path("runs")) -> Path:
