@@ -62,7 +62,7 @@ _PLAIN = {
     "acos": math.acos,
     "atan": math.atan,
     "atan2": math.atan2,
-    "sign": lambda a: (a > 0) - (a < 0),
+    "sign": lambda a: math.copysign(1.0, a) if a else 0.0,
     "floor": math.floor,
     "ceil": math.ceil,
     "round": round,

@@ -30,8 +30,10 @@ def to_window(interval: typed.Interval, grid: Grid, sink: list[Diagnostic], *, o
         outward: round a bound off the grid away from the interval.
     """
     lo = in_steps(interval.lo, grid, sink, interval.span)
+    if lo is None:
+        return _EMPTY
     hi = None if interval.hi is None else in_steps(interval.hi, grid, sink, interval.span)
-    if lo is None or (hi is None and interval.hi is not None):
+    if hi is None and interval.hi is not None:
         return _EMPTY
     if _reversed(interval, lo, hi, sink):
         return _EMPTY

@@ -11,7 +11,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Literal, TypeAlias
@@ -134,12 +134,13 @@ def compile_spec(
     timers: list[Timer] = []
     requirements = tuple(_rule(r, grid, purpose, sink, timers) for r in resolved.requirements)
     assumptions = tuple(_rule(r, grid, purpose, sink, timers) for r in resolved.assumptions)
+    added = merged(timers)
+    sink.extend(_taken(resolved, added))
     errors = [finding for finding in sink if finding.severity == "error"]
     if not errors and purpose == "train":
         errors = [_too_far(rule, grid) for rule in requirements if _leaves(rule, grid)]
     if errors:
         raise SpecError(*errors)
-    added = merged(iter(timers))
     return Compiled(
         name=resolved.name,
         spec=spec,
@@ -183,6 +184,19 @@ def _signature(spec: typed.Spec, rules: Iterable[Rule], timers: Iterable[Timer])
     read = frozenset().union(*(columns(rule.formula) for rule in rules))
     kept = Signature(tuple(column for column in spec.signature.columns if column.name in read))
     return kept.extended(*(timer.column for timer in timers))
+
+
+def _taken(spec: typed.Spec, timers: Iterable[Timer]) -> Iterator[Diagnostic]:
+    """A timer must not have the name of a signal."""
+    for timer in timers:
+        if timer.name in spec.signature:
+            declared = next(item for item in spec.source_ast.items if item.name == timer.name)
+            yield Diagnostic(
+                "E102",
+                f"`{timer.name}` is the name of a state that absolute intervals add",
+                declared.name_span,
+                help=("call the signal something else",),
+            )
 
 
 def _leaves(rule: Rule, grid: Grid) -> bool:

@@ -8,7 +8,7 @@ time from now agree.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import assert_never
@@ -94,7 +94,7 @@ def _at_least(left: ir.Num, right: ir.Num, span: Span) -> typed.Pred:
     return typed.Pred(span, ir.Op("sub", (left, right)), strict=False, guard=True)
 
 
-def merged(timers: Iterator[Timer]) -> tuple[Timer, ...]:
+def merged(timers: Iterable[Timer]) -> tuple[Timer, ...]:
     """One timer for each name, with the latest saturation."""
     latest: dict[str, Timer] = {}
     for timer in timers:

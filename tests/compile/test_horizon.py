@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from formula_strategies import GRID, formulas, traces
+from hypothesis import given, settings
+
+from stlc.compile import ir, typed
+from stlc.compile.defined import defined
+from stlc.compile.graph import robustness_signal
+from stlc.compile.horizon import columns, nodes, reach, uses_end
+from stlc.compile.lower import lower
+from stlc.compile.ops_numpy import NUMPY
+
+P, Q = ir.Atom(ir.Col("p")), ir.Atom(ir.Col("q"))
+
+
+@pytest.mark.parametrize(
+    ("formula", "past", "future", "end"),
+    [
+        (P, 0, 0, False),
+        (ir.Over("always", ir.Window(2, 5), P), 0, 5, False),
+        (ir.Over("always", ir.Window(2, 5), ir.Past("once", ir.Window(1, 9), P)), 7, 5, False),
+        (ir.Over("always", ir.Window(2, None), P), 0, 2, True),
+        (ir.Past("once", ir.Window(2, None), P), 2, 0, False),
+        (ir.Until("until", ir.Window(1, 3), ir.Shift(2, P), Q), 0, 5, False),
+        (ir.Since("since", ir.Window(1, 3), ir.Shift(2, P), Q), 3, 2, False),
+        (ir.Join("and", (ir.Shift(-1, P), ir.Shift(1, Q))), 1, 1, False),
+    ],
+)
+def test_reach(formula: ir.Formula, past: int, future: int, end: bool) -> None:
+    assert reach(formula) == (past, future)
+    assert uses_end(formula) is end
+
+
+def test_columns_of_conditions_inside_numbers() -> None:
+    num = ir.Op("add", (ir.Where(P, ir.Col("a"), ir.Lit(1.0)), ir.Ind(Q)))
+    assert columns(ir.Over("always", ir.Window(0, 1), ir.Atom(num))) == {"p", "q", "a"}
+
+
+@settings(max_examples=150)
+@given(formulas(bounded_only=True), traces(high=24))
+def test_nothing_beyond_the_reach_is_read(formula: typed.Formula, env: dict[str, np.ndarray]) -> None:
+    """A bounded formula has a value exactly where its reach fits, and samples beyond do not change it."""
+    node = lower(formula, GRID, [])
+    samples = len(env["x"])
+    past, future = reach(node)
+    inside = defined(node, samples)
+    if not any(isinstance(part, (ir.Past, ir.Since, ir.Shift)) for part in nodes(node)):
+        np.testing.assert_array_equal(inside, np.arange(samples) < samples - future)
+    assert inside[past : max(samples - future, 0)].all()
+    changed = {name: column.copy() for name, column in env.items()}
+    for column in changed.values():
+        column[future + 1 :] = 99.0
+    if inside[0]:
+        one, other = (robustness_signal(node, e, ops=NUMPY) for e in (env, changed))
+        np.testing.assert_array_equal(one[0], other[0])
