@@ -60,23 +60,36 @@ def render_text(diagnostics: Iterable[Diagnostic], *, color: bool) -> str:
 def _block(diagnostic: Diagnostic, paint: _Paint) -> Iterator[str]:
     title = f"{diagnostic.severity}[{diagnostic.code}]"
     yield f"{paint(diagnostic.severity, title)}{paint('headline', f': {_printable(diagnostic.message)}')}"
-    marks = _marks(diagnostic)
+    yield from _body(_marks(diagnostic), _advice(diagnostic), paint, diagnostic.severity)
+
+
+def render_place(
+    place: Label, labels: Iterable[Label], advice: Iterable[tuple[str, str]], *, color: bool
+) -> str:
+    """A place that is no finding, laid out as one: carets, dashes, and (word, line) pairs below."""
+    marks = [_Mark(place.span, place.text, primary=True)]
+    marks += [_Mark(label.span, label.text, primary=False) for label in labels]
+    return "\n".join(_body(marks, advice, _Paint(color), "error")) + "\n"
+
+
+def _body(
+    marks: Sequence[_Mark], advice: Iterable[tuple[str, str]], paint: _Paint, severity: str
+) -> Iterator[str]:
     width = max((len(str(mark.span.line)) for mark in marks), default=1)
     margin = " " * (width + 1)
     if marks:
-        yield from _snippets(marks, width, paint, diagnostic.severity)
-    for word, entries in _advice(diagnostic):
-        for entry in entries:
-            first, *more = _printable(entry, keep="\n").split("\n")
-            yield f"{margin}{paint('frame', '=')} {paint('help', f'{word}:')} {first}"
-            yield from (f"{margin}  {' ' * len(word)}  {line}" for line in more)
+        yield from _snippets(marks, width, paint, severity)
+    for word, entry in advice:
+        first, *more = _printable(entry, keep="\n").split("\n")
+        yield f"{margin}{paint('frame', '=')} {paint('help', f'{word}:')} {first}"
+        yield from (f"{margin}  {' ' * len(word)}  {line}" for line in more)
 
 
-def _advice(diagnostic: Diagnostic) -> Iterator[tuple[str, tuple[str, ...]]]:
-    yield "help", diagnostic.help
+def _advice(diagnostic: Diagnostic) -> Iterator[tuple[str, str]]:
+    yield from (("help", entry) for entry in diagnostic.help)
     if diagnostic.fix is not None and diagnostic.fix.text:
-        yield "fix", (diagnostic.fix.text,)
-    yield "note", diagnostic.note
+        yield "fix", diagnostic.fix.text
+    yield from (("note", entry) for entry in diagnostic.note)
 
 
 def _marks(diagnostic: Diagnostic) -> list[_Mark]:

@@ -176,14 +176,20 @@ class Verdict:
 
         Requirements that are judged once hold, or not, at every instant.
         """
+        return float(np.logical_and.reduce([self._spread(j, j.holds) for j in self.requirements]).mean())
+
+    @property
+    def failed_share(self) -> float:
+        """Share of the instants of all traces at which a requirement is certainly violated."""
+        return float(np.logical_or.reduce([self._spread(j, j.fails) for j in self.requirements]).mean())
+
+    def _spread(self, judgement: Judgement, truth: Bools) -> Bools:
+        """At as many instants as the requirement that has most of them: (instants, traces)."""
         most = max(judgement.instants for judgement in self.requirements)
-        holds = np.ones((most, self.traces), dtype=bool)
-        for judgement in self.requirements:
-            if judgement.instants == most:
-                holds &= judgement.holds
-            else:
-                holds &= judgement.holds.all(axis=0)
-        return float(holds.mean())
+        if judgement.instants == most:
+            return truth
+        once = truth.all(axis=0) if truth is judgement.holds else truth.any(axis=0)
+        return np.broadcast_to(once, (most, self.traces))
 
     @property
     def satisfied_traces(self) -> int:

@@ -13,7 +13,7 @@ from stlc.compile.ops import Array
 from stlc.compile.pipeline import Compiled, Rule, compile_spec
 from stlc.compile.schedule import End
 from stlc.compile.semantics import TOLERANCE, Exact, LogSumExp
-from stlc.diagnostics import SpecError
+from stlc.diagnostics import Diagnostic, SpecError, UsageError
 from stlc.files import read_source
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
@@ -182,6 +182,8 @@ class Monitor:
         recorded = recorded_times(given, self._asked) if isinstance(given, Trace) else Times()
         compiled = self._ready(recorded)
         rules = _chosen(compiled.requirements, require)
+        if not rules:
+            raise UsageError(Diagnostic("U101", f"`{compiled.name}` has no requirement to judge"))
         signals = arrange(given, needs_of(compiled, rules), plain=plain)
         return Prepared(compiled, rules, signals, Record(signals.env, signals.ops))
 
