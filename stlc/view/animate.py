@@ -76,7 +76,7 @@ def _scene_film(run: RunDir) -> Film | None:
         world = world_type(decl)
     except StlcError:
         return None
-    return scene_film(scene, world.draw, float(decl.dt), title=_title(run))  # type: ignore[attr-defined]
+    return scene_film(scene, world.draw, float(decl.dt), title=_title(run))
 
 
 def _signal_film(run: RunDir) -> Film | None:

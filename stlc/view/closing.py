@@ -57,6 +57,12 @@ def _commands(material: Material) -> list[str]:
     for option in ("seed", "steps"):
         if record.get(option) is not None:
             train += [f"--{option}", str(record[option])]
+    options = record.get("options") or {}
+    for option in ("method", "plans", "lr", "batch"):
+        if options.get(option) not in (None, "guided"):
+            train += [f"--{option}", str(options[option])]
+    for name, value in (record.get("overrides") or {}).items():
+        train += ["--set", f"{name}={value}"]
     commands = [shlex.join(train), f"stlc simulate {run} --backup"]
     if material.trace is not None:
         commands.append(f"stlc check {shlex.quote(f'{material.run.shown}/trace.npz')}")

@@ -3,29 +3,44 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from stlc.view.animate import STILL, current_gif
 from stlc.view.html import Child, Html, classed, el, figure, join, table
 from stlc.view.material import Material
 from stlc.view.page import section
-from stlc.view.words import count, number, seconds, share
+from stlc.view.words import count, seconds, share, spread
 
 Part = tuple[str, str, Html]
 Record = Mapping[str, Any]
 
 GUARDS = {"none": "no guard", "paper": "with the backup"}
 SHARES = {
-    "plan_accuracy": ("plan accuracy", "of the plans that were followed, the share that satisfies the specification"),
+    "plan_accuracy": (
+        "plan accuracy",
+        "of the plans that were followed, the share that satisfies the specification",
+    ),
     "policy_accuracy": ("policy's plan accuracy", "the same of what the policy proposed"),
-    "plan_safety": ("plan safety", "of the plans that were followed, the share that satisfies what is tagged @safety"),
+    "plan_safety": (
+        "plan safety",
+        "of the plans that were followed, the share that satisfies what is tagged @safety",
+    ),
     "executed": ("executed, agents", "agents whose drive satisfied everything from every start"),
-    "executed_safe": ("executed safely, agents", "agents whose drive satisfied what is tagged @safety from every start"),
+    "executed_safe": (
+        "executed safely, agents",
+        "agents whose drive satisfied what is tagged @safety from every start",
+    ),
     "executed_starts": ("executed, starts", "starts from which what was driven satisfies the specification"),
     "executed_safe_starts": ("executed safely, starts", "the same for what is tagged @safety"),
-    "foreseen": ("as foreseen", "starts from which the world did what the model said, through the whole window"),
-    "foreseen_starts": ("executed, as foreseen", "of those starts, the share that satisfies the specification"),
+    "foreseen": (
+        "as foreseen",
+        "starts from which the world did what the model said, through the whole window",
+    ),
+    "foreseen_starts": (
+        "executed, as foreseen",
+        "of those starts, the share that satisfies the specification",
+    ),
 }
 HOLDS = "holds."
 
@@ -37,9 +52,9 @@ def deployment_tiles(material: Material) -> list[tuple[str, str]]:
         return []
     name, guard = list(guards.items())[-1]
     metrics = guard.get("metrics") or {}
-    beside = "with the backup" if name == "paper" else "without a guard"
+    beside = "with backup" if name == "paper" else "no guard"
     tiles = [
-        (share(_mean(metrics, "plan_accuracy")), f"of plans in deployment, {beside}"),
+        (share(_mean(metrics, "plan_accuracy")), f"of deployed plans, {beside}"),
         (share(_mean(metrics, "executed_safe_starts")), "of driven windows safe"),
     ]
     return [tile for tile in tiles if tile[0]]
@@ -51,20 +66,16 @@ def deployment_section(material: Material) -> Part | None:
     if not guards:
         return None
     title = "How it drives"
-    header = ["", *(GUARDS.get(name, name) for name in guards)]
-    numeric = range(1, len(header))
-    body = (
+    markup = section(
+        "deployment",
+        title,
         el("p", _setting(material.simulation or {})),
-        table(header, _share_rows(guards), numeric=numeric),
-        _titled("Progress", table(header, rows, numeric=numeric)) if (rows := _progress_rows(guards)) else None,
-        _titled("Decisions", table(header, _decision_rows(guards), numeric=numeric)),
+        _compared("", guards, _share_rows(guards)),
+        _compared("Requirements as driven", guards, _requirement_rows(guards)),
+        _compared("Progress", guards, _progress_rows(guards)),
+        _compared("Decisions", guards, _decision_rows(guards)),
     )
-    return "deployment", title, section("deployment", title, body_of(body))
-
-
-def body_of(parts: Sequence[Child]) -> Html:
-    """`parts` one after the other, None left out."""
-    return join(*parts)
+    return "deployment", title, markup
 
 
 def film_section(material: Material) -> Part | None:
@@ -90,8 +101,13 @@ def _key(color: str, name: str) -> Html:
     return join(el("span", attrs={"class": "key", "style": f"background:{color}"}), f"{name}  ")
 
 
-def _titled(title: str, content: Html) -> Html:
-    return join(el("h3", title), content)
+def _compared(title: str, guards: Mapping[str, Record], rows: list[tuple[Child, ...]]) -> Html | None:
+    """A table with a column per guard; nothing where there are no rows."""
+    if not rows:
+        return None
+    header = ["", *(GUARDS.get(name, name) for name in guards)]
+    compared = table(header, rows, numeric=range(1, len(header)), kind="compare")
+    return join(el("h3", title), compared) if title else compared
 
 
 def _guards(material: Material) -> dict[str, Record]:
@@ -103,7 +119,9 @@ def _setting(simulation: Record) -> str:
     seeds, agents, steps = simulation.get("seeds") or (), simulation.get("agents"), simulation.get("steps")
     size = f"{count(len(seeds), 'seed')} of {count(agents or 0, 'agent')}, {count(steps or 0, 'step')} each"
     spread = f", {simulation['interval']}" if simulation.get("interval") else ""
-    return f"{size}. Means over the seeds with their interval ({spread.lstrip(', ')})." if spread else f"{size}."
+    return (
+        f"{size}. Means over the seeds with their interval ({spread.lstrip(', ')})." if spread else f"{size}."
+    )
 
 
 def _mean(metrics: Record, name: str) -> float | None:
@@ -117,17 +135,21 @@ def _names(guards: Mapping[str, Record]) -> list[str]:
 
 
 def _share_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    rows: list[tuple[Child, ...]] = []
-    for name in _names(guards):
-        if name in SHARES:
-            label, meaning = SHARES[name]
-        elif name.startswith(HOLDS):
-            label, meaning = name.removeprefix(HOLDS), "starts from which what was driven satisfies it"
-        else:
-            continue
-        cells = [_share_cell((guard.get("metrics") or {}).get(name)) for guard in guards.values()]
-        rows.append((join(label, el("small", meaning)), *cells))
-    return rows
+    return [
+        (join(label, el("small", meaning)), *_cells(guards, name, _share_cell))
+        for name, (label, meaning) in SHARES.items()
+        if name in _names(guards)
+    ]
+
+
+def _requirement_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
+    """Share of the starts from which what was driven satisfies one requirement."""
+    names = [name for name in _names(guards) if name.startswith(HOLDS)]
+    return [(name.removeprefix(HOLDS), *_cells(guards, name, _share_cell)) for name in names]
+
+
+def _cells(guards: Mapping[str, Record], name: str, cell: Callable[[Record | None], Child]) -> list[Child]:
+    return [cell((guard.get("metrics") or {}).get(name)) for guard in guards.values()]
 
 
 def _progress_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
@@ -146,19 +168,17 @@ def _progress_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
 def _share_cell(metric: Record | None) -> Child:
     if metric is None:
         return ""
-    spread = _half(metric)
-    return join(share(metric["mean"]), classed("span", "quiet", f" ± {100 * spread:.1f}") if spread is not None else "")
+    half = _half(metric)
+    return join(
+        share(metric["mean"]), classed("span", "quiet", f" ± {100 * half:.1f}") if half is not None else ""
+    )
 
 
 def _number_cell(metric: Record | None, unit: str) -> Child:
     if metric is None:
         return ""
-    spread = _half(metric)
-    return join(
-        number(metric["mean"]),
-        classed("span", "quiet", f" ± {number(spread)}") if spread is not None else "",
-        f" {unit}" if unit else "",
-    )
+    mean, half = spread(metric["mean"], _half(metric))
+    return join(mean, classed("span", "quiet", f" ± {half}") if half else "", f" {unit}" if unit else "")
 
 
 def _half(metric: Record) -> float | None:
@@ -178,5 +198,9 @@ def _decision_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
 
 
 def _decided(name: str) -> Child:
-    words = {"policy": "the policy decided", "backup": "the backup decided", "safest": "the safest prefix was taken"}
+    words = {
+        "policy": "the policy decided",
+        "backup": "the backup decided",
+        "safest": "the safest prefix was taken",
+    }
     return words.get(name, classed("span", "quiet", f"of which {name.removeprefix('backup ')}"))

@@ -2,17 +2,165 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from stlc.diagnostics import StlcError
+from stlc.grammar import ast
 from stlc.grammar.parser import parse
+from stlc.monitor.explain import Cause, explain
 from stlc.monitor.verdict import Judgement, Monitor, Verdict
 from stlc.source import Source
-from stlc.view.highlight import spec_html
+from stlc.trace import Trace
 from stlc.view.html import Child, Html, classed, el, figure, join, table
-from stlc.view.margins import Margins
-from stlc.view.material import Material
+from stlc.view.material import Material, untagged
 from stlc.view.page import section
 from stlc.view.signals import choose_traces, draw_signals
 from stlc.view.style import ORANGE, RED
 from stlc.view.words import count, share
 
 Part = tuple[str, str, Html]
+
+
+def driven_section(material: Material) -> Part | None:
+    """The recorded traces under the monitor; None where there is no trace that can be judged."""
+    trace = material.trace
+    if trace is None:
+        return None
+    title = "What was driven"
+    try:
+        monitor = Monitor(
+            parse(Source("spec.stl", trace.meta.spec_text or material.texts.get("spec.stl", "")))
+        )
+        verdict = monitor.check(trace)
+        margins = monitor.requirement_robustness(trace)
+    except StlcError as error:
+        reason = el(
+            "p", "The trace could not be judged: ", "; ".join(d.message for d in error.diagnostics), "."
+        )
+        return "driven", title, section("driven", title, reason)
+    names = trace_names(trace)
+    choices = choose_traces(_per_trace(verdict), names)
+    picture = draw_signals(trace, {name: np.atleast_2d(rho) for name, rho in margins.items()}, choices)
+    return (
+        "driven",
+        title,
+        section(
+            "driven",
+            title,
+            el("p", _summary(verdict)),
+            _verdict_table(verdict, names),
+            figure(picture.data_uri(), picture.alt, _caption(trace)),
+            causes_of(verdict, names, monitor.spec),
+        ),
+    )
+
+
+def trace_names(trace: Trace) -> list[str]:
+    """How traces are called: by seed and agent where that was recorded."""
+    seeds, agents = trace.extras.get("seed"), trace.extras.get("agent")
+    if seeds is None or agents is None or not len(seeds) == len(agents) == trace.traces:
+        return [f"trace {index}" for index in range(trace.traces)]
+    return [
+        f"trace {index} (seed {seed}, agent {agent})"
+        for index, (seed, agent) in enumerate(zip(seeds.tolist(), agents.tolist(), strict=True))
+    ]
+
+
+def _per_trace(verdict: Verdict) -> NDArray[np.float64]:
+    return np.atleast_1d(np.asarray(verdict.robustness, dtype=float))
+
+
+def _summary(verdict: Verdict) -> str:
+    traces = f"{verdict.satisfied_traces:,} of {count(verdict.traces, 'trace')}"
+    whole = f"{traces} satisfy every requirement at every start"
+    return f"{whole}; from {share(verdict.share)} of all starts what was driven satisfies all of them."
+
+
+def _verdict_table(verdict: Verdict, names: list[str]) -> Html:
+    header = (
+        "requirement",
+        "verdict",
+        "violating traces",
+        "starts that satisfy it",
+        "least robustness",
+        "where",
+    )
+    rows: list[tuple[Child, ...]] = []
+    for judgement in verdict:
+        trace, sample = judgement.worst
+        violating = judgement.statuses.count("violated")
+        rows.append(
+            (
+                el("strong", judgement.name),
+                classed("span", _KINDS.get(judgement.overall, "quiet"), judgement.overall),
+                f"{violating:,} of {verdict.traces:,}",
+                share(judgement.share, 2),
+                _least(judgement),
+                f"{names[trace]}, t = {verdict.subject.time(sample):.3g} s",
+            )
+        )
+    return table(header, rows, numeric=(2, 3, 4))
+
+
+_KINDS = {"satisfied": "good", "violated": "bad"}
+
+
+def _least(judgement: Judgement) -> str:
+    values = judgement.high if judgement.overall == "violated" else judgement.low
+    least = float(values.min())
+    return f"{least:+.3f}" if np.isfinite(least) else "not limited" if least > 0 else "unknown"
+
+
+def _caption(trace: Trace) -> Html:
+    words = (
+        "Beneath the signals the robustness of each requirement at every start "
+        "(red: violated; large margins are cut). "
+    )
+    if "decision" not in trace.extras:
+        return join(words)
+    backup = el("span", attrs={"class": "key", "style": f"background:{ORANGE}"})
+    safest = el("span", attrs={"class": "key", "style": f"background:{RED}"})
+    return join(words, "Shaded: ", backup, "the backup acted, ", safest, "the longest safe prefix was taken.")
+
+
+def causes_of(verdict: Verdict, names: list[str], spec: ast.Spec) -> Html | None:
+    """Of each violated requirement its worst violation: which part, when, with which values."""
+    causes = [cause for judgement in verdict if (cause := explain(verdict, judgement.name)) is not None]
+    if not causes:
+        return None
+    declared = {item.name: item for item in spec.items if isinstance(item, ast.Require)}
+    told = [_cause_html(cause, names, declared.get(cause.judgement.name)) for cause in causes]
+    return join(el("h3", "What failed, and why"), told)
+
+
+def _cause_html(cause: Cause, names: list[str], declared: ast.Require | None) -> Html:
+    written = untagged(declared) if declared else cause.judgement.rule.span
+    labels = [label for label in (cause.place, *cause.labels) if label.text]
+    marks = sorted(
+        (max(label.span.start - written.start, 0), label.span.end - written.start)
+        for label in labels
+        if written.start <= label.span.start and label.span.end <= written.end
+    )
+    told = [el("li", el("code", " ".join(label.span.text.split())), f" is {label.text}") for label in labels]
+    return join(
+        el("p", el("strong", cause.judgement.name), f" fails worst in {names[cause.trace]}."),
+        el("pre", _marked(written.text, marks)),
+        el("ul", told, el("li", "because ", _code(cause.because))),
+    )
+
+
+def _code(text: str) -> Html:
+    """What stands in backticks, as code."""
+    return join([el("code", part) if i % 2 else part for i, part in enumerate(text.split("`"))])
+
+
+def _marked(text: str, marks: list[tuple[int, int]]) -> Html:
+    """`text` with the stretches `marks` (start, end) set apart; overlapping ones are joined."""
+    parts: list[Html | str] = []
+    last = 0
+    for start, end in marks:
+        if end > last:
+            parts += [text[last : max(start, last)], el("mark", text[max(start, last) : end])]
+            last = end
+    return join([*parts, text[last:]])

@@ -151,7 +151,7 @@ def _encoded(pictures: list[Image], milliseconds: int) -> bytes:
     sheet = Image.new("RGB", (sample[0].width, sample[0].height * len(sample)))
     for row, picture in enumerate(sample):
         sheet.paste(picture, (0, row * picture.height))
-    palette = sheet.quantize(COLOURS, dither=Image.Dither.NONE)
+    palette = _palette(sheet)
     frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     buffer = io.BytesIO()
     frames[0].save(
@@ -164,3 +164,17 @@ def _encoded(pictures: list[Image], milliseconds: int) -> bytes:
         optimize=True,
     )
     return buffer.getvalue()
+
+
+def _palette(sheet: Image) -> Image:
+    """The colours that cover most, exactly (white paper stays white), and a choice of the others."""
+    from PIL import Image
+
+    counts: Any = sheet.getcolors(sheet.width * sheet.height)
+    frequent = [color for _, color in sorted(counts, reverse=True)[: COLOURS // 2]]
+    mixed = np.array(sheet.quantize(COLOURS // 2, dither=Image.Dither.NONE).getpalette()).reshape(-1, 3)
+    near = np.abs(mixed[:, None] - np.array(frequent)[None]).max(axis=2).min(axis=1) <= 8
+    colours = np.concatenate([np.array(frequent), mixed[~near]])
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(colours.ravel().tolist())
+    return palette

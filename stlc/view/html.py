@@ -46,15 +46,21 @@ def classed(name: str, kind: str, *children: Child) -> Html:
     return el(name, *children, attrs={"class": kind})
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[Child]], *, numeric: Sequence[int] = ()) -> Html:
-    """A table; the columns `numeric` stand right."""
+def table(
+    header: Sequence[str],
+    rows: Iterable[Sequence[Child]],
+    *,
+    numeric: Sequence[int] = (),
+    kind: str = "plain",
+) -> Html:
+    """A table of class `kind`; the columns `numeric` stand right."""
 
     def row(cell: str, cells: Sequence[Child]) -> Html:
         return el("tr", [_cell(cell, value, i in numeric) for i, value in enumerate(cells)])
 
     head = el("thead", row("th", header)) if header else None
     body = el("tbody", [row("td", cells) for cells in rows])
-    return classed("div", "scroll", el("table", head, body))
+    return classed("div", "scroll", classed("table", kind, head, body))
 
 
 def _cell(name: str, value: Child, numeric: bool) -> Html:

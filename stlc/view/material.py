@@ -12,7 +12,7 @@ from stlc.grammar import ast
 from stlc.grammar.parser import parse
 from stlc.rundir import RunDir
 from stlc.signature import Signature
-from stlc.source import Source
+from stlc.source import Source, Span
 from stlc.trace import Trace, load_trace
 from stlc.view.held_out import HeldOut, load_held_out
 
@@ -75,6 +75,15 @@ def gather(run: RunDir) -> Material:
         simulation=_simulation(run),
         trace=_trace(run),
     )
+
+
+def untagged(declared: ast.Require) -> Span:
+    """A requirement without the tags before it."""
+    end = max((tag.span.end for tag in declared.tags), default=declared.span.start)
+    text = declared.span.source.text
+    start = max(end, declared.span.start)
+    start += len(text[start : declared.span.end]) - len(text[start : declared.span.end].lstrip())
+    return Span(declared.span.source, start, declared.span.end)
 
 
 TEXTS = ("spec.stl", "system.yaml", "compiled.txt", "config.resolved.yaml")

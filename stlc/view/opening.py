@@ -8,7 +8,7 @@ from typing import Any
 from stlc.view.curves import draw_curves
 from stlc.view.highlight import spec_html
 from stlc.view.html import Child, Html, classed, el, facts, figure, join, table
-from stlc.view.material import Material
+from stlc.view.material import Material, untagged
 from stlc.view.page import section
 from stlc.view.words import count, interval, number, seconds, share
 
@@ -86,12 +86,12 @@ def _described(material: Material, name: str) -> Html:
     declared = material.requirements.get(name)
     if declared is None:
         return el("strong", name)
-    tags = "".join(f" @{tag.name}" for tag in declared.tags)
+    tags = " ".join(" ".join(tag.span.text.split()) for tag in declared.tags)
     return join(
         el("strong", name),
-        classed("span", "quiet", tags),
+        classed("span", "quiet", f" {tags}") if tags else None,
         el("small", declared.doc) if declared.doc else None,
-        el("pre", spec_html(declared.span.text.strip())),
+        el("pre", spec_html(untagged(declared).text)),
     )
 
 
@@ -135,6 +135,7 @@ def _facts(material: Material) -> list[tuple[str, Child]]:
     commit = str(git.get("commit", ""))[:12]
     return [
         ("steps", taken),
+        ("options", _options(record)),
         ("seed", str(record.get("seed", ""))),
         ("device", _device(record)),
         ("machine", ", ".join(part for part in machine if part)),
@@ -144,6 +145,18 @@ def _facts(material: Material) -> list[tuple[str, Child]]:
         ("specification", _hashed(record, "spec")),
         ("system", _hashed(record, "system")),
     ]
+
+
+def _options(record: Mapping[str, Any]) -> str:
+    """What the engine decided, as far as the run says it."""
+    engine = record.get("engine") or record.get("options") or {}
+    shown = [f"{name} {engine[name]}" for name in _OPTIONS if engine.get(name) is not None]
+    if record.get("margin") is not None:
+        shown.append(f"margin {number(float(record['margin']))}")
+    return ", ".join(shown)
+
+
+_OPTIONS = ("method", "hidden", "plans", "batch", "lr")
 
 
 def _device(record: Mapping[str, Any]) -> str:

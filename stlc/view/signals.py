@@ -65,7 +65,13 @@ def choose_traces(least: NDArray[np.float64], names: Sequence[str] = ()) -> tupl
 
 
 def draw_signals(trace: Trace, margins: Margins, choices: Sequence[Choice]) -> Picture:
-    """A column of panels per chosen trace; `margins` holds (traces, samples) per requirement, NaN: undefined."""
+    """A column of panels per chosen trace.
+
+    Args:
+        trace: what was recorded.
+        margins: requirement -> robustness at every sample, (traces, samples), NaN where undefined.
+        choices: the traces to show.
+    """
     rows = _rows(trace, margins)
     heights = [_HEIGHTS[kind] for kind, _ in rows]
     with look():

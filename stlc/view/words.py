@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 
@@ -21,6 +22,14 @@ def number(value: float | None, unit: str = "") -> str:
         return ""
     text = f"{value:,.0f}" if abs(value) >= 1000 or value == round(value) else f"{value:.3g}"
     return f"{text} {unit}".rstrip()
+
+
+def spread(mean: float, half: float | None) -> tuple[str, str]:
+    """A mean and half its interval with the same decimals, two digits of the half: (`4.10`, `0.10`)."""
+    if not half:
+        return number(mean), "" if half is None else "0"
+    decimals = max(0, 1 - math.floor(math.log10(half)))
+    return f"{mean:,.{decimals}f}", f"{half:,.{decimals}f}"
 
 
 def seconds(value: float | None) -> str:

@@ -120,6 +120,8 @@ def drive(agents=20, steps=150, seed=2):
         "decision": np.stack(decisions[:-1]).T.astype(np.int8),
         "t0": np.stack(decisions[:-1]).T.astype(np.int8),
         "plan_rho": np.full((agents, steps), 0.2),
+        "seed": np.arange(agents) // 10,
+        "agent": np.arange(agents) % 10,
     }
     meta = TraceMeta(
         spec_name="traffic",
@@ -140,13 +142,14 @@ def record():
     shares = {"no_collision": 0.996, "stop_sign": 0.971, "give_way": 0.999, "red_light": 0.984}
     return {
         "stlc": "0.1.0",
-        "command": "stlc train specs/traffic.stl --system car.yaml --budget 60s",
+        "command": ["train", "specs/traffic.stl", "--system", "car.yaml", "--budget", "60s"],
         "spec": "traffic",
         "spec_path": "specs/traffic.stl",
         "spec_hash": "5d1c0ffee",
         "system": "car",
         "system_path": "examples/car.yaml",
         "system_hash": "0b5e55ed",
+        "overrides": {"T_red": "3 s"},
         "seed": 0,
         "steps": 5900,
         "budget": 60.0,
@@ -183,10 +186,60 @@ def trained(tmp_path):
     return run
 
 
+def metric(mean, half):
+    return {"mean": mean, "low": mean - half, "high": mean + half, "values": [mean - half, mean + half]}
+
+
+def simulation():
+    def guard(accuracy, acted, speed):
+        return {
+            "metrics": {
+                "plan_accuracy": metric(accuracy, 0.012),
+                "policy_accuracy": metric(0.93, 0.02),
+                "plan_safety": metric(0.99, 0.004),
+                "executed": metric(accuracy - 0.2, 0.05),
+                "executed_safe": metric(accuracy - 0.1, 0.05),
+                "executed_starts": metric(accuracy - 0.02, 0.01),
+                "executed_safe_starts": metric(accuracy - 0.01, 0.01),
+                "foreseen": metric(0.71, 0.03),
+                "foreseen_starts": metric(0.995, 0.002),
+                "holds.no_collision": metric(0.999, 0.001),
+                "holds.stop_sign": metric(0.97, 0.01),
+                "holds.give_way": metric(0.99, 0.01),
+                "holds.red_light": metric(0.995, 0.002),
+                "mean_speed": metric(speed, 0.1),
+                "junctions_passed": metric(61.0, 3.2),
+                "overlapping_pairs": metric(0.0, 0.0),
+            },
+            "units": {"mean_speed": "m/s"},
+            "decisions": {
+                "policy": 1 - acted,
+                "backup": acted * 0.93,
+                "safest": acted * 0.07,
+                "backup T0=1": acted * 0.9,
+            },
+            "latency": {"median": 0.0006, "p99": 0.0213, "samples": 200},
+        }
+
+    return {
+        "spec": "traffic",
+        "system": "car",
+        "run": "0001-quiet-heron",
+        "world": "traffic_grid.py",
+        "seeds": [0, 1],
+        "agents": 10,
+        "steps": 150,
+        "replan": 1,
+        "interval": "95 %, Student's t over the deployment seeds",
+        "guards": {"none": guard(0.93, 0.0, 4.1), "paper": guard(0.981, 0.031, 4.0)},
+    }
+
+
 @pytest.fixture
-def deployed(trained):
+def deployed(trained, recording):
     """The same run with a recorded deployment."""
-    save_trace(trained.path / "trace.npz", drive())
+    save_trace(trained.path / "trace.npz", recording)
+    trained.write_json("eval/simulate.json", simulation())
     return trained
 
 

@@ -49,7 +49,18 @@ def test_panels_show_signals_decisions_and_robustness(recording, margins, choice
     picture = draw_signals(recording, margins, choices)
     shown = panels(picture, 0, 2)
     assert list(shown) == [
-        *("x [m]", "v [m/s]", "tau [s]", "dx [m]", "v_lead [m/s]", "sign", "yielding", "decision", "first", "second")
+        *(
+            "x [m]",
+            "v [m/s]",
+            "tau [s]",
+            "dx [m]",
+            "v_lead [m/s]",
+            "sign",
+            "yielding",
+            "decision",
+            "first",
+            "second",
+        )
     ]
     line = np.asarray(shown["v [m/s]"].lines[0].get_ydata())
     np.testing.assert_array_equal(line, recording.data["v"][7])
