@@ -14,6 +14,7 @@ from stlc.grammar.builder import Rule
 from stlc.grammar.tokens import Context, Leaf, name_of, number_of, own_name, unit_of
 from stlc.source import Source, Span
 
+_SIZE_DIGITS = 4
 _DOC = re.compile(r"^[ \t]*##(?!#)[ \t]?(.*?)[ \t\r]*$", re.MULTILINE)
 
 
@@ -64,9 +65,17 @@ def _tag(_: Context, span: Span, children: Sequence[Any]) -> ast.Tag:
     return ast.Tag(span, name_of(leaf), args or ())
 
 
-def _type(_: Context, span: Span, children: Sequence[Any]) -> ast.TypeRef:
+def _type(context: Context, span: Span, children: Sequence[Any]) -> ast.TypeRef:
     leaf, size = children
-    return ast.TypeRef(span, name_of(leaf), None if size is None else int(size.text.strip("[] \t\r\n")))
+    return ast.TypeRef(span, name_of(leaf), None if size is None else _size(context, size))
+
+
+def _size(context: Context, leaf: Leaf) -> int:
+    digits = leaf.text.strip("[] \t\r\n")
+    if len(digits) <= _SIZE_DIGITS:
+        return int(digits)
+    context.findings.append(Diagnostic("E005", "a vector of that size is too large", leaf.span))
+    return 1
 
 
 def _sort(context: Context, _: Span, children: Sequence[Any]) -> tuple[ast.TypeRef | None, str]:

@@ -1,0 +1,269 @@
+"""Reading with care, writing beside and then renaming, finding by name."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from stlc import files
+from stlc.cli.render import render_text
+from stlc.diagnostics import MissingError, SpecError, StlcError, UsageError
+from stlc.files import MAX_BYTES, atomic_path, find_system, find_trace, read_source, write_atomic
+
+ROOT = Path(__file__).resolve().parent.parent
+FULL = Path("/dev/full")
+
+
+def finding(error: pytest.ExceptionInfo[StlcError]):
+    (diagnostic,) = error.value.diagnostics
+    return diagnostic
+
+
+# ------------------------------------------------------------------------------ reading
+
+
+def test_a_text_is_read_under_the_name_it_was_given(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("a.stl").write_bytes(b"\xef\xbb\xbfspec a\n# gr\xc3\xb6\xc3\x9fe\n")
+    source = read_source("a.stl")
+    assert (source.name, source.text) == ("a.stl", "spec a\n# größe\n")
+
+
+def test_the_standard_input_is_a_file_too(monkeypatch):
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"spec a")))
+    source = read_source("-")
+    assert (source.name, source.text) == ("<stdin>", "spec a")
+
+
+def test_a_missing_file(tmp_path):
+    (tmp_path / "traffic.stl").touch()
+    with pytest.raises(UsageError) as caught:
+        read_source(tmp_path / "trafic.stl")
+    assert finding(caught).code == "U102"
+    assert finding(caught).help == (f"did you mean `{tmp_path / 'traffic.stl'}`?",)
+
+
+def test_a_missing_folder_and_a_folder_for_a_file(tmp_path):
+    for path in (tmp_path / "no" / "a.stl", tmp_path):
+        with pytest.raises(UsageError) as caught:
+            read_source(path)
+        assert finding(caught).code == "U102"
+
+
+def test_an_ascii_mesh_is_shown(tmp_path):
+    path = tmp_path / "part.stl"
+    path.write_text("solid bracket_v2\n  facet normal 0 0 1\n    outer loop\n", encoding="ascii")
+    with pytest.raises(SpecError) as caught:
+        read_source(path)
+    assert render_text(caught.value.diagnostics, color=False).splitlines() == [
+        f"error[E003]: `{path}` is a 3-D mesh, not a specification",
+        f" --> {path}:1:1",
+        "  |",
+        "1 | solid bracket_v2",
+        "  | ^^^^^ ASCII stereolithography starts like this",
+        "  |",
+        "  = note: both formats use the suffix .stl; stlc specifications are UTF-8 text that start with a "
+        "declaration or `spec NAME`",
+    ]
+
+
+def test_a_specification_may_speak_of_solids(tmp_path):
+    path = tmp_path / "a.stl"
+    path.write_text("# solid ground\nsignal solid\n", encoding="utf-8")
+    assert read_source(path).text.startswith("# solid")
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        (b"\0" * 80 + struct.pack("<I", 2) + b"\x01" * 100, "is a 3-D mesh"),
+        (b"PK\x03\x04\x00\x00\xff\xfe" * 20, "is a binary file"),
+        (b"spec a\0\0", "is a binary file"),
+        (b"spec a\nconst caf\xe9 = 1\n", "is not UTF-8: byte 0xe9 in line 2"),
+    ],
+)
+def test_what_is_no_text(tmp_path, data, says):
+    path = tmp_path / "a.stl"
+    path.write_bytes(data)
+    with pytest.raises(SpecError) as caught:
+        read_source(path)
+    assert finding(caught).code == "E003"
+    assert says in finding(caught).message
+
+
+def test_a_large_file_is_not_read(tmp_path):
+    path = tmp_path / "a.stl"
+    with path.open("wb") as file:
+        file.truncate(MAX_BYTES + 1)
+    with pytest.raises(SpecError) as caught:
+        read_source(path)
+    assert finding(caught).code == "E005"
+
+
+# ------------------------------------------------------------------------------ writing
+
+
+def listed(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_texts_and_bytes_are_written_whole(tmp_path):
+    path = tmp_path / "new" / "folder" / "a.json"
+    write_atomic(path, "größe")
+    assert path.read_text(encoding="utf-8") == "größe"
+    write_atomic(str(path), b"\x00\x01")
+    assert path.read_bytes() == b"\x00\x01"
+    assert listed(path.parent) == ["a.json"]
+
+
+def test_a_file_is_readable_as_the_user_wants_it(tmp_path):
+    before = os.umask(0o027)
+    try:
+        write_atomic(tmp_path / "a", "x")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "a").stat().st_mode & 0o777 == 0o640
+
+
+def test_a_link_is_written_through(tmp_path):
+    write_atomic(tmp_path / "real.txt", "old")
+    (tmp_path / "link.txt").symlink_to("real.txt")
+    write_atomic(tmp_path / "link.txt", "new")
+    assert (tmp_path / "link.txt").is_symlink()
+    assert (tmp_path / "real.txt").read_text(encoding="utf-8") == "new"
+
+
+def test_the_temporary_file_has_the_suffix_and_the_folder(tmp_path):
+    with atomic_path(tmp_path / "trace.npz") as temporary:
+        assert (temporary.suffix, temporary.parent) == (".npz", tmp_path)
+        temporary.write_bytes(b"1")
+        assert not (tmp_path / "trace.npz").exists()
+    assert (tmp_path / "trace.npz").read_bytes() == b"1"
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_whatever_happens_the_old_file_survives(tmp_path, error):
+    write_atomic(tmp_path / "a", "old")
+
+    def interrupted() -> None:
+        with atomic_path(tmp_path / "a") as temporary:
+            temporary.write_text("half", encoding="utf-8")
+            raise error
+
+    with pytest.raises(error):
+        interrupted()
+    assert (tmp_path / "a").read_text(encoding="utf-8") == "old"
+    assert listed(tmp_path) == ["a"]
+
+
+def test_a_full_disk_is_reported_and_leaves_nothing(tmp_path, monkeypatch):
+    write_atomic(tmp_path / "a", "old")
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files.os, "fsync", full)
+    with pytest.raises(MissingError) as caught:
+        write_atomic(tmp_path / "a", "new")
+    assert finding(caught).code == "R201"
+    assert finding(caught).message == f"cannot write `{tmp_path / 'a'}`: no space left on device"
+    assert caught.value.exit_code == 5
+    assert (tmp_path / "a").read_text(encoding="utf-8") == "old"
+    assert listed(tmp_path) == ["a"]
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
+def test_devices_are_written_in_place():
+    with pytest.raises(MissingError):
+        write_atomic(FULL, "x" * 100_000)
+    assert FULL.exists()
+    write_atomic(os.devnull, "x")
+    assert not Path(os.devnull).is_file()
+
+
+def test_a_folder_is_not_replaced(tmp_path):
+    (tmp_path / "a").mkdir()
+    with pytest.raises(MissingError) as caught:
+        write_atomic(tmp_path / "a", "x")
+    assert finding(caught).code == "R201"
+    assert listed(tmp_path) == ["a"]
+
+
+def test_a_file_in_the_way_of_a_folder(tmp_path):
+    (tmp_path / "a").touch()
+    with pytest.raises(MissingError):
+        write_atomic(tmp_path / "a" / "b", "x")
+
+
+def test_a_kill_in_the_middle_of_a_save_leaves_the_old_file(tmp_path):
+    path = tmp_path / "state"
+    write_atomic(path, "old")
+    script = (
+        "import os, signal, sys\nfrom stlc.files import atomic_path\n"
+        "with atomic_path(sys.argv[1]) as temporary:\n"
+        "    temporary.write_text('half')\n    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script, str(path)], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert path.read_text(encoding="utf-8") == "old"
+
+
+# ------------------------------------------------------------------------------ finding
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("specs/traffic.stl", "examples/car.yaml", "examples/maze.yml", "specs/own.yaml"):
+        write_atomic(name, "")
+    return tmp_path
+
+
+def test_a_system_is_found_as_given_beside_the_spec_and_in_examples(project):
+    spec = Path("specs/traffic.stl")
+    assert find_system("examples/car.yaml") == Path("examples/car.yaml")
+    assert find_system("own", spec) == Path("specs/own.yaml")
+    assert find_system("car.yaml", spec) == Path("examples/car.yaml")
+    assert find_system("maze") == Path("examples/maze.yml")
+    assert find_system("../examples/car.yaml", spec) == Path("examples/car.yaml")
+    assert find_system(str(project / "examples/car.yaml")) == project / "examples/car.yaml"
+    write_atomic("car.yaml", "")
+    assert find_system("car.yaml", spec) == Path("car.yaml")
+
+
+@pytest.mark.usefixtures("project")
+def test_an_installed_system_is_found_last(tmp_path, monkeypatch):
+    library = tmp_path / "installed"
+    write_atomic(library / "ship.yaml", "")
+    monkeypatch.setattr(files, "LIBRARY", library)
+    assert find_system("ship") == library / "ship.yaml"
+
+
+@pytest.mark.usefixtures("project")
+def test_a_missing_system_says_where_it_looked():
+    with pytest.raises(UsageError) as caught:
+        find_system("cra.yaml", Path("specs/traffic.stl"))
+    told = finding(caught)
+    assert (told.code, told.message) == ("U102", "there is no system `cra.yaml`")
+    assert told.help == ("did you mean `examples/car.yaml`?",)
+    assert told.note == ("looked at: cra.yaml, specs/cra.yaml, examples/cra.yaml, installed: cra.yaml",)
+
+
+@pytest.mark.usefixtures("project")
+def test_a_trace_is_found_as_given_and_then_in_the_newest_run():
+    write_atomic("runs/traffic/0001/trace.npz", "")
+    Path("runs/latest").symlink_to("traffic/0001")
+    assert find_trace("trace.npz") == Path("runs/latest/trace.npz")
+    write_atomic("trace.npz", "")
+    assert find_trace("trace.npz") == Path("trace.npz")
+    with pytest.raises(UsageError) as caught:
+        find_trace("trase.npz")
+    assert finding(caught).help == ("did you mean `trace.npz`?",)
+    assert finding(caught).note == ("looked at: trase.npz, runs/latest/trase.npz",)
