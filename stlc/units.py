@@ -19,7 +19,7 @@ _BASES = ("m", "kg", "s", "A", "K")
 _NONE: Dims = (0, 0, 0, 0, 0)
 _FACTOR = re.compile(r"(?P<symbol>[A-Za-zµ°Ω]+|%|1)(?:\^?(?P<power>[+-]?\d+)|(?P<raised>⁻?[¹²³⁴]))?")
 _RAISED = str.maketrans("⁻¹²³⁴", "-1234")
-_MAX_POWER = 12
+_MAX_POWER = 99
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +60,8 @@ class Unit:
     def __pow__(self, power: int | Fraction) -> Unit:
         """The unit to a power. Raises ValueError where an exponent would not be whole."""
         power = Fraction(power)
+        if abs(power) > _MAX_POWER:
+            raise ValueError(f"[{self}] to the power {power} is out of bounds")
         if power.denominator == 1:
             return _product(((self, int(power)),))
         dims = tuple(exponent * power for exponent in self.dims)

@@ -31,8 +31,7 @@ def evaluate(expr: ast.Expr, scope: Scope) -> Value:
     meter = scope.meter
     meter.enter()
     try:
-        if meter.over:
-            scope.fail(too_large(meter, expr.span))
+        _refuse_excess(expr.span, scope)
         return at(_value(expr, scope), expr.span)
     finally:
         meter.leave()
@@ -164,8 +163,18 @@ def _traced(entry: Definition, call: ast.Call, scope: Scope) -> Iterator[None]:
 
 def _charge(cost: Cost, place: Span, scope: Scope) -> None:
     scope.meter.charge(cost)
-    if scope.meter.over:
-        scope.fail(too_large(scope.meter, place))
+    _refuse_excess(place, scope)
+
+
+def _refuse_excess(place: Span, scope: Scope) -> None:
+    """E005, once for a declaration."""
+    meter = scope.meter
+    if not meter.over:
+        return
+    if not meter.reported:
+        meter.reported = True
+        scope.report(too_large(meter, place))
+    raise Failed
 
 
 def _call(expr: ast.Call, scope: Scope) -> Value:

@@ -20,21 +20,19 @@ from stlc.units import Unit, same_dims
 def arguments(entry: Definition, call: ast.Call, scope: Scope) -> dict[str, ast.Expr]:
     """Formal -> expression, by place or by name. Raises Failed (E105)."""
     shape = (f"{entry.name}({', '.join(entry.formals)})",)
-    bound: dict[str, ast.Expr] = {}
-    for index, arg in enumerate(call.args):
-        formal = arg.name if arg.name is not None else entry.formals[index : index + 1]
-        name = formal if isinstance(formal, str) else (formal[0] if formal else "")
-        if name in bound or name not in entry.formals:
-            if arg.name is None:
-                break
-            scope.fail(
-                Diagnostic("E105", f"`{entry.name}` has no argument `{name}` left", arg.span, help=shape)
-            )
-        bound[name] = arg.value
-    if len(bound) < len(entry.formals) or len(call.args) > len(bound):
-        count, given = len(entry.formals), len(call.args)
-        message = f"`{entry.name}` takes {count} argument{'s' if count != 1 else ''}, {given} given"
+    count, given = len(entry.formals), len(call.args)
+    if given != count:
+        were = "was" if given == 1 else "were"
+        message = f"`{entry.name}` takes {count} argument{'s' if count != 1 else ''}, {given} {were} given"
         scope.fail(Diagnostic("E105", message, call.span, help=shape))
+    bound: dict[str, ast.Expr] = {}
+    for formal, arg in zip(entry.formals, call.args, strict=True):
+        name = formal if arg.name is None else arg.name
+        if name not in entry.formals or name in bound:
+            fault = "is given twice" if name in bound else "does not exist"
+            message = f"argument `{name}` of `{entry.name}` {fault}"
+            scope.fail(Diagnostic("E105", message, arg.span, help=shape))
+        bound[name] = arg.value
     return bound
 
 

@@ -26,11 +26,13 @@ class Meter:
         nodes: so far.
         level: of nesting right now.
         deepest: largest level so far.
+        reported: the excess of the declaration at hand has been reported.
     """
 
     nodes: int = 0
     level: int = 0
     deepest: int = 0
+    reported: bool = False
 
     @property
     def over(self) -> bool:
@@ -68,7 +70,7 @@ class Meter:
     def fresh(self) -> Iterator[None]:
         """A budget of its own: a declaration is not charged for its neighbours."""
         saved = self.nodes, self.level, self.deepest
-        self.nodes, self.level, self.deepest = 0, 0, 0
+        self.nodes, self.level, self.deepest, self.reported = 0, 0, 0, False
         try:
             yield
         finally:

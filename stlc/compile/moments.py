@@ -45,6 +45,8 @@ def combine(
                 span=span,
             )
     times, factor = (left, right) if isinstance(left[1], Moment) else (right, left)
+    if isinstance(factor[1], Number) and factor[1].constant is None:
+        scope.fail(out_of_place(times[0].span))
     if (
         op in ("*", "/")
         and isinstance(times[1], Moment)
@@ -57,6 +59,12 @@ def combine(
         return _scaled(times[1], 1 / share if op == "/" else share, span)
     help_ = ("a bound is a sum of times, each times a plain number: `T / 2 - 1 s`",)
     return scope.fail(Diagnostic("E205", f"`{op}` does not apply to these times", span, help=help_))
+
+
+def out_of_place(span: Span) -> Diagnostic:
+    """E311: `T`, `dt` or a number of steps among other numbers."""
+    message = f"`{span.text}` is only known inside the interval of a temporal operator"
+    return Diagnostic("E311", message, span, help=("name the time: `const tau = 2 s`",))
 
 
 def negative(value: Moment, span: Span, scope: Scope) -> Moment:
@@ -99,8 +107,8 @@ def _bare(value: Fraction, expr: ast.Expr, scope: Scope) -> Moment:
     if scope.time_unit in ("step", "steps"):
         return Moment(steps=value, span=expr.span)
     if not scope.time_unit and value != 0:
-        fix = Fix(((expr.span, f"{expr.span.text} s"),), "say the unit")
-        help_ = (f"write `{expr.span.text} s`, or set the unit for the file: `time s`",)
+        fix = Fix(((expr.span, f"{expr.span.text} s"),), f"{expr.span.text} s")
+        help_ = ("say the unit, or set it for the whole file: `time s`",)
         scope.report(
             Diagnostic(
                 "W101",

@@ -27,12 +27,11 @@ from stlc.compile.vacuity import toothless, vacuous
 from stlc.compile.values import Number, Value, Vector
 from stlc.diagnostics import Diagnostic, Label, SpecError
 from stlc.grammar import ast
+from stlc.grammar.parser import MAX_ERRORS
 from stlc.signature import Column, Signature
 from stlc.units import same_dims
 
 Item = TypeVar("Item")
-
-MAX_ERRORS = 20
 
 
 def resolve(
@@ -173,7 +172,8 @@ def _compare(item: ast.Const, value: Number, interface: Interface, scope: Scope)
     here = _amount(value.constant / value.unit.scale, str(value.unit) if value.unit.text else "")
     there = _amount(theirs / unit.scale, unit.text)
     message = f"`{item.name}` is {here} here and {there} in {interface.where}"
-    help_ = (f"make them agree, or change both at once: `--set {item.name}={here.replace(' ', '')}`",)
+    both = f"make them agree, or change both at once: `--set {item.name}={here.replace(' ', '')}`"
+    help_ = (both,) if free or same_dims(value.unit, unit) else ()
     scope.report(Diagnostic("E104", message, item.name_span, here, labels, help=help_))
 
 

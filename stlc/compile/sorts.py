@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from stlc.compile import ir, typed
 from stlc.compile.algebra import apply, half
 from stlc.compile.conditions import condition, is_state
+from stlc.compile.moments import out_of_place
 from stlc.compile.scope import Scope
 from stlc.compile.values import Label as Member
 from stlc.compile.values import Moment, Number, Value, Vector, describe, noun
@@ -138,5 +139,4 @@ def _moment_for_number(value: Moment, expr: ast.Expr) -> Diagnostic:
     text = expr.span.text
     if value.end:
         return Diagnostic("E205", f"`{text}` is only known as the end of an interval", expr.span)
-    message = f"`{text}` is only known inside the interval of a temporal operator"
-    return Diagnostic("E311", message, expr.span, help=("name the time: `const tau = 2 s`",))
+    return out_of_place(expr.span)

@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stlc.units import DIMENSIONLESS, SYMBOLS, Unit, parse_unit, same_dims
+
+_factors = st.lists(st.tuples(st.sampled_from(sorted(SYMBOLS)), st.integers(-3, 3)), min_size=1, max_size=3)
+
+
+def _text(factors: list[tuple[str, int]]) -> str:
+    return "*".join(symbol if power == 1 else f"{symbol}^{power}" for symbol, power in factors)
+
+
+units = _factors.map(_text).map(parse_unit)
+
+
+@pytest.mark.parametrize(
+    ("text", "dims", "ratio"),
+    [
+        ("m", (1, 0, 0, 0, 0), 1),
+        ("m/s^2", (1, 0, -2, 0, 0), 1),
+        ("m/s/s", (1, 0, -2, 0, 0), 1),
+        ("m/s²", (1, 0, -2, 0, 0), 1),
+        ("m s^-2", (1, 0, -2, 0, 0), 1),
+        ("kg*m", (1, 1, 0, 0, 0), 1),
+        ("1/s", (0, 0, -1, 0, 0), 1),
+        ("1", (0, 0, 0, 0, 0), 1),
+        ("Hz", (0, 0, -1, 0, 0), 1),
+        ("N", (1, 1, -2, 0, 0), 1),
+        ("Nm", (2, 1, -2, 0, 0), 1),
+        ("W", (2, 1, -3, 0, 0), 1),
+        ("km/h", (1, 0, -1, 0, 0), Fraction(5, 18)),
+        ("ms", (0, 0, 1, 0, 0), Fraction(1, 1000)),
+        ("min", (0, 0, 1, 0, 0), 60),
+        ("%", (0, 0, 0, 0, 0), Fraction(1, 100)),
+        ("mrad", (0, 0, 0, 0, 0), Fraction(1, 1000)),
+        ("kPa", (-1, 1, -2, 0, 0), 1000),
+        ("m/rad", (1, 0, 0, 0, 0), 1),
+    ],
+)
+def test_reads_what_people_write(text: str, dims: tuple[int, ...], ratio: Fraction | int) -> None:
+    assert parse_unit(text) == Unit(dims, Fraction(ratio))  # type: ignore[arg-type]
+    assert parse_unit(text).text == text
+
+
+def test_degrees_and_revolutions() -> None:
+    assert parse_unit("deg").scale == math.pi / 180
+    assert parse_unit("°") == parse_unit("deg")
+    assert parse_unit("rpm").scale == pytest.approx(2 * math.pi / 60, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    "text", ["", " ", "furlong", "m/", "/s", "m^", "2", "m**2", "m^100", "steps", "m)", "1//s"]
+)
+def test_refuses_what_is_no_unit(text: str) -> None:
+    with pytest.raises(ValueError, match=r"unit|power"):
+        parse_unit(text)
+
+
+def test_what_was_not_written_is_told_from_one() -> None:
+    assert DIMENSIONLESS.text == ""
+    assert parse_unit("1").text == "1"
+    assert parse_unit("1") == DIMENSIONLESS
+    assert str(DIMENSIONLESS) == "1"
+
+
+@given(units, units, units)
+def test_products_form_a_group(a: Unit, b: Unit, c: Unit) -> None:
+    assert a * b == b * a
+    assert (a * b) * c == a * (b * c)
+    assert a * DIMENSIONLESS == a
+    assert (a * b) / b == a
+    assert (a / a).dimensionless
+    assert (a / a).ratio == 1
+
+
+@given(units, st.integers(-3, 3), st.integers(-3, 3))
+def test_powers_add(a: Unit, m: int, n: int) -> None:
+    assert a**m * a**n == a ** (m + n)
+
+
+@given(units)
+def test_a_root_undoes_a_square(a: Unit) -> None:
+    root = (a**2) ** Fraction(1, 2)
+    assert same_dims(root, a)
+    assert root.scale == pytest.approx(a.scale, rel=1e-12)
+
+
+def test_a_root_of_an_odd_power_has_no_unit() -> None:
+    with pytest.raises(ValueError, match="no unit"):
+        parse_unit("m") ** Fraction(1, 2)
+
+
+@given(units, units)
+def test_a_computed_unit_can_be_read_again(a: Unit, b: Unit) -> None:
+    for unit in (a * b, a / b, a**2):
+        assert parse_unit(str(unit)) == unit
+
+
+@given(units)
+def test_si_keeps_the_dimensions(a: Unit) -> None:
+    assert a.si.ratio == 1
+    assert same_dims(a, a.si)
+    assert parse_unit(str(a.si)) == a.si
