@@ -10,13 +10,13 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from importlib import import_module
+from contextlib import contextmanager
 from types import FrameType
 from typing import Annotated
 
 import typer
 
+from stlc.cli import check, compile, report, simulate, train
 from stlc.cli.errors import TERMINATED
 from stlc.cli.errors import report as report_error
 from stlc.cli.options import describe
@@ -35,9 +35,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in ("train", "simulate", "check", "compile", "report"):
-    with suppress(ModuleNotFoundError):
-        import_module(f"stlc.cli.{group}").register(app)
+for group in (train, simulate, check, compile, report):
+    group.register(app)
 
 
 def _show_version(wanted: bool) -> None:
