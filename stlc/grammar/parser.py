@@ -1,4 +1,4 @@
-"""Text -> AST. The only module that knows Lark.
+"""Text -> AST. Only this module and `parser_tables.py` know Lark.
 
 A text is cut before its declarations and each piece is parsed for itself, so that one run reports all
 independent errors. Trees are folded bottom-up without recursion: no text can exhaust the stack.
@@ -6,23 +6,20 @@ independent errors. Trees are folded bottom-up without recursion: no text can ex
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
-from functools import cache
-from importlib.resources import files
 from types import MappingProxyType
 from typing import Any
 
-from lark import Lark, Token, Tree, UnexpectedInput
+from lark import Token, Tree, UnexpectedInput
 
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar import ast, hints
 from stlc.grammar.builder import EXPRESSIONS, Rule
 from stlc.grammar.declarations import DECLARATIONS, Item, assemble
+from stlc.grammar.parser_tables import load_parser
 from stlc.grammar.scan import declaration_starts
 from stlc.grammar.stumble import Piece
 from stlc.grammar.tokens import Context, Leaf
-from stlc.grammar.words import PATTERNS
 from stlc.source import Source
 
 MAX_ERRORS = 20
@@ -93,7 +90,7 @@ def _check_size(source: Source, length: int) -> None:
 
 def _build(piece: Piece, context: Context) -> Any:
     try:
-        tree = _lark().parse(piece.text, start=piece.rule)
+        tree = load_parser().parse(piece.text, start=piece.rule)
     except UnexpectedInput as error:
         raise _PieceError(hints.diagnose(piece, _offset(error, piece))) from None
     assert isinstance(tree, Tree)
@@ -144,23 +141,9 @@ def _child(child: Tree[Token] | Token | None, values: Mapping[int, Any], context
 # -------------------------------------------------------------------------- lark
 
 
-@cache
-def _lark() -> Lark:
-    text = (files("stlc.grammar") / "stl.lark").read_text(encoding="utf-8")
-    grammar = re.sub(r"\{\{(\w+)\}\}", lambda match: PATTERNS[match[1]], text)
-    return Lark(
-        grammar,
-        parser="lalr",
-        lexer="contextual",
-        start=["start", "expr"],
-        maybe_placeholders=True,
-        propagate_positions=True,
-    )
-
-
 def _accepts(text: str, rule: str) -> frozenset[str]:
     """The terminals that may stand where the parser gives up on a text."""
-    interactive = _lark().parse_interactive(text, start=rule)
+    interactive = load_parser().parse_interactive(text, start=rule)
     try:
         for _ in interactive.iter_parse():
             pass
@@ -172,7 +155,7 @@ def _accepts(text: str, rule: str) -> frozenset[str]:
 
 def _parses(text: str, rule: str) -> bool:
     try:
-        _lark().parse(text, start=rule)
+        load_parser().parse(text, start=rule)
     except UnexpectedInput:
         return False
     return True

@@ -1,0 +1,68 @@
+"""The tables kept between processes: the same parser, and never a reason to fail."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from stlc.grammar.parser_tables import build_parser, cache_file, grammar_text, load_parser
+
+SPEC = (Path(__file__).parent / "data" / "navigation.stl").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def fresh():
+    """What a new process would get."""
+    return load_parser.__wrapped__()
+
+
+def test_tables_read_back_are_the_same_parser(folder):
+    built = fresh()
+    (path,) = (folder / "stlc").iterdir()
+    assert path == cache_file(grammar_text())
+    began = time.process_time()
+    read = fresh()
+    assert time.process_time() - began < 0.5
+    assert read is not built
+    for text, rule in ((SPEC, "start"), ("always[0, 1] x -> y until z", "expr")):
+        assert read.parse(text, start=rule) == built.parse(text, start=rule)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "[1, 2]", '[{"parser": {}}, {}]', "[{}, {}]", "\x00\xff"])
+@pytest.mark.usefixtures("folder")
+def test_a_damaged_cache_is_built_anew(content):
+    path = cache_file(grammar_text())
+    assert path is not None
+    path.parent.mkdir(parents=True)
+    path.write_text(content, encoding="latin-1")
+    assert fresh().parse("x > 0", start="expr") == build_parser(grammar_text()).parse("x > 0", start="expr")
+    assert path.stat().st_size > 10_000
+
+
+def test_no_place_for_a_cache_is_no_error(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert fresh().parse("x > 0", start="expr").data == "compare"
+
+    def homeless() -> Path:
+        raise RuntimeError("no home")
+
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", homeless)
+    assert cache_file("any") is None
+    assert fresh().parse("x > 0", start="expr").data == "compare"
+
+
+def test_another_grammar_has_another_file():
+    assert cache_file("a") != cache_file("b")
+
+
+def test_there_is_one_parser_in_a_process():
+    assert load_parser() is load_parser()
