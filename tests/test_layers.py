@@ -38,7 +38,7 @@ HOMES = {
     "rich": ("stlc.cli", "stlc.view"),
     "typer": ("stlc.cli",),
     "click": (),
-    "yaml": ("stlc.dynamics.yaml_nodes", "stlc.rundir"),
+    "yaml": ("stlc.dynamics.yaml_nodes",),
     "pydantic": ("stlc.dynamics",),
     "matplotlib": ("stlc.view",),
     "PIL": ("stlc.view",),
