@@ -7,7 +7,7 @@ array library; a call fills registers from top to bottom.
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
 from typing import Any, TypeAlias, assert_never
@@ -19,6 +19,10 @@ from stlc.compile.tape import Instr, Operand, Tape
 
 ExternFunction: TypeAlias = Callable[..., Sequence[Array]]
 """A function that the system provides: arrays in, its components out."""
+
+
+_TAKES_FLOATS = frozenset({"pow"})
+"""Kernels that want a constant as the float it is."""
 
 
 class Program:
@@ -45,16 +49,18 @@ class Program:
         self._constants = {name: float(value) for name, value in (constants or {}).items()}
         self._externs = dict(externs or {})
         self._tapes: dict[bool, tuple[Tape, dict[str, Operand]]] = {}
-        self._bound: dict[tuple[str, Switch], _Bound] = {}
+        self._bound: dict[tuple[str, Switch, Hashable], _Bound] = {}
         tape, _ = self._tape(exact=True)
         self.columns = frozenset(str(i.params[0]) for i in tape.code if i.kernel == "input")
 
     def __call__(self, env: Mapping[str, Array], ops: Ops, switch: Switch | None = None) -> dict[str, Array]:
         """All outputs. `switch` says how conditions become numbers; None is `Hard()`."""
         switch = switch or Hard()
-        bound = self._bound.get((ops.name, switch))
+        like = _first(env)
+        key = (ops.name, switch, ops.kind(like))
+        bound = self._bound.get(key)
         if bound is None:
-            bound = self._bound[ops.name, switch] = self._bind(ops, switch)
+            bound = self._bound[key] = self._bind(ops, switch, like)
         with ops.quiet():
             return bound.run(env, ops)
 
@@ -71,17 +77,13 @@ class Program:
             self._tapes[exact] = writer.tape, outputs
         return self._tapes[exact]
 
-    def _bind(self, ops: Ops, switch: Switch) -> _Bound:
+    def _bind(self, ops: Ops, switch: Switch, like: Array) -> _Bound:
         tape, outputs = self._tape(exact=switch.exact)
         registers: list[Any] = [None] * len(tape.code)
-        constants: dict[tuple[type, object], int] = {}
 
         def place(value: object) -> int:
-            key = (type(value), value)
-            if key not in constants:
-                constants[key] = len(registers)
-                registers.append(value)
-            return constants[key]
+            registers.append(value)
+            return len(registers) - 1
 
         inputs, code = [], []
         for register in _needed(tape, outputs.values()):
@@ -89,7 +91,11 @@ class Program:
             if instr.kernel == "input":
                 inputs.append((str(instr.params[0]), register))
                 continue
-            args = [arg if isinstance(arg, int) else place(arg) for arg in instr.args]
+            literal = instr.kernel in _TAKES_FLOATS
+            args = [
+                arg if isinstance(arg, int) else place(arg if literal else ops.constant(arg, like))
+                for arg in instr.args
+            ]
             args += [place(param) for param in instr.params]
             code.append((self._kernel(instr, ops, switch), tuple(args), register))
         numbers = {name: value for name, value in outputs.items() if isinstance(value, float)}

@@ -7,7 +7,7 @@ they are, because both libraries agree on them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, Protocol, TypeAlias
 
@@ -40,7 +40,7 @@ class Ops(Protocol):
     asin: Callable[[Array], Array]
     acos: Callable[[Array], Array]
     atan: Callable[[Array], Array]
-    tanh: Callable[[Array], Array]
+    sigmoid: Callable[[Array], Array]
     sign: Callable[[Array], Array]
     floor: Callable[[Array], Array]
     ceil: Callable[[Array], Array]
@@ -123,7 +123,13 @@ class Ops(Protocol):
     def softmax2(self, a: Array, b: Array, k: float) -> Array:
         """`log(exp(k a) + exp(k b)) / k`: `softmax` of two arrays of one shape."""
 
-    # shapes
+    # constants and shapes
+    def kind(self, like: Array) -> Hashable:
+        """What a constant depends on: arrays of one kind may share it."""
+
+    def constant(self, value: float, like: Array) -> Array | float:
+        """A number in the form that is fastest beside `like`."""
+
     def full(self, shape: tuple[int, ...], value: float, like: Array) -> Array:
         """A constant array with dtype and device of `like`."""
 

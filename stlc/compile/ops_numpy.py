@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from contextlib import AbstractContextManager
 from functools import reduce
 from typing import Any, cast, final
@@ -33,7 +33,6 @@ class NumpyOps:
     asin = staticmethod(np.arcsin)
     acos = staticmethod(np.arccos)
     atan = staticmethod(np.arctan)
-    tanh = staticmethod(np.tanh)
     sign = staticmethod(np.sign)
     floor = staticmethod(np.floor)
     ceil = staticmethod(np.ceil)
@@ -117,6 +116,18 @@ class NumpyOps:
         with self.quiet():
             gap = np.where(np.isfinite(top), np.abs(a - b), np.inf)
             return top + np.log1p(np.exp(-abs(k) * gap)) / k
+
+    def sigmoid(self, x: Array) -> Array:
+        """`1 / (1 + exp(-x))`."""
+        return 0.5 + 0.5 * np.tanh(0.5 * x)
+
+    def kind(self, like: Array) -> Hashable:  # noqa: ARG002
+        """Floats take the dtype of what stands beside them."""
+        return None
+
+    def constant(self, value: float, like: Array) -> Array | float:  # noqa: ARG002
+        """The float itself."""
+        return value
 
     def full(self, shape: tuple[int, ...], value: float, like: Array) -> Array:
         """A constant array."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import lru_cache
 from typing import Any, cast, final
 
 import numpy as np
@@ -30,23 +31,6 @@ class _SafeSqrt(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> Tensor:
         (root,) = ctx.saved_tensors
         return torch.where(root > 0, grad / (2.0 * root), 0.0)
-
-
-class _StraightThrough(torch.autograd.Function):
-    """Hard forward, the slope of a tanh backward."""
-
-    @staticmethod
-    def forward(ctx: Any, rho: Tensor, strict: bool, slope: float) -> Tensor:
-        ctx.save_for_backward(rho)
-        ctx.slope = slope
-        return (rho > 0 if strict else rho >= 0).to(rho.dtype)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        (rho,) = ctx.saved_tensors
-        bend = torch.tanh(rho * ctx.slope).square_()
-        return grad * torch.add(0.5 * ctx.slope, bend, alpha=-0.5 * ctx.slope), None, None
 
 
 class _SmoothMax(torch.autograd.Function):
@@ -87,12 +71,18 @@ class _SmoothMax2(torch.autograd.Function):
         return grad * left, grad * right, None
 
 
+@lru_cache(maxsize=4096)
+def _constant(value: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.tensor(value, dtype=dtype, device=device)
+
+
 def _pair(a: Tensor | float, b: Tensor | float) -> tuple[Tensor, Tensor]:
     """Both as tensors, where torch wants two of them."""
     if isinstance(a, Tensor):
-        return a, b if isinstance(b, Tensor) else a.new_tensor(b)
+        return a, b if isinstance(b, Tensor) else _constant(b, a.dtype, a.device)
     assert isinstance(b, Tensor)
-    return b.new_tensor(a), b
+    return _constant(a, b.dtype, b.device), b
 
 
 @final
@@ -115,7 +105,7 @@ class TorchOps:
     asin = staticmethod(torch.asin)
     acos = staticmethod(torch.acos)
     atan = staticmethod(torch.atan)
-    tanh = staticmethod(torch.tanh)
+    sigmoid = staticmethod(torch.sigmoid)
     sign = staticmethod(torch.sign)
     floor = staticmethod(torch.floor)
     ceil = staticmethod(torch.ceil)
@@ -145,8 +135,7 @@ class TorchOps:
 
     def addcmul(self, a: Tensor | float, b: Tensor, c: Tensor, factor: float) -> Tensor:
         """`a + factor * b * c`."""
-        start = a if isinstance(a, Tensor) else b.new_tensor(a)
-        return torch.addcmul(start, b, c, value=factor)
+        return torch.addcmul(_pair(a, b)[0], b, c, value=factor)
 
     def clamp(self, x: Tensor, low: float | None, high: float | None) -> Tensor:
         """`x` cut to [low, high]; the gradient at a bound is 1."""
@@ -155,7 +144,7 @@ class TorchOps:
     def norm(self, *components: Tensor | float) -> Tensor:
         """Euclidean length; gradient 0 at 0."""
         like = next(part for part in components if isinstance(part, Tensor))
-        parts = [part if isinstance(part, Tensor) else like.new_tensor(part) for part in components]
+        parts = [_pair(part, like)[0] for part in components]
         stacked = torch.stack(torch.broadcast_tensors(*parts))  # type: ignore[no-untyped-call]
         length: Tensor = torch.linalg.vector_norm(stacked, dim=0)
         return length
@@ -171,13 +160,15 @@ class TorchOps:
 
     def infinite(self, mask: Mask, like: Tensor) -> Tensor:
         """+inf where `mask`, else -inf, without gradient."""
-        low = like.new_full((), -torch.inf)
-        return torch.where(mask, -low, low)
+        return torch.where(mask, self.constant(torch.inf, like), self.constant(-torch.inf, like))
 
     def straight_through(self, rho: Tensor, strict: bool, slope: float) -> Tensor:
-        """Hard forward, the slope of a tanh backward."""
-        out: Tensor = _StraightThrough.apply(rho, strict, slope)  # type: ignore[no-untyped-call]
-        return out
+        """Hard forward, the slope of a tanh backward; `soft + (1 - soft)` is exactly 1 for `soft` >= 1/2."""
+        hard = torch.heaviside(rho.detach(), self.constant(0.0 if strict else 1.0, rho))
+        if not rho.requires_grad:
+            return hard
+        soft = torch.sigmoid(rho * self.constant(2.0 * slope, rho))
+        return soft + (hard - soft.detach())
 
     def amin(self, x: Tensor) -> Tensor:
         """Minimum over axis 0, kept; ties share the gradient."""
@@ -204,6 +195,14 @@ class TorchOps:
         """Smooth extremum of two of one shape."""
         out: Tensor = _SmoothMax2.apply(a, b, k)  # type: ignore[no-untyped-call]
         return out
+
+    def kind(self, like: Tensor) -> Hashable:
+        """The dtype and the device."""
+        return like.dtype, like.device
+
+    def constant(self, value: float, like: Tensor) -> Tensor:
+        """A tensor without dimensions: torch converts a Python number anew in every operation."""
+        return _constant(value, like.dtype, like.device)
 
     def full(self, shape: tuple[int, ...], value: float, like: Tensor) -> Tensor:
         """A constant array."""

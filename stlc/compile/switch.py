@@ -59,7 +59,7 @@ class Hard:
 @final
 @dataclass(frozen=True, slots=True)
 class Tanh:
-    """The paper's Eq. 6: `(1 + tanh(w rho)) / 2`, and a convex blend of both branches."""
+    """The paper's Eq. 6: `(1 + tanh(w rho)) / 2`, that is `sigmoid(2 w rho)`, and a blend of branches."""
 
     sharpness: float = 500.0
 
@@ -71,7 +71,7 @@ class Tanh:
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
         """`(1 + tanh(w rho)) / 2` with the indicator's own sharpness where it has one."""
         width = self.sharpness if sharpness is None else sharpness
-        return ops.axpy(0.5, ops.tanh(rho * width), 0.5)
+        return ops.sigmoid(rho * ops.constant(2.0 * width, rho))
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
         """`no + weight (yes - no)`."""
