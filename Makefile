@@ -1,11 +1,12 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help demo test format environment clean
+.PHONY: help demo test format docs environment clean
 
 help:
 	@echo 'make demo    train, simulate, check and report the traffic benchmark, from nothing'
 	@echo 'make test    lint, format, types and tests: what has to be green'
+	@echo 'make docs    write anew what documents take from the code: commands, codes, files'
 	@echo 'make format  lay the code out and fix what can be fixed'
 	@echo 'make clean   remove the environment and the caches; runs/ stays'
 
@@ -16,11 +17,14 @@ test: environment
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal
 
 format: environment
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+docs: environment
+	$(BIN)/python -m pytest -q tests/test_docs.py --regenerate
 
 environment:
 	@$(PYTHON) tools/environment.py

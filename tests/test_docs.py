@@ -48,7 +48,7 @@ def hold(page: Path, marker: str, wanted: str, *, regenerate: bool) -> None:
     if regenerate:
         page.write_text(head + wanted + tail, encoding="utf-8")
     else:
-        assert body == wanted, f"run: pytest {name_of(Path(__file__))} --regenerate"
+        assert body == wanted, "the code has changed; run: make docs"
 
 
 # ---------------------------------------------------------------------- commands
