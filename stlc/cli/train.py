@@ -47,7 +47,9 @@ def train(
     steps: Annotated[
         int | None, typer.Option(min=1, help="Steps of the optimiser instead of a budget.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of everything random.")] = 0,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of everything random; the system file's if not given.")
+    ] = None,
     method: Annotated[
         str, typer.Option(metavar="guided|gradient", help="Search and distil, or the paper's plain gradient.")
     ] = "guided",

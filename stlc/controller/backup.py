@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics import TOLERANCE
-from stlc.controller.prefix import safe_samples
+from stlc.controller.prefix import safe_samples, safety_margin
 
 if TYPE_CHECKING:
     from stlc.controller.policy import Policy
@@ -140,10 +140,7 @@ class Backup:
         tail = finite(self.policy.plan(reached).to(x.dtype), self.task)
         plans = torch.cat((head, tail[:, : self.task.horizon - head.shape[1]]), 1)
         judged = self.task.judge(x, plans)
-        cost = self.task.system.performance(
-            judged.columns, torch.ones_like(judged.rho), rho=judged.rho, u=plans
-        )
-        return plans, judged.rho, judged.safe >= -TOLERANCE, cost
+        return plans, judged.rho, judged.safe >= -TOLERANCE, self.task.cost(judged)
 
     def _parts(self, rows: Tensor) -> list[Tensor]:
         return _pieces(rows, self.grid.batch)
@@ -153,24 +150,28 @@ class Backup:
         good = candidates.rho >= -TOLERANCE
         eligible = torch.where(good.any(1, keepdim=True), good, candidates.safe)
         done = eligible.any(1)
-        _take(found, _at(candidates, done), (eligible[done], group[done]), (1, length))
+        chosen = _at(candidates, done)
+        _take(found, chosen, best(eligible[done], (chosen.rho, -chosen.cost)), group[done], (1, length))
         return done
 
     def _enter_safest(
         self, found: Found, candidates: _Candidates, where: tuple[Tensor, Tensor], length: int
     ) -> None:
-        """Take the plan with the longest safe prefix."""
+        """Take the plan with the longest safe prefix; of several, the most robust and the least unsafe."""
         x, group = where
         agents, choices = candidates.rho.shape
         starts = self._parts(x.repeat_interleave(choices, 0))
         plans = self._parts(candidates.plans.flatten(0, 1))
-        samples = torch.cat(
-            [
-                safe_samples(self._formulas, self.task.system.rollout_columns(start, plan))
-                for start, plan in zip(starts, plans, strict=True)
-            ]
-        ).view(agents, choices)
-        _take(found, candidates, (samples == samples.amax(1, keepdim=True), group), (2, length))
+        parts = [
+            self.task.system.rollout_columns(start, plan) for start, plan in zip(starts, plans, strict=True)
+        ]
+        samples, margin = (
+            torch.cat([measure(self._formulas, part) for part in parts]).view(agents, choices)
+            for measure in (safe_samples, safety_margin)
+        )
+        longest = samples == samples.amax(1, keepdim=True)
+        pick = best(longest, (candidates.rho, margin, -candidates.cost))
+        _take(found, candidates, pick, group, (2, length))
 
 
 def finite(plan: Tensor, task: Task) -> Tensor:
@@ -209,11 +210,9 @@ def _at(candidates: _Candidates, rows: Tensor) -> _Candidates:
     )
 
 
-def _take(found: Found, candidates: _Candidates, which: tuple[Tensor, Tensor], how: tuple[int, int]) -> None:
-    """Enter the best allowed candidates for the agents of a group."""
-    allowed, group = which
+def _take(found: Found, candidates: _Candidates, pick: Tensor, group: Tensor, how: tuple[int, int]) -> None:
+    """Enter the picked candidates for the agents of a group."""
     row = torch.arange(len(group), device=group.device)
-    pick = best(allowed, (candidates.rho, -candidates.cost))
     found.plan[group] = candidates.plans[row, pick]
     found.source[group], found.t0[group] = how
     found.rho[group], found.safe[group] = candidates.rho[row, pick], candidates.safe[row, pick]

@@ -29,17 +29,19 @@ class TrainConfig:
         plans: number of plans of the network.
         lr: peak learning rate.
         batch: fresh states a step.
+        held_out: states of the last verdict.
     """
 
     method: Method = "guided"
     budget: float | None = None
     steps: int | None = None
-    seed: int = 0
+    seed: int | None = None
     device: str = "cpu"
     threads: int | None = None
     plans: int | None = None
     lr: float | None = None
     batch: int | None = None
+    held_out: int = HELD_OUT
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +66,7 @@ class Engine:
         imitation: weight of the distance to a repaired plan.
         share: weight of the mean over plans beside the winner's loss.
         performance: factor of the performance terms.
+        held_out: states of the last verdict.
     """
 
     method: Method
@@ -77,23 +80,24 @@ class Engine:
     clip: float = 1.0
     average: float = 0.99
     pool: int = 2048
-    every: int = 50
+    every: int = 100
     most: int = 256
     slope: float = 5.0
     imitation: float = 1.0
     share: float = 0.05
     performance: float = 0.3
+    held_out: int = HELD_OUT
 
 
 def decide(task: Task, config: TrainConfig) -> Engine:
     """The engine's numbers for a task: the user's words, then the system file's, then defaults."""
     declared = task.system.decl.train
     guided = config.method == "guided"
-    batch = config.batch or declared.batch or 512
+    batch = config.batch or declared.batch or (256 if guided else 512)
     plans = config.plans or (4 if guided else 1)
     return Engine(
         method=config.method,
-        seed=config.seed,
+        seed=declared.seed if config.seed is None else config.seed,
         hidden=task.system.decl.policy.hidden,
         plans=plans,
         batch=batch,
@@ -101,4 +105,5 @@ def decide(task: Task, config: TrainConfig) -> Engine:
         lr=config.lr or declared.lr or 1e-3,
         share=0.05 if plans > 1 else 0.0,
         performance=0.3 if guided else 1.0,
+        held_out=config.held_out,
     )

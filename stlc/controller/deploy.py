@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from stlc.compile.semantics import TOLERANCE
-from stlc.controller.backup import Backup, Grid
+from stlc.controller.backup import Backup, Found, Grid
+from stlc.controller.task import rank
 
 if TYPE_CHECKING:
     from stlc.controller.policy import Policy
@@ -41,6 +42,12 @@ class Decision:
     safe: Tensor
     policy_rho: Tensor
 
+    def later(self, steps: int = 1) -> Decision:
+        """The same decision `steps` later: what is left of the plans, their last actions held on."""
+        rest = (self.plan[:, steps:], self.plan[:, -1:].expand(-1, steps, -1))
+        plan = torch.cat(rest, 1)
+        return replace(self, plan=plan, action=plan[:, 0])
+
 
 @runtime_checkable
 class _JudgesItself(Protocol):
@@ -64,23 +71,47 @@ class Guard:
         self.backup = Backup(task, policy, grid=grid) if mode == "paper" else None
 
     @torch.no_grad()
-    def decide(self, x: Tensor) -> Decision:
+    def decide(self, x: Tensor, begun: Decision | None = None) -> Decision:
         """Decide for (agents, n) states; verdicts are taken in float64.
 
-        Without a guard a plan that is no number is handed on as it is, with robustness -inf.
+        A plan that was begun and still satisfies the specification is gone on with where the new one is no
+        better; otherwise an agent that may do something later could put it off at every step.
+
+        Args:
+            x: (agents, n) states.
+            begun: what is left of the decision before; see `Decision.later`.
+
+        Returns:
+            The decision. Without a guard a plan that is no number is handed on, with robustness -inf.
         """
         x = x.to(torch.float64)
-        plan, judged = self._plan(x)
-        rho, safe = judged.rho, judged.safe >= -TOLERANCE
-        source = torch.zeros(len(x), dtype=torch.int64, device=x.device)
-        t0, policy_rho = source.clone(), rho
+        fresh, judged = self._plan(x)
+        found = self._kept(x, begun, fresh, judged)
+        plan, source, t0, rho, safe = found.plan, found.source, found.t0, found.rho, found.safe
         failing = torch.nonzero(~(rho >= -TOLERANCE)).squeeze(1)
         if self.backup is not None and len(failing):
-            found = self.backup.search(x[failing], plan[failing])
+            found = self.backup.search(x[failing], fresh[failing])
             plan = plan.index_copy(0, failing, found.plan)
             source, t0 = source.index_copy(0, failing, found.source), t0.index_copy(0, failing, found.t0)
             rho, safe = rho.index_copy(0, failing, found.rho), safe.index_copy(0, failing, found.safe)
-        return Decision(plan[:, 0], plan, source, t0, rho, safe, policy_rho)
+        return Decision(plan[:, 0], plan, source, t0, rho, safe, judged.rho)
+
+    def _kept(self, x: Tensor, begun: Decision | None, fresh: Tensor, judged: Judged) -> Found:
+        """The policy's plans, or what is left of those that were begun."""
+        zero = torch.zeros(len(x), dtype=torch.int64, device=x.device)
+        safe = judged.safe >= -TOLERANCE
+        if begun is None:
+            return Found(fresh, zero, zero, judged.rho, safe)
+        rest = self.task.judge(x, begun.plan)
+        better = rank(rest.rho, self.task.cost(rest)) >= rank(judged.rho, self.task.cost(judged))
+        keep = better & (rest.rho >= -TOLERANCE)
+        return Found(
+            torch.where(keep[:, None, None], begun.plan, fresh),
+            torch.where(keep, begun.source, zero),
+            torch.where(keep, begun.t0, zero),
+            torch.where(keep, rest.rho, judged.rho),
+            torch.where(keep, rest.safe >= -TOLERANCE, safe),
+        )
 
     def _plan(self, x: Tensor) -> tuple[Tensor, Judged]:
         if isinstance(self.policy, _JudgesItself):

@@ -172,9 +172,10 @@ def drive(
     x = worlds.reset()
     recorder.start(x, worlds.worlds[0])
     recorder.units = dict(worlds.worlds[0].units())
+    decision = None
     for step in range(setting.steps):
-        if step % setting.replan == 0:
-            decision = guard.decide(x)
+        if decision is None or step % setting.replan == 0:
+            decision = guard.decide(x, decision and decision.later(setting.replan))
         action = decision.plan[:, step % setting.replan]
         if not bool(torch.isfinite(action).all()):
             raise RunError(Diagnostic("R402", f"the policy's plan at step {step} is not a number"))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from stlc.compile.dump import dump
-from stlc.controller.config import TrainConfig
+from stlc.controller.config import TrainConfig, decide
 from stlc.controller.run import SPEC, SYSTEM, Run, spec_hash, system_hash
 from stlc.controller.train import train
 from stlc.files import write_atomic
@@ -66,7 +66,7 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
             "system": task.system.name,
             "system_path": str(decl.path),
             "overrides": dict(launch.overrides),
-            "seed": config.seed,
+            "seed": decide(task, config).seed,
             "budget": config.budget,
             "device": config.device,
             "threads": config.threads or torch.get_num_threads(),
@@ -90,7 +90,7 @@ def train_here(
     *,
     budget: float | None = None,
     steps: int | None = None,
-    seed: int = 0,
+    seed: int | None = None,
     method: Method = "guided",
 ) -> Run:
     """Train a policy in a new folder below `runs/` and return the run.
@@ -99,7 +99,7 @@ def train_here(
         task: what to train for; see `stlc.compile`.
         budget: seconds; 60 where neither this nor `steps` nor the system file says otherwise.
         steps: of the optimiser; wins over `budget`.
-        seed: of everything random.
+        seed: of everything random; None takes the system file's.
         method: `guided` (search and distil) or `gradient` (the paper's).
     """
     config = TrainConfig(method=method, budget=budget, steps=steps, seed=seed)

@@ -98,7 +98,7 @@ class Mlp:
         batch, count, steps, controls = plans.shape
         judged = self.task.judge(x0.repeat_interleave(count, 0), plans.reshape(-1, steps, controls))
         rows = torch.arange(batch, device=x0.device)
-        best = rank(judged.rho, self.task.cost(judged)).view(batch, count).argmax(1)
+        best = rank(judged.rho, self.task.cost(judged), judged.safe).view(batch, count).argmax(1)
         index = rows * count + best
         return plans[rows, best], select(judged, index)
 
@@ -109,5 +109,6 @@ def select(judged: Judged, index: Tensor) -> Judged:
         rho=judged.rho[index],
         safe=judged.safe[index],
         requirements=judged.requirements[index],
+        plans=judged.plans[index],
         columns={name: column[:, index] for name, column in judged.columns.items()},
     )

@@ -1,4 +1,4 @@
-"""How long a plan stays safe: the longest prefix that phi_safe does not yet condemn."""
+"""How far a plan that is not safe can be followed, and by how much it fails."""
 
 from __future__ import annotations
 
@@ -36,6 +36,30 @@ def open_ended(formula: ir.Formula) -> ir.Formula:
             return replace(formula, left=open_ended(formula.left), right=open_ended(formula.right))
         case _:
             assert_never(formula)
+
+
+def anchored(formula: ir.Formula) -> ir.Formula:
+    """The formula with what is said of the start alone turned into guards: it decides, but limits no margin.
+
+    All plans share their start. Where plans that violate the formula are compared, `a -> always b` should tell
+    how far b is violated, not how clearly a holds.
+    """
+    match formula:
+        case ir.Atom():
+            return replace(formula, guard=True)
+        case ir.Join():
+            return replace(formula, items=tuple(map(anchored, formula.items)))
+        case _:
+            return formula
+
+
+def safety_margin(formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor]) -> Tensor:
+    """Least robustness of the anchored formulas, (batch,); +inf where there is none."""
+    batch = next(iter(columns.values()))[0]
+    if not formulas:
+        return torch.full_like(batch, torch.inf)
+    margins = evaluate([anchored(formula) for formula in formulas], columns, ops=TORCH)
+    return torch.stack([margin[0].expand_as(batch) for margin in margins]).amin(0)
 
 
 def safe_samples(formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor]) -> Tensor:

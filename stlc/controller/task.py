@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 HARD = Hard()
 FLOAT32_SLACK = 1e-5
 """Rounding that a float32 rollout may add to a margin that is 0 by construction."""
+TIE = 1e-4
+"""What cost may weigh where robustness does not differ: it is flat where a deadline cannot be met."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,16 +175,21 @@ class Task:
             return self.system.performance(judged.columns, ones, judged.rho, judged.plans)
 
 
-def rank(rho: Tensor, cost: Tensor) -> Tensor:
-    """One number to choose plans by: among satisfying plans the cheapest, else the most robust.
+def rank(rho: Tensor, cost: Tensor, safe: Tensor | None = None) -> Tensor:
+    """One number to choose plans by: the cheapest that satisfies, else the most robust that is safe, else any.
 
     Args:
         rho: robustness, any shape.
         cost: performance terms, the same shape.
+        safe: robustness of phi_safe, the same shape; without it no plan is preferred for being safe.
 
     Returns:
-        Larger is better: > 1 where satisfied (falling with cost), < 1 elsewhere (rising with robustness).
+        Larger is better: > 1 where satisfied (falling with cost), < 1 elsewhere (rising with robustness, and where
+        that is flat falling with cost), 2 less where it is unsafe.
     """
-    good = 1.0 + 1.0 / (1.0 + cost.clamp(min=0.0))
+    cheap = torch.nan_to_num(1.0 / (1.0 + cost.clamp(min=0.0)))
     poor = torch.where(torch.isfinite(rho), rho / (1.0 + rho.abs()), torch.full_like(rho, -1.0))
-    return torch.where(satisfied(rho) & ~torch.isnan(cost), good, poor)
+    poor = poor + TIE * cheap
+    if safe is not None:
+        poor = torch.where(satisfied(safe), poor, poor - 2.0)
+    return torch.where(satisfied(rho) & ~torch.isnan(cost), 1.0 + cheap, poor)

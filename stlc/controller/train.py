@@ -168,7 +168,7 @@ class _Session:
 
     def _judged(self) -> Outcome:
         policy = self.trainer.policy
-        result = score(policy)
+        result = score(policy, n=self.trainer.engine.held_out)
         save_states(self.folder.path / "eval" / "held_out.npz", self.trainer.task, result)
         seconds = time.perf_counter() - self.begun
         self.folder.finish("finished", {**result.summary(), "seconds": seconds})

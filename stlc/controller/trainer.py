@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from stlc.controller.config import Engine
     from stlc.controller.task import Task
 
-MARGIN_STATES = 256
+MARGIN_STATES = 128
 MARGIN_SHARE = 0.2
 MARGIN_RANGE = (0.01, 0.5)
 

@@ -1,0 +1,60 @@
+"""Verdicts of plans, and the order in which plans are preferred."""
+
+from __future__ import annotations
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stlc.controller.task import Task, rank, satisfied
+
+
+def _plans(task: Task, n: int, seed: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return 20.0 * torch.rand(n, task.horizon, 1, generator=generator, dtype=torch.float64) - 10.0
+
+
+def test_judging_equals_robustness_of_the_rollout(car_task: Task) -> None:
+    x0 = car_task.sample(500, seed=1, dtype=torch.float64)
+    u = _plans(car_task, 500, seed=2)
+    judged = car_task.judge(x0, u)
+    x = car_task.rollout(x0, u)
+    assert torch.allclose(judged.rho, car_task.robustness(x), atol=1e-12)
+    assert torch.allclose(judged.requirements, car_task.requirement_robustness(x), atol=1e-12)
+    assert torch.allclose(judged.safe, car_task.safety.robustness(x), atol=1e-12)
+    assert torch.equal(judged.rho, judged.requirements.amin(1))
+    assert (judged.safe >= judged.rho).all()
+
+
+def test_a_plan_with_nan_is_violated_and_never_preferred(car_task: Task) -> None:
+    x0 = car_task.sample(2, seed=3, dtype=torch.float64)
+    u = torch.zeros(2, car_task.horizon, 1, dtype=torch.float64)
+    u[0, 3] = torch.nan
+    judged = car_task.judge(x0, u)
+    assert judged.rho[0] == -torch.inf
+    assert judged.safe[0] == -torch.inf
+    assert torch.isfinite(judged.rho[1])
+    order = rank(judged.rho, car_task.cost(judged))
+    assert order[0] < rank(torch.tensor(-1e6), torch.tensor(0.0))
+
+
+def test_satisfied_allows_for_rounding_but_not_for_more() -> None:
+    exact = torch.tensor([0.0, -0.9e-6, -1.1e-6], dtype=torch.float64)
+    assert satisfied(exact).tolist() == [True, True, False]
+    assert satisfied(torch.tensor([-0.9e-5, -1.1e-5])).tolist() == [True, False]
+
+
+@given(
+    st.lists(st.tuples(st.floats(-50, 50), st.floats(0, 100)), min_size=2, max_size=8),
+)
+def test_satisfying_plans_come_first_then_cheap_ones_then_robust_ones(
+    pairs: list[tuple[float, float]],
+) -> None:
+    rho, cost = torch.tensor(pairs, dtype=torch.float64).unbind(1)
+    best = int(rank(rho, cost).argmax())
+    good = satisfied(rho)
+    if good.any():
+        assert good[best]
+        assert cost[best] <= cost[good].min() + 1e-9
+    else:
+        assert rho[best] >= rho.max() - 1e-9

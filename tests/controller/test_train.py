@@ -1,0 +1,133 @@
+"""Training: reproducible, resumable bit for bit, interruptible, and better than where it began."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from stlc.controller.checkpoint import load_checkpoint
+from stlc.controller.config import TrainConfig
+from stlc.controller.held_out import score, wilson
+from stlc.controller.launch import Launch, open_folder
+from stlc.controller.run import Run, spec_hash, system_hash
+from stlc.controller.task import Task
+from stlc.controller.train import Watch, resume, train
+from stlc.diagnostics import MissingError, RunError
+from stlc.rundir import RunDir
+
+STEPS = 130
+
+
+def _folder(task: Task, root: Path, config: TrainConfig) -> RunDir:
+    return open_folder(task, config, Launch(root=root))
+
+
+def _saved(run: RunDir) -> dict[str, torch.Tensor]:
+    hashes = {"spec_hash": spec_hash(run), "system_hash": system_hash(run)}
+    return load_checkpoint(run, **hashes).tensors
+
+
+@pytest.mark.parametrize("method", ["guided", "gradient"])
+def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(
+    car_task: Task, tmp_path: Path, method: str
+) -> None:
+    config = TrainConfig(held_out=200, method=method, steps=STEPS, seed=3, batch=64)  # type: ignore[arg-type]
+    whole = train(car_task, config, _folder(car_task, tmp_path / "a", config))
+    count = []
+    first = _folder(car_task, tmp_path / "b", config)
+    stopped = train(car_task, config, first, Watch(stop=lambda: bool(count.append(1)) or len(count) == 71))
+    assert stopped.interrupted
+    assert first.status == "interrupted"
+    again = resume(first)
+    assert not again.interrupted
+    left, right = _saved(whole.run.dir), _saved(first)
+    assert left.keys() == right.keys()
+    for name, value in left.items():
+        assert torch.equal(value, right[name]), name
+    assert [row["step"] for row in first.rows()] == [row["step"] for row in whole.run.dir.rows()]
+
+
+def test_seeds_matter_and_repeat(car_task: Task, tmp_path: Path) -> None:
+    def weights(seed: int, root: str) -> torch.Tensor:
+        config = TrainConfig(held_out=200, steps=20, seed=seed, batch=32)
+        return _saved(train(car_task, config, _folder(car_task, tmp_path / root, config)).run.dir)[
+            "network.body.0.weight"
+        ]
+
+    assert torch.equal(weights(1, "a"), weights(1, "b"))
+    assert not torch.equal(weights(1, "c"), weights(2, "d"))
+
+
+def test_a_short_run_learns_and_opens_again(car_task: Task, tmp_path: Path) -> None:
+    config = TrainConfig(held_out=1000, steps=250, seed=0)
+    outcome = train(car_task, config, _folder(car_task, tmp_path, config))
+    assert outcome.score is not None
+    assert outcome.score.accuracy > 0.75
+    assert outcome.score.feasible >= outcome.score.accuracy
+    low, high = outcome.score.interval
+    assert low < outcome.score.accuracy < high
+    opened = Run.open(outcome.run.dir.path)
+    x0 = car_task.sample(50, seed=11, dtype=torch.float64)
+    assert torch.equal(opened.policy(x0), outcome.run.policy(x0))
+    assert opened.policy(x0).shape == (50, car_task.horizon, 1)
+    record = outcome.run.dir.record()
+    assert record["status"] == "finished"
+    assert record["result"]["accuracy"] == outcome.score.accuracy
+    assert set(record["result"]["requirements"]) == {rule.name for rule in car_task.rules}
+
+
+def test_resuming_a_finished_run_says_so(car_task: Task, tmp_path: Path) -> None:
+    config = TrainConfig(held_out=200, steps=5, batch=32)
+    folder = _folder(car_task, tmp_path, config)
+    train(car_task, config, folder)
+    with pytest.raises(RunError) as caught:
+        resume(folder)
+    assert caught.value.diagnostics[0].code == "R103"
+    assert resume(folder, steps=8).run.dir.record()["steps"] == 8
+
+
+def test_a_changed_spec_is_refused(car_task: Task, tmp_path: Path) -> None:
+    config = TrainConfig(held_out=200, steps=5, batch=32)
+    folder = _folder(car_task, tmp_path, config)
+    train(car_task, config, folder)
+    path = folder.path / "spec.stl"
+    path.write_text(path.read_text().replace("tau >= 1 s", "tau >= 2 s"))
+    for call in (lambda: Run.open(folder.path), lambda: resume(folder)):
+        with pytest.raises(RunError) as caught:
+            call()
+        assert caught.value.diagnostics[0].code == "R102"
+
+
+def test_a_budget_becomes_steps(car_task: Task, tmp_path: Path) -> None:
+    config = TrainConfig(held_out=200, budget=3.0, batch=32)
+    folder = _folder(car_task, tmp_path, config)
+    outcome = train(car_task, config, folder)
+    steps = folder.record()["steps"]
+    assert steps >= 50
+    assert outcome.seconds < 30.0
+
+
+def test_a_device_that_is_not_there(car_task: Task, tmp_path: Path) -> None:
+    config = TrainConfig(held_out=200, steps=5, device="cuda:77")
+    with pytest.raises(MissingError) as caught:
+        train(car_task, config, _folder(car_task, tmp_path, config))
+    assert caught.value.diagnostics[0].code == "R302"
+
+
+def test_held_out_states_are_always_the_same(car_task: Task, tmp_path: Path) -> None:
+    config = TrainConfig(held_out=200, steps=5, batch=32)
+    policy = train(car_task, config, _folder(car_task, tmp_path, config)).run.policy
+    first, second = score(policy, n=200), score(policy, n=200)
+    assert torch.equal(first.states, second.states)
+    assert first.accuracy == second.accuracy
+    assert first.states.dtype == torch.float64
+
+
+def test_wilson_interval_of_known_cases() -> None:
+    low, high = wilson(0.5, 100)
+    assert abs(low - 0.4038) < 1e-3
+    assert abs(high - 0.5962) < 1e-3
+    assert wilson(1.0, 10)[1] == 1.0
+    assert wilson(0.0, 10)[0] == 0.0
