@@ -151,7 +151,7 @@ def _member_parts(expr: ast.Member) -> Sequence[ast.Expr]:
 
 def _if(expr: ast.IfThenElse, values: Sequence[Value], scope: Scope) -> Value:
     cond, yes, no = values
-    choose = choose_formula if is_formula(yes) and is_formula(no) else choose_number
+    choose = choose_formula if is_formula(yes) or is_formula(no) else choose_number
     return choose(expr, (cond, yes, no), scope)
 
 

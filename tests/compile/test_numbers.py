@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import pytest
 import reference
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from stlc.compile import ir
@@ -101,6 +101,7 @@ def test_folding_equals_python_arithmetic(case) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name, f in FUNCTIONS.items() if f.kind == "function"])
+@settings(max_examples=20)
 @given(args=st.lists(st.floats(-3, 3, allow_subnormal=False), min_size=3, max_size=3))
 def test_functions_fold_to_what_they_mean(name: str, args: list[float]) -> None:
     function = FUNCTIONS[name]
