@@ -96,8 +96,16 @@ def _doc(context: Context, end: int) -> str:
 
 def _head(context: Context, span: Span, leaf: Leaf, tags: tuple[ast.Tag, ...]) -> dict[str, Any]:
     """The fields that all declarations share."""
-    doc = _doc(context, leaf.span.start)
-    return {"span": span, "name": own_name(context, leaf), "name_span": leaf.span, "tags": tags, "doc": doc}
+    (head,) = _heads(context, span, (leaf,), tags)
+    return head
+
+
+def _heads(
+    context: Context, span: Span, names: Sequence[Leaf], tags: tuple[ast.Tag, ...]
+) -> list[dict[str, Any]]:
+    """The same for a declaration of several names."""
+    shared = {"span": span, "tags": tags, "doc": _doc(context, names[0].span.start)}
+    return [{**shared, "name": own_name(context, leaf), "name_span": leaf.span} for leaf in names]
 
 
 # ------------------------------------------------------------------- declarations
@@ -122,7 +130,7 @@ def _signals(context: Context, span: Span, children: Sequence[Any]) -> tuple[ast
         "domain": domain,
         "column": None if column is None else column.text[1:-1],
     }
-    return tuple(ast.Signal(**_head(context, span, leaf, tags), **own) for leaf in names)
+    return tuple(ast.Signal(**head, **own) for head in _heads(context, span, names, tags))
 
 
 def _const(context: Context, span: Span, children: Sequence[Any]) -> ast.Const:
@@ -133,7 +141,7 @@ def _const(context: Context, span: Span, children: Sequence[Any]) -> ast.Const:
 def _params(context: Context, span: Span, children: Sequence[Any]) -> tuple[ast.Param, ...]:
     tags, names, (written, unit), domain = children
     own = {"type": written, "unit": unit, "domain": domain}
-    return tuple(ast.Param(**_head(context, span, leaf, tags), **own) for leaf in names)
+    return tuple(ast.Param(**head, **own) for head in _heads(context, span, names, tags))
 
 
 def _whole(context: Context, span: Span, children: Sequence[Any]) -> int:

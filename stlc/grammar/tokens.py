@@ -13,6 +13,7 @@ from stlc.source import Source, Span
 from stlc.units import SYMBOLS, parse_unit
 
 MAX_DIGITS = 400
+_UNIT_LENGTH = 60
 _LARGEST = Fraction(1.7976931348623157e308)
 _MANTISSA = re.compile(r"([^eE]*)(?:[eE]([+-]?\d+))?")
 _WORD = re.compile(r"[A-Za-z]+")
@@ -70,6 +71,8 @@ def unit_of(context: Context, leaf: Leaf | None) -> str:
     if text in ("step", "steps"):
         return "steps"
     try:
+        if len(text) > _UNIT_LENGTH:
+            raise ValueError("this is too long for a unit")
         parse_unit(text)
     except ValueError as error:
         context.findings.append(_bad_unit(leaf, text, str(error)))
