@@ -14,7 +14,7 @@ from stlc.compile.arith import Program
 from stlc.compile.ops_torch import TORCH
 from stlc.compile.switch import Switch
 from stlc.dynamics.algebra import names_in
-from stlc.dynamics.schedule import Accumulate, AtOnce, Loop, Stage, blocks, schedule
+from stlc.dynamics.schedule import Stage, blocks, schedule
 from stlc.dynamics.step import Step
 
 Columns = dict[str, Tensor]
@@ -63,34 +63,6 @@ class _Film:
         return fixed, timed
 
 
-class _AtOnceRunner:
-    """Runs `AtOnce`."""
-
-    def __init__(self, stage: AtOnce) -> None:
-        self.stage = stage
-        self.program = Program(stage.outputs) if stage.outputs else None
-
-    def __call__(self, film: _Film) -> None:
-        if self.program is not None:
-            film.now.update(film.run(self.program))
-        for state, source in self.stage.columns.items():
-            start = film.states[state]
-            film.enter(state, torch.cat((start[None], film.full(film.now[source]))))
-
-
-class _AccumulateRunner:
-    """Runs `Accumulate`."""
-
-    def __init__(self, stage: Accumulate) -> None:
-        self.column = stage.column
-        self.program = Program({"increment": stage.increment})
-
-    def __call__(self, film: _Film) -> None:
-        increments = film.full(film.run(self.program)["increment"])
-        column: Tensor = _Accumulated.apply(film.states[self.column], increments)  # type: ignore[no-untyped-call]
-        film.enter(self.column, column)
-
-
 class _Accumulated(torch.autograd.Function):
     """(B,) and (T, B) -> (T+1, B): every row is the one above plus an increment. Faster than `cumsum`."""
 
@@ -113,48 +85,48 @@ class _Accumulated(torch.autograd.Function):
         return rows[0], below[1:]
 
 
-class _LoopRunner:
-    """Runs `Loop`."""
+class _StageRunner:
+    """A stage, its programs compiled."""
 
-    def __init__(self, stage: Loop) -> None:
+    def __init__(self, stage: Stage) -> None:
         self.stage = stage
         self.early = Program(stage.early) if stage.early else None
         self.blocks = tuple(Program(block) for block in stage.blocks)
-        inside = stage.columns.keys() | {name for block in stage.blocks for name in block}
+        inside = stage.stepped.keys() | {name for block in stage.blocks for name in block}
         read = {name for block in stage.blocks for num in block.values() for name in names_in(num)}
         self.outside = tuple(sorted(read - inside))
 
     def __call__(self, film: _Film) -> None:
         if self.early is not None:
             film.now.update(film.run(self.early))
+        for state, source in self.stage.follows.items():
+            start = film.states[state]
+            film.enter(state, torch.cat((start[None], film.full(film.now[source]))))
+        for state, source in self.stage.sums.items():
+            increments = film.full(film.now[source])
+            column: Tensor = _Accumulated.apply(film.states[state], increments)  # type: ignore[no-untyped-call]
+            film.enter(state, column)
+        if self.blocks:
+            self._loop(film)
+
+    def _loop(self, film: _Film) -> None:
+        """Step what feeds back into itself."""
+        stage = self.stage
         env, timed = film.sliced(self.outside)
-        kept = (*self.stage.columns.values(), *self.stage.lets)
+        kept = (*stage.stepped.values(), *stage.lets)
         history: dict[str, list[Tensor]] = {name: [] for name in kept}
-        env.update((state, film.states[state]) for state in self.stage.columns)
+        env.update((state, film.states[state]) for state in stage.stepped)
         for step in range(film.steps):
             env.update((name, values[step]) for name, values in timed)
             for block in self.blocks:
                 env.update(block(env, TORCH, film.switch))
             for name in kept:
                 history[name].append(env[name])
-            env.update((state, env[source]) for state, source in self.stage.columns.items())
-        for state, source in self.stage.columns.items():
+            env.update((state, env[source]) for state, source in stage.stepped.items())
+        for state, source in stage.stepped.items():
             start = film.states[state]
             film.enter(state, torch.stack([start, *(value.expand(film.batch) for value in history[source])]))
-        film.now.update((name, torch.stack(history[name])) for name in self.stage.lets)
-
-
-_Runner = _AtOnceRunner | _AccumulateRunner | _LoopRunner
-
-
-def _runner(stage: Stage) -> _Runner:
-    match stage:
-        case AtOnce():
-            return _AtOnceRunner(stage)
-        case Accumulate():
-            return _AccumulateRunner(stage)
-        case Loop():
-            return _LoopRunner(stage)
+        film.now.update((name, torch.stack(history[name])) for name in stage.lets)
 
 
 class Stepper:
@@ -164,7 +136,7 @@ class Stepper:
         self.next = dict(step.next)
         numbers = dict(step.lets) | {f"{name}'": num for name, num in step.next.items()}
         self.once = tuple(Program(block) for block in blocks(numbers))
-        self.stages = tuple(_runner(stage) for stage in schedule(step))
+        self.stages = tuple(_StageRunner(stage) for stage in schedule(step))
 
     def step(self, state: Mapping[str, Tensor], controls: Mapping[str, Tensor], switch: Switch) -> Columns:
         """The columns one step later; those that do not move are the same tensors."""

@@ -20,39 +20,24 @@ Lets: TypeAlias = Mapping[str, ir.Num]
 
 
 @dataclass(frozen=True, slots=True)
-class AtOnce:
-    """Numbers of all steps, computed together; `columns` maps a state to the name of its next value."""
-
-    outputs: Lets
-    columns: Mapping[str, str]
-
-
-@dataclass(frozen=True, slots=True)
-class Accumulate:
-    """A state that adds `increment` every step."""
-
-    column: str
-    increment: ir.Num
-
-
-@dataclass(frozen=True, slots=True)
-class Loop:
-    """States that feed back into themselves.
+class Stage:
+    """What can be run together, once everything that it reads is known.
 
     Attributes:
-        early: computed before the loop, for all steps together.
+        early: numbers of all steps, computed together, before anything else here.
+        follows: state -> name of its next value, an early number of this stage or of one before.
+        sums: state -> name of the early number that it adds every step.
         blocks: computed in every step, one after the other.
-        columns: state -> name of its next value.
-        lets: intermediate values that other stages read.
+        stepped: state -> name of its next value in `blocks`.
+        lets: names in `blocks` that later stages read.
     """
 
     early: Lets
+    follows: Mapping[str, str]
+    sums: Mapping[str, str]
     blocks: tuple[Lets, ...]
-    columns: Mapping[str, str]
+    stepped: Mapping[str, str]
     lets: tuple[str, ...]
-
-
-Stage: TypeAlias = AtOnce | Accumulate | Loop
 
 
 def schedule(step: Step) -> tuple[Stage, ...]:
@@ -60,16 +45,66 @@ def schedule(step: Step) -> tuple[Stage, ...]:
     numbers = dict(step.lets) | {_next(name): num for name, num in step.next.items()}
     reads = {name: names_in(num) & (numbers.keys() | step.next.keys()) for name, num in numbers.items()}
     reads |= {name: frozenset((_next(name),)) for name in step.next}
-    components = _components(reads)
-    used: dict[str, set[str]] = {name: set() for name in reads}
-    for reader, names in reads.items():
-        for name in names:
-            used[name].add(reader)
-    return tuple(
-        stage
-        for index, group in enumerate(components)
-        for stage in _stage(group, index, numbers, reads, used)
-    )
+    level: dict[str, int] = {}
+    groups: list[list[list[str]]] = []
+    for group in _components(reads):
+        before = [level[name] for member in group for name in reads[member] if name in level]
+        alone_state = len(group) == 1 and group[0] not in numbers
+        depth = max(before, default=-1) + (not alone_state)
+        level |= dict.fromkeys(group, depth)
+        if depth == len(groups):
+            groups.append([])
+        groups[depth].append(group)
+    writers = [_StageWriter(numbers, reads, depth) for depth in range(len(groups))]
+    for writer, members in zip(writers, groups, strict=True):
+        for group in members:
+            writer.add(group)
+    return tuple(writer.stage() for writer in writers)
+
+
+class _StageWriter:
+    """Gathers the groups of one level."""
+
+    def __init__(self, numbers: Lets, reads: Mapping[str, frozenset[str]], depth: int) -> None:
+        self.numbers = numbers
+        self.reads = reads
+        self.prefix = f"early{depth}."
+        self.early: dict[str, ir.Num] = {}
+        self.follows: dict[str, str] = {}
+        self.sums: dict[str, str] = {}
+        self.stepped: dict[str, str] = {}
+        self.body: dict[str, ir.Num] = {}
+        self.lets: list[str] = []
+
+    def add(self, group: Sequence[str]) -> None:
+        """One strongly connected group of names."""
+        name = group[0]
+        if len(group) == 1 and name not in self.reads[name]:
+            if name in self.numbers:
+                self.early[name] = self.numbers[name]
+            else:
+                self.follows[name] = _next(name)
+            return
+        inside = frozenset(group)
+        states = {name: _next(name) for name in group if name not in self.numbers}
+        body = {name: num for name, num in self.numbers.items() if name in inside}
+        increment = _increment(states, body)
+        if increment is not None:
+            (state,) = states
+            self.sums[state] = f"{state}+"
+            self.early[f"{state}+"] = increment
+            return
+        hoist = Hoist(inside, self.prefix, self.early)
+        self.body |= {name: hoist.split(num) for name, num in body.items()}
+        self.stepped |= states
+        read_outside = {
+            name for reader, names in self.reads.items() if reader not in inside for name in names
+        }
+        self.lets += [name for name in body if name in read_outside]
+
+    def stage(self) -> Stage:
+        """The level as a stage."""
+        return Stage(self.early, self.follows, self.sums, blocks(self.body), self.stepped, tuple(self.lets))
 
 
 def blocks(numbers: Lets) -> tuple[Lets, ...]:
@@ -84,32 +119,6 @@ def blocks(numbers: Lets) -> tuple[Lets, ...]:
 def _next(name: str) -> str:
     """How the next value of a state is called."""
     return f"{name}'"
-
-
-def _stage(
-    group: Sequence[str],
-    index: int,
-    numbers: Lets,
-    reads: Mapping[str, frozenset[str]],
-    used: Mapping[str, set[str]],
-) -> tuple[Stage, ...]:
-    """The stage of one strongly connected group of names."""
-    inside = frozenset(group)
-    states = {name: _next(name) for name in group if name not in numbers}
-    if len(group) == 1:
-        name = group[0]
-        if name not in numbers:
-            return (AtOnce({}, states),)
-        if name not in reads[name]:
-            return (AtOnce({name: numbers[name]}, {}),)
-    body = {name: numbers[name] for name in numbers if name in inside}
-    hoist = Hoist(inside, f"early{index}.")
-    increment = _increment(states, body)
-    if increment is not None:
-        return (Accumulate(next(iter(states)), increment),)
-    split = {name: hoist.split(num) for name, num in body.items()}
-    wanted = tuple(name for name in body if name not in states.values() and used[name] - inside)
-    return (Loop(hoist.early, blocks(split), states, wanted),)
 
 
 def _increment(states: Mapping[str, str], body: Lets) -> ir.Num | None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from stlc.dynamics.decl import ScenarioDecl, SystemDecl
+from stlc.dynamics.schema_deploy import read_test
 from stlc.dynamics.schema_flow import read_flow, read_jumps, read_timers
 from stlc.dynamics.schema_init import read_init
 from stlc.dynamics.schema_names import (
@@ -24,7 +25,6 @@ from stlc.dynamics.schema_names import (
 from stlc.dynamics.schema_overrides import overridden
 from stlc.dynamics.schema_reader import Reader
 from stlc.dynamics.schema_settings import read_backup, read_objective, read_policy, read_train
-from stlc.dynamics.schema_test import read_test
 from stlc.dynamics.yaml_nodes import Mapping, Node, load_yaml
 from stlc.files import read_source
 from stlc.source import Source

@@ -248,7 +248,6 @@ def test_what_the_file_says_beside_the_dynamics(car: System) -> None:
     assert (float(car.control_low), float(car.control_high)) == (-10.0, 10.0)
     assert decl.objective.gamma == 0.5
     assert decl.objective.smoothing == 500
-    assert decl.train.budget == 300
     assert decl.test.world is not None
     assert (decl.test.world.path.name, decl.test.world.name) == ("traffic_grid.py", "TrafficGrid")
     assert (decl.test.agents, decl.test.steps) == (20, 150)
