@@ -15,13 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile import ir, typed
-from stlc.compile.horizon import columns
+from stlc.compile.horizon import columns, parts
 from stlc.compile.interface import Grid
 from stlc.compile.lower import lower
-from stlc.monitor.values import Record, bounds
+from stlc.monitor.values import Record, bounds, history
 from stlc.source import Span
 
 Floats = NDArray[np.float64]
+
+_MOST_LATER = 64
+"""How many instants after the last sample are looked at where past operators still know something there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +100,7 @@ class Blamer:
                 return self._until(formula, sample, wanted)
             case typed.Shift(_, steps, body):
                 there = sample + steps
-                inside = 0 <= there < self.record.samples
+                inside = there >= 0
                 parts = (self.blame(body, there, wanted=wanted),) if inside else ()
                 return replace(self._node(formula, wanted, sample), parts=parts)
             case typed.Edge():
@@ -116,8 +119,13 @@ class Blamer:
 
     def _margins(self, formula: typed.Formula, wanted: bool, instants: range) -> Floats:
         """By how much the formula is as wanted, at best, at consecutive instants: (instants,)."""
-        _, high = bounds(self._lowered(formula, wanted), self.record, instants, "open")
-        return np.asarray(high[:, 0], dtype=np.float64)
+        lowered, last = self._lowered(formula, wanted), self.record.samples - 1
+        inside = range(instants.start, min(instants.stop, last + 1))
+        found = [bounds(lowered, self.record, inside, "open")[1][:, 0]] if inside else []
+        for later in range(max(instants.start, last + 1), instants.stop):
+            seen = ir.Shift(later - last, lowered)
+            found.append(bounds(seen, self.record, range(last, last + 1), "open")[1][:, 0])
+        return np.concatenate(found).astype(np.float64)
 
     def _node(self, formula: typed.Formula, wanted: bool, sample: int) -> Blame:
         margin = float(self._margins(formula, wanted, range(sample, sample + 1))[0])
@@ -170,12 +178,13 @@ class Blamer:
     # ------------------------------------------------------------------- windows
 
     def _instants(self, formula: typed.Formula, sample: int, wanted: bool) -> range:
-        """The instants of the window of a temporal operator, within the record, in order of time."""
+        """The instants of the window of a temporal operator of which something is known, in order of time."""
         lowered = self._lowered(formula, wanted)
         last = self.record.samples - 1
         match lowered:
             case ir.Over(window=window) | ir.Until(window=window):
-                high = last if window.hi is None else min(sample + window.hi, last)
+                known = last + min(max(map(history, parts(lowered))), _MOST_LATER)
+                high = last if window.hi is None else min(sample + window.hi, known)
                 return range(sample + window.lo, high + 1)
             case ir.Past(window=window) | ir.Since(window=window):
                 low = 0 if window.hi is None else max(sample - window.hi, 0)
@@ -219,8 +228,9 @@ class Blamer:
         offset, is_left = _unmet(left, right)
         there_ = sample - offset if past else sample + offset
         part = self.blame(formula.left if is_left else formula.right, there_, wanted=wanted)
-        until = None if is_left else (instants[0] if past else instants[-1])
-        return replace(node, parts=(part,), until=until)
+        if is_left:
+            return replace(node, parts=(part,))
+        return replace(node, sample=instants[0], until=instants[-1], parts=(part,))
 
     def _unless(self, formula: typed.Until, sample: int, wanted: bool) -> Blame:
         """`always[0, b] left or left until[a, b] right`."""
@@ -231,13 +241,16 @@ class Blamer:
 
 
 def _unmet(left: Floats, right: Floats) -> tuple[int, bool]:
-    """Where `until` comes closest: an offset from now, and whether the left side is what fails there."""
+    """Why `until` fails: an offset from now, and whether it is the left side that fails there.
+
+    Where the right side is never met, it is shown where it comes closest; where it is, the left side did not
+    hold up to there.
+    """
     skipped = len(left) - len(right)
-    held = np.minimum.accumulate(left)[skipped:]
-    best = int(np.argmax(np.minimum(held, right)))
-    if right[best] <= held[best]:
-        return skipped + best, False
-    return int(np.argmin(left[: skipped + best + 1])), True
+    met = np.flatnonzero(right >= 0)
+    if not len(met):
+        return skipped + int(np.argmax(right)), False
+    return int(np.argmin(left[: skipped + int(met[0]) + 1])), True
 
 
 def _released(left: Floats, right: Floats) -> tuple[int, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
@@ -105,7 +106,7 @@ def _cause(judgement: Judgement, subject: Prepared, trace: int, start: int) -> C
         readings=words.readings(leaf),
         place=place,
         labels=tuple(labels[: _MOST_LABELS - 1]),
-        because=words.because(leaf),
+        because=words.because(tree),
         tree=tree,
     )
 
@@ -124,7 +125,7 @@ class _Words:
         """The signals that the predicates below read, each at its instant."""
         seen: dict[tuple[str, int], Reading] = {}
         for leaf in blame.leaves:
-            for name in leaf.signals:
+            for name in _in_order(leaf):
                 value = float(self.record.env[name][leaf.sample, 0])
                 text = f"{name} = {shown(value, self.subject.compiled.signature[name])}"
                 seen.setdefault((name, leaf.sample), Reading(name, value, text))
@@ -151,17 +152,24 @@ class _Words:
         values = ", ".join(reading.text for reading in self.readings(blame))
         return f"{word} at {moment} ({values})" if values else f"{word} at {moment}"
 
-    def because(self, leaf: Blame) -> str:
+    def because(self, tree: Blame) -> str:
         """`before_junction means x < x_inter / 2, and x = 0.27 m at t = 4.6 s (line 17)`."""
+        leaf = tree.leaf
+        moment, truth = self.subject.moment(leaf.sample), "true" if leaf.holds else "false"
         values = " and ".join(reading.text for reading in self.readings(leaf))
-        moment = self.subject.moment(leaf.sample)
-        measured = f"{values} at {moment}" if values else f"it does so at {moment}"
+        text = _flat(leaf.span.text)
+        if not values:
+            return f"`{text}` is {truth} whatever the signals are"
         chain = self.chain(self.written, leaf.span)
+        closest = _closest(tree)
         if not chain:
-            return f"{measured}, where `{_flat(leaf.span.text)}` is {'true' if leaf.holds else 'false'}"
-        name = chain[-1]
-        body = _flat(self.definitions[name.name].span.text)
-        return f"{name.name} means {body}, and {measured} (line {leaf.span.line})"
+            if closest:
+                return f"`{text}` comes closest at {moment}, where {values}"
+            return f"`{text}` is {truth} where {values}, at {moment}"
+        name = chain[-1].name
+        body = _flat(self.definitions[name].span.text)
+        found = f"comes closest at {moment}, where {values}" if closest else f"{values} at {moment}"
+        return f"{name} means {body}, and {found} (line {leaf.span.line})"
 
     def site(self, span: Span) -> Span:
         """The place in the requirement that brings `span` in, be it by a definition."""
@@ -180,6 +188,12 @@ class _Words:
         return None
 
 
+def _in_order(leaf: Blame) -> list[str]:
+    """The signals of a predicate as its text has them; those behind a name come last."""
+    words = re.findall(r"\w+(?:\[\d+\])?", leaf.span.text)
+    return sorted(leaf.signals, key=lambda name: (words.index(name) if name in words else len(words), name))
+
+
 def _told(tree: Blame) -> Iterator[Blame]:
     """The nodes that get a label: premises as a whole, windows without success, predicates."""
     if tree.premise or tree.until is not None or not tree.parts:
@@ -194,6 +208,13 @@ def _telling(tree: Blame) -> Blame:
     if tree.until is not None:
         return replace(tree, formula=_body(tree.formula))
     return _telling(tree.parts[tree.main]) if tree.parts else tree
+
+
+def _closest(tree: Blame) -> bool:
+    """Whether the predicate that decides is the best of a window in which nothing succeeds."""
+    if tree.until is not None:
+        return True
+    return bool(tree.parts) and _closest(tree.parts[tree.main])
 
 
 def _body(formula: typed.Formula) -> typed.Formula:

@@ -41,4 +41,4 @@ class Prepared:
 
     def moment(self, sample: int) -> str:
         """The same in words: `t = 4.6 s`."""
-        return f"sample {sample}" if self.dt is None else f"t = {self.time(sample):.6g} s"
+        return f"sample {sample}" if self.dt is None else f"t = {self.time(sample):.10g} s"

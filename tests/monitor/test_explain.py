@@ -1,0 +1,173 @@
+"""Explanations are true, minimal in what they pick, and read as golden texts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import reference
+from formula_strategies import GRID, formulas, traces
+from hypothesis import assume, given, settings
+
+from stlc.cli.render import render_place
+from stlc.compile import typed
+from stlc.compile.ops_numpy import NUMPY
+from stlc.diagnostics import UsageError
+from stlc.monitor.blame import Blame, Blamer
+from stlc.monitor.explain import explain, names_in, shown
+from stlc.monitor.values import Record
+from stlc.monitor.verdict import Monitor
+from stlc.signature import Column
+from stlc.units import parse_unit
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "check"
+
+
+def nodes(blame: Blame) -> Iterator[Blame]:
+    yield blame
+    for part in blame.parts:
+        yield from nodes(part)
+
+
+@settings(max_examples=100)
+@given(formula=formulas(), env=traces(low=3, batch=1))
+def test_every_node_is_what_it_is_said_to_be(formula: typed.Formula, env: dict[str, np.ndarray]) -> None:
+    trace = reference.Trace({name: column[:, 0] for name, column in env.items()}, GRID, "open")
+    judge = reference.Robustness(trace)
+    value = judge.at(formula, 0)
+    assert value is not None
+    assume(value[1] < 0)
+    tree = Blamer(Record(env, NUMPY), GRID).blame(formula, 0)
+    assert -abs(tree.rho) == pytest.approx(value[1])
+    for node in nodes(tree):
+        if node.until is None:
+            polarity = not node.holds
+            found = judge.at(node.formula, node.sample, polarity)
+            assert found is not None
+            assert (found[0] > 0) if node.holds else (found[1] < 0), node
+        assert not node.signals or 0 <= node.sample < trace.samples
+        assert all(name in env for name in node.signals)
+
+
+@settings(max_examples=60)
+@given(formula=formulas(bounded_only=True), env=traces(low=3, batch=1))
+def test_an_operator_that_never_succeeds_is_explained_by_its_best(
+    formula: typed.Formula, env: dict[str, np.ndarray]
+) -> None:
+    trace = reference.Trace({name: column[:, 0] for name, column in env.items()}, GRID, "open")
+    judge = reference.Robustness(trace)
+    value = judge.at(formula, 0)
+    assert value is not None
+    assume(value[1] < 0)
+    tree = Blamer(Record(env, NUMPY), GRID).blame(formula, 0)
+    for node in nodes(tree):
+        match node:
+            case Blame(formula=typed.Temporal(body=body), until=int() as last, parts=(best,)):
+                wanted = not node.holds
+                ends = [judge.at(body, k, wanted) for k in range(node.sample, last + 1)]
+                margins = [end[1] if wanted else -end[0] for end in ends if end is not None]
+                assert -abs(best.rho) == pytest.approx(max(margins))
+
+
+# --------------------------------------------------------------------------- texts
+
+HEAD = """\
+spec demo
+enum Light { red = 0, green = 1 }
+signal x [m]
+signal v [m/s]
+signal light : Light
+signal ready : bool
+def near(limit) = x > -limit
+def fast = v > 3
+def reckless = near(2 m) and fast
+"""
+
+CASES = {
+    "always": ("always[0 s, 3 s] v < 4", {"v": [1, 2, 6, 5]}),
+    "eventually": ("eventually[0 s, 3 s] v > 4", {"v": [1, 3.5, 2, 1]}),
+    "premise": (
+        "light == red and ready -> always[0 s, 2 s] x < 0",
+        {"light": [0] * 3, "ready": [1] * 3, "x": [-2, 1, 0.5]},
+    ),
+    "definitions": ("always[0 s, 2 s] not reckless", {"x": [-3, -1, 0], "v": [5, 4, 2]}),
+    "until": ("v < 4 until[0 s, 3 s] ready", {"v": [1, 5, 1, 1], "ready": [0, 0, 0, 1]}),
+    "until_never": ("v < 4 until[0 s, 2 s] ready", {"v": [1, 1, 1], "ready": [0, 0, 0]}),
+    "release": ("ready release[0 s, 2 s] v < 4", {"v": [1, 5, 1], "ready": [0, 0, 1]}),
+    "or": (
+        "always[0 s, 1 s] (v < 4 or x > 2 or light == green)",
+        {"v": [1, 9], "x": [0, 1], "light": [1, 0]},
+    ),
+    "equivalence": ("always[0 s, 1 s] (ready <-> light == green)", {"ready": [1, 1], "light": [1, 0]}),
+    "rise": ("eventually[0 s, 2 s] rise(ready)", {"ready": [1, 1, 1]}),
+    "past": ("always[0 s, 2 s] (fast -> once[0 s, 1 s] ready)", {"v": [1, 1, 5], "ready": [1, 0, 0]}),
+    "two_signals": ("always[0 s, 1 s] x + v * 1 s < 3", {"x": [1, 2], "v": [1, 1.5]}),
+    "chain": ("always[0 s, 1 s] 0 <= v < 4", {"v": [1, -1]}),
+    "every_line": ("light == green ->\n    always[0 s, 1 s]\n        v < 4", {"light": [1, 1], "v": [1, 8]}),
+    "false": ("false", {}),
+    "clock": ("always@[1 s, 2 s] v < 4", {"v": [9, 1, 7]}),
+}
+
+
+def text_of(formula: str, columns: dict[str, list[float]]) -> str:
+    monitor = Monitor(f"{HEAD}require r: {formula}\n", dt=1)
+    verdict = monitor.check(columns or {"v": [0.0]})
+    cause = explain(verdict, "r")
+    assert cause is not None
+    return render_place(cause.place, cause.labels, [("because", cause.because)], color=False)
+
+
+def test_the_golden_texts(request: pytest.FixtureRequest) -> None:
+    text = "\n".join(f"# {name}\n{text_of(*case)}" for name, case in CASES.items())
+    golden = GOLDEN / "causes.txt"
+    if request.config.getoption("--regenerate"):
+        golden.write_text(text, encoding="utf-8")
+    assert text == golden.read_text(encoding="utf-8")
+
+
+def test_a_cause_in_numbers() -> None:
+    monitor = Monitor(f"{HEAD}require r: always[0 s, 2 s] fast\n", dt=0.5)
+    v = np.array([[4.0, 4, 4, 4, 4, 4], [4, 4, 4, 1, 4, 4]])
+    verdict = monitor.check({"v": v})
+    cause = explain(verdict, "r")
+    assert cause is not None
+    assert (cause.trace, cause.start, cause.sample, cause.time) == (1, 0, 3, 1.5)
+    assert cause.predicate == "v > 3"
+    assert cause.span.line == 8
+    assert [(r.signal, r.value, r.text) for r in cause.readings] == [("v", 1.0, "v = 1 m/s")]
+    assert cause.tree.leaf.rho == verdict.robustness[1] == -2.0
+
+
+def test_what_is_not_violated_has_no_cause() -> None:
+    verdict = Monitor("signal a\nrequire r: always[0 s, 2 s] a > 0\n", dt=1).check({"a": [1.0]})
+    assert verdict.status == "inconclusive"
+    assert explain(verdict, "r") is None
+    with pytest.raises(UsageError, match="no requirement `q`"):
+        explain(verdict, "q")
+
+
+def test_a_violation_before_the_end_of_a_short_trace() -> None:
+    verdict = Monitor("signal a\nrequire r: always[0 s, 9 s] a > 0\n", dt=1).check({"a": [1.0, -2, -1]})
+    cause = explain(verdict, "r")
+    assert cause is not None
+    assert (cause.sample, cause.tree.rho) == (1, -2.0)
+
+
+def test_values_as_one_reads_them() -> None:
+    light = Column("light", kind="enum", labels=(("red", 0.0), ("green", 1.0)))
+    assert [shown(value, light) for value in (0.0, 1.0, 0.5)] == ["red", "green", "0.5"]
+    assert shown(0.27000000001, Column("x", parse_unit("m"))) == "0.27 m"
+
+
+def test_names_are_found_in_every_kind_of_expression() -> None:
+    monitor = Monitor(
+        f"{HEAD}require r: if ready then forall i in 0..1: near(i * 1 m) else max(v, 1) > 2\n", dt=1
+    )
+    formula = monitor.spec.items[-1].formula
+    assert [name.name for name in names_in(formula) if name.name in ("ready", "near", "v")] == [
+        "ready",
+        "near",
+        "v",
+    ]
