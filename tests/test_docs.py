@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import shlex
+import shutil
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
@@ -261,6 +262,19 @@ def test_the_readme_shows_the_specification_as_it_is():
     written = (ROOT / "specs/traffic.stl").read_text(encoding="utf-8").splitlines()
     for line in filter(None, shown.splitlines()):
         assert line in written
+
+
+def test_the_readme_shows_a_real_diagnostic(monkeypatch, tmp_path, capsys):
+    (shown,) = [
+        body for _, body in FENCE.findall((ROOT / "README.md").read_text()) if body.startswith("error")
+    ]
+    text = (ROOT / "specs/traffic.stl").read_text(encoding="utf-8")
+    for folder in ("specs", "examples"):
+        shutil.copytree(ROOT / folder, tmp_path / folder)
+    (tmp_path / "specs/traffic.stl").write_text(text.replace("dx > gap  ", "dx > 1 s  "), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    assert main(["compile", "specs/traffic.stl"]) == 3
+    assert capsys.readouterr().err == shown
 
 
 # ---------------------------------------------------------------------- links and files
