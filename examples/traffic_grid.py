@@ -80,6 +80,12 @@ def overlap(a: np.ndarray, b: np.ndarray, grow: float = 0.0) -> np.ndarray:
     return hit
 
 
+def counted_on(v: float, v_lead: float, dt: float) -> float:
+    """The constant speed of a leader that asks for as much room as one that brakes as hard as it can."""
+    slower = max(v_lead - BRAKE * dt, 0.0)
+    return slower if v <= slower else v - math.sqrt(v**2 - slower**2)
+
+
 @cache
 def conflicts(relative: int, mine: int, other: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Where my turn meets that of a car which entered `relative` quarter turns to the left of my direction.
@@ -352,7 +358,7 @@ class TrafficGrid:
         row[self.at["sign"]] = light
         row[self.at["tau"]] = self._timer(ahead, self.grid.heading[past, ahead]) if light else car.tau
         row[self.at["dx"]] = max(gap, 0.0) if seen else -1.0
-        row[self.at["v_lead"]] = max(speed, 0.0) if seen else 0.0
+        row[self.at["v_lead"]] = counted_on(car.v, speed, self.system.dt) if seen else 0.0
         row[self.at["yielding"]] = not light and self.holder.get(ahead) is not car
 
     def _leader(self, car: Car, lanes: Lanes, inside: Inside) -> Lead:

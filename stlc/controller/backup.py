@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics import TOLERANCE
-from stlc.controller.prefix import safe_samples, safety_margin
+from stlc.controller.prefix import prefix_robustness
 
 if TYPE_CHECKING:
     from stlc.controller.policy import Policy
@@ -157,20 +157,24 @@ class Backup:
     def _enter_safest(
         self, found: Found, candidates: _Candidates, where: tuple[Tensor, Tensor], length: int
     ) -> None:
-        """Take the plan with the longest safe prefix; of several, the most robust and the least unsafe."""
+        """Take the plan with the longest safe prefix; of several the most robust, the latest to fail."""
         x, group = where
         agents, choices = candidates.rho.shape
-        starts = self._parts(x.repeat_interleave(choices, 0))
-        plans = self._parts(candidates.plans.flatten(0, 1))
-        parts = [
-            self.task.system.rollout_columns(start, plan) for start, plan in zip(starts, plans, strict=True)
-        ]
-        samples, margin = (
-            torch.cat([measure(self._formulas, part) for part in parts]).view(agents, choices)
-            for measure in (safe_samples, safety_margin)
+        starts = x.repeat_interleave(choices, 0)
+        size = max(self.grid.batch // self.task.horizon, 1)  # as every prefix is a trajectory of its own
+        falls = torch.cat(
+            [
+                prefix_robustness(self._formulas, self.task.system.rollout_columns(start, plan))
+                for start, plan in zip(
+                    _pieces(starts, size), _pieces(candidates.plans.flatten(0, 1), size), strict=True
+                )
+            ],
+            1,
         )
+        samples = (falls >= -TOLERANCE).sum(0).view(agents, choices)
+        depth = falls.clamp(max=0.0).mean(0).view(agents, choices)
         longest = samples == samples.amax(1, keepdim=True)
-        pick = best(longest, (candidates.rho, margin, -candidates.cost))
+        pick = best(longest, (candidates.rho, depth, -candidates.cost))
         _take(found, candidates, pick, group, (2, length))
 
 

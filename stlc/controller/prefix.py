@@ -1,4 +1,4 @@
-"""How far a plan that is not safe can be followed, and by how much it fails."""
+"""How far a plan that is not safe can be followed, and how soon and how much it fails."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from torch import Tensor
 from stlc.compile import ir
 from stlc.compile.graph import evaluate
 from stlc.compile.ops_torch import TORCH
-from stlc.compile.semantics import TOLERANCE
 
 BEYOND = "#beyond"
 
@@ -53,35 +52,24 @@ def anchored(formula: ir.Formula) -> ir.Formula:
             return formula
 
 
-def safety_margin(formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor]) -> Tensor:
-    """Least robustness of the anchored formulas, (batch,); +inf where there is none."""
-    batch = next(iter(columns.values()))[0]
-    if not formulas:
-        return torch.full_like(batch, torch.inf)
-    margins = evaluate([anchored(formula) for formula in formulas], columns, ops=TORCH)
-    return torch.stack([margin[0].expand_as(batch) for margin in margins]).amin(0)
-
-
-def safe_samples(formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor]) -> Tensor:
-    """How many samples from the start on keep all formulas, by bisection; exact.
+def prefix_robustness(formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor]) -> Tensor:
+    """The least robustness of the anchored formulas on every prefix, whatever comes after it; exact.
 
     Args:
         formulas: the safety requirements.
         columns: name -> (time, batch).
 
     Returns:
-        (batch,) int64, 0 to time.
+        (time, batch), never rising over time: entry k is that of the samples 0 to k.
     """
-    steps, batch = next(iter(columns.values())).shape
-    device = next(iter(columns.values())).device
-    opened = [open_ended(formula) for formula in formulas]
-    index = torch.arange(steps, device=device)[:, None]
-    low = torch.zeros(batch, dtype=torch.int64, device=device)
-    high = torch.full_like(low, steps if opened else 0)
-    while bool((low < high).any()):
-        middle = (low + high + 1) // 2
-        beyond = torch.where(index >= middle, 1.0, -1.0).to(torch.float64)
-        margins = evaluate(opened, {**columns, BEYOND: beyond}, ops=TORCH)
-        kept = torch.stack([margin[0] for margin in margins]).amin(0) >= -TOLERANCE
-        low, high = torch.where(kept, middle, low), torch.where(kept, high, middle - 1)
-    return low if opened else torch.full_like(low, steps)
+    like = next(iter(columns.values()))
+    steps, batch = like.shape
+    if not formulas:
+        return torch.full_like(like, torch.inf)
+    index = torch.arange(steps, device=like.device)
+    beyond = torch.where(index[:, None] > index[None], 1.0, -1.0).to(like.dtype)
+    env = {name: column.repeat(1, steps) for name, column in columns.items()}
+    env[BEYOND] = beyond.repeat_interleave(batch, 1)
+    opened = [open_ended(anchored(formula)) for formula in formulas]
+    margins = evaluate(opened, env, ops=TORCH)
+    return torch.stack([margin[0].expand(steps * batch) for margin in margins]).amin(0).view(steps, batch)

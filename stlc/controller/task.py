@@ -176,7 +176,7 @@ class Task:
 
 
 def rank(rho: Tensor, cost: Tensor, safe: Tensor | None = None) -> Tensor:
-    """One number to choose plans by: the cheapest that satisfies, else the most robust that is safe, else any.
+    """One number to choose plans by: the cheapest that satisfies, else the most robust, safe ones first.
 
     Args:
         rho: robustness, any shape.
@@ -184,8 +184,8 @@ def rank(rho: Tensor, cost: Tensor, safe: Tensor | None = None) -> Tensor:
         safe: robustness of phi_safe, the same shape; without it no plan is preferred for being safe.
 
     Returns:
-        Larger is better: > 1 where satisfied (falling with cost), < 1 elsewhere (rising with robustness, and where
-        that is flat falling with cost), 2 less where it is unsafe.
+        Larger is better: > 1 where satisfied (falling with cost), < 1 elsewhere (rising with robustness, and
+        where that is flat falling with cost), 2 less where it is unsafe.
     """
     cheap = torch.nan_to_num(1.0 / (1.0 + cost.clamp(min=0.0)))
     poor = torch.where(torch.isfinite(rho), rho / (1.0 + rho.abs()), torch.full_like(rho, -1.0))
