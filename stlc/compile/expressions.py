@@ -287,8 +287,10 @@ def _domain(expr: ast.Quantifier, scope: Scope) -> Iterator[Number]:
             message = f"`{expr.kind}` runs over whole numbers that are known at compile time"
             scope.fail(Diagnostic("E205", message, end.span))
         ends.append(int(number.exact))
-    for value_ in range(ends[0], ends[1] + 1):
-        yield literal(Fraction(value_), expr.span)
+    scope.meter.charge(Cost(nodes=max(0, ends[1] - ends[0])))
+    _refuse_excess(expr.span, scope)
+    for index in range(ends[0], ends[1] + 1):
+        yield literal(Fraction(index), expr.span)
 
 
 _HANDLERS: Mapping[type[ast.Node], Callable[[Any, Scope], Value]] = MappingProxyType(
