@@ -95,9 +95,10 @@ def test_constants_fold_exactly(case) -> None:
 
 @given(st.recursive(_leaves, _grown, max_leaves=6))
 def test_folding_equals_python_arithmetic(case) -> None:
+    """Up to rounding; a float modulo jumps where an exact one does not."""
     text, _ = case
-    python = eval(text)
-    assert number(text).constant == pytest.approx(python, rel=1e-9, abs=1e-9)
+    assume("%" not in text)
+    assert number(text).constant == pytest.approx(eval(text), rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", [name for name, f in FUNCTIONS.items() if f.kind == "function"])
