@@ -43,6 +43,7 @@ SHARES = {
     ),
 }
 HOLDS = "holds."
+SOURCES = ("policy", "backup", "safest", "")
 
 
 def deployment_tiles(material: Material) -> list[tuple[str, str]]:
@@ -187,6 +188,7 @@ def _half(metric: Record) -> float | None:
 
 def _decision_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
     names = list(dict.fromkeys(name for guard in guards.values() for name in guard.get("decisions") or {}))
+    names.sort(key=lambda name: next(i for i, prefix in enumerate(SOURCES) if name.startswith(prefix)))
     rows: list[tuple[Child, ...]] = []
     for name in names:
         shares = [(guard.get("decisions") or {}).get(name) for guard in guards.values()]

@@ -16,12 +16,14 @@ from stlc.trace import Trace
 from stlc.view.style import FAINT, INK, ORANGE, PAPER, look, new_figure
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from PIL.Image import Image
 
 MAX_FRAMES = 150
 MAX_BYTES = 4_000_000
 COLOURS = 64
+MOST_PANELS, MOST_AGENTS = 6, 40
 _LONGER_SIDE = 760  # pixels
 
 Scene = Mapping[str, NDArray[Any]]
@@ -36,54 +38,78 @@ class Film:
         frames: how many instants there are.
         dt: seconds between them.
         size: of the picture in inches.
-        draw: draws one instant into an empty figure.
+        begin: prepares an empty figure and returns what turns it to an instant.
         alt: what is seen, in words.
     """
 
     frames: int
     dt: float
     size: tuple[float, float]
-    draw: Callable[[Figure, int], None]
+    begin: Callable[[Figure], Callable[[int], None]]
     alt: str
 
 
 def scene_film(scene: Scene, draw: DrawScene, dt: float, *, title: str = "") -> Film:
     """The film of a recorded scene (arrays (instants, …)), drawn by its world."""
 
-    def draw_frame(figure: Figure, index: int) -> None:
+    def begin(figure: Figure) -> Callable[[int], None]:
         figure.set_layout_engine("none")
         axes = figure.add_axes((0.0, 0.0, 1.0, 0.955))
-        draw(axes, scene, index)
         figure.text(0.02, 0.972, title, color=INK, va="center", weight="bold")
-        figure.text(0.98, 0.972, f"{index * dt:.1f} s", color=INK, va="center", ha="right")
+        clock = figure.text(0.98, 0.972, "", color=INK, va="center", ha="right")
+
+        def turn(index: int) -> None:
+            axes.clear()
+            draw(axes, scene, index)
+            clock.set_text(f"{index * dt:.1f} s")
+
+        return turn
 
     frames = min(len(values) for values in scene.values())
-    return Film(
-        frames, dt, _fitting_size(draw, scene), draw_frame, f"{title}: {frames * dt:.0f} s of deployment."
-    )
+    return Film(frames, dt, _fitting_size(draw, scene), begin, f"{title}: {frames * dt:.0f} s of deployment.")
 
 
 def signal_film(trace: Trace, *, title: str = "") -> Film:
     """The film of a trace without a world: every agent's signals, drawn up to now."""
-    names = [c.name for c in trace.signature.columns if c.kind in ("real", "int")][:6]
-    names = names or list(trace.signature.names[:6])
+    names = [c.name for c in trace.signature.columns if c.kind in ("real", "int")][:MOST_PANELS]
+    names = names or list(trace.signature.names[:MOST_PANELS])
 
-    def draw_frame(figure: Figure, index: int) -> None:
+    def begin(figure: Figure) -> Callable[[int], None]:
         grid = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-        for axes, name in zip(grid, names, strict=True):
-            values = trace.data[name]
-            axes.plot(trace.times, values.T, color=FAINT, lw=0.8)
-            axes.plot(trace.times[: index + 1], values[:, : index + 1].T, color=INK, lw=0.8, alpha=0.7)
-            axes.plot(np.full(len(values), trace.times[index]), values[:, index], "o", color=ORANGE, ms=3)
-            unit = trace.signature[name].unit.text
-            axes.set_ylabel(f"{name} [{unit}]" if unit not in ("", "1") else name)
-        grid[0].set_title(f"{title}   {trace.times[index]:.1f} s")
+        panels = [_panel(axes, trace, name) for axes, name in zip(grid, names, strict=True)]
+        head = grid[0].set_title(f"{title}   {trace.times[-1]:.1f} s")
         grid[-1].set_xlabel("time [s]")
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
+
+        def turn(index: int) -> None:
+            head.set_text(f"{title}   {trace.times[index]:.1f} s")
+            for panel in panels:
+                panel(index)
+
+        return turn
 
     height = 0.7 + 0.8 * len(names)
-    return Film(
-        trace.samples, trace.dt, (6.4, height), draw_frame, f"{title}: signals of {trace.traces} agents."
-    )
+    return Film(trace.samples, trace.dt, (6.4, height), begin, f"{title}: signals of {trace.traces} agents.")
+
+
+def _panel(axes: Axes, trace: Trace, name: str) -> Callable[[int], None]:
+    """One signal of at most `MOST_AGENTS` agents; all curves are one line with gaps, which draws fast."""
+    values = trace.data[name][:MOST_AGENTS]
+    gap = np.full((len(values), 1), np.nan)
+    unit = trace.signature[name].unit.text
+    axes.set_ylabel(f"{name} [{unit}]" if unit not in ("", "1") else name)
+    times = np.broadcast_to(trace.times, values.shape)
+    axes.plot(np.hstack([times, gap]).ravel(), np.hstack([values, gap]).ravel(), color=FAINT, lw=0.8)
+    (past,) = axes.plot([], [], color=INK, lw=0.8, alpha=0.7)
+    (present,) = axes.plot([], [], "o", color=ORANGE, ms=3)
+
+    def turn(index: int) -> None:
+        until = slice(0, index + 1)
+        past.set_data(np.hstack([times[:, until], gap]).ravel(), np.hstack([values[:, until], gap]).ravel())
+        present.set_data(times[:, index], values[:, index])
+
+    return turn
 
 
 def save_gif(film: Film, path: Path, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_BYTES) -> Path:
@@ -107,7 +133,7 @@ def save_still(film: Film, path: Path, *, at: float = 0.5, dpi: int = 160) -> Pa
     index = min(film.frames - 1, int(at * film.frames))
     with look():
         figure = new_figure(*film.size)
-        film.draw(figure, index)
+        film.begin(figure)(index)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=dpi, facecolor=PAPER)
     write_atomic(path, buffer.getvalue())
@@ -135,10 +161,10 @@ def _frames(film: Film, indices: range) -> Iterator[Image]:
         figure = new_figure(*film.size)
         figure.set_dpi(_LONGER_SIDE / max(film.size))
         figure.set_facecolor(PAPER)
+        turn = film.begin(figure)
+        canvas: Any = figure.canvas
         for index in indices:
-            figure.clear()
-            film.draw(figure, index)
-            canvas: Any = figure.canvas
+            turn(index)
             canvas.draw()
             yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
 

@@ -1,7 +1,7 @@
 """Where in the initial set a policy fails, as one sentence: numbers only, nothing is drawn here.
 
-The sentence is a conjunction of simple conditions that is grown greedily, one condition at a time, so that it
-covers many failing starts and few others (subgroup discovery with the F-score as its measure).
+The sentence is a conjunction of simple conditions that covers many failing starts and few others: subgroup
+discovery by beam search, with the F-score as its measure.
 """
 
 from __future__ import annotations
@@ -19,8 +19,11 @@ from stlc.compile.semantics import TOLERANCE
 from stlc.signature import Signature
 
 MAX_CONDITIONS = 4
+BEAM = 12
+ENOUGH = 10  # failing starts; fewer do not make a region
 LEAST_GAIN = 1.04  # an added condition has to better the F-score by this factor
-FEW_VALUES = 8  # columns with at most so many distinct values are compared by `=`
+FEW_VALUES = 8  # columns with at most so many distinct values are compared by `=` alone
+COMMON = 0.05  # a single value of a continuous column counts from this share of the starts on
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -107,28 +110,43 @@ def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | N
     failing = held.each[:, index] < -TOLERANCE
     if not failing.any():
         return None
-    conditions: list[Condition] = []
-    region = np.ones(len(failing), dtype=bool)
-    score = _f_score(region, failing)
-    while len(conditions) < MAX_CONDITIONS:
-        best = max(
-            _candidates(held.x0, region, failing),
-            key=lambda condition: _f_score(region & condition.holds(held.x0), failing),
-            default=None,
-        )
-        if best is None or _f_score(region & best.holds(held.x0), failing) < LEAST_GAIN * score:
-            break
-        conditions.append(best)
-        region &= best.holds(held.x0)
-        score = _f_score(region, failing)
+    conditions = _grow(held.x0, failing) if failing.sum() >= ENOUGH else ()
+    region = _region(held.x0, conditions)
     return Weakness(
         requirement=index,
         failing=float(failing.mean()),
-        conditions=tuple(conditions),
+        conditions=conditions,
         inside=float(failing[region].mean()),
         covered=float(region[failing].mean()),
         axes=_telling(held.x0, failing, conditions),
     )
+
+
+def _grow(x0: Array, failing: Mask) -> tuple[Condition, ...]:
+    """The best conjunction that a beam search finds; a condition more has to be worth its reading."""
+    best: tuple[Condition, ...] = ()
+    best_score = _f_score(np.ones(len(x0), dtype=bool), failing)
+    values = [_Values.of(column) for column in x0.T]
+    beam = [best]
+    for _ in range(MAX_CONDITIONS):
+        grown: dict[frozenset[Condition], tuple[float, tuple[Condition, ...]]] = {}
+        for kept in beam:
+            region = _region(x0, kept)
+            for condition in _candidates(x0, region, failing, values):
+                score = _f_score(region & condition.holds(x0), failing)
+                grown.setdefault(frozenset((*kept, condition)), (score, (*kept, condition)))
+        ranked = sorted(grown.values(), key=lambda found: -found[0])[:BEAM]
+        beam = [conditions for _, conditions in ranked]
+        if ranked and ranked[0][0] > LEAST_GAIN * best_score:
+            best_score, best = ranked[0]
+    return best
+
+
+def _region(x0: Array, conditions: tuple[Condition, ...]) -> Mask:
+    held = np.ones(len(x0), dtype=bool)
+    for condition in conditions:
+        held &= condition.holds(x0)
+    return held
 
 
 def _f_score(region: Mask, failing: Mask) -> float:
@@ -136,20 +154,35 @@ def _f_score(region: Mask, failing: Mask) -> float:
     return 2 * hits / (int(region.sum()) + int(failing.sum()))
 
 
-def _candidates(x0: Array, region: Mask, failing: Mask) -> list[Condition]:
+@dataclass(frozen=True, slots=True)
+class _Values:
+    """What a column takes: single values that many starts share, and whether there are others.
+
+    A continuous column may have such values too: a timer that starts at 0, a sentinel for "nothing there".
+    """
+
+    common: tuple[float, ...]
+    continuous: bool
+    span: float
+
+    @classmethod
+    def of(cls, column: Array) -> _Values:
+        values, counts = np.unique(column, return_counts=True)
+        continuous = len(values) > FEW_VALUES
+        common = values[counts >= COMMON * len(column)] if continuous else values
+        return cls(tuple(common.tolist()), continuous, float(np.ptp(column)))
+
+
+def _candidates(x0: Array, region: Mask, failing: Mask, values: list[_Values]) -> list[Condition]:
+    """Conditions that may narrow the region."""
     found: list[Condition] = []
-    for column in range(x0.shape[1]):
-        values = np.unique(x0[region, column])
-        if len(values) <= 1:
-            continue
-        if len(values) <= FEW_VALUES:
-            found.extend(Condition(column, "=", float(value)) for value in values)
-            continue
-        cuts = _rounded(
-            np.quantile(x0[region & failing, column], np.linspace(0, 1, 11)), np.ptp(x0[:, column])
-        )
-        found.extend(Condition(column, ">=", cut) for cut in cuts[:-1])
-        found.extend(Condition(column, "<=", cut) for cut in cuts[1:])
+    bad = x0[region & failing]
+    for column, kinds in enumerate(values):
+        found.extend(Condition(column, "=", value) for value in kinds.common)
+        if kinds.continuous and len(bad):
+            cuts = _rounded(np.quantile(bad[:, column], np.linspace(0, 1, 11)), kinds.span)
+            found.extend(Condition(column, ">=", cut) for cut in cuts[:-1] if cut not in kinds.common)
+            found.extend(Condition(column, "<=", cut) for cut in cuts[1:] if cut not in kinds.common)
     return found
 
 
@@ -159,13 +192,10 @@ def _rounded(cuts: Array, span: float) -> list[float]:
     return [round(float(cut), max(digits, 0)) for cut in cuts]
 
 
-def _telling(x0: Array, failing: Mask, conditions: list[Condition]) -> tuple[int, int]:
+def _telling(x0: Array, failing: Mask, conditions: tuple[Condition, ...]) -> tuple[int, int]:
     """The two columns for a picture: those of the region's inequalities first, then by separation."""
     used = [condition.column for condition in conditions if condition.op != "="]
-    focus = np.ones(len(x0), dtype=bool)
-    for condition in conditions:
-        if condition.op == "=":
-            focus &= condition.holds(x0)
+    focus = _region(x0, tuple(condition for condition in conditions if condition.op == "="))
     many = [c for c in range(x0.shape[1]) if len(np.unique(x0[focus, c])) > FEW_VALUES] or list(
         range(x0.shape[1])
     )
@@ -216,7 +246,8 @@ def _column_text(conditions: list[Condition], name: str, signature: Signature | 
 def weakness_text(weakness: Weakness, held: HeldOut, signature: Signature | None = None) -> str:
     """One sentence: where the requirement fails, how often there, and how much of its failing that is."""
     if not weakness.conditions:
-        return f"fails in {100 * weakness.failing:.1f} % of the starts, in no region of its own"
+        failing = round(weakness.failing * len(held.x0))
+        return f"fails in {failing:,} of {len(held.x0):,} starts, in no region of their own"
     region = region_text(weakness.conditions, held.names, signature)
     return (
         f"fails in {100 * weakness.inside:.0f} % of the starts with {region}"

@@ -124,7 +124,7 @@ def _draw_row(axes: Axes, kind: str, name: str, agent: _Agent) -> None:
             _draw_decisions(axes, agent)
         case _:
             _draw_robustness(axes, agent, name)
-    if kind != "decision":
+    if kind in ("line", "robustness"):
         _mark_backup(axes, agent)
 
 
@@ -204,7 +204,7 @@ def _mark_backup(axes: Axes, agent: _Agent) -> None:
         if value != POLICY:
             _, color = DECISIONS.get(int(value), ("", MUTED))
             left, right = trace.t0 + start * trace.dt, trace.t0 + stop * trace.dt
-            axes.axvspan(left, right, color=color, alpha=0.18, lw=0)
+            axes.axvspan(left, right, color=color, alpha=0.13, lw=0)
 
 
 def _draw_robustness(axes: Axes, agent: _Agent, name: str) -> None:

@@ -28,7 +28,7 @@ def spread(mean: float, half: float | None) -> tuple[str, str]:
     """A mean and half its interval with the same decimals, two digits of the half: (`4.10`, `0.10`)."""
     if not half:
         return number(mean), "" if half is None else "0"
-    decimals = max(0, 1 - math.floor(math.log10(half)))
+    decimals = max(0, 1 - math.floor(math.log10(float(f"{half:.1e}"))))
     return f"{mean:,.{decimals}f}", f"{half:,.{decimals}f}"
 
 

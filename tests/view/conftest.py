@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from stlc.rundir import RunDir
 from stlc.signature import Column, Signature
@@ -237,9 +238,10 @@ def simulation():
 
 @pytest.fixture
 def deployed(trained, recording):
-    """The same run with a recorded deployment."""
+    """The same run with a recorded deployment that was animated."""
     save_trace(trained.path / "trace.npz", recording)
     trained.write_json("eval/simulate.json", simulation())
+    Image.new("P", (8, 8)).save(trained.path / "traffic.gif")
     return trained
 
 

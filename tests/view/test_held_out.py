@@ -57,7 +57,24 @@ def test_everything_failing_has_no_region():
     x0 = np.random.default_rng(0).uniform(0, 1, (50, 2))
     weakness = find_weakness(held(x0, -np.ones((50, 1))))
     assert weakness.conditions == ()
-    assert "100.0 %" in weakness_text(weakness, held(x0, -np.ones((50, 1))))
+    text = weakness_text(weakness, held(x0, -np.ones((50, 1))))
+    assert text == "fails in 50 of 50 starts, in no region of their own"
+
+
+def test_a_few_failures_make_no_region():
+    data, _ = boxed()
+    each = np.ones((4000, 1))
+    each[:5] = -1
+    assert find_weakness(held(data.x0, each)).conditions == ()
+
+
+def test_a_value_that_many_starts_share_is_named():
+    """A sentinel in a continuous column, not an inequality that only it meets."""
+    rng = np.random.default_rng(0)
+    gap = np.where(rng.random(2000) < 0.3, -1.0, rng.uniform(0, 10, 2000))
+    each = np.where(gap == -1, -1.0, 1.0)[:, None]
+    weakness = find_weakness(held(np.stack([gap, rng.random(2000)], axis=1), each))
+    assert [(c.column, c.op, c.value) for c in weakness.conditions] == [(0, "=", -1.0)]
 
 
 def test_ties_count_as_satisfied():

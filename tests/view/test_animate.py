@@ -1,0 +1,86 @@
+"""The animation of a run: by its world, else by its signals."""
+
+import os
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stlc.view.animate import current_gif, film_of, gif_name, write_gif
+
+WORLD = """
+class Dots:
+    def reset(self): ...
+    def advance(self, x, action): ...
+    def progress(self): return {}
+    def units(self): return {}
+    def snapshot(self): ...
+    @staticmethod
+    def draw(axes, scene, index):
+        axes.plot(scene["x"][index], 0 * scene["x"][index], "o", color="#0072b2")
+        axes.set(xlim=(0, 10), ylim=(-2, 2), aspect="equal")
+"""
+
+
+@pytest.fixture
+def seen(deployed):
+    """A run whose system names a world that was recorded."""
+    system = (deployed.path / "system.yaml").read_text()
+    lines = [line for line in system.splitlines() if "world:" not in line]
+    lines.insert(lines.index("test:") + 1, '  world: "dots.py:Dots"')
+    (deployed.path / "system.yaml").write_text("\n".join(lines) + "\n")
+    (deployed.path / "dots.py").write_text(WORLD)
+    frames = np.linspace(1, 9, 7)[:, None] + np.zeros(3)
+    np.savez(deployed.path / "scene.npz", x=frames, decision=np.zeros((7, 3), dtype=np.int8))
+    return deployed
+
+
+def frame_count(path):
+    with Image.open(path) as image:
+        return image.n_frames
+
+
+def test_a_world_draws_its_scene(seen):
+    film = film_of(seen)
+    assert film.frames == 7
+    assert film.dt == pytest.approx(0.1)
+    path = write_gif(seen)
+    assert path.name == "traffic.gif"
+    assert frame_count(path) == 7
+    assert (seen.path / "scene.png").exists()
+
+
+@pytest.mark.parametrize(
+    "damage", ["no scene", "no world file", "a world that fails", "a scene that is no archive"]
+)
+def test_without_a_world_signals_are_shown(seen, damage, recording):
+    match damage:
+        case "no scene":
+            (seen.path / "scene.npz").unlink()
+        case "no world file":
+            (seen.path / "dots.py").unlink()
+        case "a world that fails":
+            (seen.path / "dots.py").write_text("raise RuntimeError('broken')\n")
+        case _:
+            (seen.path / "scene.npz").write_bytes(b"nothing")
+    assert film_of(seen).frames == recording.samples
+
+
+def test_a_run_without_a_deployment_has_no_film(trained):
+    assert film_of(trained) is None
+    assert write_gif(trained) is None
+    assert not list(trained.path.glob("*.gif"))
+
+
+def test_a_gif_is_drawn_again_only_for_a_newer_recording(seen):
+    path = write_gif(seen)
+    drawn = path.stat().st_mtime_ns
+    assert current_gif(seen).stat().st_mtime_ns == drawn
+    later = drawn + 2_000_000_000
+    os.utime(seen.path / "scene.npz", ns=(later, later))
+    assert current_gif(seen).stat().st_mtime_ns != drawn
+
+
+def test_a_hostile_name_stays_in_the_folder(seen):
+    seen.update({"spec": "../../etc/passwd"})
+    assert gif_name(seen) == "etc-passwd.gif"

@@ -1,0 +1,176 @@
+"""The report: whole by itself, complete, and harmless whatever stands in the files."""
+
+import base64
+import json
+import os
+import re
+from dataclasses import replace
+from html import unescape
+from html.parser import HTMLParser
+
+import pytest
+
+import stlc.view
+from stlc.diagnostics import MissingError, RunError
+from stlc.rundir import RunDir
+from stlc.trace import save_trace
+from stlc.view.report import write_report
+
+VOID = {"meta", "img", "br", "hr"}
+
+
+class Page(HTMLParser):
+    """Anchors, images and text of a page; fails where a tag is not closed."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.open, self.ids, self.links, self.images, self.tags, self.text = [], [], [], [], set(), ""
+        self.feed(html)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        attrs = dict(attrs)
+        self.tags.add(tag)
+        self.ids += [attrs["id"]] if "id" in attrs else []
+        self.links += [attrs["href"]] if "href" in attrs else []
+        self.images += [attrs] if tag == "img" else []
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] != "style":
+            self.text += data
+
+
+def page_of(run):
+    return Page(write_report(run).read_text(encoding="utf-8"))
+
+
+def test_a_trained_run(trained):
+    page = page_of(trained)
+    assert page.ids == ["requirements", "failures", "training", "repeat", "texts"]
+    assert page.links == [f"#{anchor}" for anchor in page.ids]
+    assert "The policy's plan satisfies traffic from 95.7 % of 5,000 held-out starts" in page.text
+    assert "95.1 to 96.2 %" in page.text
+    assert "98.8 %" in page.text
+    assert "require stop_sign: sign == stop -> eventually[0, T] tau >= 1 s" in page.text
+    assert "5,900 steps (a budget of 60 s)" in page.text
+    assert "0123456789ab, with uncommitted changes" in page.text
+    command = (
+        "stlc train specs/traffic.stl --system examples/car.yaml --seed 0 --steps 5900 --set 'T_red=3 s'"
+    )
+    assert command in page.text
+    assert (trained.path / "spec.stl").read_text() in page.text
+    assert (trained.path / "system.yaml").read_text() in page.text
+
+
+def test_a_deployed_run(deployed):
+    page = page_of(deployed)
+    anchors = ["requirements", "deployment", "film", "driven", "failures", "training", "repeat", "texts"]
+    assert page.ids == anchors
+    assert "2 seeds of 10 agents, 150 steps each" in page.text
+    assert "98.1 % ± 1.2" in page.text
+    assert "4.00 ± 0.10 m/s" in page.text
+    assert "of which T0=1" in page.text
+    assert "0.6 ms" in page.text
+    assert "What failed, and why" in page.text
+    assert "before_junction means x < x_inter / 2" in page.text
+    assert "stlc check" in page.text
+    kinds = [image["src"].partition(";")[0] for image in page.images]
+    assert kinds == ["data:image/gif", *["data:image/svg+xml"] * 3]
+    assert all(image["alt"] for image in page.images)
+
+
+def test_the_page_needs_nothing_from_outside(deployed):
+    html = write_report(deployed).read_text()
+    page = Page(html)
+    assert not page.tags & {"script", "link", "iframe", "object", "embed", "form"}
+    assert "default-src 'none'" in unescape(html)
+    assert not re.search(r"""(?:src|href)\s*=\s*["'](?!data:|#)""", html)
+    assert "url(" not in html
+    for image in page.images:
+        content = base64.b64decode(image["src"].partition("base64,")[2])
+        if "svg" in image["src"][:20]:
+            assert b"<script" not in content
+            assert not re.search(rb'href="(?!#|data:)', content)
+
+
+@pytest.mark.parametrize(
+    "name", ["run.json", "spec.stl", "system.yaml", "compiled.txt", "config.resolved.yaml"]
+)
+def test_hostile_texts_stay_texts(trained, name):
+    hostile = "</pre><script>alert(1)</script><img src=x onerror=alert(1)>"
+    if name == "run.json":
+        record = trained.record()
+        for key in ("spec", "system", "spec_path", "system_path", "started", "device"):
+            record[key] = hostile
+        record["versions"] = {hostile: hostile}
+        record["result"]["requirements"] = {hostile: 0.5}
+        trained.write_json(name, record)
+    else:
+        path = trained.path / name
+        path.write_text((path.read_text() if path.exists() else "") + "\n# " + hostile + "\n")
+    html = write_report(trained).read_text()
+    assert "<script" not in html
+    assert "<img src=x" not in html
+    assert hostile in Page(html).text
+
+
+def test_what_is_damaged_or_missing_is_left_out(deployed):
+    (deployed.path / "trace.npz").write_bytes(b"not an archive")
+    (deployed.path / "eval/simulate.json").write_text("{")
+    (deployed.path / "eval/held_out.npz").write_bytes(b"PK")
+    (deployed.path / "spec.stl").write_text("require ((")
+    (deployed.path / "system.yaml").unlink()
+    page = page_of(deployed)
+    assert page.ids == ["requirements", "training", "repeat", "texts"]
+    assert "stop_sign" in page.text
+
+
+def test_a_trace_of_another_specification_says_so(deployed, recording):
+    meta = replace(recording.meta, spec_text="spec other\nsignal z [m]\nrequire r: always[0, T] z > 0\n")
+    save_trace(deployed.path / "trace.npz", replace(recording, meta=meta))
+    os.utime(deployed.path / "traffic.gif")
+    page = page_of(deployed)
+    assert "The trace could not be judged" in page.text
+    assert "`z`" in page.text
+
+
+def test_a_run_that_has_just_begun(tmp_path):
+    run = RunDir.create(tmp_path, "traffic", "new")
+    run.write_json("run.json", {"status": "running", "spec": "traffic"})
+    page = page_of(run)
+    assert page.ids == ["training", "repeat"]
+    assert "Training of traffic is running" in page.text
+
+
+def test_a_folder_that_is_no_run(tmp_path):
+    with pytest.raises(RunError):
+        write_report(RunDir(tmp_path))
+
+
+def test_without_matplotlib_the_reason_is_given(trained, monkeypatch):
+    monkeypatch.setattr(stlc.view, "find_spec", lambda _: None)
+    with pytest.raises(MissingError, match="R301"):
+        write_report(trained)
+    assert not (trained.path / "report.html").exists()
+
+
+def test_every_metric_of_a_deployment_is_shown(deployed):
+    document = json.loads((deployed.path / "eval/simulate.json").read_text())
+    metrics = document["guards"]["paper"]["metrics"]
+    for index, name in enumerate(metrics):
+        metrics[name] = {"mean": 0.100 + index / 1000, "low": None, "high": None, "values": []}
+    deployed.write_json("eval/simulate.json", document)
+    text = page_of(deployed).text
+    for index, name in enumerate(metrics):
+        shown = (
+            f"{0.1 + index / 1000:.3g}"
+            if name in ("mean_speed", "junctions_passed", "overlapping_pairs")
+            else None
+        )
+        assert (shown or f"{10 + index / 10:.1f} %") in text

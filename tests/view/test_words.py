@@ -1,0 +1,47 @@
+"""Numbers as a reader wants them."""
+
+import pytest
+
+from stlc.view.words import count, interval, number, seconds, share, spread
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0006, "0.6 ms"),
+        (0.0213, "21.3 ms"),
+        (1.5, "1.5 s"),
+        (61.2, "61.2 s"),
+        (312.0, "5 min 12 s"),
+        (None, ""),
+    ],
+)
+def test_seconds(value, text):
+    assert seconds(value) == text
+
+
+@pytest.mark.parametrize(
+    ("mean", "half", "text"),
+    [
+        (4.0, 0.1, ("4.00", "0.10")),
+        (4.0, 4.1 - 4.0, ("4.00", "0.10")),
+        (61.0, 3.2, ("61.0", "3.2")),
+        (15.6, 11.3, ("16", "11")),
+        (0.0, 0.0, ("0", "0")),
+        (4.123, None, ("4.12", "")),
+        (-2.5, 0.0123, ("-2.500", "0.012")),
+    ],
+)
+def test_spread(mean, half, text):
+    assert spread(mean, half) == text
+
+
+def test_shares_and_counts():
+    assert share(0.957) == "95.7 %"
+    assert share(None) == ""
+    assert interval([0.951, 0.9619]) == "95.1 to 96.2 %"
+    assert interval(None) == ""
+    assert count(1, "trace") == "1 trace"
+    assert count(2000, "trace") == "2,000 traces"
+    assert number(None) == ""
+    assert number(23.54, "GiB") == "23.5 GiB"
