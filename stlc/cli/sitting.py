@@ -95,7 +95,7 @@ def _info(folder: RunDir) -> RunInfo:
 
 
 def _summary(outcome: Outcome) -> Summary:
-    from stlc.view.held_out import find_weakness, load_held_out, region_text
+    from stlc.view.held_out import find_weakness, load_held_out, weakness_text
 
     score, folder = outcome.score, outcome.run.dir
     assert score is not None
@@ -103,7 +103,7 @@ def _summary(outcome: Outcome) -> Summary:
     weakness = find_weakness(held) if held is not None else None
     where = ""
     if held is not None and weakness is not None:
-        where = region_text(weakness.conditions, held.names, outcome.run.task.system.signature)
+        where = weakness_text(weakness, held, outcome.run.task.system.signature)
     return Summary(
         accuracy=score.accuracy,
         interval=score.interval,
