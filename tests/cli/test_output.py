@@ -74,7 +74,7 @@ def test_the_console_obeys(color, monkeypatch, capsys, mode):
 
 
 def test_the_console_takes_brackets_literally_and_never_wraps_a_pipe(capsys):
-    line = "always[0, T] " * 30
+    line = " ".join(["always[0, T]"] * 30)
     console().print(line)
     assert capsys.readouterr().out == line + "\n"
 
