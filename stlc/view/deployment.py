@@ -41,6 +41,7 @@ SHARES = {
         "executed, as foreseen",
         "of those starts, the share that satisfies the specification",
     ),
+    "foreseen_safe_starts": ("executed safely, as foreseen", "the same for what is tagged @safety"),
 }
 HOLDS = "holds."
 SOURCES = ("policy", "backup", "safest", "")
@@ -205,4 +206,6 @@ def _decided(name: str) -> Child:
         "backup": "the backup decided",
         "safest": "the safest prefix was taken",
     }
-    return words.get(name, classed("span", "quiet", f"of which {name.removeprefix('backup ')}"))
+    if name.startswith("backup "):
+        return classed("span", "quiet", f"of which {name.removeprefix('backup ')}")
+    return words.get(name, name)

@@ -174,3 +174,10 @@ def test_every_metric_of_a_deployment_is_shown(deployed):
             else None
         )
         assert (shown or f"{10 + index / 10:.1f} %") in text
+
+
+def test_every_share_of_an_evaluation_has_words():
+    from stlc.controller.evaluate import METRICS
+    from stlc.view.deployment import SHARES
+
+    assert set(METRICS) <= set(SHARES)
