@@ -61,16 +61,16 @@ def system_of(name: str, spec: ast.Spec) -> tuple[Times, Interface]:
     return Times(decl.dt, decl.dt * decl.horizon), decl.interface()
 
 
-def named_times(spec: ast.Spec) -> Times:
-    """Times of the system that the specification names; unknown where its file is not there."""
+def named_times(spec: ast.Spec) -> Times | None:
+    """Times of the system that the specification names; None without one, or without its file."""
     from stlc.dynamics.schema import load_system_decl
 
     if spec.system is None:
-        return Times()
+        return None
     try:
         path = find_system(spec.system, Path(spec.source.name))
     except UsageError:
-        return Times()
+        return None
     decl = load_system_decl(path)
     return Times(decl.dt, decl.dt * decl.horizon)
 

@@ -195,9 +195,18 @@ class Monitor:
         try:
             return self._compile(known)
         except SpecError as error:
-            if self.spec.system is None or all(finding.code != "E311" for finding in error.diagnostics):
+            if all(finding.code != "E311" for finding in error.diagnostics):
                 raise
-            return self._compile(known.or_else(named_times(self.spec)))
+            named = named_times(self.spec)
+            if named is None:
+                raise SpecError(*(self._who_knows(finding) for finding in error.diagnostics)) from None
+            return self._compile(known.or_else(named))
+
+    def _who_knows(self, finding: Diagnostic) -> Diagnostic:
+        """E311 with what became of the system that the specification names."""
+        if finding.code != "E311" or self.spec.system is None:
+            return finding
+        return finding.with_note(f"the specification names `{self.spec.system}`, but there is no such file")
 
     def _compile(self, times: Times) -> Compiled:
         grid = times.grid()

@@ -374,6 +374,9 @@ def test_dt_and_horizon_come_from_who_knows_them() -> None:
     text = "signal a\nrequire r: always[0, T] a > 0\n"
     with pytest.raises(SpecError, match="E311"):
         _ = Monitor(text, dt=0.1).compiled
+    with pytest.raises(SpecError, match="E311") as caught:
+        _ = Monitor(f'system "lorry.yaml"\n{text}', dt=0.1).compiled
+    assert "`lorry.yaml`, but there is no such file" in caught.value.diagnostics[0].note[-1]
     with pytest.raises(UsageError, match="not a whole number of steps"):
         Monitor(text, dt=0.1, horizon=0.25)
     with pytest.raises(UsageError, match="above 0"):
