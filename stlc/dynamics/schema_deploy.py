@@ -36,7 +36,7 @@ def read_test(node: Node | None, reader: Reader, names: Names, dt: Fraction) -> 
     items = reader.items(found.get("events"), "`events`")
     return TestDecl(
         steps or default.steps,
-        reader.integer(found.get("agents"), "`agents`") or default.agents,
+        reader.integer(found.get("agents"), "`agents`", high=100_000) or default.agents,
         reader.integer(found.get("replan"), "`replan`") or default.replan,
         tuple(_event(item, index, here, names, dt) for index, item in enumerate(items)),
         tuple(metric for metric in metrics if metric),

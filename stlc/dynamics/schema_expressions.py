@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import TypeVar
@@ -24,11 +24,13 @@ from stlc.units import Unit, parse_unit, same_dims
 
 _T = TypeVar("_T")
 SECOND = parse_unit("s")
+MAX_STEPS = 100_000
 _ATTRIBUTE = re.compile(r"(?<=[\w)\]\"'])(?<!\d)\.\s*([A-Za-z_]\w*)")
 _NOT_FINITE = frozenset(
     {".nan", ".NaN", ".NAN", "nan", "NaN", ".inf", "-.inf", ".Inf", "-.Inf", "inf", "-inf"}
 )
 _SORTS = {"E201": "S203", "E202": "S203"}
+_SORTS_DIFFER = frozenset({"E201", "E202", "E205"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +113,23 @@ class Expressions:
             return None
         return formula
 
+    def check(self, expr: ast.Expr) -> None:
+        """Report what is wrong with an expression of any sort."""
+        rejected: list[list[Diagnostic]] = []
+        resolvers: tuple[Callable[[ast.Expr, Scope], object], ...] = (resolve_number, resolve_state_formula)
+        for resolve in resolvers:
+            sink: list[Diagnostic] = []
+            try:
+                resolve(expr, replace(self.scope, sink=sink, cache={}))
+                return
+            except StlcError as error:
+                rejected.append([*sink, *(f for f in error.diagnostics if f not in sink)])
+        for findings in rejected:
+            inner = [f for f in findings if f.code not in _SORTS_DIFFER or f.span != expr.span]
+            if inner:
+                self._report(inner)
+                return
+
     def _typed(self, resolve: Callable[[ast.Expr, Scope], _T], expr: ast.Expr) -> _T | None:
         """What a resolver of the compiler makes of an expression, or None with its findings reported."""
         sink: list[Diagnostic] = []
@@ -120,9 +139,11 @@ class Expressions:
             sink.extend(finding for finding in error.diagnostics if finding not in sink)
             return None
         finally:
-            self.reader.add(
-                *(replace(finding, code=_SORTS.get(finding.code, finding.code)) for finding in sink)
-            )
+            self._report(sink)
+
+    def _report(self, findings: Sequence[Diagnostic]) -> None:
+        """Remember findings of the compiler under the codes of system files."""
+        self.reader.add(*(replace(f, code=_SORTS.get(f.code, f.code)) for f in findings))
 
     def _known(self, names: frozenset[str], span: Span) -> bool:
         """Whether all columns have a value here."""
@@ -198,6 +219,9 @@ class Expressions:
                 if seconds is None:
                     return None
                 count = seconds / dt
+        if count > MAX_STEPS:
+            self.reader.wrong(node, where, f"at most {MAX_STEPS} steps")
+            return None
         if count.denominator != 1 or count < 1:
             self.reader.wrong(
                 node,

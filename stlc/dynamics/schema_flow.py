@@ -24,6 +24,11 @@ def read_flow(node: Node | None, reader: Reader, names: Names, clock: Clockwork)
         column = state_of(entry, "`flow`", reader, names)
         if column is None:
             continue
+        if column.kind != "real" and not clock.discrete:
+            kind = "true or false" if column.kind == "bool" else "an enum"
+            message = f"`flow` sets `{column.name}`, which is {kind}"
+            reader.report("S203", message, entry.key.span, "change it with a jump or an event")
+            continue
         if clock.discrete:
             where, unit = f"the next `{column.name}`", column.unit
         else:
@@ -113,6 +118,10 @@ def column_assign(column: Column, node: Node, here: Expressions) -> Assign | Non
     where = f"`{column.name}`"
     boolean = column.kind == "bool"
     value = here.truth(node, where) if boolean else here.stored(node, where, column.unit)
+    allowed = {0.0: "false", 1.0: "true"} if boolean else {number: label for label, number in column.labels}
+    if allowed and isinstance(value, ir.Lit) and value.value not in allowed:
+        here.reader.wrong(node, where, " or ".join(f"`{label}`" for label in allowed.values()))
+        return None
     return None if value is None else Assign(column.name, value, written(node))
 
 

@@ -21,7 +21,8 @@ from stlc.diagnostics import Label, SystemFileError
 from stlc.dynamics.decl import ControlDecl, Squash
 from stlc.dynamics.schema_expressions import SECOND, Expressions
 from stlc.dynamics.schema_reader import Reader, first_line
-from stlc.dynamics.yaml_nodes import Mapping, Node, Scalar, Sequence, as_int
+from stlc.dynamics.yaml_nodes import Mapping, Node, Scalar, Sequence
+from stlc.grammar import ast
 from stlc.signature import Column, Role, Signature
 from stlc.source import Span
 from stlc.units import Unit, parse_unit
@@ -105,7 +106,7 @@ def read_time(node: Node | None, reader: Reader, names: Names) -> Clockwork:
     return Clockwork(
         dt,
         here.steps(found.get("horizon"), "`horizon`", dt) or default.horizon,
-        reader.integer(found.get("substeps"), "`substeps`") or default.substeps,
+        reader.integer(found.get("substeps"), "`substeps`", high=1000) or default.substeps,
         reader.option(found.get("integrator"), "`integrator`", INTEGRATORS) or default.integrator,
         reader.flag(found.get("discrete"), "`discrete`") or default.discrete,
     )
@@ -169,16 +170,20 @@ def _column(name: str, found: dict[str, Node], where: str, reader: Reader, names
 
 def _members(node: Node, where: str, reader: Reader) -> tuple[tuple[str, float], ...]:
     """`{stop: 0, light: 1}` or `[stop, light]`."""
+    members: list[tuple[str, float]] = []
     if isinstance(node, Sequence):
         words = [reader.text(item, f"a member of {where}") for item in reader.items(node, where)]
-        return tuple((word, float(value)) for value, word in enumerate(words) if word)
-    members: list[tuple[str, float]] = []
-    for entry in reader.entries(node, f"`enum` of {where}"):
-        value = as_int(entry.value) if isinstance(entry.value, Scalar) else None
-        if value is None:
-            reader.wrong(entry.value, f"the member `{entry.key.text}`", "a whole number")
-        else:
-            members.append((entry.key.text, float(value)))
+        members = [(word, float(value)) for value, word in enumerate(words) if word]
+    else:
+        for entry in reader.entries(node, f"`enum` of {where}"):
+            value = reader.integer(entry.value, f"the member `{entry.key.text}`", low=-1_000_000)
+            if value is not None:
+                members.append((entry.key.text, float(value)))
+    if len(dict(members)) < max(len(members), 1) or len({value for _, value in members}) < len(members):
+        help_ = "{enum: {stop: 0, go: 1}}"
+        reader.report(
+            "S103", f"{where} needs members, each with a name and a value of its own", node.span, help_
+        )
     return tuple(members)
 
 
@@ -263,15 +268,20 @@ def _control(name: str, found: dict[str, Node], where: str, here: Expressions) -
 
 
 def read_definitions(node: Node | None, reader: Reader, names: Names) -> None:
-    """The section `def`: named sub-expressions, numbers or formulas."""
+    """The section `def`: named sub-expressions, numbers or formulas; checked even where nothing uses them."""
+    written: list[ast.Expr] = []
     for entry in reader.entries(node, "`def`"):
         if not names.declare(entry.key, "definition", reader):
             continue
         expr = names.expressions(reader).parse(entry.value, f"the definition `{entry.key.text}`")
         if expr is not None:
+            written.append(expr)
             names.entries[entry.key.text] = Definition(
                 entry.key.text, expr, about="definition", span=entry.key.span
             )
+    here = names.expressions(reader)
+    for expr in written:
+        here.check(expr)
 
 
 def later(reader: Reader, node: Node, what: str) -> None:

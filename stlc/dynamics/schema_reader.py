@@ -147,13 +147,16 @@ class Reader:
             return None
         return node.text
 
-    def integer(self, node: Node | None, where: str, *, low: int = 1) -> int | None:
-        """A whole number of at least `low`."""
+    def integer(self, node: Node | None, where: str, *, low: int = 1, high: int = 10**9) -> int | None:
+        """A whole number between `low` and `high`."""
         if node is None:
             return None
         value = as_int(node) if isinstance(node, Scalar) else None
-        if value is None or value < low:
-            self.wrong(node, where, f"a whole number of at least {low}")
+        if value is None or not low <= value <= high:
+            bounds = (
+                f"between {low} and {high}" if value is not None and value > high else f"of at least {low}"
+            )
+            self.wrong(node, where, f"a whole number {bounds}")
             return None
         return value
 

@@ -75,7 +75,7 @@ def read_train(node: Node | None, reader: Reader, names: Names) -> TrainDecl:
     return TrainDecl(
         None if budget is None else float(budget),
         reader.integer(found.get("steps"), "`steps`"),
-        reader.integer(found.get("seed"), "`seed`", low=0) or 0,
+        reader.integer(found.get("seed"), "`seed`", low=0, high=2**63 - 1) or 0,
         reader.number(found.get("lr"), "`lr`", low=1e-12),
         reader.integer(found.get("batch"), "`batch`"),
         reader.integer(found.get("samples"), "`samples`"),
@@ -101,5 +101,5 @@ def _integers(node: Node | None, where: str, reader: Reader) -> tuple[int, ...]:
     """A list of positive whole numbers; one alone counts as a list."""
     if isinstance(node, Scalar) and as_int(node) is not None:
         node = Sequence(node.span, (node,), 1)
-    found = [reader.integer(item, f"an entry of {where}") for item in reader.items(node, where)]
+    found = [reader.integer(item, f"an entry of {where}", high=65_536) for item in reader.items(node, where)]
     return tuple(value for value in found if value is not None)

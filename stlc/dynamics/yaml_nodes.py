@@ -8,6 +8,7 @@ and `yes` are words, `012` is twelve, `12:30` is a word).
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -136,7 +137,8 @@ def as_int(node: Scalar) -> int | None:
 
 def as_float(node: Scalar) -> float | None:
     """A finite decimal number, else None (`.nan` and `.inf` are refused)."""
-    return float(node.text) if node.style == "plain" and _FLOAT.match(node.text) else None
+    value = float(node.text) if node.style == "plain" and _FLOAT.match(node.text) else math.inf
+    return value if math.isfinite(value) else None
 
 
 # ---------------------------------------------------------------------------- reading

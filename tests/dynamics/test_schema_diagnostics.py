@@ -108,6 +108,12 @@ CHANGES: dict[str, tuple[str, str]] = {
         "flow:\n  x: v +\n  w: u\n  v: u + q\n  x: 1\njumps:",
     ),
     "world": ("  steps: 50\n", "  steps: 50\n  world: traffic\n"),
+    "enum_value_twice": ("{low: 0, high: 1}", "{low: 0, high: 0}"),
+    "enum_out_of_range": ("gear: low, wet", "gear: 7, wet"),
+    "flow_on_enum": ("  v: u\n", "  v: u\n  gear: 1\n"),
+    "infinite_number": ("weight: 0.1", "weight: 1e400"),
+    "huge_horizon": ("20 steps", "99999999999 steps"),
+    "unused_definition": ("  near_wall:", "  far: x > wal\n  near_wall:"),
     "name_twice": ("  wall: 5 m", "  wall: 5 m\n  v: 1"),
     "two_documents": ("test:\n", "---\ntest:\n"),
 }
