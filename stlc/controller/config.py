@@ -60,7 +60,7 @@ class Engine:
         clip: bound of the gradient's norm.
         average: decay of the average of the weights.
         pool: fresh states that a search round judges.
-        every: steps between search rounds.
+        every: steps between search rounds, twice as many where a round repaired little.
         most: failing states that a round repairs at most.
         slope: backward slope of switches, per unit.
         imitation: weight of the distance to a repaired plan.
@@ -80,7 +80,7 @@ class Engine:
     clip: float = 1.0
     average: float = 0.99
     pool: int = 2048
-    every: int = 100
+    every: int = 50
     most: int = 256
     slope: float = 5.0
     imitation: float = 1.0

@@ -33,7 +33,7 @@ def steps_within(task: Task, engine: Engine, seconds: float, device: torch.devic
     step = _time(trial.advance, TIMED_STEPS)
     look = _time(trial.look, 2)
     left = seconds * (1.0 - RESERVE) - (time.perf_counter() - begun) - built
-    return max(engine.every, int(left / (step + look / engine.every)))
+    return max(engine.every, int(left / (step + look / (1.5 * engine.every))))
 
 
 def _time(call: object, times: int) -> float:

@@ -139,11 +139,13 @@ class Task:
 
     def robustness(self, x: Tensor, smoothing: float | None = None) -> Tensor:
         """Robustness at time 0: (B, T+1, n) -> (B,). Exact (Eq. 4); `smoothing` is the paper's k (Eq. 7)."""
-        return self.graph.robustness(x, smoothing)
+        rho: Tensor = self.graph.robustness(x, smoothing)
+        return rho
 
     def requirement_robustness(self, x: Tensor, smoothing: float | None = None) -> Tensor:
         """Robustness per requirement, before weight and scale: (B, T+1, n) -> (B, requirements)."""
-        return self.graph.per_requirement(x, smoothing)
+        each: Tensor = self.graph.per_requirement(x, smoothing)
+        return each
 
     def judge(self, x0: Tensor, u: Tensor) -> Judged:
         """Roll plans out exactly and judge them, without gradient.

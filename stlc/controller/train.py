@@ -153,7 +153,7 @@ class _Session:
         sat_down, first = time.perf_counter(), trainer.step
         value = math.nan
         while trainer.step < trainer.steps:
-            if trainer.step % trainer.engine.every == 0 and trainer.step > 0:
+            if trainer.step >= trainer.next_look:
                 pace = (time.perf_counter() - sat_down) / max(1, trainer.step - first)
                 self._row(trainer.look(), value, pace)
             value = trainer.advance()

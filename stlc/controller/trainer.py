@@ -19,6 +19,7 @@ from stlc.controller.buffer import Buffer
 from stlc.controller.objective import Objective, guided_objective, loss, paper_objective
 from stlc.controller.policy import Mlp, PlanNetwork
 from stlc.controller.search import QUICK, Searcher
+from stlc.controller.supply import Supply
 from stlc.controller.task import satisfied
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 MARGIN_STATES = 128
 MARGIN_SHARE = 0.2
 MARGIN_RANGE = (0.01, 0.5)
+BUSY = 0.15
+"""Share of failing states whose repair makes another search round worth while soon."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +61,12 @@ class Trainer:
         self.steps = steps
         self.device = device
         self.step = 0
+        self.next_look = engine.every
         self.generator = torch.Generator(device=device).manual_seed(engine.seed)
+        self.supply = Supply(task, self.generator, device)
         self.network = _network(task, engine, device)
         self.average = _network(task, engine, device)
-        self.network.normalise(self._sample(4096))
+        self.network.normalise(self.supply.take(4096))
         self.average.load_state_dict(self.network.state_dict())
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=engine.lr, fused=True)
         self.buffer = Buffer.empty(len(task.names), task.horizon, len(task.system.control_names), device)
@@ -82,8 +87,9 @@ class Trainer:
         self.step += 1
         decay = min(self.engine.average, self.step / (self.step + 10.0))
         with torch.no_grad():
-            averaged, current = list(self.average.parameters()), list(self.network.parameters())
-            torch._foreach_lerp_(averaged, current, 1.0 - decay)
+            pairs = zip(self.average.parameters(), self.network.parameters(), strict=True)
+            for averaged, current in pairs:
+                averaged.lerp_(current, 1.0 - decay)
         return float(value.detach())
 
     @property
@@ -100,12 +106,16 @@ class Trainer:
 
     @torch.no_grad()
     def look(self) -> Look:
-        """Judge fresh states; with the guided method also repair what fails."""
-        x0 = self._sample(self.engine.pool)
+        """Judge fresh states; with the guided method also repair what fails.
+
+        The next look is due sooner where this one repaired much.
+        """
+        x0 = self.supply.take(self.engine.pool)
         plans, judged = Mlp(self.task, self.network).plan_judged(x0)
         good = satisfied(judged.rho)
         shares = tuple(float(share) for share in satisfied(judged.requirements).double().mean(0))
         accuracy = float(good.double().mean())
+        self.next_look = self.step + self.engine.every
         if self.engine.method != "guided":
             return Look(accuracy, shares, None, 0, 0)
         failing = (~good).nonzero()[:, 0][: self.engine.most]
@@ -114,13 +124,15 @@ class Trainer:
         self.buffer.add(x0[failing][solved], found.plans[solved])
         repaired = int(solved.sum())
         rate = repaired / max(1, len(failing))
+        if rate < BUSY:
+            self.next_look += self.engine.every
         return Look(accuracy, shares, accuracy + (1.0 - accuracy) * rate, len(failing), repaired)
 
     # ------------------------------------------------------------------ pieces
 
     def _loss(self) -> Tensor:
         engine = self.engine
-        fresh = self._sample(engine.batch)
+        fresh = self.supply.take(engine.batch)
         hard = engine.hard if len(self.buffer) else 0
         x0, targets = fresh, fresh.new_zeros(0)
         if hard:
@@ -145,7 +157,7 @@ class Trainer:
 
     def _feasible_margin(self) -> float:
         """A gamma of the size that plans can reach: a share of what search reaches on the median state."""
-        x0 = self._sample(MARGIN_STATES)
+        x0 = self.supply.take(MARGIN_STATES)
         middle = 0.5 * (self.task.system.control_low + self.task.system.control_high)
         start = middle.expand(MARGIN_STATES, self.task.horizon, -1)
         searcher = Searcher(self.task, self.generator, enough=math.inf)
@@ -165,9 +177,6 @@ class Trainer:
             self.margin, slope=self.engine.slope, performance_weight=self.engine.performance
         )
 
-    def _sample(self, n: int) -> Tensor:
-        return self.task.sample(n, generator=self.generator, device=self.device)
-
     # ------------------------------------------------------------- checkpoints
 
     def tensors(self) -> dict[str, Tensor]:
@@ -178,17 +187,24 @@ class Trainer:
         for index, state in self.optimizer.state_dict()["state"].items():
             found.update({f"adam.{index}.{name}": value for name, value in state.items()})
         kept = len(self.buffer)
+        found["supply"] = self.supply.block
         found["buffer.states"], found["buffer.plans"] = self.buffer.states[:kept], self.buffer.plans[:kept]
         return found
 
     def facts(self) -> dict[str, float | int]:
         """The plain numbers that go with `tensors`."""
-        return {"step": self.step, "steps": self.steps, "margin": self.margin, "solved": self.buffer.count}
+        return {
+            "step": self.step,
+            "steps": self.steps,
+            "margin": self.margin,
+            "solved": self.buffer.count,
+            "next_look": self.next_look,
+        }
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
         """Go on where `tensors` and `facts` were taken."""
         self.step, self.steps = int(facts["step"]), int(facts["steps"])
-        self.margin = float(facts["margin"])
+        self.margin, self.next_look = float(facts["margin"]), int(facts["next_look"])
         self.objective = self._objective()
         for prefix, module in (("network", self.network), ("average", self.average)):
             module.load_state_dict(_below(tensors, prefix))
@@ -202,6 +218,7 @@ class Trainer:
         self.buffer.states[:kept] = tensors["buffer.states"]
         self.buffer.plans[:kept] = tensors["buffer.plans"]
         self.buffer.count = int(facts["solved"])
+        self.supply.block = tensors["supply"].to(self.device)
         self.generator.set_state(tensors["generator"].cpu())
 
 
