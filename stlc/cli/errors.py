@@ -112,6 +112,7 @@ def _usage(error: BaseException) -> Diagnostic:
 def _crash(error: BaseException, argv: Sequence[str]) -> StlcError:
     headline = "".join(traceback.format_exception_only(error)).strip().splitlines()[-1]
     path = _write_report(error, argv)
+    advice: tuple[str, ...]
     if path is None:
         note, advice = "no crash report could be written", ()
     else:
