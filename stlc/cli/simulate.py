@@ -170,10 +170,12 @@ def _draw(run: Run) -> dict[str, str]:
 ROWS = {
     "plan accuracy": "plan_accuracy",
     "plan safety": "plan_safety",
+    "policy's own plans": "policy_accuracy",
     "executed, agents": "executed",
     "executed, starts": "executed_starts",
-    "executed, as foreseen": "foreseen_starts",
-    "executed safety, starts": "executed_safe_starts",
+    "  safely": "executed_safe_starts",
+    "  where foreseen": "foreseen_starts",
+    "  safely, where foreseen": "foreseen_safe_starts",
 }
 
 
@@ -191,6 +193,9 @@ def _screen(document: Record, drawn: Mapping[str, str], record: Path | None) -> 
     for name, guard in guards.items():
         if name != "none":
             yield f"  guard acted in {_acted(guard['decisions'])}"
+    foreseen = list(guards.values())[-1]["metrics"].get("foreseen")
+    if foreseen:
+        yield f"  foreseen: the {foreseen['mean']:.0%} of starts from which the world did as the model says"
     yield ""
     yield f"  trace      {document['trace']}"
     for what, path in drawn.items():

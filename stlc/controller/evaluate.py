@@ -34,6 +34,7 @@ METRICS = {
     "executed_safe_starts": "share of starts from which it satisfies the safety requirements",
     "foreseen": "share of starts from which the world did as the model says, through the window",
     "foreseen_starts": "share of those from which what was driven satisfies the specification",
+    "foreseen_safe_starts": "share of those from which it satisfies the safety requirements",
 }
 """What the shares mean; one of nothing is left out."""
 
@@ -112,6 +113,7 @@ def _of_seed(recording: Recording, executed: Executed, seed: int) -> dict[str, f
     rows = slice(seed * recording.agents, (seed + 1) * recording.agents)
     names, safety = tuple(executed.rules), executed.safety
     starts, foreseen = executed.starts(names)[:, rows], executed.foreseen[:, rows]
+    safe_starts = executed.starts(safety)[:, rows]
     shares = {
         "plan_accuracy": recording.rho[rows] >= -TOLERANCE,
         "policy_accuracy": recording.policy_rho[rows] >= -TOLERANCE,
@@ -119,9 +121,10 @@ def _of_seed(recording: Recording, executed: Executed, seed: int) -> dict[str, f
         "executed": executed.agents(names)[rows],
         "executed_safe": executed.agents(safety)[rows],
         "executed_starts": starts,
-        "executed_safe_starts": executed.starts(safety)[:, rows],
+        "executed_safe_starts": safe_starts,
         "foreseen": foreseen,
         "foreseen_starts": starts[foreseen],
+        "foreseen_safe_starts": safe_starts[foreseen],
     }
     shares |= {f"holds.{name}": held[:, rows] for name, held in executed.rules.items()}
     found = {name: float(mask.mean()) if mask.size else math.nan for name, mask in shares.items()}
@@ -138,16 +141,20 @@ def decided(recording: Recording) -> dict[str, float]:
 
 
 def latency(guard: Guard, recording: Recording, samples: int = LATENCY_SAMPLES) -> Latency:
-    """Time decisions for one agent alone in states drawn evenly from those that were visited."""
-    visited = recording.states[:, :-1].reshape(-1, recording.states.shape[-1])
-    picked = visited[np.linspace(0, len(visited) - 1, min(samples, len(visited))).astype(int)]
+    """Time decisions for one agent alone in states drawn evenly from those that were visited.
+
+    Each goes on from a decision in the state before, as in the deployment; that one is not timed.
+    """
+    rows, steps = recording.actions.shape[:2]
+    picked = np.linspace(0, rows * steps - 1, min(samples, rows * steps)).astype(int)
     seconds = []
-    for x in torch.from_numpy(np.concatenate([picked[:3], picked]))[:, None]:
+    for row, step in zip(picked // steps, picked % steps, strict=True):
+        before, now = torch.from_numpy(recording.states[row, [max(step - 1, 0), step]])[:, None]
+        begun = guard.decide(before).later()
         begin = perf_counter()
-        guard.decide(x)
+        guard.decide(now, begun)
         seconds.append(perf_counter() - begin)
-    timed = np.array(seconds[3:] or seconds)
-    return Latency(float(np.median(timed)), float(np.quantile(timed, 0.99)), len(timed))
+    return Latency(float(np.median(seconds)), float(np.quantile(seconds, 0.99)), len(seconds))
 
 
 def as_json(

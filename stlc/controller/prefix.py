@@ -40,8 +40,8 @@ def open_ended(formula: ir.Formula) -> ir.Formula:
 def anchored(formula: ir.Formula) -> ir.Formula:
     """The formula with what is said of the start alone turned into guards: it decides, but limits no margin.
 
-    All plans share their start. Where plans that violate the formula are compared, `a -> always b` should tell
-    how far b is violated, not how clearly a holds.
+    All plans share their start. Where plans that violate it are compared, `a -> always b` should tell how far
+    b is violated, not how clearly a holds.
     """
     match formula:
         case ir.Atom():

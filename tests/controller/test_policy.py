@@ -24,10 +24,10 @@ def test_the_choice_is_the_best_of_the_candidates(car_task: Task) -> None:
     plans, judged = policy.plan_judged(x0)
     again = car_task.judge(x0, plans)
     assert torch.equal(judged.rho, again.rho)
-    chosen = rank(judged.rho, car_task.cost(judged))
+    chosen = rank(judged.rho, car_task.cost(judged), judged.safe)
     for index in range(5):
         other = car_task.judge(x0, candidates[:, index])
-        assert (chosen >= rank(other.rho, car_task.cost(other)) - 1e-12).all()
+        assert (chosen >= rank(other.rho, car_task.cost(other), other.safe) - 1e-12).all()
 
 
 def test_a_batch_equals_its_states_one_by_one(car_task: Task) -> None:

@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from stlc.controller.deploy import Guard
+from stlc.controller.task import Task
+
+F64 = torch.float64
+
+
+class Rule:
+    """A policy from a function of the states."""
+
+    def __init__(self, task: Task, action: float) -> None:
+        self.horizon, self.action = task.horizon, action
+
+    def plan(self, x0: Tensor) -> Tensor:
+        return torch.full((len(x0), self.horizon, 1), self.action)
+
+
+def test_without_a_guard_the_policy_acts_whatever_it_plans(car_task: Task) -> None:
+    x = car_task.sample(200, seed=1)
+    decision = Guard(car_task, Rule(car_task, 10.0), "none").decide(x)
+    assert decision.action.dtype == F64
+    assert (decision.action == 10.0).all()
+    assert (decision.source == 0).all()
+    assert torch.equal(decision.rho, decision.policy_rho)
+    assert 0.1 < float((decision.rho >= -1e-6).double().mean()) < 0.9
+
+
+def test_the_guard_only_touches_violated_plans(car_task: Task) -> None:
+    x = car_task.sample(300, seed=2)
+    free = Guard(car_task, Rule(car_task, 10.0), "none").decide(x)
+    guarded = Guard(car_task, Rule(car_task, 10.0), "paper").decide(x)
+    good = free.rho >= -1e-6
+    assert torch.equal(guarded.plan[good], free.plan[good])
+    assert torch.equal(guarded.source > 0, ~good)
+    assert torch.equal(guarded.policy_rho, free.policy_rho)
+    assert (guarded.t0[~good] > 0).all()
+    assert (guarded.rho >= -1e-6).sum() > (free.rho >= -1e-6).sum() + 20
+    assert guarded.safe.sum() > free.safe.sum() + 10
+    again = car_task.judge(x.double(), guarded.plan)
+    assert torch.equal(again.rho, guarded.rho)
+
+
+def test_decisions_do_not_depend_on_who_else_decides(car_task: Task) -> None:
+    x = car_task.sample(60, seed=3)
+    guard = Guard(car_task, Rule(car_task, 10.0))
+    together = guard.decide(x)
+    for i in range(0, 60, 7):
+        alone = guard.decide(x[i : i + 1])
+        assert torch.equal(alone.plan[0], together.plan[i])
+        assert int(alone.source[0]) == int(together.source[i])
+
+
+def test_a_plan_that_is_no_number_is_never_executed_under_guard(car_task: Task) -> None:
+    x = car_task.sample(20, seed=4)
+    broken = Rule(car_task, float("nan"))
+    guarded = Guard(car_task, broken, "paper").decide(x)
+    assert torch.isfinite(guarded.plan).all()
+    assert torch.isneginf(guarded.policy_rho).all()
+    assert (guarded.source > 0).all()
+    assert torch.isneginf(Guard(car_task, broken, "none").decide(x).rho).all()
+
+
+def test_the_rest_of_a_plan_holds_its_last_action(car_task: Task) -> None:
+    guard = Guard(car_task, Rule(car_task, 10.0))
+    decision = guard.decide(car_task.sample(30, seed=5))
+    rest = decision.later(3)
+    assert torch.equal(rest.plan[:, :-3], decision.plan[:, 3:])
+    assert (rest.plan[:, -3:] == decision.plan[:, -1:]).all()
+    assert torch.equal(rest.action, rest.plan[:, 0])
+
+
+def test_a_begun_plan_goes_on_while_it_holds_and_is_no_worse(car_task: Task) -> None:
+    """A policy that would wait at every step is overruled by what was begun."""
+    state = {"x": -1.3, "v": 0.0, "sign": 0.0, "tau": 0.0, "dx": -1.0, "v_lead": 0.0, "yielding": 0.0}
+    x = torch.tensor([[state[name] for name in car_task.names]], dtype=F64)
+
+    class Later:
+        """Waits for half a second, then moves up to the line."""
+
+        def plan(self, x0: Tensor) -> Tensor:
+            steps = torch.zeros(len(x0), car_task.horizon, 1, dtype=x0.dtype)
+            steps[:, 5:8], steps[:, 9:12] = 10.0 / 3, -10.0 / 3
+            return steps
+
+    guard = Guard(car_task, Later(), "none")
+    decision, begun = guard.decide(x), None
+    assert float(decision.rho[0]) >= 0
+    fresh = x
+    for _ in range(16):
+        fresh = car_task.system.step(fresh, guard.decide(fresh).action)
+        decision = guard.decide(x, begun)
+        x, begun = car_task.system.step(x, decision.action), decision.later()
+    at = car_task.names.index("x")
+    assert float(fresh[0, at]) == pytest.approx(-1.3)
+    assert float(x[0, at]) > -1.0
