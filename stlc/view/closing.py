@@ -6,11 +6,9 @@ import shlex
 
 from stlc.view.failures import draw_failures
 from stlc.view.highlight import spec_html, yaml_html
-from stlc.view.html import Html, classed, el, figure
+from stlc.view.html import classed, el, figure, join
 from stlc.view.material import Material
-from stlc.view.page import section
-
-Part = tuple[str, str, Html]
+from stlc.view.page import Section
 
 _TITLES = {
     "spec.stl": "The specification",
@@ -20,33 +18,31 @@ _TITLES = {
 }
 
 
-def failures_section(material: Material) -> Part | None:
+def failures_section(material: Material) -> Section | None:
     """Where in the initial set the policy's plans fail."""
     if material.held_out is None:
         return None
     picture = draw_failures(material.held_out, material.signature)
-    title = "Where plans fail"
     if picture is None:
         text = f"None of the plans from {len(material.held_out.x0):,} held-out starts fails a requirement."
-        return "failures", title, section("failures", title, el("p", text))
+        return Section("failures", "Where plans fail", el("p", text))
     caption = (
         "Held-out starts over the two columns that tell most about failing; the dashed box is the region "
         "named above. Right: how far the plans are from failing (counts on a logarithmic scale)."
     )
     body = figure(picture.data_uri(), picture.alt, caption)
-    return "failures", title, section("failures", title, el("p", picture.alt), body)
+    return Section("failures", "Where plans fail", join(el("p", picture.alt), body), picture)
 
 
-def repeat_section(material: Material) -> Part:
+def repeat_section(material: Material) -> Section:
     """The commands that lead here again."""
-    title = "How to repeat it"
     intro = el(
         "p",
         "The same seed and number of steps give the same weights on the same machine. The folder of the run "
         "holds the specification and the system as they were.",
     )
     lines = "\n".join(_commands(material))
-    return "repeat", title, section("repeat", title, intro, el("pre", lines))
+    return Section("repeat", "How to repeat it", join(intro, el("pre", lines)))
 
 
 def _commands(material: Material) -> list[str]:
@@ -69,11 +65,10 @@ def _commands(material: Material) -> list[str]:
     return [*commands, f"stlc report {run}"]
 
 
-def texts_section(material: Material) -> Part | None:
+def texts_section(material: Material) -> Section | None:
     """The specification and the system word by word; what was derived from them can be unfolded."""
     if not material.texts:
         return None
-    title = "What it was made from"
     blocks = []
     for name, text in material.texts.items():
         shown = (
@@ -82,4 +77,4 @@ def texts_section(material: Material) -> Part | None:
         attrs = {"open": ""} if name == "spec.stl" else {}
         summary = el("summary", _TITLES[name], " ", classed("span", "quiet", name))
         blocks.append(el("details", summary, el("pre", shown), attrs=attrs))
-    return "texts", title, section("texts", title, blocks)
+    return Section("texts", "What it was made from", join(blocks))

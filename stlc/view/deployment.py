@@ -9,10 +9,9 @@ from typing import Any
 from stlc.view.animate import STILL, current_gif
 from stlc.view.html import Child, Html, classed, el, figure, join, table
 from stlc.view.material import Material
-from stlc.view.page import section
+from stlc.view.page import Section
 from stlc.view.words import count, seconds, share, spread
 
-Part = tuple[str, str, Html]
 Record = Mapping[str, Any]
 
 GUARDS = {"none": "no guard", "paper": "with the backup"}
@@ -62,25 +61,22 @@ def deployment_tiles(material: Material) -> list[tuple[str, str]]:
     return [tile for tile in tiles if tile[0]]
 
 
-def deployment_section(material: Material) -> Part | None:
+def deployment_section(material: Material) -> Section | None:
     """The table of metrics, one column per guard; who decided; how fast."""
     guards = _guards(material)
     if not guards:
         return None
-    title = "How it drives"
-    markup = section(
-        "deployment",
-        title,
+    body = join(
         el("p", _setting(material.simulation or {})),
         _compared("", guards, _share_rows(guards)),
         _compared("Requirements as driven", guards, _requirement_rows(guards)),
         _compared("Progress", guards, _progress_rows(guards)),
         _compared("Decisions", guards, _decision_rows(guards)),
     )
-    return "deployment", title, markup
+    return Section("deployment", "How it drives", body)
 
 
-def film_section(material: Material) -> Part | None:
+def film_section(material: Material) -> Section | None:
     """The animation of the first seed."""
     if material.trace is None:
         return None
@@ -94,9 +90,8 @@ def film_section(material: Material) -> Part | None:
         _key("#e08a00", "backup"),
         _key("#c0267e", "safest prefix"),
     )
-    title = "What it looks like"
     film = figure(uri, f"Animation of the deployment; a still is in {STILL}.", caption, kind="film")
-    return "film", title, section("film", title, film)
+    return Section("film", "What it looks like", film)
 
 
 def _key(color: str, name: str) -> Html:

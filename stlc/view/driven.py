@@ -14,20 +14,19 @@ from stlc.source import Source
 from stlc.trace import Trace
 from stlc.view.html import Child, Html, classed, el, figure, join, table
 from stlc.view.material import Material, untagged
-from stlc.view.page import section
+from stlc.view.page import Section
 from stlc.view.signals import choose_traces, draw_signals
 from stlc.view.style import ORANGE, RED
 from stlc.view.words import count, share
 
-Part = tuple[str, str, Html]
+TITLE = "What was driven"
 
 
-def driven_section(material: Material) -> Part | None:
+def driven_section(material: Material) -> Section | None:
     """The recorded traces under the monitor; None where there is no trace that can be judged."""
     trace = material.trace
     if trace is None:
         return None
-    title = "What was driven"
     try:
         monitor = Monitor(
             parse(Source("spec.stl", trace.meta.spec_text or material.texts.get("spec.stl", "")))
@@ -38,22 +37,17 @@ def driven_section(material: Material) -> Part | None:
         reason = el(
             "p", "The trace could not be judged: ", "; ".join(d.message for d in error.diagnostics), "."
         )
-        return "driven", title, section("driven", title, reason)
+        return Section("driven", TITLE, reason)
     names = trace_names(trace)
     choices = choose_traces(_per_trace(verdict), names)
     picture = draw_signals(trace, {name: np.atleast_2d(rho) for name, rho in margins.items()}, choices)
-    return (
-        "driven",
-        title,
-        section(
-            "driven",
-            title,
-            el("p", _summary(verdict)),
-            _verdict_table(verdict, names),
-            figure(picture.data_uri(), picture.alt, _caption(trace)),
-            causes_of(verdict, names, monitor.spec),
-        ),
+    body = join(
+        el("p", _summary(verdict)),
+        _verdict_table(verdict, names),
+        figure(picture.data_uri(), picture.alt, _caption(trace)),
+        causes_of(verdict, names, monitor.spec),
     )
+    return Section("driven", TITLE, body, picture)
 
 
 def trace_names(trace: Trace) -> list[str]:

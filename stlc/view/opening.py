@@ -9,7 +9,7 @@ from stlc.view.curves import draw_curves
 from stlc.view.highlight import spec_html
 from stlc.view.html import Child, Html, classed, el, facts, figure, join, table
 from stlc.view.material import Material, untagged
-from stlc.view.page import section
+from stlc.view.page import Section
 from stlc.view.words import count, interval, number, seconds, share
 
 
@@ -62,7 +62,7 @@ def _tiles(tiles: list[tuple[str, str]]) -> Html | None:
     )
 
 
-def requirements_section(material: Material) -> tuple[str, str, Html] | None:
+def requirements_section(material: Material) -> Section | None:
     """Every requirement with its text and how often the policy's plans meet it."""
     shares: Mapping[str, float] = material.result.get("requirements") or {}
     names = list(shares) or list(material.requirements)
@@ -77,9 +77,9 @@ def requirements_section(material: Material) -> tuple[str, str, Html] | None:
         kind = "bad" if name == worst and value is not None and value < 1 else "plain"
         rows.append((_described(material, name), classed("span", kind, share(value)), fails))
     header = ("requirement", "satisfied", f"fails of {held_out:,}" if held_out else "fails")
-    title = "Requirements"
     intro = el("p", "Each is judged alone, on the plans from the held-out starts; all must hold together.")
-    return "requirements", title, section("requirements", title, intro, table(header, rows, numeric=(1, 2)))
+    body = join(intro, table(header, rows, numeric=(1, 2)))
+    return Section("requirements", "Requirements", body)
 
 
 def _described(material: Material, name: str) -> Html:
@@ -95,11 +95,10 @@ def _described(material: Material, name: str) -> Html:
     )
 
 
-def training_section(material: Material) -> tuple[str, str, Html]:
+def training_section(material: Material) -> Section:
     """Curves, options, machine and versions."""
     curves = draw_curves(material.rows)
-    title = "How it was trained"
-    picture = figure(curves.data_uri(), curves.alt, _CURVES) if curves else None
+    shown = figure(curves.data_uri(), curves.alt, _CURVES) if curves else None
     last = material.rows[-1] if material.rows else {}
     search = None
     if last.get("failing") is not None:
@@ -108,7 +107,8 @@ def training_section(material: Material) -> tuple[str, str, Html]:
             f"In the last round the search repaired {last.get('repaired', 0)} of "
             f"{count(int(last['failing']), 'failing start')}.",
         )
-    return "training", title, section("training", title, picture, search, facts(_facts(material)))
+    body = join(shown, search, facts(_facts(material)))
+    return Section("training", "How it was trained", body, curves)
 
 
 _CURVES = (

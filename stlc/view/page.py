@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 
 from stlc.view.html import Child, Html, el, join
+from stlc.view.style import Picture
 
 SHEET = "report.css"
 
@@ -14,21 +16,38 @@ def _sheet() -> str:
     return (files("stlc.view") / SHEET).read_text(encoding="utf-8")
 
 
-def section(anchor: str, title: str, *children: Child) -> Html:
-    """A titled section that `page` lists among its links."""
-    return el("section", el("h2", title), *children, attrs={"id": anchor})
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of the page.
+
+    Attributes:
+        anchor: its name in links; also the file name of its picture.
+        title: its heading.
+        body: its content.
+        picture: the one drawn figure in it, if any.
+    """
+
+    anchor: str
+    title: str
+    body: Html
+    picture: Picture | None = None
+
+    @property
+    def html(self) -> Html:
+        """The markup."""
+        return el("section", el("h2", self.title), self.body, attrs={"id": self.anchor})
 
 
-def page(title: str, head: Child, sections: Sequence[tuple[str, str, Html]], foot: Child) -> str:
+def page(title: str, head: Child, sections: Sequence[Section], foot: Child) -> str:
     """The whole document.
 
     Args:
         title: of the browser's tab.
         head: what stands above the links.
-        sections: (anchor, title, markup) in order.
+        sections: in order.
         foot: the last line.
     """
-    links = el("nav", [el("a", name, attrs={"href": f"#{anchor}"}) for anchor, name, _ in sections])
+    links = el("nav", [el("a", part.title, attrs={"href": f"#{part.anchor}"}) for part in sections])
     policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
     html = el(
         "html",
@@ -40,7 +59,7 @@ def page(title: str, head: Child, sections: Sequence[tuple[str, str, Html]], foo
             el("title", title),
             el("style", Html(_sheet())),
         ),
-        el("body", el("main", head, links, [markup for _, _, markup in sections], el("footer", foot))),
+        el("body", el("main", head, links, [part.html for part in sections], el("footer", foot))),
         attrs={"lang": "en"},
     )
     return str(join(Html("<!doctype html>\n"), html, "\n"))

@@ -17,26 +17,31 @@ from stlc.view.deployment import deployment_section, deployment_tiles, film_sect
 from stlc.view.driven import driven_section
 from stlc.view.material import Material, gather
 from stlc.view.opening import headline, requirements_section, training_section
-from stlc.view.page import page
+from stlc.view.page import Section, page
 
 REPORT = "report.html"
 
 
 def write_report(run: RunDir) -> Path:
-    """Write the report of `run` into its folder and return its path.
+    """Write the report of `run` into its folder, its pictures beside it as PNG; returns the report's path.
 
     Raises:
-        MissingError: R301, matplotlib or Pillow is missing; R201, the file cannot be written.
+        MissingError: R301, matplotlib or Pillow is missing; R201, a file cannot be written.
         RunError: R101, the folder is no run.
     """
     require_drawing()
+    material = gather(run)
+    sections = sections_of(material)
     path = run.path / REPORT
-    write_atomic(path, render_report(gather(run)))
+    write_atomic(path, render_report(material, sections))
+    for part in sections:
+        if part.picture is not None:
+            part.picture.save_png(run.path / f"{part.anchor}.png")
     return path
 
 
-def render_report(material: Material) -> str:
-    """The page of `material`."""
+def sections_of(material: Material) -> list[Section]:
+    """What there is to say, in order."""
     parts = (
         requirements_section(material),
         deployment_section(material),
@@ -47,9 +52,14 @@ def render_report(material: Material) -> str:
         repeat_section(material),
         texts_section(material),
     )
+    return [part for part in parts if part is not None]
+
+
+def render_report(material: Material, sections: list[Section]) -> str:
+    """The page of `material`."""
     return page(
         f"{material.spec} · {material.run.name}",
         headline(material, deployment_tiles(material)),
-        [part for part in parts if part is not None],
+        sections,
         f"Written by stlc {__version__} from {material.run.shown}",
     )

@@ -80,6 +80,8 @@ def test_a_deployed_run(deployed):
     assert "What failed, and why" in page.text
     assert "before_junction means x < x_inter / 2" in page.text
     assert "stlc check" in page.text
+    drawn = {path.name for path in deployed.path.glob("*.png")}
+    assert drawn == {"driven.png", "failures.png", "training.png"}
     kinds = [image["src"].partition(";")[0] for image in page.images]
     assert kinds == ["data:image/gif", *["data:image/svg+xml"] * 3]
     assert all(image["alt"] for image in page.images)
