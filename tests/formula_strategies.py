@@ -89,36 +89,47 @@ def _interval(*, bounded_only: bool) -> st.SearchStrategy[typed.Interval]:
     )
 
 
-def _logic(inner: st.SearchStrategy[typed.Formula]) -> st.SearchStrategy[typed.Formula]:
-    many = st.lists(inner, min_size=2, max_size=3).map(tuple)
-    return st.builds(typed.Logic, st.just(SPAN), st.sampled_from(["and", "or"]), many) | st.builds(
-        typed.Logic, st.just(SPAN), st.sampled_from(["->", "<->", "xor"]), st.tuples(inner, inner)
-    )
+_UNARY = ("always", "eventually", "once", "historically")
+_BINARY = ("until", "release", "unless", "since")
+_KINDS = ("unary", "unary", "unary", "binary", "binary", "many", "two", "not", "shift", "edge")
 
 
-def formulas(*, bounded_only: bool = False, truth: bool = True) -> st.SearchStrategy[typed.Formula]:
-    """Typed formulas with every operator, bounds on the grid of `GRID`."""
+@st.composite
+def formulas(  # noqa: C901 - one case an operator
+    draw: st.DrawFn, *, bounded_only: bool = False, truth: bool = True, depth: int | None = None
+) -> typed.Formula:
+    """Typed formulas with every operator, bounds on the grid of `GRID`, up to three operators deep."""
+    if depth is None:
+        depth = draw(st.sampled_from([0, 1, 1, 2, 2, 2, 3, 3]))
+    if depth == 0:
+        if truth and draw(st.integers(0, 9)) == 0:
+            return typed.Truth(SPAN, draw(st.booleans()))
+        return draw(_predicates)
+
+    def part() -> typed.Formula:
+        return draw(formulas(bounded_only=bounded_only, truth=truth, depth=depth - 1))
+
+    def smaller() -> typed.Formula:
+        inner = draw(st.integers(0, depth - 1))
+        return draw(formulas(bounded_only=bounded_only, truth=truth, depth=inner))
+
     interval = _interval(bounded_only=bounded_only)
-    span = st.just(SPAN)
-    leaves: st.SearchStrategy[typed.Formula] = _predicates
-    if truth:
-        leaves = leaves | st.builds(typed.Truth, span, st.booleans())
-
-    def grown(inner: st.SearchStrategy[typed.Formula]) -> st.SearchStrategy[typed.Formula]:
-        unary = st.sampled_from(["always", "eventually", "once", "historically"])
-        binary = st.sampled_from(["until", "release", "unless", "since"])
-        return (
-            st.builds(typed.Not, span, inner)
-            | _logic(inner)
-            | st.builds(typed.Temporal, span, unary, interval, inner)
-            | st.builds(typed.Temporal, span, unary, interval, inner)
-            | st.builds(typed.Until, span, binary, interval, inner, inner)
-            | st.builds(typed.Until, span, binary, interval, inner, inner)
-            | st.builds(typed.Shift, span, st.sampled_from([-1, 1]), inner)
-            | st.builds(typed.Edge, span, st.sampled_from(["rise", "fall"]), inner)
-        )
-
-    return st.recursive(leaves, grown, max_leaves=5)
+    match draw(st.sampled_from(_KINDS)):
+        case "unary":
+            return typed.Temporal(SPAN, draw(st.sampled_from(_UNARY)), draw(interval), part())
+        case "binary":
+            pair = (part(), smaller()) if draw(st.booleans()) else (smaller(), part())
+            return typed.Until(SPAN, draw(st.sampled_from(_BINARY)), draw(interval), *pair)
+        case "many":
+            return typed.Logic(SPAN, draw(st.sampled_from(["and", "or"])), (part(), smaller(), smaller()))
+        case "two":
+            return typed.Logic(SPAN, draw(st.sampled_from(["->", "<->", "xor"])), (smaller(), part()))
+        case "not":
+            return typed.Not(SPAN, part())
+        case "shift":
+            return typed.Shift(SPAN, draw(st.sampled_from([-1, 1])), part())
+        case _:
+            return typed.Edge(SPAN, draw(st.sampled_from(["rise", "fall"])), part())
 
 
 def traces(low: int = 1, high: int = 14, batch: int = 2) -> st.SearchStrategy[dict[str, np.ndarray]]:

@@ -108,7 +108,7 @@ class NumpyOps:
         finite = np.where(np.isfinite(top), top, 0.0)
         with self.quiet():
             total = np.exp(np.minimum(k * (x - finite), 0.0)).sum(axis=0, keepdims=True)
-            return top + np.log(np.maximum(total, 1.0)) / k
+            return top + np.log(total) / k
 
     def softmax2(self, a: Array, b: Array, k: float) -> Array:
         """Smooth extremum of two."""

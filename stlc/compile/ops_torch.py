@@ -41,7 +41,7 @@ class _SmoothMax(torch.autograd.Function):
         top = x.amax(dim=0, keepdim=True) if k > 0 else x.amin(dim=0, keepdim=True)
         unbounded = torch.isinf(top)
         shares = ((x - top.masked_fill(unbounded, 0.0)) * k).clamp_max_(0.0).exp_()
-        total = shares.sum(dim=0, keepdim=True).clamp_min_(1.0)
+        total = shares.sum(dim=0, keepdim=True)
         ctx.save_for_backward(shares.div_(total.masked_fill(unbounded, torch.inf)))
         return top + total.log_() / k
 

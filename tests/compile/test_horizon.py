@@ -55,3 +55,31 @@ def test_nothing_beyond_the_reach_is_read(formula: typed.Formula, env: dict[str,
     if inside[0]:
         one, other = (robustness_signal(node, e, ops=NUMPY) for e in (env, changed))
         np.testing.assert_array_equal(one[0], other[0])
+
+
+SOON = ir.Over("eventually", ir.Window(0, 2), P)
+BEFORE = ir.Shift(-1, P)
+
+
+@pytest.mark.parametrize(
+    ("formula", "samples"),
+    [
+        (SOON, "1111.."),
+        (ir.Over("always", ir.Window(1, None), P), "11111."),
+        (ir.Over("always", ir.Window(0, None), SOON), "......"),
+        (ir.Until("until", ir.Window(0, 1), SOON, Q), "111..."),
+        (ir.Until("until", ir.Window(0, 1), Q, SOON), "111..."),
+        (ir.Until("release", ir.Window(1, None), Q, P), "11111."),
+        (ir.Until("until", ir.Window(2, 3), BEFORE, Q), ".11..."),
+        (BEFORE, ".11111"),
+        (ir.Shift(-1, P, outside=False), "111111"),
+        (ir.Shift(2, P), "1111.."),
+        (ir.Past("once", ir.Window(0, None), BEFORE), "......"),
+        (ir.Past("once", ir.Window(2, 2), BEFORE), "11.111"),
+        (ir.Since("since", ir.Window(1, 1), BEFORE, Q), "1.1111"),
+        (ir.Since("since", ir.Window(1, 2), P, SOON), "11111."),
+        (ir.Join("and", (SOON, BEFORE)), ".111.."),
+    ],
+)
+def test_where_a_formula_is_defined(formula: ir.Formula, samples: str) -> None:
+    assert "".join("1" if inside else "." for inside in defined(formula, 6)) == samples
