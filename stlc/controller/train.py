@@ -16,6 +16,7 @@ from stlc.controller.pace import steps_within
 from stlc.controller.run import Run, load_engine, load_task, save_engine, spec_hash, system_hash
 from stlc.controller.trainer import Look, Trainer
 from stlc.diagnostics import Diagnostic, MissingError, RunError
+from stlc.dynamics.memory import keep_freed_memory
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -72,6 +73,7 @@ def train(task: Task, config: TrainConfig, folder: RunDir, watch: Watch | None =
         RunError: R401, the loss is not finite.
     """
     begun = time.perf_counter()
+    keep_freed_memory()
     device = find_device(config.device)
     if config.threads is not None:
         torch.set_num_threads(config.threads)
@@ -101,6 +103,7 @@ def resume(
         RunError: R101, R102, or R103 when there is nothing left to do.
     """
     begun = time.perf_counter()
+    keep_freed_memory()
     task = load_task(folder)
     engine: Engine = load_engine(folder)
     saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
