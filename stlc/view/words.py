@@ -7,8 +7,12 @@ from collections.abc import Sequence
 
 
 def share(value: float | None, digits: int = 1) -> str:
-    """0.957 as `95.7 %`; nothing for None."""
-    return "" if value is None else f"{100 * value:.{digits}f} %"
+    """0.957 as `95.7 %`; nothing for None. What is not all, or not nothing, never reads as if it were."""
+    if value is None:
+        return ""
+    while digits < 4 and 0 < value < 1 and round(100 * value, digits) in (0, 100):
+        digits += 1
+    return f"{100 * value:.{digits}f} %"
 
 
 def interval(ends: Sequence[float] | None) -> str:

@@ -39,6 +39,9 @@ def test_spread(mean, half, text):
 def test_shares_and_counts():
     assert share(0.957) == "95.7 %"
     assert share(None) == ""
+    assert share(1.0) == "100.0 %"
+    assert share(0.9996) == "99.96 %"
+    assert share(0.0002) == "0.02 %"
     assert interval([0.951, 0.9619]) == "95.1 to 96.2 %"
     assert interval(None) == ""
     assert count(1, "trace") == "1 trace"
