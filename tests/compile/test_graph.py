@@ -325,3 +325,19 @@ def test_graph_without_requirements_is_satisfied() -> None:
 def test_graph_refuses_states_of_another_width() -> None:
     with pytest.raises(ValueError, match="2 columns where 3"):
         RobustnessGraph([], SIGNATURE).robustness(np.zeros((1, 4, 2)))
+
+
+def test_graph_follows_the_device() -> None:
+    """Tensors of the device "meta" do not mix with others: an array left on the CPU would show."""
+    x = torch.zeros((5, 4, 3), device="meta", requires_grad=True)
+    guard = ir.Atom(ir.Op("sub", (ir.Col("y"), ir.Lit(0.5))), guard=True)
+    body = ir.Join("or", (guard, ir.Atom(ir.Op("mod", (ir.Col("x"), ir.Lit(2.0))))))
+    held = ir.Past("once", ir.Window(0, None), ir.Until("until", ir.Window(1, 2), body, ir.Atom(ir.Col("z"))))
+    graph = RobustnessGraph(
+        [Requirement(body), Requirement(ir.Over("always", ir.Window(0, 1), held))], SIGNATURE
+    )
+    for smoothing in (None, 50.0):
+        value = graph.robustness(x, smoothing)
+        assert value.device.type == "meta"
+        assert value.shape == (5,)
+        value.sum().backward()
