@@ -3,15 +3,15 @@
 The truth beside the model of `car.yaml`. Each car drives on its own path, by arc length, as the model's own
 step says; what it meets is decided here. Right-hand traffic, metres, seconds.
 
-* A leader is the nearest car ahead on the own path, through the junction and into the lane behind it. A car
-  in the junction ahead on a crossing or merging path (or that cannot stop before it any more) stands for a
-  leader at rest, where the paths begin to conflict. The gap is the one between bumpers.
+* A leader is the nearest car ahead on the own path, through the junction and into the lane behind it, with
+  the speed to be counted on if it brakes. A car in the junction ahead on a crossing or merging path (or that
+  cannot stop before it any more) stands for a leader at rest where the paths begin to conflict.
 * At a stop sign one car has the grant, the nearest of those that are first in their lanes, until it has left
   the junction; everybody else yields. So `yielding` only goes from 1 to 0 while a car approaches.
 * The full cycle of a light is T_total + 2 c. The timer that cars see is held at 0 for 2 c when red begins,
-  then runs to T_total; the crossing direction is half a cycle later. So c seconds of red for all lie between
-  two greens: c = 1.5 s is what a car of 1 m needs at 5 m/s for the box of 6 m. No plan looks from the start
-  of red to the next green, so the held timer never makes it count on green too early.
+  then runs on; the crossing direction is half a cycle later. So c seconds of red for all lie between greens:
+  c = 1.5 s is what a car of 1 m needs at 5 m/s for the box of 6 m. No plan looks from the start of red to the
+  next green, so none counts on green too early.
 """
 
 from __future__ import annotations
@@ -38,8 +38,7 @@ DIRECTIONS = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])  # eas
 LEFT, STRAIGHT, RIGHT = 1, 0, -1
 RADIUS = {LEFT: 0.75 * WIDTH, RIGHT: 0.25 * WIDTH}
 SPAN = {STRAIGHT: WIDTH, LEFT: math.pi / 2 * RADIUS[LEFT], RIGHT: math.pi / 2 * RADIUS[RIGHT]}
-STEP = 0.1  # m: resolution of the conflict tables
-BEFORE = 2.0  # m before the box where the tables begin
+STEP, BEFORE = 0.1, 2.0  # m: resolution of the conflict tables, and how long before the box they begin
 ROAD, MARKING = "#e3e5e8", "#ffffff"
 SHOWN = {-1: "#4a4f57", 0: "#d43d3d", 1: "#2f9e57"}  # stop sign, red, green
 DECIDED = ("#2563a8", "#e08a00", "#c0267e")  # policy, backup, safest
@@ -55,14 +54,14 @@ def turn_pose(direction: int, turn: int, s: float) -> tuple[float, float, float]
     forward, right = DIRECTIONS[direction], right_of(direction)
     entry = -WIDTH / 2 * forward + WIDTH / 4 * right
     heading = direction * math.pi / 2
-    ahead, aside, over = s, 0.0, 0.0
+    ahead, aside = s, 0.0
     if turn != STRAIGHT and s > 0:
-        radius, angle = RADIUS[turn], min(s, SPAN[turn]) / RADIUS[turn]
-        over = max(s - SPAN[turn], 0.0)
+        radius, over = RADIUS[turn], max(s - SPAN[turn], 0.0)
+        angle = (s - over) / radius
         ahead, aside = radius * math.sin(angle), -turn * (radius * (1 - math.cos(angle)) + over)
         heading += turn * angle
-    place = entry + ahead * forward + aside * right
-    return float(place[0]), float(place[1]), heading
+    x, y = (entry + ahead * forward + aside * right).tolist()
+    return x, y, heading
 
 
 def overlap(a: np.ndarray, b: np.ndarray, grow: float = 0.0) -> np.ndarray:
@@ -152,11 +151,10 @@ class Grid:
         light[[0, COLUMNS - 1, -COLUMNS, -1]] = False
         grid = cls(places, light, rng.uniform(0, cycle, len(places)))
         for junction in range(len(places)):
-            row, column = divmod(junction, COLUMNS)
-            around = ((row, column + 1), (row + 1, column), (row, column - 1), (row - 1, column))
-            near = {
-                d: r * COLUMNS + c for d, (r, c) in enumerate(around) if 0 <= r < ROWS and 0 <= c < COLUMNS
-            }
+            row, col = divmod(junction, COLUMNS)
+            around = ((row, col + 1), (row + 1, col), (row, col - 1), (row - 1, col))
+            arms = [(d, r, c) for d, (r, c) in enumerate(around) if r in range(ROWS) and c in range(COLUMNS)]
+            near = {d: r * COLUMNS + c for d, r, c in arms}
             grid.neighbours.append(near)
             for direction, other in near.items():
                 grid.heading[junction, other] = direction
@@ -176,12 +174,11 @@ class Grid:
 
     def pose(self, car: Car) -> tuple[float, float, float]:
         """Place and heading of a car."""
-        direction, place = self.heading[car.past, car.here], self.places[car.here]
+        s, turn = car.s - self.length[car.past, car.here], STRAIGHT
         if car.inside:
-            x, y, angle = turn_pose(direction, self.turn(*car.way), car.s)
-        else:
-            x, y, angle = turn_pose(direction, STRAIGHT, car.s - self.length[car.past, car.here])
-        return x + float(place[0]), y + float(place[1]), angle
+            s, turn = car.s, self.turn(*car.way)
+        x, y, angle = turn_pose(self.heading[car.past, car.here], turn, s)
+        return x + float(self.places[car.here][0]), y + float(self.places[car.here][1]), angle
 
 
 class TrafficGrid:
@@ -194,9 +191,8 @@ class TrafficGrid:
         self.period = float(system.decl.constants["T_total"][0])
         self.cycle = self.period + 2 * ALL_RED
         self.grid = Grid.drawn(self.rng, self.cycle)
-        lanes = len(self.grid.length)
-        if agents > lanes:
-            raise ValueError(f"{agents} cars do not fit on {lanes} lanes")
+        if agents > len(self.grid.length):
+            raise ValueError(f"{agents} cars do not fit on {len(self.grid.length)} lanes")
 
     def reset(self) -> torch.Tensor:
         """Every car at 5 m/s at the beginning of a lane, the first 20 coming from different junctions."""
@@ -211,7 +207,7 @@ class TrafficGrid:
             onward = self.grid.choose(past, here, self.rng)
             self.cars.append(Car(past, here, onward, self.grid.choose(here, onward, self.rng)))
         self.clock, self.holder = 0, dict[int, Car]()
-        self.speeds, self.touched, self.min_gap = 0.0, set[tuple[int, int]](), math.inf
+        self.speeds, self.touched, self.min_gap = 0.0, set[tuple[int, int]](), SIGHT
         return self._observe()
 
     def advance(self, x: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
@@ -220,15 +216,15 @@ class TrafficGrid:
         travel = (moved[:, self.at["x"]] - x[:, self.at["x"]]).tolist()
         speed, tau = moved[:, self.at["v"]].tolist(), moved[:, self.at["tau"]].tolist()
         self.clock += 1
+        self.speeds += sum(speed)
         for index, car in enumerate(self.cars):
             car.s, car.v, car.tau = car.s + travel[index], speed[index], tau[index]
             self._pass_on(car, travel[index])
-            self.speeds += car.v
         self._count_overlaps()
         return self._observe()
 
     def progress(self) -> Mapping[str, float]:
-        """Mean speed, junctions passed, pairs of cars that ever overlapped, smallest gap."""
+        """Mean speed, junctions passed, pairs of cars that ever overlapped, smallest gap within sight."""
         return {
             "mean_speed": self.speeds / max(self.clock * self.agents, 1),
             "junctions_passed": float(sum(car.passed for car in self.cars)),
@@ -257,8 +253,7 @@ class TrafficGrid:
         places, shows = scene["junctions"][index], scene["shows"][index]
         (left, bottom), (right, top) = places.min(0), places.max(0)
         roads = [((x, bottom), (x, top)) for x in set(places[:, 0])]
-        roads += [((left, y), (right, y)) for y in set(places[:, 1])]
-        for road in np.array(roads):
+        for road in np.array([*roads, *(((left, y), (right, y)) for y in set(places[:, 1]))]):
             corner, extent = road[0] - WIDTH / 2, road[1] - road[0] + WIDTH
             axes.add_patch(Rectangle(corner, *extent, color=ROAD, lw=0))
             axes.plot(*road.T, color=MARKING, lw=0.6, dashes=(4, 4), zorder=2)
@@ -331,8 +326,7 @@ class TrafficGrid:
                 self.holder[junction] = max(queue, key=lambda c: c.v**2 / (2 * BRAKE) - self._to_line(c))
 
     def _observe(self) -> torch.Tensor:
-        lanes: Lanes = {}
-        inside: Inside = {}
+        lanes, inside = Lanes(), Inside()
         for car in sorted(self.cars, key=lambda car: -car.s):
             if car.inside:
                 inside.setdefault(car.here, []).append(car)

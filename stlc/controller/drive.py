@@ -119,9 +119,11 @@ class _Worlds:
     def __init__(self, task: Task, make: WorldType, setting: Setting) -> None:
         self.size = (len(setting.seeds) * setting.agents, len(task.names))
         self.parts = [setting.agents] * len(setting.seeds)
-        self.worlds = [
-            make(task.system, setting.agents, torch.Generator().manual_seed(seed)) for seed in setting.seeds
-        ]
+        with _blame("be made"):
+            self.worlds = [
+                make(task.system, setting.agents, torch.Generator().manual_seed(seed))
+                for seed in setting.seeds
+            ]
 
     def reset(self) -> Tensor:
         """The first states, (rows, n)."""
@@ -156,7 +158,9 @@ def _blame(what: str) -> Iterator[None]:
         raise
     except Exception as error:
         note = f"{type(error).__name__}: {error}"
-        raise SystemFileError(Diagnostic("S207", f"the world cannot {what}", note=(note,))) from error
+        raise SystemFileError(
+            Diagnostic("S207", f"the world cannot {what}: {error}", note=(note,))
+        ) from error
 
 
 def drive(

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from stlc.controller.task import Task
 
 LATENCY_SAMPLES = 200
+LATENCY_SECONDS = 5.0
+"""After so long the samples that there are have to do."""
 
 METRICS = {
     "plan_accuracy": "share of followed plans that satisfy the specification",
@@ -103,10 +105,12 @@ def deploy(
 
 
 def measure(recording: Recording, executed: Executed) -> dict[str, Interval]:
-    """All metrics over the seeds."""
+    """All metrics over the seeds that have them: a share of nothing is none, and so is what is not finite."""
     each = [_of_seed(recording, executed, seed) for seed in range(len(recording.progress))]
-    names = [name for name in each[0] if all(not math.isnan(values[name]) for values in each)]
-    return {name: Interval.of([values[name] for values in each]) for name in names}
+    found = {
+        name: [seed[name] for seed in each if math.isfinite(seed.get(name, math.nan))] for name in each[0]
+    }
+    return {name: Interval.of(values) for name, values in found.items() if values}
 
 
 def _of_seed(recording: Recording, executed: Executed, seed: int) -> dict[str, float]:
@@ -141,19 +145,21 @@ def decided(recording: Recording) -> dict[str, float]:
 
 
 def latency(guard: Guard, recording: Recording, samples: int = LATENCY_SAMPLES) -> Latency:
-    """Time decisions for one agent alone in states drawn evenly from those that were visited.
+    """Time decisions for one agent alone in states drawn evenly from those visited, some seconds at most.
 
     Each goes on from a decision in the state before, as in the deployment; that one is not timed.
     """
     rows, steps = recording.actions.shape[:2]
     picked = np.linspace(0, rows * steps - 1, min(samples, rows * steps)).astype(int)
-    seconds = []
+    picked, seconds, stop = np.random.default_rng(0).permutation(picked), [], perf_counter() + LATENCY_SECONDS
     for row, step in zip(picked // steps, picked % steps, strict=True):
         before, now = torch.from_numpy(recording.states[row, [max(step - 1, 0), step]])[:, None]
         begun = guard.decide(before).later()
         begin = perf_counter()
         guard.decide(now, begun)
         seconds.append(perf_counter() - begin)
+        if perf_counter() > stop:
+            break
     return Latency(float(np.median(seconds)), float(np.quantile(seconds, 0.99)), len(seconds))
 
 

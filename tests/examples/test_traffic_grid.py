@@ -215,7 +215,7 @@ def test_the_leader_is_seen_through_the_junction(system: System, grid: Any) -> N
     ahead.s, ahead.v, ahead.beyond = 2.0, 3.0, behind.beyond
     behind.s = world.grid.length[behind.past, behind.here] - 1.5
     row = dict(zip(system.names, world._observe()[0].tolist(), strict=True))
-    assert (row["dx"], row["v_lead"]) == pytest.approx((2.5, 3.0))
+    assert (row["dx"], row["v_lead"]) == pytest.approx((2.5, grid.counted_on(5.0, 3.0, 0.1)))
     ahead.past, ahead.here, ahead.onward, ahead.inside = behind.here, behind.onward, behind.beyond, False
     ahead.s = 1.0
     row = dict(zip(system.names, world._observe()[0].tolist(), strict=True))
@@ -239,6 +239,15 @@ def test_a_crossing_car_in_the_junction_counts_as_a_leader_at_rest(system: Syste
     crossing.s = 5.9
     row = dict(zip(system.names, world._observe()[0].tolist(), strict=True))
     assert row["dx"] == -1.0
+
+
+@pytest.mark.parametrize(("v", "v_lead"), [(5.0, 5.0), (8.0, 3.0), (3.0, 9.0), (4.0, 0.5), (0.0, 0.0)])
+def test_the_speed_to_count_on_asks_for_room_to_brake(grid: Any, v: float, v_lead: float) -> None:
+    counted, worst = grid.counted_on(v, v_lead, 0.1), max(v_lead - 1.0, 0.0)
+    assert 0.0 <= counted <= v_lead
+    needed_if_constant = max(v - counted, 0.0) ** 2 / 20
+    needed_if_braking = max(v**2 - worst**2, 0.0) / 20
+    assert needed_if_constant == pytest.approx(needed_if_braking)
 
 
 def test_too_many_cars_are_refused(system: System) -> None:

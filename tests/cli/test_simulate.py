@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from stlc.cli.app import main
+from stlc.rundir import RunDir
+from stlc.trace import load_trace
+
+ROOT = Path(__file__).parents[2]
+SMALL = ["--seeds", "2", "--agents", "4", "--steps", "6", "--no-pictures"]
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which a run has been trained for a moment."""
+    folder = tmp_path_factory.mktemp("home")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        spec, system = ROOT / "specs/traffic.stl", ROOT / "examples/car.yaml"
+        command = ["train", str(spec), "--system", str(system), "--steps", "30", "--batch", "64"]
+        assert main([*command, "--no-pictures"]) == 0
+    return folder
+
+
+@pytest.fixture
+def there(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> RunDir:
+    monkeypatch.chdir(home)
+    monkeypatch.setattr("stlc.controller.evaluate.LATENCY_SECONDS", 0.2)
+    capsys.readouterr()
+    return RunDir.newest()
+
+
+def test_the_newest_run_is_simulated_with_and_without_guard(
+    there: RunDir, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["simulate", "--backup", *SMALL, "--steps", "30", "--record", "trace.npz"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert f"run {there.name}" in lines[0]
+    assert "world traffic_grid.py" in lines[0]
+    assert "2 seeds x 4 agents x 30 steps" in lines[0]
+    assert lines[1].split() == ["no", "guard", "paper's", "guard"]
+    assert any(line.strip().startswith("plan accuracy") and "±" in line for line in lines)
+    assert any(line.strip().startswith("mean speed") and "m/s" in line for line in lines)
+    assert any("guard acted in" in line for line in lines)
+    assert lines[-1].split(maxsplit=1) == ["next", "stlc check trace.npz"]
+    for path in (Path("trace.npz"), there.path / "trace.npz"):
+        trace = load_trace(path)
+        assert (trace.traces, trace.samples) == (8, 31)
+        assert trace.meta.run == there.name
+    document = there.read_json("eval/simulate.json")
+    assert set(document["guards"]) == {"none", "paper"}
+    assert document["seeds"] == [0, 1]
+    assert (there.path / "scene.npz").exists()
+
+
+def test_without_backup_nothing_is_guarded(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", there.name, *SMALL, "--seed", "5", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["schema"] == "simulate/1"
+    assert document["ok"] is True
+    result = document["result"]
+    assert set(result["guards"]) == {"none"}
+    assert result["seeds"] == [5, 6]
+    assert result["guards"]["none"]["decisions"]["policy"] == 1.0
+
+
+def test_the_same_seed_gives_the_same_trace(there: RunDir) -> None:
+    found = []
+    for name in ("a.npz", "b.npz"):
+        assert main(["simulate", "--guard", "paper", *SMALL, "--record", name]) == 0
+        found.append(load_trace(there.path.parents[2] / name))
+    assert all((found[0].data[signal] == found[1].data[signal]).all() for signal in found[0].data)
+
+
+@pytest.mark.usefixtures("there")
+def test_fail_under_is_exit_code_1() -> None:
+    assert main(["simulate", *SMALL, "--fail-under", "1.01"]) == 1
+    assert main(["simulate", *SMALL, "--fail-under", "0"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--guard", "full"], "no guard `full`"),
+        (["--backup", "--guard", "none"], "contradict"),
+        (["--no-backup", "--guard", "paper"], "contradict"),
+        (["0099"], "0099"),
+        (["--agents", "63"], "63 cars"),
+        (["--seeds", "0"], "seeds"),
+    ],
+)
+@pytest.mark.usefixtures("there")
+def test_what_cannot_be_done_is_said(
+    capsys: pytest.CaptureFixture[str], options: list[str], said: str
+) -> None:
+    rest = [] if "--agents" in options or "--seeds" in options else SMALL
+    code = main(["simulate", *options, *rest])
+    captured = capsys.readouterr()
+    assert code == (3 if "--agents" in options else 2)
+    assert said in captured.err
+    assert "Traceback" not in captured.err
+
+
+def test_a_world_that_fails_on_the_way_leaves_a_trace(
+    there: RunDir, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    world = there.path / "traffic_grid.py"
+    text = world.read_text()
+    broken = text.replace(
+        "        self.clock += 1\n", "        self.clock += 1\n        1 / (5 - self.clock)\n"
+    )
+    assert broken != text
+    world.write_text(broken)
+    try:
+        code = main(["simulate", *SMALL, "--record", str(tmp_path / "t.npz")])
+    finally:
+        world.write_text(text)
+    error = capsys.readouterr().err
+    assert code == 3
+    assert "S207" in error
+    assert "the first 4 steps" in error
+    assert load_trace(tmp_path / "t.npz").samples == 5
+
+
+def test_pictures_are_drawn(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", "--backup", *SMALL[:-1]]) == 0
+    out = capsys.readouterr().out
+    assert "report.html" in out
+    assert "traffic.gif" in out
+    assert (there.path / "report.html").exists()
+    assert (there.path / "traffic.gif").read_bytes()[:6] in (b"GIF89a", b"GIF87a")
