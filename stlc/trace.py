@@ -16,19 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
-from stlc.registry import closest
-from stlc.signature import Column, Signature
-from stlc.trace_csv import GROUPS, read_csv, write_csv
-from stlc.trace_meta import TraceMeta, meta_array, read_meta
-from stlc.trace_npz import read_npz, unreadable, write_npz
-from stlc.trace_time import read_clock
-from stlc.units import DIMENSIONLESS, Unit, parse_unit
+from stlc.signature import Column, Kind, Signature
+from stlc.trace_csv import write_csv
+from stlc.trace_formats import read_recording
+from stlc.trace_meta import TraceMeta, meta_array
+from stlc.trace_npz import write_npz
+from stlc.trace_recording import CLOCK, EXTRA, Recording, absent, fit
+from stlc.trace_resample import resampled
+from stlc.trace_table import GROUPS
+from stlc.trace_time import RESAMPLE, read_clock
 
-__all__ = ["Trace", "TraceMeta", "as_fraction", "load_trace", "save_trace"]
+__all__ = ["Reading", "Trace", "TraceMeta", "as_fraction", "load_trace", "save_trace"]
 
 Floats = NDArray[np.float64]
 
-EXTRA = "extra."
 RESERVED = ("t", "meta")
 
 
@@ -75,7 +76,9 @@ class Trace:
         Raises:
             TraceError: E601, a signal that is not in the trace.
         """
-        findings = [self._absent(old) for old in names.values() if old not in self.data]
+        if not names:
+            return self
+        findings = [absent(self.name, old, self.data) for old in names.values() if old not in self.data]
         if findings:
             raise TraceError(*findings)
         back = {old: new for new, old in names.items()}
@@ -84,119 +87,72 @@ class Trace:
         data = {back.get(c.name, c.name): self.data[c.name] for c in kept}
         return replace(self, signature=Signature(columns), data=data)
 
-    def _absent(self, name: str) -> Diagnostic:
-        near = closest(name, self.data)
-        return Diagnostic(
-            "E601",
-            f"trace `{self.name}` has no signal `{name}`",
-            help=(f"did you mean `{near}`?",) if near else (),
-            note=(f"signals in {self.name}: {', '.join(self.data)}",),
-        )
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """How a file is read.
+
+    Attributes:
+        names: signal -> its name in the file; `t` names the clock.
+        resample: put the signals on a grid of so many seconds; None takes the file's own, which is uniform.
+        kinds: signal -> what its numbers mean, which says how it is resampled.
+    """
+
+    names: Mapping[str, str] = field(default_factory=dict)
+    resample: float | None = None
+    kinds: Mapping[str, Kind] = field(default_factory=dict)
+
+
+AS_IT_IS = Reading()
 
 
 # ----------------------------------------------------------------------- reading
 
 
-def load_trace(path: Path | str) -> Trace:
-    """Read a trace; the format follows the suffix (`.csv`; everything else is `.npz`).
+def load_trace(path: Path | str, reading: Reading = AS_IT_IS) -> Trace:
+    """Read a trace; the format follows the suffix.
 
+    It is one of `.csv`, `.parquet`, `.mat` and `.mcap`; everything else is an `.npz`.
     Values may be NaN or infinite here: the monitor refuses them where a requirement needs them.
 
     Raises:
         UsageError: U102, no such file.
-        TraceError: E601, no time; E602, time is not uniform; E603, the file cannot be read safely;
-            E605, its arrays do not fit together.
+        MissingError: R301, the format needs a package that is not installed.
+        TraceError: E601, no time, or no such signal; E602, time is not uniform; E603, the file cannot be read
+            safely; E605, its arrays do not fit together.
     """
-    path = Path(path)
-    if path.suffix.lower() == ".csv":
-        return _from_csv(path)
-    return _from_npz(path)
+    recording = read_recording(Path(path))
+    names = dict(reading.names)
+    clock = names.pop(CLOCK, None)
+    if clock is not None:
+        recording = recording.clocked_by(clock)
+    if reading.resample is None:
+        trace = _uniform(recording)
+    else:
+        kinds = {names.get(name, name): kind for name, kind in reading.kinds.items()}
+        t0, data = resampled(recording, reading.resample, kinds)
+        trace = _trace(recording, t0, reading.resample, data)
+    return trace.renamed(names)
 
 
-def _from_npz(path: Path) -> Trace:
-    arrays = read_npz(path)
-    meta, columns = read_meta(path, arrays.pop("meta", None))
-    extras = {name.removeprefix(EXTRA): arrays.pop(name) for name in list(arrays) if name.startswith(EXTRA)}
-    texts = [name for name, values in arrays.items() if values.dtype.kind == "U"]
-    if texts:
-        raise unreadable(path, f"`{texts[0]}` holds text, not numbers")
-    clock = arrays.pop("t", None)
-    t0, dt, samples = read_clock(str(path), clock, meta.dt, _longest(arrays))
-    data = _fit(str(path), arrays, samples)
-    signature = Signature(tuple(columns.get(name, Column(name)) for name in data))
-    return Trace(signature, dt, data, t0, extras, meta, str(path))
+def _uniform(recording: Recording) -> Trace:
+    """The trace of a file with one uniform clock."""
+    name = recording.name
+    strands = [strand for strand in recording.strands if strand.arrays] or list(recording.strands)
+    if len(strands) > 1:
+        message = f"the signals of `{name}` follow {len(strands)} clocks"
+        raise TraceError(Diagnostic("E602", message, help=(RESAMPLE,)))
+    (strand,) = strands
+    longest = max((values.shape[-1] for values in strand.arrays.values() if values.ndim), default=0)
+    t0, dt, samples = read_clock(name, strand.clock, recording.meta.dt, longest)
+    data = fit(name, strand.arrays, samples)
+    whole = {n: np.ascontiguousarray(values, dtype=np.float64) for n, values in data.items()}
+    return _trace(recording, t0, dt, whole)
 
 
-def _longest(arrays: Mapping[str, NDArray[Any]]) -> int:
-    return max((values.shape[-1] for values in arrays.values() if values.ndim), default=0)
-
-
-def _fit(name: str, arrays: Mapping[str, NDArray[Any]], samples: int) -> dict[str, Floats]:
-    """Signals as (traces, samples); a third axis holds the components of a vector."""
-    findings: list[Diagnostic] = []
-    data: dict[str, NDArray[Any]] = {}
-    for signal, values in arrays.items():
-        if values.ndim in (1, 2) and values.shape[-1] == samples:
-            data[signal] = np.atleast_2d(values)
-        elif values.ndim in (2, 3) and values.shape[-2] == samples:
-            stacked = values[None] if values.ndim == 2 else values
-            data |= {f"{signal}[{i}]": stacked[..., i] for i in range(values.shape[-1])}
-        else:
-            shape = " x ".join(map(str, values.shape)) or "a single number"
-            message = f"`{signal}` in `{name}` is {shape}, and `t` has {samples} samples"
-            findings.append(
-                Diagnostic("E605", message, help=("signals are (samples,) or (traces, samples)",))
-            )
-    traces = max((len(values) for values in data.values()), default=0)
-    for signal, values in data.items():
-        if len(values) not in (1, traces):
-            message = f"`{signal}` in `{name}` has {len(values)} traces, other signals have {traces}"
-            findings.append(Diagnostic("E605", message))
-    if findings:
-        raise TraceError(*findings)
-    if not data:
-        raise TraceError(Diagnostic("E601", f"trace `{name}` has no signals"))
-    if not traces:
-        raise TraceError(Diagnostic("E605", f"the arrays of `{name}` hold no traces"))
-    return {
-        signal: np.ascontiguousarray(np.broadcast_to(values, (traces, samples)), dtype=np.float64)
-        for signal, values in data.items()
-    }
-
-
-def _from_csv(path: Path) -> Trace:
-    table = read_csv(path)
-    group = next((name for name in GROUPS if name in table.columns), None)
-    columns = {name: values for name, values in table.columns.items() if name != group}
-    keys = table.columns[group] if group else np.zeros(table.rows)
-    labels, sizes = np.unique(keys, return_counts=True)
-    if len(set(sizes.tolist())) > 1:
-        i = int(np.argmax(sizes != sizes[0]))
-        message = (
-            f"traces in `{path}` differ in length: {group} {labels[0]:g} has {sizes[0]} samples, "
-            f"{labels[i]:g} has {sizes[i]}"
-        )
-        raise TraceError(
-            Diagnostic("E605", message, help=("put traces of other lengths into files of their own",))
-        )
-    order = np.argsort(keys, kind="stable").reshape(len(labels), -1)
-    arrays = {name: values[order] for name, values in columns.items()}
-    clock = arrays.pop("t", None)
-    if clock is not None and not np.array_equal(
-        clock, np.broadcast_to(clock[0], clock.shape), equal_nan=True
-    ):
-        raise TraceError(Diagnostic("E605", f"the traces in `{path}` were not sampled at the same times"))
-    t0, dt, samples = read_clock(str(path), None if clock is None else clock[0], None, 0)
-    data = _fit(str(path), arrays, samples)
-    signature = Signature(tuple(Column(name, _unit(path, name, table.units[name])) for name in data))
-    return Trace(signature, dt, data, t0, name=str(path))
-
-
-def _unit(path: Path, name: str, text: str) -> Unit:
-    try:
-        return parse_unit(text) if text else DIMENSIONLESS
-    except ValueError as error:
-        raise TraceError(Diagnostic("E605", f"column `{name}` of `{path}`: {error}")) from None
+def _trace(recording: Recording, t0: float, dt: float, data: dict[str, Floats]) -> Trace:
+    signature = Signature(tuple(recording.columns.get(name, Column(name)) for name in data))
+    return Trace(signature, dt, data, t0, recording.extras, recording.meta, recording.name)
 
 
 # ----------------------------------------------------------------------- writing

@@ -21,34 +21,16 @@ from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.files import write_atomic
 from stlc.source import Source, Span
 from stlc.trace_npz import unreadable
+from stlc.trace_table import Table
 
 Floats = NDArray[np.float64]
 
 MAX_BYTES = 1_000_000_000
-GROUPS = ("trace", "agent")
 
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
 _HEAD = re.compile(r"(?P<name>[^\[\]\s]+(?:\[\d+\])?)\s*(?:\[(?P<unit>[^\]]*)\])?")
 _WORDS = {"true": 1.0, "false": 0.0}
 _MAX_FINDINGS = 20
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """A file as read.
-
-    Attributes:
-        columns: name -> values, one per line of the file.
-        units: unit in brackets behind a name, "" where there is none.
-    """
-
-    columns: dict[str, Floats]
-    units: dict[str, str]
-
-    @property
-    def rows(self) -> int:
-        """How many lines of numbers."""
-        return len(next(iter(self.columns.values())))
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +108,12 @@ def _read_header(sheet: _Sheet) -> tuple[list[str], dict[str, str]]:
     if findings:
         raise TraceError(*findings[:_MAX_FINDINGS])
     return names, units
+
+
+def split_head(text: str) -> tuple[str, str]:
+    """`v [km/h]` as name and unit; what is of another form is a name as a whole."""
+    match = _HEAD.fullmatch(text.strip())
+    return (match["name"], (match["unit"] or "").strip()) if match else (text.strip(), "")
 
 
 def _cells(source: Source, start: int, line: str, delimiter: str) -> Iterator[tuple[str, Span]]:

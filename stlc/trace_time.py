@@ -15,6 +15,8 @@ Floats = NDArray[np.float64]
 TOLERANCE = 0.05
 """Share of a step by which samples may stand beside the grid (rounded decimals, jitter)."""
 
+RESAMPLE = "--resample 0.1s  puts them on one grid (bool, int and enum held, real ones interpolated)"
+
 _SNAP = 1e-6
 
 
@@ -36,7 +38,7 @@ def read_clock(
         raise TraceError(Diagnostic("E602", f"the time step of `{name}` is {dt:g} s"))
     if clock is None:
         if dt is None:
-            help_ = ("add an array `t` with the time of every sample in seconds",)
+            help_ = ("add an array `t` with the time of every sample in seconds, or name it: --map t=NAME",)
             raise TraceError(Diagnostic("E601", f"trace `{name}` has no `t`", help=help_))
         return 0.0, dt, samples
     if clock.ndim != 1:
@@ -78,7 +80,7 @@ def _step(name: str, times: Floats, dt: float | None) -> float:
             f"time in `{name}` is not uniform: dt is {usual:.6g} s except at t[{i}] = {times[i]:.6g} s, "
             f"where it is {gaps[i]:.6g} s"
         )
-        raise TraceError(Diagnostic("E602", message, help=("resample the signals on a uniform grid",)))
+        raise TraceError(Diagnostic("E602", message, help=(RESAMPLE,)))
     mean = float(times[-1] - times[0]) / len(gaps)
     drift = np.abs(times - times[0] - mean * np.arange(len(times)))
     if drift.max() > TOLERANCE * mean:
@@ -86,7 +88,7 @@ def _step(name: str, times: Floats, dt: float | None) -> float:
         message = (
             f"time in `{name}` is not uniform: t[{i}] = {times[i]:.6g} s is {drift[i]:.3g} s beside the grid"
         )
-        raise TraceError(Diagnostic("E602", message, help=("resample the signals on a uniform grid",)))
+        raise TraceError(Diagnostic("E602", message, help=(RESAMPLE,)))
     return _snap(mean, dt)
 
 

@@ -13,13 +13,18 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "stlc"
 
+TRACE_FORMATS = (
+    *("trace_csv", "trace_extras", "trace_formats", "trace_mat", "trace_mat5", "trace_mcap", "trace_meta"),
+    *("trace_npz", "trace_parquet", "trace_recording", "trace_resample", "trace_table", "trace_time"),
+)
+
 # From the bottom up; what stands in one line is one room.
 ROOMS = (
     {"source", "version"},
     {"diagnostics"},
     {"registry", "units", "words", "jsontext"},
     {"signature"},
-    {"trace", "trace_csv", "trace_meta", "trace_npz", "trace_time", "rundir", "files", "provenance"},
+    {"rundir", "files", "provenance", "trace", *TRACE_FORMATS},
     {"grammar"},
     {"compile"},
     {"dynamics"},
@@ -51,6 +56,10 @@ HOMES = {
         "stlc.view",
         "stlc.cli",
     ),
+    "pyarrow": ("stlc.trace_parquet",),
+    "h5py": ("stlc.trace_mat",),
+    "mcap": ("stlc.trace_mcap",),
+    "mcap_ros2": ("stlc.trace_mcap",),
     "pickle": (),
     "marshal": (),
     "shelve": (),

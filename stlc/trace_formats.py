@@ -1,0 +1,53 @@
+"""Which reader reads which file: by its suffix; everything that is not known is taken for an `.npz`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from pathlib import Path
+
+from stlc.trace_csv import read_csv
+from stlc.trace_meta import read_meta
+from stlc.trace_npz import read_npz, unreadable
+from stlc.trace_recording import Recording, of_arrays
+from stlc.trace_table import of_table
+
+Reader = Callable[[Path], Recording]
+
+SUFFIXES = (".npz", ".csv", ".parquet", ".mat", ".mcap")
+
+_LAZY: Mapping[str, str] = {
+    ".parquet": "stlc.trace_parquet:read_parquet",
+    ".pq": "stlc.trace_parquet:read_parquet",
+    ".mat": "stlc.trace_mat:read_mat",
+    ".mcap": "stlc.trace_mcap:read_mcap",
+}
+
+
+def read_recording(path: Path) -> Recording:
+    """Read a file of any format.
+
+    Raises:
+        UsageError: U102, no such file.
+        MissingError: R301, the format needs a package that is not installed.
+        TraceError: the file cannot be read (E603) or does not fit together (E605).
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".csv":
+        return of_table(path, read_csv(path))
+    if suffix not in _LAZY:
+        return _from_npz(path)
+    module, _, function = _LAZY[suffix].partition(":")
+    reader: Reader = getattr(import_module(module), function)
+    return reader(path)
+
+
+def _from_npz(path: Path) -> Recording:
+    arrays = read_npz(path)
+    meta, columns = read_meta(path, arrays.pop("meta", None))
+    recording = of_arrays(path, arrays, meta)
+    (strand,) = recording.strands
+    texts = [name for name, values in strand.arrays.items() if values.dtype.kind == "U"]
+    if texts:
+        raise unreadable(path, f"`{texts[0]}` holds text, not numbers")
+    return Recording(str(path), (strand,), columns, meta, recording.extras)

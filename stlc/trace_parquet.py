@@ -1,0 +1,141 @@
+"""Named columns in a `.parquet` file (extra `parquet`): numbers, truth values, times, and lists as vectors.
+
+Units stand in brackets behind a name, `v [km/h]`, or in the field's metadata under `unit`. Columns that hold
+anything else, texts among them, are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.diagnostics import Diagnostic, StlcError, TraceError, UsageError
+from stlc.trace_csv import split_head
+from stlc.trace_extras import needed
+from stlc.trace_npz import MAX_BYTES, unreadable
+from stlc.trace_recording import Recording
+from stlc.trace_table import Table, of_table
+
+Floats = NDArray[np.float64]
+
+MAX_COMPONENTS = 1000
+
+
+def read_parquet(path: Path) -> Recording:
+    """The numeric columns of a file.
+
+    Raises:
+        UsageError: U102, the file does not exist or cannot be opened.
+        MissingError: R301, `pyarrow` is not installed.
+        TraceError: E603, no such file format, or damaged; E605, columns that do not fit.
+    """
+    file = open_parquet(path)
+    with damage(path):
+        table = file.read(columns=[name for name, _ in numeric_fields(file.schema_arrow)])
+    return of_table(path, table_of(path, table))
+
+
+def open_parquet(path: Path) -> Any:
+    """The file, opened, and small enough to be read."""
+    parquet = needed("pyarrow.parquet")
+    if not path.is_file():
+        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: no such file or directory"))
+    with damage(path):
+        file = parquet.ParquetFile(path, memory_map=True)
+        size = file.metadata.num_rows * max(file.metadata.num_columns, 1) * 8
+    if size > MAX_BYTES or size < 0:
+        why = f"it unpacks to {size / 1e9:.1f} GB, more than {MAX_BYTES / 1e9:.0f} GB"
+        raise unreadable(path, why, advice="split it")
+    return file
+
+
+class damage:  # noqa: N801 - reads as a word: with damage(path): …
+    """Whatever a library says about a file that it cannot read, as E603."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        if isinstance(error, Exception) and not isinstance(error, StlcError):
+            lines = str(error).strip().splitlines()
+            why = lines[0][:100] if lines else type(error).__name__
+            raise unreadable(self.path, f"it is damaged or of another format ({why})") from None
+
+
+def numeric_fields(schema: Any) -> Iterator[tuple[str, Any]]:
+    """Name and type of every column that can be a signal."""
+    types = needed("pyarrow").types
+    for field in schema:
+        kind = field.type.value_type if _list(field.type, types) else field.type
+        if _numeric(kind, types):
+            yield field.name, field.type
+
+
+def _numeric(kind: Any, types: Any) -> bool:
+    numbers = (types.is_integer, types.is_floating, types.is_boolean, types.is_decimal)
+    return any(test(kind) for test in (*numbers, types.is_timestamp, types.is_duration))
+
+
+def _list(kind: Any, types: Any) -> bool:
+    return bool(types.is_fixed_size_list(kind) or types.is_list(kind) or types.is_large_list(kind))
+
+
+def table_of(path: Path, table: Any) -> Table:
+    """An arrow table as numbers; a missing value is NaN.
+
+    Raises:
+        TraceError: E605, a name twice, lists of different lengths; E603, no line of numbers.
+    """
+    columns: dict[str, Floats] = {}
+    units: dict[str, str] = {}
+    for field, chunked in zip(table.schema, table.columns, strict=True):
+        name, unit = split_head(field.name)
+        told = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
+        for part, values in _values(path, name, chunked):
+            if part in columns:
+                raise TraceError(Diagnostic("E605", f"two columns of `{path}` are called `{part}`"))
+            columns[part], units[part] = values, unit or told
+    if not columns or not table.num_rows:
+        raise unreadable(path, "it holds no line of numbers")
+    return Table(columns, units)
+
+
+def _values(path: Path, name: str, chunked: Any) -> Iterator[tuple[str, Floats]]:
+    types = needed("pyarrow").types
+    with damage(path):
+        if not _list(chunked.type, types):
+            yield name, _floats(chunked)
+            return
+        lists = chunked.combine_chunks()
+        rows, flat = len(lists), _floats(lists.flatten())
+    size, rest = divmod(len(flat), max(rows, 1))
+    if rest or not 1 <= size <= MAX_COMPONENTS or lists.null_count or not _even(lists, size):
+        raise TraceError(Diagnostic("E605", f"the lists in `{name}` of `{path}` differ in length"))
+    for i in range(size):
+        yield f"{name}[{i}]", np.ascontiguousarray(flat[i::size])
+
+
+def _even(lists: Any, size: int) -> bool:
+    lengths = needed("pyarrow.compute").list_value_length(lists)
+    return bool((np.asarray(lengths) == size).all())
+
+
+def _floats(values: Any) -> Floats:
+    """Numbers as they are, times in seconds: a point in time since the first one."""
+    arrow = needed("pyarrow")
+    kind = values.type
+    if arrow.types.is_timestamp(kind) or arrow.types.is_duration(kind):
+        scale = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[kind.unit]
+        ticks = np.asarray(values.cast(arrow.int64()).fill_null(0))
+        ticks = ticks - ticks[:1] if arrow.types.is_timestamp(kind) else ticks
+        return ticks.astype(np.float64) * scale
+    if arrow.types.is_boolean(kind):
+        values = values.cast(arrow.uint8())
+    return np.asarray(values.cast(arrow.float64(), safe=False), dtype=np.float64)
