@@ -48,7 +48,7 @@ def simulate(
     ] = None,
     guard: Annotated[str | None, typer.Option(metavar="none|paper", help="What guards the policy.")] = None,
     seeds: Annotated[int, typer.Option(min=1, help="How many deployments.")] = 10,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the first; the others follow.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**62, help="Seed of the first; the others follow.")] = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Of each; by default the system's.")] = None,
     agents: Annotated[int | None, typer.Option(min=1, help="In each; by default the system's.")] = None,
     record: Annotated[

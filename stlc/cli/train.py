@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from pathlib import Path
@@ -48,7 +49,8 @@ def train(
         int | None, typer.Option(min=1, help="Steps of the optimiser instead of a budget.")
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(help="Seed of everything random; the system file's if not given.")
+        int | None,
+        typer.Option(min=0, max=2**63 - 1, help="Seed of everything random; the system file's if not given."),
     ] = None,
     method: Annotated[
         str, typer.Option(metavar="guided|gradient", help="Search and distil, or the paper's plain gradient.")
@@ -74,6 +76,8 @@ def train(
         from stlc.controller.config import TrainConfig
         from stlc.controller.launch import Launch
 
+        if budget is not None and steps is not None:
+            raise UsageError(Diagnostic("U101", "`--budget` and `--steps` contradict each other"))
         config = TrainConfig(
             method=_method(method),
             budget=_seconds(budget) if budget is not None else None,
@@ -82,7 +86,7 @@ def train(
             device=device,
             threads=threads,
             plans=plans,
-            lr=lr,
+            lr=_rate(lr) if lr is not None else None,
             batch=batch,
         )
         launch = Launch(root=runs, name=name, overrides=parse_overrides(set_), command=sys.argv[1:])
@@ -95,6 +99,13 @@ def _method(name: str) -> Method:
         if name == method:
             return method
     raise UsageError(Diagnostic("U101", f"there is no method `{name}`", help=(" or ".join(METHODS),)))
+
+
+def _rate(value: float) -> float:
+    """A learning rate: a positive number."""
+    if not 0.0 < value < math.inf:
+        raise UsageError(Diagnostic("U101", f"`--lr {value:g}` is not a learning rate", help=("--lr 1e-3",)))
+    return value
 
 
 def _seconds(text: str) -> float:
