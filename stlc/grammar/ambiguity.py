@@ -1,0 +1,116 @@
+"""Where a formula without parentheses means one thing here and another in other tools.
+
+What the others do, from their grammars:
+
+    RTAMT      `or` binds tighter than `and`, temporal words loosest of all, `->` from the left
+    MoonLight  `->` binds tighter than `or`, `or` tighter than `and`, temporal words loosest, `->` from the left
+    STLRom     `and`, `or` and `=>` have one rank, temporal words bind tightest
+    FalCAuN    `&&`, `||` and `->` have one rank, from the left; `!` and temporal words bind loosest
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from stlc.grammar import ast
+from stlc.grammar.children import descendants
+from stlc.grammar.scan import Lexeme, lexemes
+from stlc.source import Span
+
+Kind: TypeAlias = Literal["scope", "mixed", "chain", "until", "implication"]
+
+
+@dataclass(frozen=True, slots=True)
+class Ambiguity:
+    """A part of a formula that should stand in parentheses.
+
+    Attributes:
+        span: the part.
+        kind: "scope", a temporal word that elsewhere governs what follows too; "mixed", `and` beside `or`;
+            "chain", implications in a row; "until" beside another connective; "implication", `and` or `or`
+            beside `->`, which most tools read as here.
+        outer: the connective beside it.
+    """
+
+    span: Span
+    kind: Kind
+    outer: str
+
+
+def ambiguities(spec: ast.Spec, *, implications: bool = False) -> Iterator[Ambiguity]:
+    """All parts that other tools read differently, in the order of the text.
+
+    Args:
+        spec: as parsed.
+        implications: also those beside `->`.
+    """
+    words = _Words(spec)
+    seen: set[tuple[int, int]] = set()
+    for node in descendants(spec):
+        if not isinstance(node, ast.Logic | ast.Until):
+            continue
+        for found in (*_operands(node, words), *_scope(node, words)):
+            place = (found.span.start, found.span.end)
+            if place not in seen and (implications or found.kind != "implication"):
+                seen.add(place)
+                yield found
+
+
+class _Words:
+    """What stands beside a part of the text."""
+
+    def __init__(self, spec: ast.Spec) -> None:
+        self.items: list[Lexeme] = list(lexemes(spec.source.text))
+        self.starts = [item.start for item in self.items]
+
+    def closed(self, node: ast.Node, *, left: bool) -> bool:
+        """Whether an operand stands in parentheses; `left` says on which side of its operator."""
+        at = bisect_left(self.starts, node.span.end if left else node.span.start)
+        if left:
+            return at < len(self.items) and self.items[at].text == ")"
+        return at > 0 and self.items[at - 1].text == "("
+
+
+def _operands(node: ast.Logic | ast.Until, words: _Words) -> Iterator[Ambiguity]:
+    """Operands that are a connective of their own."""
+    for operand, left in ((node.left, True), (node.right, False)):
+        if words.closed(operand, left=left):
+            continue
+        kind = _clash(node, operand, left=left)
+        if kind is not None:
+            yield Ambiguity(operand.span, kind, node.op)
+
+
+def _clash(node: ast.Logic | ast.Until, operand: ast.Expr, *, left: bool) -> Kind | None:
+    if isinstance(operand, ast.Until):
+        return "until"
+    if not isinstance(operand, ast.Logic):
+        return None
+    juncts = ("and", "or", "xor")
+    if node.op in juncts and operand.op in juncts and node.op != operand.op:
+        return "mixed"
+    if node.op == "->" and operand.op == "->" and not left:
+        return "chain"
+    return "implication" if node.op == "->" and operand.op in juncts else None
+
+
+def _scope(node: ast.Logic | ast.Until, words: _Words) -> Iterator[Ambiguity]:
+    """The temporal word at the end of a left operand: elsewhere it goes on behind the connective."""
+    part: ast.Expr = node.left
+    governed: ast.Expr | None = None
+    while not words.closed(part, left=True):
+        match part:
+            case ast.Logic(right=right) | ast.Until(right=right):
+                part, governed = right, None
+            case ast.Temporal():
+                yield Ambiguity((governed or part).span, "scope", node.op)
+                return
+            case ast.Not(operand=body) | ast.Quantifier(body=body) | ast.Freeze(body=body):
+                part, governed = body, governed or part
+            case ast.IfThenElse(no=body):
+                part, governed = body, governed or part
+            case _:
+                return
