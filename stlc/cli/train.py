@@ -23,6 +23,18 @@ if TYPE_CHECKING:
 
 METHODS: tuple[Method, ...] = ("guided", "gradient")
 
+SeedOption = Annotated[
+    int | None,
+    typer.Option(min=0, max=2**63 - 1, help="Seed of everything random; the system file's if not given."),
+]
+MethodOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="guided|gradient",
+        help="Search and distil, or the paper's plain gradient; guided unless the system says otherwise.",
+    ),
+]
+
 
 def register(app: typer.Typer) -> None:
     """Add the command to the program."""
@@ -48,13 +60,8 @@ def train(
     steps: Annotated[
         int | None, typer.Option(min=1, help="Steps of the optimiser instead of a budget.")
     ] = None,
-    seed: Annotated[
-        int | None,
-        typer.Option(min=0, max=2**63 - 1, help="Seed of everything random; the system file's if not given."),
-    ] = None,
-    method: Annotated[
-        str, typer.Option(metavar="guided|gradient", help="Search and distil, or the paper's plain gradient.")
-    ] = "guided",
+    seed: SeedOption = None,
+    method: MethodOption = None,
     resume: Annotated[str | None, typer.Option(metavar="RUN", help="Go on with an interrupted run.")] = None,
     name: Annotated[str | None, typer.Option(help="Name of the run; drawn if not given.")] = None,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")] = "cpu",
@@ -70,7 +77,11 @@ def train(
     """Learn a policy, or go on with a run that was interrupted."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads of torch must not spin
     if resume is not None:
-        _refuse_on_resume(spec=spec, system=system, budget=budget, name=name, set_=set_)
+        _refuse_on_resume(
+            {"SPEC": spec, "--system": system, "--budget": budget, "--seed": seed, "--method": method}
+            | {"--name": name, "--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch}
+            | {"--set": set_}
+        )
         sitting = _resume(resume, runs=runs, steps=steps, device=device)
     else:
         from stlc.controller.config import TrainConfig
@@ -79,7 +90,7 @@ def train(
         if budget is not None and steps is not None:
             raise UsageError(Diagnostic("U101", "`--budget` and `--steps` contradict each other"))
         config = TrainConfig(
-            method=_method(method),
+            method=_method(method) if method is not None else None,
             budget=_seconds(budget) if budget is not None else None,
             steps=steps,
             seed=seed,
@@ -175,9 +186,9 @@ def _resume(where: str, *, runs: Path, steps: int | None, device: str) -> Sittin
     return sitting
 
 
-def _refuse_on_resume(**given: object) -> None:
-    """A resumed run goes on with what it was started with; only `--steps` may change."""
-    named = [f"--{key.rstrip('_')}" if key != "spec" else "SPEC" for key, value in given.items() if value]
+def _refuse_on_resume(given: Mapping[str, object]) -> None:
+    """A resumed run goes on with what it was started with; only `--steps` and `--device` may change."""
+    named = [option for option, value in given.items() if value is not None]
     if named:
         raise UsageError(
             Diagnostic(

@@ -20,7 +20,7 @@ class TrainConfig:
     """What the user may say; None leaves the choice to the system file, then to the engine.
 
     Attributes:
-        method: `guided` searches and distils; `gradient` is the paper's.
+        method: `guided` (the default) searches and distils; `gradient` is the paper's.
         budget: seconds, turned into steps in the first of them.
         steps: of the optimiser; wins over `budget`.
         seed: of everything random in training.
@@ -32,7 +32,7 @@ class TrainConfig:
         held_out: states of the last verdict.
     """
 
-    method: Method = "guided"
+    method: Method | None = None
     budget: float | None = None
     steps: int | None = None
     seed: int | None = None
@@ -92,11 +92,12 @@ class Engine:
 def decide(task: Task, config: TrainConfig) -> Engine:
     """The engine's numbers for a task: the user's words, then the system file's, then defaults."""
     declared = task.system.decl.train
-    guided = config.method == "guided"
+    method: Method = "gradient" if (config.method or declared.method) == "gradient" else "guided"
+    guided = method == "guided"
     batch = config.batch or declared.batch or (256 if guided else 512)
     plans = config.plans or (4 if guided else 1)
     return Engine(
-        method=config.method,
+        method=method,
         seed=declared.seed if config.seed is None else config.seed,
         hidden=task.system.decl.policy.hidden,
         plans=plans,

@@ -91,7 +91,7 @@ def train_here(
     budget: float | None = None,
     steps: int | None = None,
     seed: int | None = None,
-    method: Method = "guided",
+    method: Method | None = None,
 ) -> Run:
     """Train a policy in a new folder below `runs/` and return the run.
 
@@ -100,7 +100,7 @@ def train_here(
         budget: seconds; 60 where neither this nor `steps` nor the system file says otherwise.
         steps: of the optimiser; wins over `budget`.
         seed: of everything random; None takes the system file's.
-        method: `guided` (search and distil) or `gradient` (the paper's).
+        method: `guided` (search and distil) or `gradient` (the paper's); None takes the system file's.
     """
     config = TrainConfig(method=method, budget=budget, steps=steps, seed=seed)
     return train(task, config, open_folder(task, config)).run

@@ -107,6 +107,8 @@ def resume(
     task = load_task(folder)
     engine: Engine = load_engine(folder)
     saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
+    if asked := folder.record().get("options", {}).get("threads"):
+        torch.set_num_threads(asked)  # sums of other lengths round otherwise
     trainer = Trainer(task, engine, steps=int(saved.facts["steps"]), device=find_device(device))
     trainer.restore(saved.tensors, saved.facts)
     trainer.steps = steps or trainer.steps

@@ -45,3 +45,16 @@ def test_options_out_of_range_are_usage_errors_and_make_no_run(
     assert [finding["code"] for finding in document["diagnostics"]] == ["U101"]
     assert options[0] in document["diagnostics"][0]["message"]
     assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize(
+    "option",
+    [["--seed", "0"], ["--method", "gradient"], ["--lr", "1e-3"], ["--threads", "1"], ["--set", "T_red=3s"]],
+)
+def test_what_a_resumed_run_cannot_change_is_refused(
+    option: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", "--resume", "latest", *option, "--json"]) == 2
+    (finding,) = json.loads(capsys.readouterr().out)["diagnostics"]
+    assert finding["code"] == "R104"
+    assert finding["message"].startswith(option[0])

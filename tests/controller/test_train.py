@@ -8,15 +8,19 @@ import pytest
 import torch
 
 from stlc.controller.checkpoint import load_checkpoint
-from stlc.controller.config import TrainConfig
+from stlc.controller.config import TrainConfig, decide
 from stlc.controller.held_out import score, wilson
 from stlc.controller.launch import Launch, open_folder
 from stlc.controller.run import Run, spec_hash, system_hash
 from stlc.controller.task import Task
 from stlc.controller.train import Watch, resume, train
 from stlc.diagnostics import MissingError, RunError
+from stlc.dynamics.system import System
+from stlc.files import read_source
+from stlc.grammar.parser import parse
 from stlc.rundir import RunDir
 
+ROOT = Path(__file__).parents[2]
 STEPS = 130
 
 
@@ -47,6 +51,26 @@ def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(
     for name, value in left.items():
         assert torch.equal(value, right[name]), name
     assert [row["step"] for row in first.rows()] == [row["step"] for row in whole.run.dir.rows()]
+
+
+def test_a_resumed_run_has_the_threads_it_was_started_with(
+    car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = TrainConfig(held_out=50, steps=4, batch=16, threads=1)
+    folder = _folder(car_task, tmp_path, config)
+    train(car_task, config, folder, Watch(stop=lambda: True))
+    told: list[int] = []
+    monkeypatch.setattr(torch, "set_num_threads", told.append)
+    resume(folder)
+    assert told == [1]
+
+
+def test_the_system_file_chooses_the_method_unless_told() -> None:
+    spec = parse(read_source(ROOT / "specs/traffic.stl"))
+    system = System.load(ROOT / "examples/car.yaml", {"train.method": "gradient"})
+    task = Task.of(spec, system)
+    assert decide(task, TrainConfig()).method == "gradient"
+    assert decide(task, TrainConfig(method="guided")).method == "guided"
 
 
 def test_seeds_matter_and_repeat(car_task: Task, tmp_path: Path) -> None:
