@@ -67,6 +67,21 @@ _predicates = st.builds(
 )
 
 
+_seen = (
+    _columns
+    | _columns
+    | st.builds(ir.At, st.sampled_from(NAMES), st.sampled_from([-2, -1, 1, 2]), clamped=st.booleans())
+)
+"""A column, now or at another sample."""
+
+
+def _looking(held: tuple[str, ...]) -> st.SearchStrategy[typed.Formula]:
+    """Predicates about other samples and frozen values."""
+    right = _seen | st.sampled_from(held).map(ir.Held) if held else _seen
+    number = st.builds(lambda a, b, c: ir.Op("sub", (ir.Op("sub", (a, b)), ir.Lit(c))), _seen, right, _values)
+    return st.builds(typed.Pred, st.just(SPAN), number, strict=st.booleans())
+
+
 def _interval(*, bounded_only: bool) -> st.SearchStrategy[typed.Interval]:
     def build(lo: int, width: int | None, opened: tuple[bool, bool], unit: str) -> typed.Interval:
         lo_open, hi_open = opened
@@ -96,25 +111,39 @@ _KINDS = ("unary", "unary", "unary", "binary", "binary", "many", "two", "not", "
 
 @st.composite
 def formulas(  # noqa: C901 - one case an operator
-    draw: st.DrawFn, *, bounded_only: bool = False, truth: bool = True, depth: int | None = None
+    draw: st.DrawFn,
+    *,
+    bounded_only: bool = False,
+    truth: bool = True,
+    depth: int | None = None,
+    held: tuple[str, ...] | None = None,
 ) -> typed.Formula:
-    """Typed formulas with every operator, bounds on the grid of `GRID`, up to three operators deep."""
+    """Typed formulas with every operator, bounds on the grid of `GRID`, up to three operators deep.
+
+    With `held` (names that are frozen around) `freeze` is among them, and numbers read other samples.
+    """
     if depth is None:
         depth = draw(st.sampled_from([0, 1, 1, 2, 2, 2, 3, 3]))
     if depth == 0:
         if truth and draw(st.integers(0, 9)) == 0:
             return typed.Truth(SPAN, draw(st.booleans()))
-        return draw(_predicates)
+        return draw(_predicates if held is None else _looking(held))
 
     def part() -> typed.Formula:
-        return draw(formulas(bounded_only=bounded_only, truth=truth, depth=depth - 1))
+        return draw(formulas(bounded_only=bounded_only, truth=truth, depth=depth - 1, held=held))
 
     def smaller() -> typed.Formula:
         inner = draw(st.integers(0, depth - 1))
-        return draw(formulas(bounded_only=bounded_only, truth=truth, depth=inner))
+        return draw(formulas(bounded_only=bounded_only, truth=truth, depth=inner, held=held))
 
     interval = _interval(bounded_only=bounded_only)
-    match draw(st.sampled_from(_KINDS)):
+    match draw(st.sampled_from(_KINDS if held is None else (*_KINDS, "freeze", "freeze", "freeze"))):
+        case "freeze":
+            assert held is not None
+            names = tuple(f"f#{len(held) + i}" for i in range(draw(st.integers(1, 2))))
+            bindings = tuple((name, draw(_seen)) for name in names)
+            inner = formulas(bounded_only=bounded_only, truth=truth, depth=depth - 1, held=(*held, *names))
+            return typed.Freeze(SPAN, bindings, draw(inner))
         case "unary":
             return typed.Temporal(SPAN, draw(st.sampled_from(_UNARY)), draw(interval), part())
         case "binary":

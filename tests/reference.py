@@ -8,8 +8,8 @@ known or windows are cut both ends are equal. `holds` is the Boolean semantics.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Literal
 
@@ -29,13 +29,71 @@ class Trace:
     columns: Mapping[str, Sequence[float]]
     grid: Grid
     end: Literal["strict", "truncate", "open"] = "strict"
+    held: Mapping[str, float | None] = field(default_factory=dict)
+    """What `freeze` binds around; None where it has no value."""
 
     @property
     def samples(self) -> int:
         return len(next(iter(self.columns.values())))
 
-    def row(self, t: int) -> dict[str, float]:
-        return {name: float(values[t]) for name, values in self.columns.items()}
+    def row(self, t: int) -> Row:
+        return Row(self, t)
+
+    def has(self, num: ir.Num, t: int) -> bool:
+        """Whether everything exists that a number reads at sample `t`."""
+        return 0 <= t < self.samples and all(self._there(leaf, t) for leaf in _leaves(num))
+
+    def _there(self, leaf: ir.Num, t: int) -> bool:
+        match leaf:
+            case ir.At(_, steps, clamped):
+                return clamped or 0 <= t + steps < self.samples
+            case ir.Held(name):
+                return self.held[name] is not None
+        return True
+
+
+def _leaves(node: object) -> Iterator[ir.Num]:
+    """Columns, other samples and frozen values, wherever they stand."""
+    match node:
+        case ir.Col() | ir.At() | ir.Held():
+            yield node
+        case ir.Op(_, args) | ir.Extern(_, args):
+            yield from (leaf for arg in args for leaf in _leaves(arg))
+        case ir.Ind(cond):
+            yield from _leaves(cond)
+        case ir.Where(cond, yes, no):
+            yield from (leaf for part in (cond, yes, no) for leaf in _leaves(part))
+        case ir.Atom(num):
+            yield from _leaves(num)
+        case ir.Join(_, items):
+            yield from (leaf for item in items for leaf in _leaves(item))
+
+
+class Row(Mapping[str, float]):
+    """One sample of a trace, from where others can be seen."""
+
+    def __init__(self, trace: Trace, t: int) -> None:
+        self.trace, self.t = trace, t
+
+    def __getitem__(self, name: str) -> float:
+        return float(self.trace.columns[name][self.t])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.trace.columns)
+
+    def __len__(self) -> int:
+        return len(self.trace.columns)
+
+    def at(self, leaf: ir.At) -> float:
+        there = self.t + leaf.steps
+        if leaf.clamped:
+            there = min(max(there, 0), self.trace.samples - 1)
+        return float(self.trace.columns[leaf.name][there])
+
+    def held(self, leaf: ir.Held) -> float:
+        value = self.trace.held[leaf.name]
+        assert value is not None
+        return value
 
 
 # ---------------------------------------------------------------------- numbers
@@ -81,6 +139,10 @@ def number(num: ir.Num, row: Mapping[str, float]) -> float:
             return value
         case ir.Col(name):
             return row[name]
+        case ir.At():
+            return row.at(num)
+        case ir.Held():
+            return row.held(num)
         case ir.Op(name, args):
             return float(_PLAIN[name](*[number(arg, row) for arg in args]))
         case ir.Ind(cond):
@@ -122,7 +184,7 @@ def distances(interval: typed.Interval, grid: Grid, most: int, *, outward: bool)
         and (high is None or (k < high if interval.hi_open else k <= high))
     ]
     if outward:
-        if low.denominator != 1:
+        if low.denominator != 1 and math.floor(low) <= most:
             inside = [math.floor(low), *inside]
         if high is not None and high.denominator != 1 and math.ceil(high) <= most:
             inside = [*inside, math.ceil(high)]
@@ -162,7 +224,7 @@ class Robustness:
             self._known[key] = self._at(node, t, positive)
         return self._known[key]
 
-    def _at(self, node: typed.Formula, t: int, positive: bool) -> Interval | None:
+    def _at(self, node: typed.Formula, t: int, positive: bool) -> Interval | None:  # noqa: C901
         match node:
             case typed.Truth(_, value):
                 return TRUE if value else FALSE
@@ -184,11 +246,16 @@ class Robustness:
                 now = self.at(body, t, positive if op == "rise" else not positive)
                 before = self.at(body, t - 1, not positive if op == "rise" else positive)
                 return _most([now, _negated(before)] if op == "rise" else [_negated(now), before], "min")
+            case typed.Freeze():
+                inner = _frozen(node, self.trace, t)
+                if self.trace.end == "strict" and None in inner.held.values():
+                    return None
+                return Robustness(inner).at(node.body, t, positive)
         raise TypeError(node)
 
-    def _pred(self, num: ir.Num, strict: bool, guard: bool, t: int) -> Interval:
-        if t >= self.trace.samples:
-            return UNKNOWN
+    def _pred(self, num: ir.Num, strict: bool, guard: bool, t: int) -> Interval | None:
+        if not self.trace.has(num, t):
+            return {"strict": None, "truncate": FALSE, "open": UNKNOWN}[self.trace.end]
         value = number(num, self.trace.row(t))
         if guard:
             return TRUE if (value > 0 if strict else value >= 0) else FALSE
@@ -280,6 +347,12 @@ class Robustness:
         return {"strict": None, "truncate": FALSE, "open": UNKNOWN}[self.trace.end]
 
 
+def _frozen(node: typed.Freeze, trace: Trace, t: int) -> Trace:
+    """The trace with what `node` binds at `t`."""
+    values = {name: number(num, trace.row(t)) if trace.has(num, t) else None for name, num in node.bindings}
+    return replace(trace, held={**trace.held, **values})
+
+
 def robustness(formula: typed.Formula, trace: Trace, t: int = 0) -> Interval | None:
     """Robustness of `formula` at sample `t`; None where it is undefined."""
     return Robustness(trace).at(formula, t)
@@ -294,8 +367,10 @@ def holds(formula: typed.Formula, trace: Trace, t: int = 0) -> bool:  # noqa: C9
         case typed.Truth(_, value):
             return value
         case typed.Pred(_, num, strict):
-            value = number(num, trace.row(t))
+            value = number(num, trace.row(t)) if trace.has(num, t) else -math.inf
             return value > 0 if strict else value >= 0
+        case typed.Freeze(_, _, body):
+            return holds(body, _frozen(formula, trace, t), t)
         case typed.Not(_, body):
             return not holds(body, trace, t)
         case typed.Logic(_, op, items):

@@ -14,6 +14,7 @@ from typing import Any, TypeAlias, assert_never
 
 from stlc.compile import ir
 from stlc.compile.ops import Array, Ops
+from stlc.compile.samples import key_of, leaves
 from stlc.compile.switch import Hard, Switch
 from stlc.compile.tape import Instr, Operand, Tape
 
@@ -34,7 +35,7 @@ class Program:
         externs: functions of the system that `ir.Extern` names.
 
     Calling it takes an environment of arrays that broadcast against each other, each of the columns in
-    `columns`, and returns one array for every output; an output that is a constant takes the shape of the
+    `columns` (those of another sample under the keys of `shifted`), and returns one array for every output; an output that is a constant takes the shape of the
     first array of the environment. Common sub-expressions are computed once.
     """
 
@@ -52,6 +53,8 @@ class Program:
         self._bound: dict[tuple[str, Switch, Hashable], _Bound] = {}
         tape, _ = self._tape(exact=True)
         self.columns = frozenset(str(i.params[0]) for i in tape.code if i.kernel == "input")
+        shifted = (leaf for num in outputs.values() for leaf in leaves(num) if isinstance(leaf, ir.At))
+        self.shifted = {key_of(leaf): leaf for leaf in shifted}
 
     def __call__(self, env: Mapping[str, Array], ops: Ops, switch: Switch | None = None) -> dict[str, Array]:
         """All outputs. `switch` says how conditions become numbers; None is `Hard()`."""
@@ -187,6 +190,8 @@ class _Writer:
             case ir.Col(name):
                 known = self._constants.get(name)
                 return self.tape.emit("input", params=(name,)) if known is None else known
+            case ir.At() | ir.Held():
+                return self.tape.emit("input", params=(key_of(num),))
             case ir.Op(name, args):
                 return self._op(name, [self.number(arg) for arg in args])
             case ir.Ind(cond, sharpness):

@@ -64,7 +64,18 @@ def _pair(
         )
     (a, b), _ = agree((a, b), "compare", place, scope)
     big, small = (a, b) if op in (">", ">=") else (b, a)
-    return typed.Pred(whole, apply("sub", (big, small), whole, scope).num, strict=op in ("<", ">"))
+    return _above(big, small, op in ("<", ">"), whole, scope)
+
+
+def _above(big: Number, small: Number, strict: bool, span: Span, scope: Scope) -> typed.Pred:
+    """`big > small` (`strict`) or `big >= small`; between whole numbers with half a step of margin.
+
+    Whole numbers differ by one step or not at all: halfway, no rounding and no tie decides, and the margin is
+    that of `==`.
+    """
+    if (big.kind, small.kind) == ("int", "int"):
+        big = apply("sub" if strict else "add", (big, half(span)), span, scope)
+    return typed.Pred(span, apply("sub", (big, small), span, scope).num, strict=strict)
 
 
 def _refuse_vectors(
@@ -155,7 +166,7 @@ def in_set(
 def in_range(
     item: tuple[ast.Expr, Value], ends: Sequence[tuple[ast.Expr, Value]], span: Span, scope: Scope
 ) -> typed.Formula:
-    """`x in [lo, hi]`: min(x - lo, hi - x)."""
+    """`x in [lo, hi]`: min(x - lo, hi - x), or under `@product` the paper's (x - lo) (hi - x)."""
     need = "`in [lo, hi]` compares numbers"
     x = as_number(item[1], item[0], Need(need, "the left side"), scope)
     low, high = (as_number(value, expr, Need(need, "a bound"), scope) for expr, value in ends)
@@ -168,8 +179,11 @@ def in_range(
                 ends[0][0].span.to(ends[1][0].span),
             )
         )
-    above = typed.Pred(span, apply("sub", (x, low), span, scope).num, strict=False)
-    below = typed.Pred(span, apply("sub", (high, x), span, scope).num, strict=False)
+    if scope.product and "int" not in (x.kind, low.kind, high.kind):
+        sides = apply("sub", (x, low), span, scope), apply("sub", (high, x), span, scope)
+        return typed.Pred(span, apply("mul", sides, span, scope).num, strict=False)
+    above = _above(x, low, False, span, scope)
+    below = _above(high, x, False, span, scope)
     return typed.Logic(span, "and", (above, below))
 
 

@@ -5,18 +5,21 @@ from __future__ import annotations
 from typing import assert_never
 
 from stlc.compile import ir, typed
+from stlc.compile.samples import leaves
 
 
 def is_state(formula: typed.Formula) -> bool:
-    """Whether its truth depends on one instant alone."""
+    """Whether its truth depends on one instant alone, with what is frozen around it."""
     match formula:
-        case typed.Truth() | typed.Pred():
+        case typed.Truth():
             return True
+        case typed.Pred(_, num):
+            return not any(isinstance(leaf, ir.At) for leaf in leaves(num))
         case typed.Not(_, body):
             return is_state(body)
         case typed.Logic(_, _, items):
             return all(is_state(item) for item in items)
-        case typed.Temporal() | typed.Until() | typed.Shift() | typed.Edge():
+        case typed.Temporal() | typed.Until() | typed.Shift() | typed.Edge() | typed.Freeze():
             return False
         case _:
             assert_never(formula)

@@ -1,7 +1,7 @@
 """Where a formula has a value on a finite trace without cutting any window of the future.
 
-Windows of the past are cut at the start of the trace and so are always defined; `prev` and `next` are not
-defined outside the trace, and neither is a window that reaches beyond its last sample. A window "to the end"
+Windows of the past are cut at the start of the trace and so are always defined; `prev`, `next` and `shift`
+are not defined outside the trace, and neither is a window that reaches beyond its last sample. A window "to the end"
 is defined where it has a sample.
 """
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile import ir
+from stlc.compile.samples import Reach, reach_of
 
 Defined: TypeAlias = NDArray[np.bool_]
 
@@ -21,8 +22,13 @@ Defined: TypeAlias = NDArray[np.bool_]
 def defined(formula: ir.Formula, samples: int) -> Defined:
     """For every sample of a trace with `samples` of them: has `formula` a value there? Shape `(samples,)`."""
     match formula:
-        case ir.Truth() | ir.Atom():
+        case ir.Truth():
             return np.ones(samples, dtype=bool)
+        case ir.Atom(num):
+            return _within(reach_of(num), samples)
+        case ir.Freeze(bindings, body):
+            bound = [_within(reach_of(num), samples) for _, num in bindings]
+            return reduce(np.logical_and, bound, defined(body, samples))
         case ir.Join(_, items):
             return reduce(np.logical_and, [defined(item, samples) for item in items])
         case ir.Over(_, window, body):
@@ -43,6 +49,12 @@ def defined(formula: ir.Formula, samples: int) -> Defined:
             return _shifted(defined(body, samples), steps, outside is not None)
         case _:
             assert_never(formula)
+
+
+def _within(reach: Reach, samples: int) -> Defined:
+    """Where all samples that a number reads exist."""
+    now = np.arange(samples)
+    return np.asarray((now >= reach.past) & (now < samples - reach.future))
 
 
 def _future(window: ir.Window, samples: int) -> tuple[NDArray[np.int_], NDArray[np.int_]]:

@@ -9,13 +9,15 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Protocol
 
 import numpy as np
 
 from stlc.compile import ir
 from stlc.compile.defined import defined
+from stlc.compile.frozen import Freezer
+from stlc.compile.inputs import inputs
 from stlc.compile.machine import Machine
 from stlc.compile.ops import Array, Ops
 from stlc.compile.ops_numpy import NUMPY
@@ -91,11 +93,14 @@ def execute(plan: Schedule, env: Mapping[str, Array], windows: Windows) -> list[
     """The values of the roots of a schedule, each `(count, batch)`."""
     outputs = [_batch(batch, env, windows.ops) for batch in plan.batches]
     machine = Machine(plan.extent, windows, like=next(iter(env.values())))
+    freezer = Freezer(plan.extent, env, windows.ops, partial(_judge, windows=windows))
     values: list[Array] = []
     for index, step in enumerate(plan.steps):
         if isinstance(step.node, ir.Atom):
-            known = _rows(plan, index, outputs)
-            values.append(machine.atom(step.node, step.run, known))
+            known, missing = _rows(plan, index, outputs)
+            values.append(machine.atom(step.node, step.run, known, missing))
+        elif isinstance(step.node, ir.Freeze):
+            values.append(freezer.values(step.node, step.run))
         else:
             values.append(
                 machine.value(step, [None if part is None else values[part] for part in step.parts])
@@ -103,23 +108,33 @@ def execute(plan: Schedule, env: Mapping[str, Array], windows: Windows) -> list[
     return [values[root] for root in plan.roots]
 
 
-def _rows(plan: Schedule, index: int, outputs: Sequence[Mapping[str, Array]]) -> Array | None:
-    """What the batches know of the predicate of step `index`: its rows within the trace."""
+def _judge(
+    formula: ir.Formula, env: Mapping[str, Array], run: Run, extent: Extent, *, windows: Windows
+) -> Array:
+    """One formula at consecutive instants, on the trace or beyond it: `(count, batch)`."""
+    return execute(_scheduled(formula, run, extent), env, windows)[0]
+
+
+@lru_cache(maxsize=512)
+def _scheduled(formula: ir.Formula, run: Run, extent: Extent) -> Schedule:
+    return schedule((formula,), run, extent)
+
+
+def _rows(plan: Schedule, index: int, outputs: Sequence[Mapping[str, Array]]) -> tuple[Array | None, int]:
+    """What the batches know of the predicate of step `index`: its rows, and how many are missing before."""
     place = plan.atoms.get(index)
     if place is None:
-        return None
-    number, name = place
-    values, run = outputs[number][name], plan.steps[index].run
-    offset = run.start - plan.batches[number].run.start
-    return values if offset == 0 and len(values) <= run.count else values[offset : offset + run.count]
+        return None, 0
+    number, name, inside = place
+    values = outputs[number][name]
+    offset = inside.start - plan.batches[number].run.start
+    whole = offset == 0 and len(values) == inside.count
+    known = values if whole else values[offset : offset + inside.count]
+    return known, inside.start - plan.steps[index].run.start
 
 
 def _batch(batch: Batch, env: Mapping[str, Array], ops: Ops) -> dict[str, Array]:
-    first, stop = batch.run.start, batch.run.start + batch.run.count
-    names = batch.program.columns or list(env)[:1]
-    columns = {name: env[name] for name in names}
-    whole = all(len(column) == batch.run.count for column in columns.values())
-    return batch.program(columns if whole else {n: c[first:stop] for n, c in columns.items()}, ops)
+    return batch.program(inputs(batch.program, env, batch.run, ops), ops)
 
 
 class Weighed(Protocol):

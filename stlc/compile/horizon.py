@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple, assert_never
+from typing import assert_never
 
 from stlc.compile import ir
+from stlc.compile.samples import Reach, columns_of, looks_on, reach_of
 
-
-class Reach(NamedTuple):
-    """Steps that a formula may look back and ahead from where it is judged."""
-
-    past: int
-    future: int
+__all__ = ["Reach", "columns", "nodes", "numbers", "parts", "reach", "uses_end"]
 
 
 def reach(formula: ir.Formula) -> Reach:
@@ -22,8 +18,12 @@ def reach(formula: ir.Formula) -> Reach:
     Windows of the past are cut at the start of the trace: the past is what they use, never what they need.
     """
     match formula:
-        case ir.Truth() | ir.Atom():
+        case ir.Truth():
             return Reach(0, 0)
+        case ir.Atom(num):
+            return reach_of(num)
+        case ir.Freeze(bindings, body):
+            return _furthest(reach(body), *(reach_of(num) for _, num in bindings))
         case ir.Join(_, items):
             return _furthest(*map(reach, items))
         case ir.Over(_, window, body):
@@ -56,8 +56,20 @@ def _back(body: Reach, window: ir.Window) -> Reach:
 
 
 def uses_end(formula: ir.Formula) -> bool:
-    """Whether a window of the future runs to the end of the trace."""
-    return any(isinstance(n, (ir.Over, ir.Until)) and n.window.hi is None for n in nodes(formula))
+    """Whether a window of the future runs to the end of the trace, or a segment would leave it (`sweep`)."""
+    return any(_uses_end(node) for node in nodes(formula))
+
+
+def _uses_end(node: ir.Formula) -> bool:
+    match node:
+        case ir.Over(_, window) | ir.Until(_, window):
+            return window.hi is None
+        case ir.Atom(num):
+            return looks_on(num)
+        case ir.Freeze(bindings):
+            return any(looks_on(num) for _, num in bindings)
+        case _:
+            return False
 
 
 def nodes(formula: ir.Formula) -> Iterator[ir.Formula]:
@@ -74,7 +86,7 @@ def parts(formula: ir.Formula) -> tuple[ir.Formula, ...]:
             return ()
         case ir.Join(_, items):
             return items
-        case ir.Over(_, _, body) | ir.Past(_, _, body) | ir.Shift(_, body):
+        case ir.Over(_, _, body) | ir.Past(_, _, body) | ir.Shift(_, body) | ir.Freeze(_, body):
             return (body,)
         case ir.Until(_, _, left, right) | ir.Since(_, _, left, right):
             return (left, right)
@@ -84,21 +96,16 @@ def parts(formula: ir.Formula) -> tuple[ir.Formula, ...]:
 
 def columns(formula: ir.Formula) -> frozenset[str]:
     """Names of the columns that a formula reads."""
-    atoms = (node for node in nodes(formula) if isinstance(node, ir.Atom))
-    return frozenset(name for atom in atoms for name in _read(atom.num))
+    return frozenset(name for num in numbers(formula) for name in columns_of(num))
 
 
-def _read(num: ir.Num) -> frozenset[str]:
-    match num:
-        case ir.Lit():
-            return frozenset()
-        case ir.Col(name):
-            return frozenset({name})
-        case ir.Op(_, args) | ir.Extern(_, args):
-            return frozenset().union(*map(_read, args))
-        case ir.Ind(cond):
-            return columns(cond)
-        case ir.Where(cond, yes, no):
-            return columns(cond) | _read(yes) | _read(no)
-        case _:
-            assert_never(num)
+def numbers(formula: ir.Formula) -> Iterator[ir.Num]:
+    """The numbers of predicates, and those that `freeze` binds."""
+    for node in nodes(formula):
+        match node:
+            case ir.Atom(num):
+                yield num
+            case ir.Freeze(bindings):
+                yield from (num for _, num in bindings)
+            case _:
+                pass

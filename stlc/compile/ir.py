@@ -29,6 +29,26 @@ class Col:
 
 
 @dataclass(frozen=True, slots=True)
+class At:
+    """A column `steps` samples later (negative: earlier).
+
+    Outside the trace it is undefined, and so is a predicate that reads it; a `clamped` one reads the first or
+    the last sample instead.
+    """
+
+    name: str
+    steps: int
+    clamped: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """A value that a `Freeze` around binds; its name is unique among those."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
 class Op:
     """A function of the table `stlc.compile.functions.FUNCTIONS`, e.g. `add`, `clip`, `norm`."""
 
@@ -65,7 +85,7 @@ class Extern:
     output: int = 0
 
 
-Num: TypeAlias = Lit | Col | Op | Ind | Where | Extern
+Num: TypeAlias = Lit | Col | At | Held | Op | Ind | Where | Extern
 
 # --------------------------------------------------------------------- formulas
 
@@ -171,4 +191,16 @@ class Shift:
     weak: bool = False
 
 
-Formula: TypeAlias = Truth | Atom | Join | Over | Past | Until | Since | Shift
+@dataclass(frozen=True, slots=True)
+class Freeze:
+    """`body` now, where each `Held` name stands for the number's value of now, at whatever instant it is read.
+
+    Where a number is undefined, so are the predicates that read its name.
+    """
+
+    bindings: tuple[tuple[str, Num], ...]
+    body: Formula
+    span: Span | None = field(default=None, compare=False, repr=False)
+
+
+Formula: TypeAlias = Truth | Atom | Join | Over | Past | Until | Since | Shift | Freeze

@@ -44,6 +44,9 @@ def show_formula(formula: ir.Formula) -> str:
         case ir.Shift(steps, body):
             name = {1: "next", -1: "prev"}.get(steps, f"shift[{steps}]")
             return f"{name}({show_formula(body)})"
+        case ir.Freeze(bindings, body):
+            bound = ", ".join(f"{shown(name)} = {show_number(num, 1)}" for name, num in bindings)
+            return f"freeze {bound} in {_operand(body)}"
         case _:
             assert_never(formula)
 
@@ -71,18 +74,35 @@ def _sides(num: ir.Num) -> tuple[ir.Num, ir.Num]:
             return num, ir.Lit(0.0)
 
 
+def shown(name: str) -> str:
+    """A name as it was written: frozen values have a number behind theirs."""
+    return name.partition("#")[0]
+
+
 def show_number(num: ir.Num, level: int = 0) -> str:
     """A number in infix notation; `level` is how tightly its surroundings bind."""
     text, own = _number(num)
     return f"({text})" if own < level else text
 
 
+def _leaf(leaf: ir.Col | ir.At | ir.Held) -> str:
+    match leaf:
+        case ir.At(name, 1):
+            return f"next({name})"
+        case ir.At(name, -1):
+            return f"prev({name})"
+        case ir.At(name, steps):
+            return f"shift({name}, {steps})"
+        case _:
+            return shown(leaf.name)
+
+
 def _number(num: ir.Num) -> tuple[str, int]:
     match num:
         case ir.Lit(value):
             return f"{value:g}", _TOP if value >= 0 else _UNARY
-        case ir.Col(name):
-            return name, _TOP
+        case ir.Col() | ir.At() | ir.Held():
+            return _leaf(num), _TOP
         case ir.Op("neg", (arg,)):
             return f"-{show_number(arg, _UNARY)}", _UNARY
         case ir.Op("sub", (left, ir.Lit(value))) if value < 0:

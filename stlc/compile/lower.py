@@ -58,6 +58,8 @@ class _Lowering:
                 return ir.Shift(steps, self.formula(body, sign), None, span, weak=sign < 0)
             case typed.Edge():
                 return self._edge(node, sign)
+            case typed.Freeze(span, bindings, body):
+                return ir.Freeze(bindings, self.formula(body, sign), span)
             case _:
                 assert_never(node)
 

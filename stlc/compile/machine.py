@@ -51,14 +51,19 @@ class Machine:
         """What stands for what nobody knows yet."""
         return math.inf if self.extent.end == "upper" else -math.inf
 
-    def atom(self, node: ir.Atom, run: Run, known: Array | None) -> Array:
-        """A predicate: `known` are its rows within the trace, already with its sign."""
+    def atom(self, node: ir.Atom, run: Run, known: Array | None, missing: int = 0) -> Array:
+        """A predicate: `known` are the rows that have a value, `missing` rows after the first of `run`.
+
+        They are signed already. Beyond the trace a predicate is unknown, and false where windows are cut.
+        """
+        outside = self.unknown if self.extent.open else -node.sign * math.inf
         if known is None:
-            return self.constant(run.count, self.unknown)
+            return self.constant(run.count, outside)
+        ops = self.windows.ops
         if node.guard:
-            ops = self.windows.ops
             known = ops.infinite(ops.gt(known, 0.0) if node.strict else ops.ge(known, 0.0), known)
-        return self.windows.padded(known, run.count, self.unknown)
+        known = self.windows.padded(known, run.count - missing, outside)
+        return ops.cat([self.constant(missing, outside), known]) if missing else known
 
     def value(self, step: Step, parts: Sequence[Array | None]) -> Array:
         """Any other node, from the values of its parts (None: at no instant)."""
@@ -79,8 +84,8 @@ class Machine:
                 return self._past(window, run, parts, _PICK[op])
             case ir.Shift():
                 return self._shift(node, run, parts[0])
-            case ir.Atom():
-                raise TypeError("predicates come from programs")
+            case ir.Atom() | ir.Freeze():
+                raise TypeError("predicates and frozen values come from programs")
             case _:
                 assert_never(node)
 

@@ -25,7 +25,7 @@ def bounds(num: ir.Num, facts: Facts) -> Bounds | None:
     match num:
         case ir.Lit(value):
             return (value, value)
-        case ir.Col(name):
+        case ir.Col(name) | ir.At(name) | ir.Held(name):
             return facts.get(name)
         case ir.Ind():
             return (0.0, 1.0)

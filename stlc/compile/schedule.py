@@ -13,6 +13,7 @@ from typing import Literal, TypeAlias, assert_never
 
 from stlc.compile import ir
 from stlc.compile.arith import Program
+from stlc.compile.samples import Reach, reach_of
 
 End: TypeAlias = Literal["strict", "truncate", "lower", "upper"]
 """What stands beyond the last sample.
@@ -63,7 +64,7 @@ def upto(start: int, last: int) -> Run:
 def operands(node: ir.Formula, run: Run, extent: Extent) -> tuple[tuple[ir.Formula, Run], ...]:
     """What `node` at the instants `run` needs of its parts; runs may be empty."""
     match node:
-        case ir.Truth() | ir.Atom():
+        case ir.Truth() | ir.Atom() | ir.Freeze():
             return ()
         case ir.Join(_, items):
             return tuple((item, run) for item in items)
@@ -124,14 +125,15 @@ class Schedule:
         extent: of the trace.
         batches: programs of the predicates.
         steps: values, parts first.
-        atoms: step of a predicate -> (batch, name of the output); absent where it lies beyond the trace.
+        atoms: step of a predicate -> (batch, name of the output, at which instants it has a value); absent
+            where it has none.
         roots: steps of the formulas that were asked for.
     """
 
     extent: Extent
     batches: tuple[Batch, ...]
     steps: tuple[Step, ...]
-    atoms: dict[int, tuple[int, str]]
+    atoms: dict[int, tuple[int, str, Run]]
     roots: tuple[int, ...]
 
 
@@ -155,14 +157,17 @@ def schedule(formulas: Sequence[ir.Formula], run: Run, extent: Extent) -> Schedu
     return Schedule(extent, batches, tuple(steps), atoms, roots)
 
 
-def _batches(steps: Sequence[Step], extent: Extent) -> tuple[tuple[Batch, ...], dict[int, tuple[int, str]]]:
+def _batches(
+    steps: Sequence[Step], extent: Extent
+) -> tuple[tuple[Batch, ...], dict[int, tuple[int, str, Run]]]:
     """One program for all predicates that are needed over the same stretch of the trace."""
     wanted: dict[ir.Num, list[tuple[Run, int]]] = {}
     for index, step in enumerate(steps):
-        if isinstance(step.node, ir.Atom) and step.run.start < extent.samples:
-            inside = upto(step.run.start, min(step.run.last, extent.samples - 1))
-            wanted.setdefault(_signed(step.node), []).append((inside, index))
-    grouped: dict[Run, dict[ir.Num, list[int]]] = {}
+        if isinstance(step.node, ir.Atom):
+            inside = within(reach_of(step.node.num), step.run, extent)
+            if inside.count > 0:
+                wanted.setdefault(_signed(step.node), []).append((inside, index))
+    grouped: dict[Run, dict[ir.Num, list[tuple[Run, int]]]] = {}
     for num, asked in wanted.items():
         for stretch, indices in _stretches(asked):
             grouped.setdefault(stretch, {})[num] = indices
@@ -171,7 +176,7 @@ def _batches(steps: Sequence[Step], extent: Extent) -> tuple[tuple[Batch, ...], 
         outputs = {str(i): num for i, num in enumerate(nums)}
         batches.append(Batch(stretch, Program(outputs)))
         for i, indices in enumerate(nums.values()):
-            atoms.update(dict.fromkeys(indices, (number, str(i))))
+            atoms.update({index: (number, str(i), inside) for inside, index in indices})
     return tuple(batches), atoms
 
 
@@ -179,13 +184,19 @@ def _signed(atom: ir.Atom) -> ir.Num:
     return atom.num if atom.sign > 0 else ir.Op("neg", (atom.num,))
 
 
-def _stretches(asked: list[tuple[Run, int]]) -> list[tuple[Run, list[int]]]:
+def within(reach: Reach, run: Run, extent: Extent) -> Run:
+    """The instants of `run` at which all samples exist that a number of this reach reads."""
+    first = max(run.start, reach.past)
+    return upto(first, max(min(run.last, extent.samples - 1 - reach.future), first - 1))
+
+
+def _stretches(asked: list[tuple[Run, int]]) -> list[tuple[Run, list[tuple[Run, int]]]]:
     """Runs that touch are put together."""
-    out: list[tuple[Run, list[int]]] = []
+    out: list[tuple[Run, list[tuple[Run, int]]]] = []
     for run, index in sorted(asked, key=lambda item: (item[0].start, item[0].count)):
         if out and run.start <= out[-1][0].last + 1:
             whole, indices = out[-1]
-            out[-1] = (upto(whole.start, max(whole.last, run.last)), [*indices, index])
+            out[-1] = (upto(whole.start, max(whole.last, run.last)), [*indices, (run, index)])
         else:
-            out.append((run, [index]))
+            out.append((run, [(run, index)]))
     return out

@@ -86,6 +86,7 @@ class Scope:
         time_unit: unit of bare numbers in intervals; "" where no pragma says so.
         facts: enforced ranges of columns, in stored units.
         elsewhere: names that only the system knows, with the advice to give.
+        product: `x in [lo, hi]` is `(x - lo) (hi - x)` (`@product`).
         locals: arguments of the macro and quantifier variables at hand, with what they cost.
     """
 
@@ -97,6 +98,7 @@ class Scope:
     time_unit: str = ""
     facts: Mapping[str, Bounds] = field(default_factory=dict)
     elsewhere: Mapping[str, str] = field(default_factory=dict)
+    product: bool = False
     locals: Mapping[str, tuple[Value, Cost]] = field(default_factory=dict)
     meter: Meter = field(default_factory=Meter, compare=False, repr=False)
     cache: dict[str, tuple[Value, Cost] | None] = field(default_factory=dict, compare=False, repr=False)

@@ -10,6 +10,8 @@ from dataclasses import replace
 from typing import assert_never
 
 from stlc.compile import ir
+from stlc.compile.horizon import numbers
+from stlc.compile.samples import held_by, thawed
 
 _NOW = ir.Window(0, 0)
 
@@ -30,6 +32,8 @@ def simplify(formula: ir.Formula) -> ir.Formula:
         case ir.Shift():
             body = simplify(formula.body)
             return body if formula.steps == 0 else replace(formula, body=body)
+        case ir.Freeze():
+            return _freeze(replace(formula, body=simplify(formula.body)))
         case _:
             assert_never(formula)
 
@@ -72,6 +76,17 @@ def _past(node: ir.Past) -> ir.Formula:
         if together is not None:
             return replace(node, window=together, body=body.body)
     return node
+
+
+def _freeze(node: ir.Freeze) -> ir.Formula:
+    """Without what nobody reads; a predicate of this very instant reads the number itself."""
+    read = frozenset().union(*map(held_by, numbers(node.body)))
+    kept = tuple((name, num) for name, num in node.bindings if name in read)
+    if not kept:
+        return node.body
+    if not isinstance(node.body, ir.Atom):
+        return replace(node, bindings=kept)
+    return replace(node.body, num=thawed(node.body.num, dict(kept)))
 
 
 def _sum(outer: ir.Window, inner: ir.Window) -> ir.Window | None:

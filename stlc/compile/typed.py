@@ -110,7 +110,15 @@ class Edge(Node):
     body: Formula
 
 
-Formula: TypeAlias = Truth | Pred | Not | Logic | Temporal | Until | Shift | Edge
+@dataclass(frozen=True, slots=True)
+class Freeze(Node):
+    """`freeze p0 = p in body`: each name (of an `ir.Held`) stands for the value that its number has now."""
+
+    bindings: tuple[tuple[str, ir.Num], ...]
+    body: Formula
+
+
+Formula: TypeAlias = Truth | Pred | Not | Logic | Temporal | Until | Shift | Edge | Freeze
 
 
 @dataclass(frozen=True, slots=True)

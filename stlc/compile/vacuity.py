@@ -49,7 +49,7 @@ def truth(formula: typed.Formula, facts: Facts) -> bool | None:
             return None if inner is None else not inner
         case typed.Logic():
             return _logic(formula, facts)
-        case typed.Temporal(_, "always" | "eventually", _, body):
+        case typed.Temporal(_, "always" | "eventually", _, body) | typed.Freeze(_, _, body):
             return truth(body, facts)
         case typed.Temporal() | typed.Until() | typed.Shift() | typed.Edge():
             return None
@@ -82,7 +82,7 @@ def _antecedents(formula: typed.Formula) -> Iterator[typed.Formula]:
         case typed.Logic(_, "and", items):
             for item in items:
                 yield from _antecedents(item)
-        case typed.Temporal(_, "always", _, body):
+        case typed.Temporal(_, "always", _, body) | typed.Freeze(_, _, body):
             yield from _antecedents(body)
         case _:
             return
@@ -106,7 +106,7 @@ def _columns(formula: typed.Formula) -> Iterator[str]:
         case typed.Logic(_, _, items):
             for item in items:
                 yield from _columns(item)
-        case typed.Not(_, body) | typed.Temporal(_, _, _, body):
+        case typed.Not(_, body) | typed.Temporal(_, _, _, body) | typed.Freeze(_, _, body):
             yield from _columns(body)
         case _:
             return
@@ -114,7 +114,7 @@ def _columns(formula: typed.Formula) -> Iterator[str]:
 
 def _in_number(num: ir.Num) -> Iterator[str]:
     match num:
-        case ir.Col(name):
+        case ir.Col(name) | ir.At(name):
             yield name
         case ir.Op(_, args):
             for arg in args:
@@ -153,6 +153,8 @@ def _constrains(formula: typed.Formula, *, positive: bool) -> bool:
             return True
         case typed.Not(_, body):
             return _constrains(body, positive=not positive)
+        case typed.Freeze(_, _, body):
+            return _constrains(body, positive=positive)
         case typed.Logic(_, op, items):
             if op == "->":
                 sides = [
@@ -183,6 +185,8 @@ def _promise(formula: typed.Formula, *, positive: bool) -> Span:
     match formula:
         case typed.Not(_, body):
             return _promise(body, positive=not positive)
+        case typed.Freeze(_, _, body):
+            return _promise(body, positive=positive)
         case typed.Logic(_, "->", (left, right)):
             if not _constrains(right, positive=positive):
                 return _promise(right, positive=positive)

@@ -12,9 +12,9 @@ from stlc.compile import ir
 def names_in(num: ir.Num) -> frozenset[str]:
     """Names of all columns that a number reads."""
     match num:
-        case ir.Lit():
+        case ir.Lit() | ir.Held():
             return frozenset()
-        case ir.Col(name):
+        case ir.Col(name) | ir.At(name):
             return frozenset((name,))
         case ir.Op(_, args) | ir.Extern(_, args):
             return frozenset().union(*map(names_in, args))
@@ -58,7 +58,7 @@ def map_formula(formula: ir.Formula, rewrite: Rewrite) -> ir.Formula:
 def map_parts(num: ir.Num, rewrite: Rewrite) -> ir.Num:
     """A number with its direct parts rewritten."""
     match num:
-        case ir.Lit() | ir.Col():
+        case ir.Lit() | ir.Col() | ir.At() | ir.Held():
             return num
         case ir.Op(_, args) | ir.Extern(_, args):
             return replace(num, args=tuple(map(rewrite, args)))

@@ -15,9 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile import ir, typed
+from stlc.compile.defined import defined
 from stlc.compile.horizon import columns, parts
 from stlc.compile.interface import Grid
 from stlc.compile.lower import lower
+from stlc.compile.thaw import thaw
 from stlc.monitor.values import Record, bounds, history
 from stlc.source import Span
 
@@ -105,9 +107,23 @@ class Blamer:
                 return replace(self._node(formula, wanted, sample), parts=parts)
             case typed.Edge():
                 return self._edge(formula, sample, wanted)
+            case typed.Freeze(_, _, body):
+                return self.blame(thaw(body, self._values(formula, sample)), sample, wanted=wanted)
         assert_never(formula)
 
     # ------------------------------------------------------------------- values
+
+    def _values(self, formula: typed.Freeze, sample: int) -> dict[str, ir.Num]:
+        """What the formula binds at a sample; what does not exist becomes a sample beyond the trace."""
+        values: dict[str, ir.Num] = {}
+        last = self.record.samples - 1
+        for name, num in formula.bindings:
+            if sample <= last and defined(ir.Atom(num), last + 1)[sample]:
+                value, _ = bounds(ir.Atom(num), self.record, range(sample, sample + 1), "open")
+                values[name] = ir.Lit(float(value[0, 0]))
+            else:
+                values[name] = ir.At(next(iter(self.record.env)), last + 1)
+        return values
 
     def _lowered(self, formula: typed.Formula, wanted: bool) -> ir.Formula:
         """The formula, or its negation where it is not wanted: what fails."""

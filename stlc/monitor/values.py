@@ -12,6 +12,7 @@ from stlc.compile import ir
 from stlc.compile.defined import defined
 from stlc.compile.graph import evaluate
 from stlc.compile.ops import Array, Ops
+from stlc.compile.samples import reach_of
 from stlc.compile.schedule import End
 from stlc.compile.semantics import Exact, Semantics
 
@@ -100,8 +101,12 @@ def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator
 def history(formula: ir.Formula) -> int:
     """How many samples before its instant a formula looks at where they exist."""
     match formula:
-        case ir.Truth() | ir.Atom():
+        case ir.Truth():
             return 0
+        case ir.Atom(num=num):
+            return reach_of(num).past
+        case ir.Freeze(bindings=bindings, body=body):
+            return max(history(body), *(reach_of(num).past for _, num in bindings))
         case ir.Join(items=items):
             return max(map(history, items))
         case ir.Over(window=window, body=body):
@@ -125,34 +130,20 @@ def _back(window: ir.Window) -> int:
 # ------------------------------------------------------------------ strict predicates
 
 
-def by_truth(formulas: Sequence[ir.Formula], record: Record) -> tuple[list[ir.Formula], Record]:
-    """The formulas over columns that hold the truth of their predicates: +inf (true) and -inf (false).
+def by_truth(formula: ir.Formula) -> ir.Formula:
+    """The formula with the truth of its predicates for values: +inf (true) and -inf (false).
 
     `a > b` is true above 0 and `a >= b` from 0 on, without any tolerance.
     """
-    names: dict[ir.Atom, str] = {}
-    replaced = [_abstract(formula, names) for formula in formulas]
-    if not names:
-        return replaced, record
-    values = evaluate(list(names), record.env, ops=record.ops, start=0, count=record.samples)
-    ops = record.ops
-    env = {
-        name: ops.infinite(ops.gt(value, 0.0) if atom.strict else ops.ge(value, 0.0), value)
-        for (atom, name), value in zip(names.items(), values, strict=True)
-    }
-    return replaced, replace(record, env=env)
-
-
-def _abstract(formula: ir.Formula, names: dict[ir.Atom, str]) -> ir.Formula:
     match formula:
         case ir.Atom():
-            return ir.Atom(ir.Col(names.setdefault(formula, f"#{len(names)}")), span=formula.span)
+            return replace(formula, guard=True)
         case ir.Truth():
             return formula
         case ir.Join(items=items):
-            return replace(formula, items=tuple(_abstract(item, names) for item in items))
-        case ir.Over(body=body) | ir.Past(body=body) | ir.Shift(body=body):
-            return replace(formula, body=_abstract(body, names))
+            return replace(formula, items=tuple(map(by_truth, items)))
+        case ir.Over(body=body) | ir.Past(body=body) | ir.Shift(body=body) | ir.Freeze(body=body):
+            return replace(formula, body=by_truth(body))
         case ir.Until(left=left, right=right) | ir.Since(left=left, right=right):
-            return replace(formula, left=_abstract(left, names), right=_abstract(right, names))
+            return replace(formula, left=by_truth(left), right=by_truth(right))
     assert_never(formula)

@@ -245,7 +245,7 @@ def _judge(rule: Rule, ready: Prepared, starts: range, ends: Ends, tolerance: fl
         holds = low >= -tolerance
         fails = high < -tolerance
     else:
-        (formula,), record = by_truth([rule.formula], ready.record)
-        least, most = rule_bounds(replace(rule, formula=formula), record, starts, ready.horizon, ends)
+        plain = replace(rule, formula=by_truth(rule.formula))
+        least, most = rule_bounds(plain, ready.record, starts, ready.horizon, ends)
         holds, fails = least > 0, most < 0
     return Judgement(rule, starts.start, low, high, holds, fails, ready.signals.shape)
