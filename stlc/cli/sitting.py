@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -13,6 +14,8 @@ from stlc.cli.errors import INTERRUPTED, TERMINATED
 from stlc.cli.output import console, emit_json, say
 from stlc.cli.progress import Progress, RunInfo, Summary
 from stlc.controller.train import Outcome, Watch
+from stlc.diagnostics import StlcError
+from stlc.rundir import LATEST, RUNS
 
 if TYPE_CHECKING:
     from types import FrameType, TracebackType
@@ -51,6 +54,9 @@ class Sitting:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.progress.stop()
+        if error is not None:
+            with suppress(StlcError):
+                self.folder.finish("interrupted" if kind is KeyboardInterrupt else "failed")
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
@@ -65,8 +71,12 @@ class Sitting:
         assert outcome is not None
         if outcome.score is None:
             say(f"interrupted, saved: {self.folder.shown}")
-            say(f"go on with: stlc train --resume {self.folder.name}")
-            raise typer.Exit(TERMINATED if signal.SIGTERM in self._asked else INTERRUPTED)
+            say(f"go on with: stlc train --resume {spoken(self.folder)}")
+            code = TERMINATED if signal.SIGTERM in self._asked else INTERRUPTED
+            if json:
+                result = {"run": self.folder.shown, "seconds": outcome.seconds}
+                emit_json("train/1", ok=False, exit_code=code, result=result)
+            raise typer.Exit(code)
         if pictures:
             draw_report(self.folder)
         found = outcome.score.feasible > 0.0
@@ -77,6 +87,18 @@ class Sitting:
         else:
             self.progress.finish(_summary(outcome), to=console())
         raise typer.Exit(code)
+
+
+def spoken(folder: RunDir) -> str:
+    """What other commands find the run by: its name in the usual place, its path elsewhere."""
+    usual = folder.path.resolve().parent.parent == RUNS.resolve()
+    return folder.name if usual else folder.shown
+
+
+def _next(folder: RunDir) -> str:
+    """The command that drives the run: it need not be named while it is the newest."""
+    newest = (RUNS / LATEST).resolve() == folder.path.resolve()
+    return "stlc simulate --backup" if newest else f"stlc simulate {spoken(folder)} --backup"
 
 
 def _info(folder: RunDir) -> RunInfo:
@@ -112,6 +134,7 @@ def _summary(outcome: Outcome) -> Summary:
         feasible=score.feasible,
         seconds=outcome.seconds,
         folder=folder.shown,
+        next_command=_next(folder),
         where=where,
     )
 

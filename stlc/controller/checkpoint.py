@@ -102,7 +102,12 @@ def _read(folder: Path) -> tuple[dict[str, Any], bytes]:
         data = (folder / name).read_bytes()
     except FileNotFoundError as error:
         raise RunError(
-            Diagnostic("R101", f"there is no checkpoint in `{folder}`", help=("train: stlc train SPEC",))
+            Diagnostic(
+                "R101",
+                f"there is no checkpoint in `{folder}`",
+                help=("train: stlc train SPEC", "an earlier run is named by its number: stlc simulate 7"),
+                note=("nothing has been saved yet, or the run ended before that",),
+            )
         ) from error
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise RunError(_damaged(folder, str(error))) from error

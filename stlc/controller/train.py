@@ -26,7 +26,9 @@ if TYPE_CHECKING:
 
 DEFAULT_BUDGET = 60.0
 SAVE_EVERY = 500
-"""Steps between checkpoints."""
+"""Steps between checkpoints at most."""
+SAVE_SECONDS = 10.0
+"""Seconds between checkpoints at most: what a kill can cost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +158,7 @@ class _Session:
         """Train to the end, judge, and close the record."""
         trainer = self.trainer
         sat_down, first = time.perf_counter(), trainer.step
+        saved = sat_down
         value = math.nan
         while trainer.step < trainer.steps:
             if trainer.step >= trainer.next_look:
@@ -164,8 +167,9 @@ class _Session:
             value = trainer.advance()
             if not math.isfinite(value):
                 raise self._diverged()
-            if trainer.step % SAVE_EVERY == 0:
+            if trainer.step % SAVE_EVERY == 0 or time.perf_counter() - saved > SAVE_SECONDS:
                 self._save()
+                saved = time.perf_counter()
             if self.watch.stop() and trainer.step < trainer.steps:
                 return self._interrupted()
         self._save()

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from pathlib import Path
 
 import pytest
 
 from stlc.cli.app import main
+from stlc.controller.trainer import Trainer
+from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[2]
 TRAIN = [
@@ -58,3 +62,36 @@ def test_what_a_resumed_run_cannot_change_is_refused(
     (finding,) = json.loads(capsys.readouterr().out)["diagnostics"]
     assert finding["code"] == "R104"
     assert finding["message"].startswith(option[0])
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_run_is_saved_and_told(
+    number: int, code: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    advance, asked = Trainer.advance, [number]
+
+    def interrupted(self: Trainer) -> float:
+        if asked:
+            os.kill(os.getpid(), asked.pop())
+        return advance(self)
+
+    monkeypatch.setattr(Trainer, "advance", interrupted)
+    assert main([*TRAIN, "--steps", "5", "--runs", "elsewhere", "--json"]) == code
+    told = capsys.readouterr()
+    document = json.loads(told.out)
+    assert (document["ok"], document["exit_code"]) == (False, code)
+    folder = RunDir.newest(Path("elsewhere"))
+    assert document["result"]["run"] == folder.shown
+    assert f"stlc train --resume {folder.shown}" in told.err
+    assert folder.status == "interrupted"
+    assert main(["train", "--resume", folder.shown, "--no-pictures"]) == 0
+    assert f"Next:  stlc simulate {folder.shown} --backup" in capsys.readouterr().out
+
+
+def test_a_run_that_breaks_off_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_self: Trainer) -> float:
+        raise OSError(28, "No space left on device", "ckpt")
+
+    monkeypatch.setattr(Trainer, "advance", full)
+    assert main([*TRAIN, "--steps", "5"]) == 5
+    assert RunDir.newest().status == "failed"

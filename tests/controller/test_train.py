@@ -73,6 +73,18 @@ def test_the_system_file_chooses_the_method_unless_told() -> None:
     assert decide(task, TrainConfig(method="guided")).method == "guided"
 
 
+def test_a_slow_run_is_saved_by_the_clock(
+    car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stlc.controller.train.SAVE_SECONDS", 0.0)
+    config = TrainConfig(held_out=50, steps=3, batch=16)
+    folder = _folder(car_task, tmp_path, config)
+    seen: list[bool] = []
+    pointer = folder.path / "ckpt" / "last.json"
+    train(car_task, config, folder, Watch(stop=lambda: bool(seen.append(pointer.exists()))))
+    assert seen == [True, True, True]
+
+
 def test_seeds_matter_and_repeat(car_task: Task, tmp_path: Path) -> None:
     def weights(seed: int, root: str) -> torch.Tensor:
         config = TrainConfig(held_out=200, steps=20, seed=seed, batch=32)
