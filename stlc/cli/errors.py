@@ -23,7 +23,10 @@ _NO_WRITING = frozenset(
     {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG, errno.EIO, errno.EMFILE}
 )
 _NO_FILE = frozenset({errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP})
-_EXTRAS = {"matplotlib": "plot", "PIL": "plot", "pybullet": "panda", "pytorch_kinematics": "panda"}
+_EXTRAS = {
+    **{"matplotlib": "plot", "PIL": "plot", "pybullet": "panda", "pytorch_kinematics": "panda"},
+    **{"pygls": "lsp", "lsprotocol": "lsp"},
+}
 
 
 class BugError(StlcError):
@@ -103,6 +106,7 @@ def _missing_package(name: str) -> StlcError:
 def _usage(error: BaseException) -> Diagnostic:
     """What typer says about a command line. Its error classes are not public, their methods are."""
     message = str(error.format_message()).strip().rstrip(".")  # type: ignore[attr-defined]
+    message = message.replace(": Value error, ", ": ")  # how pydantic introduces what an option said
     context = getattr(error, "ctx", None)
     command = getattr(context, "command_path", "stlc")
     lowered = message[:1].lower() + message[1:] if message[1:2].islower() else message

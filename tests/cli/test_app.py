@@ -209,6 +209,11 @@ def test_nothing_asked_shows_the_help(capsys):
         (["check", "--nonsense", "--json"], "stlc check", "no such option: --nonsense"),
         (["compile", "--json"], "stlc compile", "missing argument 'SPEC'"),
         (["--color", "sometimes", "check"], "stlc", "'sometimes'"),
+        (
+            ["check", "t.npz", "--end", "soon"],
+            "stlc check",
+            "invalid value for '--end': 'soon' is not one of",
+        ),
     ],
 )
 def test_usage_errors(capsys, arguments, command, message):
