@@ -14,6 +14,8 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile.extremum import Pick, Sliding
+
 Array: TypeAlias = Any
 """A NumPy array or a torch tensor."""
 
@@ -33,7 +35,9 @@ class Ops(Protocol):
     div: Callable[[Array, Array], Array]
     abs: Callable[[Array], Array]
     exp: Callable[[Array], Array]
+    expm1: Callable[[Array], Array]
     log: Callable[[Array], Array]
+    log1p: Callable[[Array], Array]
     sin: Callable[[Array], Array]
     cos: Callable[[Array], Array]
     tan: Callable[[Array], Array]
@@ -46,8 +50,9 @@ class Ops(Protocol):
     ceil: Callable[[Array], Array]
     round: Callable[[Array], Array]
     square: Callable[[Array], Array]
-    minimum: Callable[[Array, Array], Array]
-    maximum: Callable[[Array, Array], Array]
+    minimum: Callable[..., Array]
+    """Of two arrays; `out=` takes the result without a gradient."""
+    maximum: Callable[..., Array]
 
     def sqrt(self, x: Array) -> Array:
         """Square root; its gradient at 0 is 0, so that a distance of 0 does no harm."""
@@ -108,6 +113,9 @@ class Ops(Protocol):
     def amax(self, x: Array) -> Array:
         """Maximum over axis 0, which stays with length 1."""
 
+    def sum(self, x: Array) -> Array:
+        """Sum over axis 0, which stays with length 1."""
+
     def cummin(self, x: Array) -> Array:
         """Running minimum along axis 0."""
 
@@ -123,6 +131,15 @@ class Ops(Protocol):
     def softmax2(self, a: Array, b: Array, k: float) -> Array:
         """`log(exp(k a) + exp(k b)) / k`: `softmax` of two arrays of one shape."""
 
+    def slides(self, x: Array, window: Sliding) -> bool:
+        """Whether `extrema` and `until` are the fastest way for arrays like `x`."""
+
+    def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array:
+        """Exact extrema of sliding windows: `(time, batch)` -> `(count, batch)`."""
+
+    def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array:
+        """Exact `until` ("max") and `release` ("min"): two of `(time, batch)` -> `(count, batch)`."""
+
     # constants and shapes
     def kind(self, like: Array) -> Hashable:
         """What a constant depends on: arrays of one kind may share it."""
@@ -132,6 +149,12 @@ class Ops(Protocol):
 
     def full(self, shape: tuple[int, ...], value: float, like: Array) -> Array:
         """A constant array with dtype and device of `like`."""
+
+    def empty(self, shape: tuple[int, ...], like: Array) -> Array:
+        """Memory with dtype and device of `like`, to be written to."""
+
+    def unbind(self, x: Array, axis: int) -> Sequence[Array]:
+        """Views of the slices along an axis."""
 
     def cat(self, parts: Sequence[Array]) -> Array:
         """Joined along axis 0."""

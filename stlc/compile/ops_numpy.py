@@ -11,7 +11,12 @@ from typing import Any, cast, final
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile import sliding
+from stlc.compile.extremum import Pick, Sliding
 from stlc.compile.ops import Array, Mask, Ops
+
+_WIDE = 8
+"""From so many columns on sliding windows beat putting pairs together."""
 
 
 @final
@@ -26,7 +31,9 @@ class NumpyOps:
     div = staticmethod(np.true_divide)
     abs = staticmethod(np.abs)
     exp = staticmethod(np.exp)
+    expm1 = staticmethod(np.expm1)
     log = staticmethod(np.log)
+    log1p = staticmethod(np.log1p)
     sin = staticmethod(np.sin)
     cos = staticmethod(np.cos)
     tan = staticmethod(np.tan)
@@ -94,6 +101,10 @@ class NumpyOps:
         """Maximum over axis 0, kept."""
         return x.max(axis=0, keepdims=True)
 
+    def sum(self, x: Array) -> Array:
+        """Sum over axis 0, kept."""
+        return x.sum(axis=0, keepdims=True)
+
     def cummin(self, x: Array) -> Array:
         """Running minimum along axis 0."""
         return np.minimum.accumulate(x, axis=0)
@@ -101,6 +112,18 @@ class NumpyOps:
     def cummax(self, x: Array) -> Array:
         """Running maximum along axis 0."""
         return np.maximum.accumulate(x, axis=0)
+
+    def slides(self, x: Array, window: Sliding) -> bool:  # noqa: ARG002
+        """For rows that are long enough."""
+        return bool(x.ndim == 2 and x.shape[1] >= _WIDE)
+
+    def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array:
+        """Exact extrema of sliding windows."""
+        return sliding.extrema(x, sliding.Asked(pick, window, NUMPY))
+
+    def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array:
+        """Exact `until` and `release`."""
+        return sliding.until(left, right, sliding.Asked(pick, window, NUMPY))
 
     def softmax(self, x: Array, k: float) -> Array:
         """Smooth extremum over axis 0, kept."""
@@ -132,6 +155,14 @@ class NumpyOps:
     def full(self, shape: tuple[int, ...], value: float, like: Array) -> Array:
         """A constant array."""
         return np.full(shape, value, dtype=like.dtype)
+
+    def empty(self, shape: tuple[int, ...], like: Array) -> Array:
+        """Memory to be written to."""
+        return np.empty(shape, dtype=like.dtype)
+
+    def unbind(self, x: Array, axis: int) -> Sequence[Array]:
+        """Views of the slices along an axis."""
+        return list(np.moveaxis(x, axis, 0))
 
     def flip(self, x: Array) -> Array:
         """Reversed along axis 0."""

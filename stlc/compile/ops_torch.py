@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from stlc.compile.extremum import Pick, Sliding
 from stlc.compile.ops import Mask, Ops
+from stlc.compile.ops_torch_windows import SlidingExtremum, SlidingUntil
+from stlc.compile.sliding import Asked
+
+_LARGE = 1 << 14
+"""On a processor, from so many numbers on a gradient of our own beats those that torch puts together."""
 
 
 class _SafeSqrt(torch.autograd.Function):
@@ -98,7 +104,9 @@ class TorchOps:
     pow = staticmethod(operator.pow)
     abs = staticmethod(torch.abs)
     exp = staticmethod(torch.exp)
+    expm1 = staticmethod(torch.expm1)
     log = staticmethod(torch.log)
+    log1p = staticmethod(torch.log1p)
     sin = staticmethod(torch.sin)
     cos = staticmethod(torch.cos)
     tan = staticmethod(torch.tan)
@@ -144,10 +152,14 @@ class TorchOps:
     def norm(self, *components: Tensor | float) -> Tensor:
         """Euclidean length; gradient 0 at 0."""
         like = next(part for part in components if isinstance(part, Tensor))
-        parts = [_pair(part, like)[0] for part in components]
-        stacked = torch.stack(torch.broadcast_tensors(*parts))  # type: ignore[no-untyped-call]
-        length: Tensor = torch.linalg.vector_norm(stacked, dim=0)
-        return length
+        first, *others = (_pair(part, like)[0] for part in components)
+        total = first * first
+        for part in others:
+            total = torch.addcmul(total, part, part)
+        if not total.requires_grad:
+            return total.sqrt()
+        positive = total > 0.0
+        return torch.where(positive, torch.where(positive, total, 1.0).sqrt(), total)
 
     def number(self, mask: Mask, like: Tensor) -> Tensor:
         """1 where `mask`, else 0."""
@@ -178,6 +190,10 @@ class TorchOps:
         """Maximum over axis 0, kept; ties share the gradient."""
         return x.amax(dim=0, keepdim=True)
 
+    def sum(self, x: Tensor) -> Tensor:
+        """Sum over axis 0, kept."""
+        return x.sum(dim=0, keepdim=True)
+
     def cummin(self, x: Tensor) -> Tensor:
         """Running minimum along axis 0."""
         return torch.cummin(x, dim=0).values
@@ -185,6 +201,22 @@ class TorchOps:
     def cummax(self, x: Tensor) -> Tensor:
         """Running maximum along axis 0."""
         return torch.cummax(x, dim=0).values
+
+    def slides(self, x: Tensor, window: Sliding) -> bool:
+        """For large arrays on a processor; elsewhere many small operations are what costs."""
+        return (
+            x.ndim == 2 and x.device.type == "cpu" and min(x.numel(), window.covered * x.shape[1]) >= _LARGE
+        )
+
+    def extrema(self, x: Tensor, pick: Pick, window: Sliding) -> Tensor:
+        """Exact extrema of sliding windows; one of several equal operands gets the gradient."""
+        out: Tensor = SlidingExtremum.apply(x, Asked(pick, window, TORCH))  # type: ignore[no-untyped-call]
+        return out
+
+    def until(self, left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Tensor:
+        """Exact `until` and `release`; one of several equal operands gets the gradient."""
+        out: Tensor = SlidingUntil.apply(left, right, Asked(pick, window, TORCH))  # type: ignore[no-untyped-call]
+        return out
 
     def softmax(self, x: Tensor, k: float) -> Tensor:
         """Smooth extremum over axis 0, kept."""
@@ -215,6 +247,15 @@ class TorchOps:
     def stack(self, parts: Sequence[Tensor]) -> Tensor:
         """A new axis 0 in front."""
         return torch.stack(list(parts))
+
+    def empty(self, shape: tuple[int, ...], like: Tensor) -> Tensor:
+        """Memory to be written to, also outside of inference mode."""
+        with torch.inference_mode(False):
+            return like.new_empty(shape)
+
+    def unbind(self, x: Tensor, axis: int) -> Sequence[Tensor]:
+        """Views of the slices along an axis."""
+        return x.unbind(axis)
 
     def flip(self, x: Tensor) -> Tensor:
         """Reversed along axis 0."""

@@ -1,4 +1,4 @@
-"""Extrema over windows of time, the algorithms: reductions, running extrema, doubling, scans.
+"""Extrema over windows of time, the algorithms: reductions, running extrema, sliding, doubling, scans.
 
 All arrays are `(time, batch)`. Window `j` of `count` starts at row `j` and has `width` rows; rows beyond the
 array are absent, and a window without rows has the neutral value (+inf for a minimum, -inf for a maximum).
@@ -6,25 +6,17 @@ array are absent, and a window without rows has the neutral value (+inf for a mi
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import final
 
+from stlc.compile.extremum import Pick, Sliding, dual, neutral
 from stlc.compile.ops import Array, Ops
-from stlc.compile.semantics import Pick, Semantics
+from stlc.compile.semantics_protocol import Parts, Semantics
+
+__all__ = ["Windows", "dual", "neutral"]
 
 _SCAN_BATCH = 64
 """From this batch size on a sequential scan beats the log-depth one."""
-
-
-def dual(pick: Pick) -> Pick:
-    """The other extremum."""
-    return "max" if pick == "min" else "min"
-
-
-def neutral(pick: Pick) -> float:
-    """The extremum of nothing."""
-    return math.inf if pick == "min" else -math.inf
 
 
 @final
@@ -44,10 +36,15 @@ class Windows:
 
     def extrema(self, x: Array, pick: Pick, *, count: int, width: int) -> Array:
         """`count` windows of `width` rows: `(time, batch)` -> `(count, batch)`."""
-        width = min(width, max(len(x), 1))
-        if count == 1 and len(x):
+        rows = len(x)
+        width = min(width, max(rows, 1))
+        if count == 1 and rows:
             return self.semantics.reduce(self.padded(x, width, neutral(pick)), pick, self.ops)
-        if width >= len(x) > 1 and self.semantics.idempotent:
+        if self.semantics.exact and rows:
+            window = Sliding(rows, min(count, rows), width)
+            if self.ops.slides(x, window):
+                return self.padded(self.ops.extrema(x, pick, window), count, neutral(pick))
+        if width >= rows > 1 and self.semantics.idempotent:
             return self.padded(self._to_end(x, pick), count, neutral(pick))
         return self._doubling(self.padded(x, count + width - 1, neutral(pick)), pick, width)
 
@@ -58,25 +55,29 @@ class Windows:
 
     def _doubling(self, x: Array, pick: Pick, width: int) -> Array:
         """Full windows only, in about log2(width) operations: pieces of 1, 2, 4, … rows are put together."""
-        piece, size, done, total = x, 1, 0, None
+        if width == 1:
+            return x
+        piece, size, done = self.semantics.lift(x, pick, self.ops), 1, 0
+        total: Parts | None = None
         while True:
             if self.semantics.idempotent and 2 * size > width:
-                return self._overlapped(piece, pick, width - size)
+                total = self._merged(piece, piece, width - size, pick) if width > size else piece
+                break
             if width & size:
-                part = piece[done:] if done else piece
-                total = part if total is None else self._joined(total, part, pick)
+                total = piece if total is None else self._merged(total, piece, done, pick)
                 done += size
                 if done == width:
-                    return total
-            piece = self._joined(piece, piece[size:], pick)
+                    break
+            piece = self._merged(piece, piece, size, pick)
             size *= 2
+        return self.semantics.finish(total, pick, self.ops)
 
-    def _joined(self, a: Array, b: Array, pick: Pick) -> Array:
-        rows = min(len(a), len(b))
-        return self.semantics.pair(a[:rows], b[:rows], pick, self.ops)
-
-    def _overlapped(self, piece: Array, pick: Pick, shift: int) -> Array:
-        return self._joined(piece, piece[shift:], pick) if shift else piece
+    def _merged(self, a: Parts, b: Parts, shift: int, pick: Pick) -> Parts:
+        """The pieces that start at a row, and `shift` rows later."""
+        rows = min(len(a[0]), len(b[0]) - shift)
+        return self.semantics.merge(
+            tuple(part[:rows] for part in a), tuple(part[shift : shift + rows] for part in b), pick, self.ops
+        )
 
     def until(self, left: Array, right: Array, pick: Pick, *, count: int, width: int) -> Array:
         """`until` for `pick` "max", its dual `release` for "min".
@@ -96,8 +97,14 @@ class Windows:
         """
         rows = len(left)
         width = min(width, max(rows, 1))
+        if not self.semantics.associative:
+            return self._until_by_offset(left, right, pick, count, width)
         if count == 1 and rows:
             return self._until_once(left[:width], right[:width], pick)
+        if self.semantics.exact and rows:
+            window = Sliding(rows, min(count, rows), width)
+            if self.ops.slides(left, window):
+                return self.padded(self.ops.until(left, right, pick, window), count, neutral(pick))
         if width >= rows > 0 and (rows <= _SCAN_BATCH or left[0].shape[0] >= _SCAN_BATCH):
             return self.padded(self._until_to_end(left, right, pick, min(rows, count)), count, neutral(pick))
         left = self.padded(left, count + width - 1, neutral(dual(pick)))
@@ -110,6 +117,20 @@ class Windows:
             return self._until_doubling(left, pair(left, right, other, self.ops), pick, len(left))
         held = (self.ops.cummin if pick == "max" else self.ops.cummax)(left)
         return self.semantics.reduce(pair(held, right, other, self.ops), pick, self.ops)
+
+    def _until_by_offset(self, left: Array, right: Array, pick: Pick, count: int, width: int) -> Array:
+        """By the definition, one distance of `t` after the other: `width` operations on `count` rows."""
+        semantics, ops, other = self.semantics, self.ops, dual(pick)
+        left = self.padded(left, count + width - 1, neutral(other))
+        right = self.padded(right, count + width - 1, neutral(pick))
+        held = semantics.lift(left[:count], other, ops)
+        found = semantics.lift(semantics.pair(left[:count], right[:count], other, ops), pick, ops)
+        for ahead in range(1, width):
+            rows = slice(ahead, ahead + count)
+            held = semantics.merge(held, semantics.lift(left[rows], other, ops), other, ops)
+            met = semantics.pair(semantics.finish(held, other, ops), right[rows], other, ops)
+            found = semantics.merge(found, semantics.lift(met, pick, ops), pick, ops)
+        return semantics.finish(found, pick, ops)
 
     def _until_to_end(self, left: Array, right: Array, pick: Pick, count: int) -> Array:
         """The recursion `u(t) = min(left(t), max(right(t), u(t + 1)))`, from behind."""

@@ -1,0 +1,162 @@
+"""Sliding extrema and until: values by loops, gradients by plain torch, whatever the blocks and chunks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stlc.compile import extremum, scans
+from stlc.compile.extremum import Pick, Sliding
+from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.ops_torch import TORCH
+
+BOTH = pytest.mark.parametrize("pick", ["min", "max"])
+
+
+@pytest.fixture(params=["one piece", "pieces", "chunks"])
+def _layout(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Long rows are scanned one by one, short ones in pieces, and large batches in chunks."""
+    monkeypatch.setattr(scans, "_LONG_ROW", 1 if request.param == "one piece" else 1 << 30)
+    monkeypatch.setattr(scans, "_FEW_ROWS", 2)
+    if request.param == "chunks":
+        monkeypatch.setattr(extremum, "_CHUNK", 8)
+        monkeypatch.setattr(extremum, "_NARROW", 1)
+
+
+@st.composite
+def windows(draw: st.DrawFn) -> Sliding:
+    rows = draw(st.integers(1, 40))
+    return Sliding(rows, draw(st.integers(1, rows)), draw(st.integers(1, rows + 3)))
+
+
+def extrema_by_loops(x: torch.Tensor, pick: Pick, window: Sliding) -> torch.Tensor:
+    reduce = torch.amin if pick == "min" else torch.amax
+    return torch.stack([reduce(x[j : j + window.width], 0) for j in range(window.count)])
+
+
+def until_by_loops(left: torch.Tensor, right: torch.Tensor, pick: Pick, window: Sliding) -> torch.Tensor:
+    one, other = (torch.minimum, torch.maximum) if pick == "min" else (torch.maximum, torch.minimum)
+    out = []
+    for j in range(window.count):
+        held = found = None
+        for t in range(j, min(j + window.width, window.rows)):
+            held = left[t] if held is None else other(held, left[t])
+            met = other(held, right[t])
+            found = met if found is None else one(found, met)
+        out.append(found)
+    return torch.stack(out)
+
+
+def gradients(
+    function: Callable[..., torch.Tensor], operands: list[torch.Tensor], seed: int
+) -> list[torch.Tensor]:
+    value = function(*operands)
+    generator = torch.Generator().manual_seed(seed)
+    weights = torch.randn(value.shape, generator=generator, dtype=value.dtype)
+    return list(torch.autograd.grad(value, operands, weights))
+
+
+def random(window: Sliding, seed: int, batch: int = 3) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(window.rows, batch, generator=generator, dtype=torch.float64)
+
+
+@pytest.mark.usefixtures("_layout")
+@BOTH
+@settings(max_examples=40)
+@given(window=windows(), seed=st.integers(0, 999))
+def test_values_and_gradients_are_those_of_loops(pick: Pick, window: Sliding, seed: int) -> None:
+    x, y = random(window, seed).requires_grad_(), random(window, seed + 1).requires_grad_()
+    value, wanted = TORCH.extrema(x, pick, window), extrema_by_loops(x, pick, window)
+    assert torch.equal(value, wanted)
+    np.testing.assert_array_equal(NUMPY.extrema(x.detach().numpy(), pick, window), wanted.detach())
+    mine = gradients(lambda x: TORCH.extrema(x, pick, window), [x], seed)
+    theirs = gradients(lambda x: extrema_by_loops(x, pick, window), [x], seed)
+    torch.testing.assert_close(mine, theirs, atol=1e-12, rtol=1e-12)
+
+    value, wanted = TORCH.until(x, y, pick, window), until_by_loops(x, y, pick, window)
+    assert torch.equal(value, wanted)
+    plain = NUMPY.until(x.detach().numpy(), y.detach().numpy(), pick, window)
+    np.testing.assert_array_equal(plain, wanted.detach())
+    mine = gradients(lambda x, y: TORCH.until(x, y, pick, window), [x, y], seed)
+    theirs = gradients(lambda x, y: until_by_loops(x, y, pick, window), [x, y], seed)
+    torch.testing.assert_close(mine, theirs, atol=1e-12, rtol=1e-12)
+
+
+@pytest.mark.usefixtures("_layout")
+@BOTH
+@settings(max_examples=10)
+@given(window=windows(), seed=st.integers(0, 999))
+def test_gradients_where_operands_tie_are_subgradients(pick: Pick, window: Sliding, seed: int) -> None:
+    """The gradient of every window goes, whole, to operands that have its value."""
+    x, y = random(window, seed).round_().requires_grad_(), random(window, seed + 1).round_().requires_grad_()
+    for j in range(window.count):
+        (row,) = torch.autograd.grad(TORCH.extrema(x, pick, window)[j].sum(), [x])
+        assert (row.sum(0) == 1).all()
+        inside = torch.zeros(window.rows, 1, dtype=torch.bool)
+        inside[j : j + window.width] = True
+        value = extrema_by_loops(x, pick, window)[j]
+        assert ((row == 0) | inside & (x == value)).all()
+        left, right = torch.autograd.grad(TORCH.until(x, y, pick, window)[j].sum(), [x, y])
+        assert (left.sum(0) + right.sum(0) == 1).all()
+        value = until_by_loops(x, y, pick, window)[j]
+        assert ((left == 0) | inside & (x == value)).all()
+        assert ((right == 0) | inside & (y == value)).all()
+
+
+@BOTH
+@pytest.mark.parametrize("width", [5, 50])
+def test_gradients_are_central_differences(pick: Pick, width: int) -> None:
+    window = Sliding(50, 48, width)
+    x, y = random(window, 0).requires_grad_(), random(window, 1).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: TORCH.extrema(x, pick, window), (x,))
+    assert torch.autograd.gradcheck(lambda x, y: TORCH.until(x, y, pick, window), (x, y))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_any_layout_of_the_operands_will_do(dtype: torch.dtype) -> None:
+    """Transposed, expanded, in inference mode, and after it."""
+    window = Sliding(30, 30, 7)
+    x = random(window, 2, batch=4).to(dtype)
+    wanted = extrema_by_loops(x, "min", window)
+    turned = x.T.contiguous().T.requires_grad_()
+    value = TORCH.extrema(turned, "min", window)
+    assert value.dtype == dtype
+    assert torch.equal(value, wanted)
+    value.sum().backward()
+    assert torch.equal(turned.grad.sum(0), torch.full((4,), 30.0, dtype=dtype))
+    one = x[:, :1].expand(-1, 4)
+    assert torch.equal(TORCH.until(one, x, "max", window), until_by_loops(one, x, "max", window))
+    with torch.inference_mode():
+        assert torch.equal(TORCH.extrema(x, "min", window), wanted)
+    assert torch.equal(TORCH.extrema(x, "min", window), wanted)
+
+
+def test_infinite_operands_are_neutral() -> None:
+    """Nothing is NaN, and what is finite and chosen gets its gradient."""
+    window = Sliding(6, 6, 3)
+    inf = torch.inf
+    x = torch.tensor([inf, 2.0, inf, inf, inf, 1.0], dtype=torch.float64)[:, None].requires_grad_()
+    value = TORCH.extrema(x, "min", window)
+    assert value.flatten().tolist() == [2.0, 2.0, inf, 1.0, 1.0, 1.0]
+    value[torch.isfinite(value)].sum().backward()
+    assert x.grad.flatten().tolist() == [0.0, 2.0, 0.0, 0.0, 0.0, 3.0]
+
+
+def test_memory_does_not_grow_with_the_width() -> None:
+    """Scratch arrays hold no more than a few traces, whatever the window."""
+    for width in (1, 2, 10, 101, 500, 999, 1000, 5000):
+        window = Sliding(1000, 1000, width)
+        assert window.covered <= 2 * 1000 + width
+        assert window.covered <= 3 * 1000
+        assert window.numbers(1000) <= extremum._CHUNK + window.covered * extremum._NARROW
+        chunks = window.chunks(1000)
+        assert chunks[0].start == 0
+        assert chunks[-1].stop == 1000
+        assert all(a.stop == b.start for a, b in pairwise(chunks))

@@ -1,0 +1,54 @@
+"""Windows under every semantics against loops, and the shapes at their edges."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.semantics import ArithmeticGeometricMean, Exact, GeneralizedMean, LogSumExp, Pick, Semantics
+from stlc.compile.windows import Windows
+
+
+@pytest.mark.parametrize(
+    "semantics", [Exact(), LogSumExp(1.0), ArithmeticGeometricMean(), GeneralizedMean(0.1)]
+)
+@pytest.mark.parametrize("pick", ["min", "max"])
+@settings(max_examples=60)
+@given(
+    values=st.lists(st.integers(-9, 9), min_size=1, max_size=20),
+    count=st.integers(1, 20),
+    width=st.integers(1, 25),
+    batch=st.sampled_from([1, 64]),
+)
+def test_windows_are_the_definition(
+    semantics: Semantics, pick: Pick, values: list[int], count: int, width: int, batch: int
+) -> None:
+    """Extrema and until over every window, cut to the array, by loops."""
+    rng = np.random.default_rng(len(values))
+    x = np.repeat(np.array(values, dtype=float)[:, None], batch, axis=1)
+    y = np.repeat(rng.integers(-9, 9, (len(values), 1)).astype(float), batch, axis=1)
+    windows = Windows(semantics, NUMPY)
+    extrema = windows.extrema(x, pick, count=count, width=width)
+    until = windows.until(y, x, pick, count=count, width=width)
+    assert extrema.shape == until.shape == (count, batch)
+    other: Pick = "max" if pick == "min" else "min"
+    nothing = math.inf if pick == "min" else -math.inf
+    for j in range(count):
+        inside = range(j, min(j + width, len(values)))
+        if not inside:
+            assert extrema[j, 0] == until[j, 0] == nothing
+            continue
+        wanted = semantics.reduce(x[inside.start : inside.stop], pick, NUMPY)[0]
+        np.testing.assert_allclose(extrema[j], wanted, atol=1e-9)
+        met = []
+        for t in inside:
+            held = semantics.reduce(y[j : t + 1], other, NUMPY)
+            met.append(semantics.pair(held, x[t : t + 1], other, NUMPY))
+        slack = 1e-9 if semantics.exact or not semantics.associative else 3 * math.log(len(values) + 1)
+        wanted = semantics.reduce(np.concatenate(met), pick, NUMPY)[0]
+        np.testing.assert_allclose(until[j], wanted, atol=slack)
