@@ -13,6 +13,7 @@ from stlc.cli.output import emit, emit_json, say, show_diagnostics
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import Compiled, Rule
+    from stlc.compile.timers import Timer
     from stlc.dynamics.decl import SystemDecl
 
 Part = Literal["all", "steps", "states", "ir"]
@@ -87,9 +88,20 @@ def _result(compiled: Compiled, decl: SystemDecl) -> dict[str, Any]:
         "dt": float(decl.dt),
         "horizon": {"seconds": float(decl.dt * steps), "steps": steps},
         "states": [*decl.signature.names, *(timer.name for timer in compiled.timers)],
-        "added": [{"name": timer.name, "saturation": timer.saturation} for timer in compiled.timers],
+        "added": [_added(timer) for timer in compiled.timers],
         "safety": [rule.name for rule in compiled.safety],
         "requirements": [_requirement(rule, float(decl.dt)) for rule in compiled.requirements],
+    }
+
+
+def _added(timer: Timer) -> dict[str, Any]:
+    """A state that the compiler adds."""
+    return {
+        "name": timer.name,
+        "kind": timer.kind,
+        "initial": timer.initial,
+        "range": [timer.low, timer.high],
+        "about": timer.about,
     }
 
 

@@ -8,10 +8,11 @@ from typing import Literal, TypeAlias
 
 from stlc.compile import ir
 from stlc.compile.bounds import in_words
-from stlc.compile.horizon import nodes
+from stlc.compile.horizon import columns, nodes
 from stlc.compile.interface import Grid
 from stlc.compile.ir_text import show_formula
 from stlc.compile.pipeline import Compiled, Rule
+from stlc.compile.timers import Timer
 from stlc.grammar.printer import show
 
 Part: TypeAlias = Literal["all", "steps", "states", "ir"]
@@ -22,8 +23,8 @@ def dump(compiled: Compiled, part: Part = "all") -> str:
     """The text of `part`. It depends on nothing but the specification and the system's grid."""
     blocks = ["\n".join(_head(compiled))]
     if part != "states":
-        blocks += ["\n".join(_rule(rule, compiled.grid, part)) for rule in compiled.requirements]
-        blocks += ["\n".join(_rule(rule, compiled.grid, part, "assume")) for rule in compiled.assumptions]
+        blocks += ["\n".join(_rule(rule, compiled, part)) for rule in compiled.requirements]
+        blocks += ["\n".join(_rule(rule, compiled, part, "assume")) for rule in compiled.assumptions]
     if part in ("all", "states"):
         blocks.append("\n".join(_states(compiled)))
     return "\n\n".join(blocks) + "\n"
@@ -46,7 +47,7 @@ def _both(steps: int, grid: Grid) -> str:
     return count if grid.dt is None else f"{in_words(Fraction(steps), grid)} = {count}"
 
 
-def _rule(rule: Rule, grid: Grid, part: Part, kind: str = "") -> Iterator[str]:
+def _rule(rule: Rule, compiled: Compiled, part: Part, kind: str = "") -> Iterator[str]:
     tags = [f"@{tag}" for tag in sorted(rule.tags)]
     if rule.weight != 1:
         tags.append(f"@weight({rule.weight:g})")
@@ -55,12 +56,19 @@ def _rule(rule: Rule, grid: Grid, part: Part, kind: str = "") -> Iterator[str]:
     yield "  ".join(["", *([kind] if kind else []), rule.name, *tags]).rstrip()
     if part == "all":
         yield f"    written   {show(rule.typed.written)}"
+        read = columns(rule.formula)
+        yield from (_added(timer, "    ") for timer in compiled.timers if timer.name in read)
     if part in ("all", "ir"):
         yield f"    compiled  {show_formula(rule.formula)}"
     if part in ("all", "steps"):
-        lines = list(_times(rule, grid)) or ["the first sample alone"]
+        lines = list(_times(rule, compiled.grid)) or ["the first sample alone"]
         for label, line in zip(["time", *[""] * len(lines)], lines, strict=False):
             yield f"    {label:<8}  {line}"
+
+
+def _added(timer: Timer, indent: str) -> str:
+    """A state that the compiler adds, and what it says."""
+    return f"{indent}+ {timer.kind:<6}  {timer.name}  {timer.about}".rstrip()
 
 
 def _times(rule: Rule, grid: Grid) -> Iterator[str]:
@@ -87,8 +95,8 @@ def _states(compiled: Compiled) -> Iterator[str]:
     added = [timer.name for timer in compiled.timers]
     read = [name for name in compiled.signature.names if name not in added]
     yield "  columns   " + " ".join(read) + (f" | {' '.join(added)}" if added else "")
-    for timer in compiled.timers:
-        most = _both(timer.saturation, compiled.grid)
-        yield f"  + {timer.name:<8}counts the samples of the mission, up to {most}"
+    yield from (_added(timer, "  ") for timer in compiled.timers)
+    if compiled.mission is not None:
+        yield f"  mission   {_both(compiled.mission, compiled.grid)}"
     safe = ", ".join(rule.name for rule in compiled.safety)
     yield f"  phi_safe  {safe or '(no requirement is tagged @safety)'}"

@@ -1,7 +1,7 @@
 """The stages of the compiler, in order. Read first.
 
     resolve   ast.Spec      -> typed.Spec                 names, sorts, units; time in seconds
-    timers    typed.Formula -> typed.Formula, Timer…      absolute intervals
+    augment   typed.Formula -> typed.Formula, Timer…      absolute intervals and the past become states
     lower     typed.Formula -> ir.Formula                 negation normal form; time in steps
     simplify  ir.Formula    -> ir.Formula                 fewer nodes, no constants
     horizon   ir.Formula    -> int                        how far it looks
@@ -11,21 +11,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, final
 
 from stlc.compile import ir, typed
+from stlc.compile.augment import Augmented, augment
 from stlc.compile.bounds import in_words
 from stlc.compile.defined import defined
 from stlc.compile.horizon import columns, reach, uses_end
 from stlc.compile.interface import Grid, Interface
+from stlc.compile.lift import recorded
 from stlc.compile.lower import lower
+from stlc.compile.mission import Goal, mission_steps
+from stlc.compile.pull import pull
 from stlc.compile.resolve import resolve
 from stlc.compile.safety import safe_part
 from stlc.compile.simplify import simplify
-from stlc.compile.timers import Timer, absolute, augment, mentions_horizon, merged, recorded
+from stlc.compile.timers import Ledger, Timer
+from stlc.compile.walk import absolute, mentions_horizon
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar import ast
 from stlc.signature import Signature
@@ -34,7 +39,8 @@ from stlc.source import Span
 Purpose: TypeAlias = Literal["train", "check"]
 """What a specification is compiled for.
 
-`train`: for plans over the horizon; absolute intervals become timers, no window may leave the plan (E306).
+`train`: for plans over the horizon; absolute intervals and the past become states, and no window may leave
+the plan (E306).
 `check`: for recorded traces; absolute intervals are judged on the mission clock.
 """
 
@@ -54,6 +60,7 @@ class Rule:
         windowed: it mentions `T`, and so speaks about every planning window.
         uses_end: a window of it runs to the end of the trace.
         absolute: it has an interval on the mission clock.
+        alive: for training, whether the mission so far leaves a way to satisfy it; about the state at hand.
         span: of the declaration.
         typed: what it was lowered from.
     """
@@ -68,6 +75,7 @@ class Rule:
     windowed: bool
     uses_end: bool
     absolute: bool
+    alive: ir.Formula
     span: Span = field(compare=False, repr=False)
     typed: typed.Requirement = field(compare=False, repr=False)
 
@@ -83,6 +91,8 @@ class Compiled:
         requirements: in order.
         assumptions: the `assume`s, in order; never part of the whole.
         timers: states that the requirements need beyond those of the system.
+        pull: for training, how far the next goal of the mission is at one sample; None without such goals.
+        mission: the last step of the mission that a requirement names; None where none does.
         grid: of time.
         warnings: what is worth saying although it compiles.
         typed: the resolved specification.
@@ -94,6 +104,8 @@ class Compiled:
     requirements: tuple[Rule, ...]
     assumptions: tuple[Rule, ...]
     timers: tuple[Timer, ...]
+    pull: ir.Num | None = field(repr=False)
+    mission: int | None
     grid: Grid
     warnings: tuple[Diagnostic, ...]
     typed: typed.Spec = field(repr=False)
@@ -131,11 +143,10 @@ def compile_spec(
     """
     sink: list[Diagnostic] = []
     resolved = resolve(spec, interface=interface, overrides=overrides or {}, sink=sink)
-    timers: list[Timer] = []
-    requirements = tuple(_rule(r, grid, purpose, sink, timers) for r in resolved.requirements)
-    assumptions = tuple(_rule(r, grid, purpose, sink, timers) for r in resolved.assumptions)
-    added = merged(timers)
-    sink.extend(_taken(resolved, added))
+    stage = _Stage(grid, purpose, Ledger(_taken(resolved, interface)), sink)
+    requirements = tuple(map(stage.rule, resolved.requirements))
+    goals = tuple(stage.goals)
+    assumptions = tuple(map(stage.rule, resolved.assumptions))
     errors = [finding for finding in sink if finding.severity == "error"]
     if not errors and purpose == "train":
         errors = [_too_far(rule, grid) for rule in requirements if _leaves(rule, grid)]
@@ -144,40 +155,61 @@ def compile_spec(
     return Compiled(
         name=resolved.name,
         spec=spec,
-        signature=_signature(resolved, (*requirements, *assumptions), added),
+        signature=_signature(resolved, (*requirements, *assumptions), stage.ledger.timers),
         requirements=requirements,
         assumptions=assumptions,
-        timers=added,
+        timers=stage.ledger.timers,
+        pull=pull(goals),
+        mission=max(map(mission_steps, goals), default=None),
         grid=grid,
         warnings=tuple(sink),
         typed=resolved,
     )
 
 
-def _rule(
-    requirement: typed.Requirement, grid: Grid, purpose: Purpose, sink: list[Diagnostic], timers: list[Timer]
-) -> Rule:
-    written = requirement.formula
-    if purpose == "train":
-        rewritten, added = augment(written, grid, sink)
-        timers.extend(added)
-    else:
-        rewritten = recorded(written, sink) if absolute(written) else written
-    formula = simplify(lower(rewritten, grid, sink))
-    return Rule(
-        name=requirement.name,
-        doc=requirement.doc,
-        tags=requirement.tags,
-        weight=requirement.weight,
-        scale=requirement.scale,
-        formula=formula,
-        reach=reach(formula).future,
-        windowed=mentions_horizon(written),
-        uses_end=uses_end(formula),
-        absolute=absolute(written),
-        span=requirement.span,
-        typed=requirement,
-    )
+@final
+@dataclass(frozen=True, slots=True)
+class _Stage:
+    """From resolved requirements to compiled ones; timers, goals and findings gather on the way."""
+
+    grid: Grid
+    purpose: Purpose
+    ledger: Ledger
+    sink: list[Diagnostic]
+    goals: list[Goal] = field(default_factory=list)
+
+    def rule(self, requirement: typed.Requirement) -> Rule:
+        """One requirement, compiled."""
+        written = requirement.formula
+        rewritten = self._rewritten(requirement)
+        if rewritten.goal is not None:
+            self.goals.append(rewritten.goal)
+        formula = self._lowered(rewritten.formula)
+        return Rule(
+            name=requirement.name,
+            doc=requirement.doc,
+            tags=requirement.tags,
+            weight=requirement.weight,
+            scale=requirement.scale,
+            formula=formula,
+            reach=reach(formula).future,
+            windowed=mentions_horizon(written),
+            uses_end=uses_end(formula),
+            absolute=absolute(written),
+            alive=self._lowered(rewritten.alive),
+            span=requirement.span,
+            typed=requirement,
+        )
+
+    def _rewritten(self, requirement: typed.Requirement) -> Augmented:
+        if self.purpose == "train":
+            return augment(requirement, self.grid, self.ledger, self.sink)
+        written = requirement.formula
+        formula = recorded(written, self.sink) if absolute(written) else written
+        return Augmented(formula, typed.Truth(written.span, True), None)
+
+    def _lowered(self, formula: typed.Formula) -> ir.Formula:
+        return simplify(lower(formula, self.grid, self.sink))
 
 
 def _signature(spec: typed.Spec, rules: Iterable[Rule], timers: Iterable[Timer]) -> Signature:
@@ -186,17 +218,10 @@ def _signature(spec: typed.Spec, rules: Iterable[Rule], timers: Iterable[Timer])
     return kept.extended(*(timer.column for timer in timers))
 
 
-def _taken(spec: typed.Spec, timers: Iterable[Timer]) -> Iterator[Diagnostic]:
-    """A timer must not have the name of a signal."""
-    for timer in timers:
-        if timer.name in spec.signature:
-            declared = next(item for item in spec.source_ast.items if item.name == timer.name)
-            yield Diagnostic(
-                "E102",
-                f"`{timer.name}` is the name of a state that absolute intervals add",
-                declared.name_span,
-                help=("call the signal something else",),
-            )
+def _taken(spec: typed.Spec, interface: Interface | None) -> frozenset[str]:
+    """Names that a timer must not have."""
+    offered = () if interface is None else interface.signature.names
+    return frozenset((*spec.signature.names, *offered))
 
 
 def _leaves(rule: Rule, grid: Grid) -> bool:

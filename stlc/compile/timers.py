@@ -1,201 +1,149 @@
-"""Absolute intervals: on the mission clock instead of from now on.
+"""States that the compiler adds, because a plan must know what was before it: their values and how they move.
 
-For training, the paper's rewriting: `always@[a, b] p` with a state formula p becomes a timer state `clock`
-and `always[0, T] (a <= clock <= b -> p)`, so that a plan knows how late it is. On a recorded trace a
-requirement with an absolute interval is judged once, at the first sample, where the mission clock and the
-time from now agree.
+`clock`: how many steps the mission is old. `status`: what is known of an absolute formula. `latch`: whether a
+formula held at the sample before, or ever. `timer`: for how long it has, or has not. All of them are whole
+numbers, and one step later each is a function of the state at the start of the step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from fractions import Fraction
-from typing import assert_never
+from typing import Literal, TypeAlias
 
 from stlc.compile import ir, typed
-from stlc.compile.bounds import report, to_window
-from stlc.compile.interface import Grid
-from stlc.diagnostics import Diagnostic
+from stlc.compile.semantics import TOLERANCE
 from stlc.signature import Column
 from stlc.source import Span
 
-CLOCK = "clock"
+Kind: TypeAlias = Literal["clock", "status", "latch", "timer"]
+
+OPEN, TRUE, FALSE = 0.0, 1.0, -1.0
+"""Values of a status."""
 
 
 @dataclass(frozen=True, slots=True)
 class Timer:
-    """A state that the compiler adds: it grows by `rate` every step until `saturation`.
+    """A state that the compiler adds.
 
     Attributes:
         name: of its column.
-        saturation: where it stops, in steps; beyond it no formula tells instants apart.
-        rate: what one step adds; a clock counts steps, so that no rounding enters.
+        kind: what it holds.
+        initial: its value at the start of a mission.
+        update: its value one step later, read from the state at the start of the step.
+        low: its least value.
+        high: its greatest value; beyond it no formula tells instants apart.
+        about: what it says, in words.
     """
 
     name: str
-    saturation: int
-    rate: int = 1
+    kind: Kind
+    initial: float
+    update: ir.Num
+    low: float
+    high: float
+    about: str = ""
 
     @property
     def column(self) -> Column:
         """The column that it adds to a state."""
-        return Column(self.name, kind="int", role="timer", low=0.0, high=float(self.saturation), fact=True)
+        return Column(self.name, kind="int", role="timer", low=self.low, high=self.high, fact=True)
 
 
-def absolute(formula: typed.Formula) -> bool:
-    """Whether an interval of `formula` is on the mission clock."""
-    return any(_on_clock(node) for node in _nodes(formula))
+def clock_of(name: str, high: int) -> Timer:
+    """The mission clock: it counts steps, so that no rounding enters, and stops at `high`."""
+    later = ir.Op("min", (ir.Op("add", (ir.Col(name), ir.Lit(1.0))), ir.Lit(float(high))))
+    return Timer(name, "clock", 0.0, later, 0.0, float(high), "counts the samples of the mission")
 
 
-def _on_clock(node: typed.Formula) -> bool:
-    return isinstance(node, (typed.Temporal, typed.Until)) and node.interval.clock == "start"
+class Ledger:
+    """The timers of a specification, gathered requirement by requirement; equal ones are kept once."""
+
+    def __init__(self, taken: frozenset[str]) -> None:
+        """Timers get names that are not among `taken`."""
+        self._taken = set(taken)
+        self._known: dict[tuple[object, ...], Timer] = {}
+        self._clock: str | None = None
+        self._latest = 0
+
+    @property
+    def timers(self) -> tuple[Timer, ...]:
+        """The clock first, if there is one, then the others in order."""
+        clocks = () if self._clock is None else (clock_of(self._clock, self._latest),)
+        return (*clocks, *self._known.values())
+
+    def clock(self, latest: int) -> ir.Col:
+        """The mission clock, which tells instants apart up to step `latest`."""
+        self._latest = max(self._latest, latest)
+        if self._clock is None:
+            self._clock = self.fresh("clock")
+        return ir.Col(self._clock)
+
+    def add(self, draft: Timer, update: Callable[[ir.Col], ir.Num]) -> ir.Col:
+        """A timer like `draft`, whose own column `update` is given; of equal ones there is one."""
+        key = (draft.kind, draft.initial, draft.high, update(ir.Col("")))
+        if key not in self._known:
+            name = self.fresh(draft.name)
+            self._known[key] = replace(draft, name=name, update=update(ir.Col(name)))
+        return ir.Col(self._known[key].name)
+
+    def fresh(self, wanted: str) -> str:
+        """`wanted`, or with a number behind it where that is the name of something else."""
+        name, number = wanted, 1
+        while name in self._taken:
+            number += 1
+            name = f"{wanted}_{number}"
+        self._taken.add(name)
+        return name
 
 
-def augment(
-    formula: typed.Formula, grid: Grid, sink: list[Diagnostic]
-) -> tuple[typed.Formula, tuple[Timer, ...]]:
-    """The formula of a requirement for training, and the timers that it needs.
-
-    Findings go to `sink`: E310 for a body that looks into the future, E307 and E015 for absolute intervals
-    that have no rewriting yet.
-    """
-    if not absolute(formula):
-        return formula, ()
-    match formula:
-        case typed.Temporal(span, "always", interval, body) if not absolute(body):
-            if not _is_state_formula(body):
-                report(sink, _looks_ahead(body.span))
-                return typed.Truth(span, True), ()
-            return _clocked(formula, interval, grid, sink)
-        case _:
-            report(sink, _without_rewriting(formula))
-            return typed.Truth(formula.span, True), ()
+# ------------------------------------------------------------------------- conditions
 
 
-def _clocked(
-    node: typed.Temporal, interval: typed.Interval, grid: Grid, sink: list[Diagnostic]
-) -> tuple[typed.Formula, tuple[Timer, ...]]:
-    """`always[0, T] (a <= clock <= b -> body)`, with the test of the clock as a guard."""
-    window = to_window(interval, grid, sink, outward=True)
-    span, clock = node.span, ir.Col(CLOCK)
-    tests: list[typed.Formula] = [_at_least(clock, ir.Lit(float(window.lo)), span)]
-    if window.hi is not None:
-        tests.append(_at_least(ir.Lit(float(window.hi)), clock, span))
-    inside = tests[0] if len(tests) == 1 else typed.Logic(span, "and", tuple(tests))
-    horizon = typed.Interval(typed.Time(), typed.Time(horizons=Fraction(1), span=interval.span))
-    body = typed.Logic(span, "->", (inside, node.body))
-    latest = window.lo if window.hi is None else window.hi
-    timer = Timer(CLOCK, saturation=latest + (grid.horizon or 0) + 1)
-    return typed.Temporal(span, "always", horizon, body), (timer,)
+def at_least(left: ir.Num, right: ir.Num) -> ir.Atom:
+    """`left >= right`, between whole numbers."""
+    return ir.Atom(ir.Op("sub", (left, right)))
 
 
-def _at_least(left: ir.Num, right: ir.Num, span: Span) -> typed.Pred:
+def guard(left: ir.Num, right: ir.Num, span: Span) -> typed.Pred:
+    """`left >= right` as a test of time: it decides truth and never limits the margin."""
     return typed.Pred(span, ir.Op("sub", (left, right)), strict=False, guard=True)
 
 
-def merged(timers: Iterable[Timer]) -> tuple[Timer, ...]:
-    """One timer for each name, with the latest saturation."""
-    latest: dict[str, Timer] = {}
-    for timer in timers:
-        known = latest.get(timer.name, timer)
-        latest[timer.name] = replace(timer, saturation=max(timer.saturation, known.saturation))
-    return tuple(latest.values())
+def choose(condition: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
+    """`yes` where a state formula holds, else `no`."""
+    if isinstance(condition, ir.Truth):
+        return yes if condition.value else no
+    return ir.Where(condition, yes, no)
 
 
-def recorded(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
-    """The formula of a requirement for a recorded trace that is judged at its first sample alone.
-
-    There the mission clock and the time from now agree. An absolute interval under another temporal operator
-    is asked for at other instants too: E307.
-    """
-    for node in _nodes(formula):
-        if isinstance(node, (typed.Temporal, typed.Until)):
-            for inner in _operands(node):
-                for part in _nodes(inner):
-                    if _on_clock(part):
-                        report(sink, _nested(part.span, node.span))
-    return _from_now(formula)
-
-
-def _from_now(formula: typed.Formula) -> typed.Formula:
+def tolerant(formula: ir.Formula) -> ir.Formula:
+    """A state formula that is true exactly where the monitor calls it satisfied: ties count."""
     match formula:
-        case typed.Truth() | typed.Pred():
+        case ir.Atom(num, sign, _, False):
+            return ir.Atom(ir.Op("add", (num, ir.Lit(sign * TOLERANCE))), sign)
+        case ir.Join(_, items):
+            return replace(formula, items=tuple(map(tolerant, items)))
+        case _:
             return formula
-        case typed.Not() | typed.Shift() | typed.Edge():
-            return replace(formula, body=_from_now(formula.body))
-        case typed.Logic():
-            return replace(formula, items=tuple(map(_from_now, formula.items)))
-        case typed.Temporal():
-            interval = replace(formula.interval, clock="now")
-            return replace(formula, interval=interval, body=_from_now(formula.body))
-        case typed.Until():
-            interval = replace(formula.interval, clock="now")
-            left, right = _from_now(formula.left), _from_now(formula.right)
-            return replace(formula, interval=interval, left=left, right=right)
-        case _:
-            assert_never(formula)
 
 
-def _operands(formula: typed.Formula) -> tuple[typed.Formula, ...]:
+def denied(formula: ir.Formula) -> ir.Formula:
+    """The exact complement of a state formula."""
     match formula:
-        case typed.Truth() | typed.Pred():
-            return ()
-        case typed.Logic(_, _, items):
-            return items
-        case typed.Until(_, _, _, left, right):
-            return (left, right)
-        case typed.Not() | typed.Shift() | typed.Edge() | typed.Temporal():
-            return (formula.body,)
+        case ir.Truth(value):
+            return replace(formula, value=not value)
+        case ir.Atom(_, sign, strict):
+            return replace(formula, sign=1 if sign < 0 else -1, strict=not strict)
+        case ir.Join(op, items):
+            return replace(formula, op="or" if op == "and" else "and", items=tuple(map(denied, items)))
         case _:
-            assert_never(formula)
+            raise TypeError(f"not a state formula: {formula!r}")
 
 
-def _nodes(formula: typed.Formula) -> Iterator[typed.Formula]:
-    yield formula
-    for part in _operands(formula):
-        yield from _nodes(part)
-
-
-def _is_state_formula(formula: typed.Formula) -> bool:
-    state = (typed.Truth, typed.Pred, typed.Not, typed.Logic)
-    return all(isinstance(node, state) for node in _nodes(formula))
-
-
-def _looks_ahead(span: Span) -> Diagnostic:
-    return Diagnostic(
-        "E310",
-        "the body of an absolute operator looks at more than the present",
-        span,
-        help=("use a formula without temporal operators here; `stlc check` judges this one as it is",),
-    )
-
-
-def _nested(span: Span, outer: Span) -> Diagnostic:
-    return Diagnostic(
-        "E307",
-        "an absolute interval under another temporal operator",
-        span,
-        help=("its truth does not depend on now: move it out of the operator around it",),
-    ).with_note(f"the operator around it starts at line {outer.line}, column {outer.column}")
-
-
-def _without_rewriting(formula: typed.Formula) -> Diagnostic:
-    place = next(node for node in _nodes(formula) if _on_clock(node))
-    return Diagnostic(
-        "E015",
-        "this absolute interval cannot be compiled for training yet",
-        place.span,
-        help=("`always@[a, b] p` with a state formula p, as a requirement of its own, can",),
-        note=("`stlc check` judges all absolute intervals on recorded traces",),
-    )
-
-
-def mentions_horizon(formula: typed.Formula) -> bool:
-    """Whether a bound of `formula` is written with `T`."""
-    temporal = (node for node in _nodes(formula) if isinstance(node, (typed.Temporal, typed.Until)))
-    return any(_with_horizon(node.interval.lo) or _with_horizon(node.interval.hi) for node in temporal)
-
-
-def _with_horizon(time: typed.Time | None) -> bool:
-    return time is not None and time.horizons != 0
+def both(*items: ir.Formula) -> ir.Formula:
+    """Their conjunction, constants folded."""
+    if any(isinstance(item, ir.Truth) and not item.value for item in items):
+        return ir.Truth(False)
+    kept = tuple(item for item in items if not isinstance(item, ir.Truth))
+    return ir.Truth(True) if not kept else kept[0] if len(kept) == 1 else ir.Join("and", kept)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from stlc.compile import ir
-from stlc.compile.timers import Timer
-from stlc.dynamics.algebra import add, blend, substitute
+from stlc.dynamics.algebra import blend, substitute
 from stlc.dynamics.decl import JumpDecl, SystemDecl
 from stlc.dynamics.integrators import INTEGRATORS, State
 
@@ -44,8 +43,8 @@ class _Writer:
         return {name: self.name(name, num) for name, num in state.items()}
 
 
-def build_step(decl: SystemDecl, timers: Sequence[Timer] = (), *, soft: bool) -> Step:
-    """The step of a declaration, and of the timers that a specification adds.
+def build_step(decl: SystemDecl, *, soft: bool) -> Step:
+    """The step of a declaration.
 
     `soft` blends jumps as `I_w(g) reset + (1 - I_w(g)) flow`; otherwise a jump is a choice.
     Guards and resets read the state at the start of the step, clamps act after each substep,
@@ -61,14 +60,7 @@ def build_step(decl: SystemDecl, timers: Sequence[Timer] = (), *, soft: bool) ->
     reset = {assign.name for jump in decl.jumps for assign in jump.resets}
     state = {name: _clamped(decl, name, num) if name in reset else num for name, num in state.items()}
     ordered = [name for name in decl.signature.names if name in moved | set(decl.clamps)]
-    moves = {name: state[name] for name in ordered} | {timer.name: _ticked(timer) for timer in timers}
-    return Step(tuple(writer.lets), moves)
-
-
-def _ticked(timer: Timer) -> ir.Num:
-    """A timer one step later: whole steps, up to its saturation."""
-    later = add(ir.Col(timer.name), ir.Lit(float(timer.rate)))
-    return ir.Op("min", (later, ir.Lit(float(timer.saturation))))
+    return Step(tuple(writer.lets), {name: state[name] for name in ordered})
 
 
 def _flow(decl: SystemDecl, writer: _Writer, state: State) -> State:

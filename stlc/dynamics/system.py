@@ -18,11 +18,10 @@ from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.algebra import add, multiply, names_in
 from stlc.dynamics.decl import ControlDecl, SystemDecl
 from stlc.dynamics.describe import describe
-from stlc.dynamics.draws import Rows
 from stlc.dynamics.rollout import Columns, Stepper
 from stlc.dynamics.samplers import InitialStates
 from stlc.dynamics.schema import load_system_decl
-from stlc.dynamics.step import build_step
+from stlc.dynamics.step import Step, build_step
 from stlc.files import find_system
 
 HARD = Hard()
@@ -59,8 +58,8 @@ class System:
     def augmented(self, timers: Sequence[Timer]) -> System:
         """The same system with timers as its last columns.
 
-        A timer grows by its rate every step up to its saturation; initial states draw it evenly from all
-        its values, so that a policy learns every moment of the mission.
+        They follow from the states before; no gradient goes through them. Initial states are the starts of
+        missions.
         """
         return System(self.decl, (*self.timers, *timers))
 
@@ -125,8 +124,14 @@ class System:
 
     def step(self, x: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
         """One step: (B, n), (B, m) -> (B, n)."""
-        moved = self._stepper(switch).step(self._named(x), self._inputs(u), switch)
+        before = self._named(x)
+        moved = self._stepper(switch).step(before, self._inputs(u), switch) | self._later(before)
         return torch.stack([moved[name] for name in self.names], 1)
+
+    def timers_later(self, x: Tensor) -> Tensor:
+        """The timers one step after a state, whatever moved it: (B, n) -> (B, timers)."""
+        later = self._later(self._named(x))
+        return torch.stack([later[timer.name] for timer in self.timers], 1) if later else x[:, :0]
 
     def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
         """Many steps: (B, n), (B, T, m) -> (B, T+1, n), the initial state first."""
@@ -142,12 +147,34 @@ class System:
             )
         start = dict(zip(self.names, x0.t().contiguous().unbind(0), strict=True))
         inputs = dict(zip(self.control_names, u.permute(2, 1, 0).contiguous().unbind(0), strict=True))
-        return self._stepper(switch).rollout(start, inputs, u.shape[1], switch)
+        moving = {name: column for name, column in start.items() if name not in self._keeper.next}
+        columns = self._stepper(switch).rollout(moving, inputs, u.shape[1], switch)
+        return columns | self._kept(start, columns, u.shape[1])
+
+    def _later(self, before: Columns) -> Columns:
+        with torch.no_grad():
+            after = self._keeper.step(before, {}, HARD)
+        return {timer.name: after[timer.name] for timer in self.timers}
+
+    def _kept(self, start: Columns, columns: Columns, steps: int) -> Columns:
+        """The timers over time, which follow from the states over time."""
+        if not self.timers:
+            return {}
+        with torch.no_grad():
+            seen = {name: column[:-1].detach() for name, column in columns.items()}
+            begun = {timer.name: start[timer.name] for timer in self.timers}
+            kept = self._keeper.rollout(begun, seen, steps, HARD)
+        return {timer.name: kept[timer.name] for timer in self.timers}
+
+    @cached_property
+    def _keeper(self) -> Stepper:
+        """What moves the timers."""
+        return Stepper(Step((), {timer.name: timer.update for timer in self.timers}))
 
     def _stepper(self, switch: Switch) -> Stepper:
         soft = not switch.exact
         if soft not in self._steppers:
-            self._steppers[soft] = Stepper(build_step(self.decl, self.timers, soft=soft))
+            self._steppers[soft] = Stepper(build_step(self.decl, soft=soft))
         return self._steppers[soft]
 
     def _named(self, x: Tensor) -> Columns:
@@ -167,7 +194,9 @@ class System:
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> Tensor:
-        """Initial states, (n, dim). The same seed gives the same states, whatever the dtype.
+        """Initial states, (n, dim), timers as at the start of a mission.
+
+        The same seed gives the same states, whatever the dtype.
 
         Raises SystemFileError (S301) where `where` rejects (nearly) everything.
         """
@@ -178,11 +207,8 @@ class System:
             else:
                 generator.manual_seed(seed)
         states = self.initial.sample(n, generator)
-        rows = Rows(n, generator)
-        clocks = [torch.floor(rows.uniforms() * (timer.saturation + 1.0)) for timer in self.timers]
-        if clocks:
-            states = torch.cat((states, torch.stack(clocks, 1)), 1)
-        return states.to(device=device, dtype=dtype)
+        begun = torch.tensor([timer.initial for timer in self.timers]).to(states)
+        return torch.cat((states, begun.expand(n, -1)), 1).to(device=device, dtype=dtype)
 
     # -------------------------------------------------------------- policy, objective
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 from stlc.compile import typed
-from stlc.compile.timers import recorded
+from stlc.compile.lift import recorded
 from stlc.diagnostics import Label
 from stlc.grammar import ast
 from stlc.monitor.blame import Blame, Blamer

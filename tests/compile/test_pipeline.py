@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mission_strategies import augmented
 
 from stlc.compile import ir
 from stlc.compile.dump import dump
@@ -92,11 +93,17 @@ def test_absolute_always_becomes_a_clock() -> None:
     spec = compiled(
         "require a: always@[0.5 s, 1 s] x > 1 m\nrequire b: always@[2 s, end] y > 1 m\nrequire c: x > 0 m"
     )
-    assert show_formula(spec.requirements[0].formula) == "always[0..25] (clock < 5 or clock > 10 or x > 1)"
-    assert show_formula(spec.requirements[1].formula) == "always[0..25] (clock < 20 or y > 1)"
-    (timer,) = spec.timers
-    assert (timer.name, timer.saturation, timer.rate) == ("clock", 20 + 25 + 1, 1)
-    assert spec.signature.names == ("x", "y", "clock")
+    first, second, _ = (show_formula(rule.formula) for rule in spec.requirements)
+    assert first == "a >= -0.5 and always[0..25] (clock < 5 or clock > 10 or x > 1)"
+    assert second == "b >= -0.5 and always[0..25] (clock < 20 or y > 1)"
+    clock, *statuses = spec.timers
+    assert (clock.name, clock.kind, clock.initial, clock.high) == ("clock", "clock", 0, 20 + 25 + 1)
+    assert [(timer.name, timer.kind, timer.initial) for timer in statuses] == [
+        ("a", "status", 0),
+        ("b", "status", 0),
+    ]
+    assert spec.mission == 20
+    assert spec.signature.names == ("x", "y", "clock", "a", "b")
     assert spec.signature["clock"].role == "timer"
     assert [rule.absolute for rule in spec.requirements] == [True, True, False]
 
@@ -107,12 +114,15 @@ def test_a_clock_decides_truth_and_never_limits_the_margin() -> None:
     plain = compiled("require a: always@[0.5 s, 1 s] x > 1 m", purpose="check")
     rng = np.random.default_rng(0)
     x = rng.choice([2.0, 3.0, 5.0, 0.0], p=[0.32, 0.32, 0.32, 0.04], size=(30, 400))
-    clock = np.minimum(np.arange(30.0), spec.timers[0].saturation)[:, None] * np.ones((1, 400))
-    env = {"x": x, "clock": clock}
+    env = augmented(spec.timers, {"x": x})
+    assert set(env) == {"x", "clock", "a"}
+    np.testing.assert_array_equal(env["clock"][:, 0], np.minimum(np.arange(30), 10 + 4 + 1))
     (windows,) = evaluate([spec.requirements[0].formula], env, ops=NUMPY, count=26)
     (whole,) = evaluate([plain.requirements[0].formula], env, ops=NUMPY)
-    np.testing.assert_array_equal(windows.min(0), whole[0])
-    assert (windows[12:] == np.inf).all()
+    good = whole[0] >= 0
+    np.testing.assert_array_equal(windows.min(0)[good], whole[0][good])
+    assert (windows.min(0)[~good] < 0).all()
+    assert (windows[12:][:, good] == np.inf).all()
     assert {True, False} == set((whole[0] >= 0).tolist())
 
 
@@ -120,22 +130,65 @@ def test_a_clock_decides_truth_and_never_limits_the_margin() -> None:
     ("text", "train", "check"),
     [
         ("always@[0, 1 s] eventually[0, 1 s] x > 1 m", ["E310"], None),
-        ("eventually@[0, 1 s] x > 1 m", ["E015"], None),
-        ("x > 0 m or always@[0, 1 s] x > 1 m", ["E015"], None),
-        ("always[0, 1 s] always@[0, 1 s] x > 1 m", ["E015"], ["E307"]),
+        ("eventually@[0, end] x > 1 m", ["E312"], None),
+        ("not always@[1 s, end] x > 1 m", ["E312"], None),
+        ("once[1 s, 2 s] always@[0, 1 s] x > 1 m", ["E307"], ["E307"]),
+        ("rise(always@[0, 1 s] x > 1 m)", ["E307"], ["E307"]),
+        ("always[0, 1 s] (x > 1 m or (y > 1 m and always@[0, 1 s] x > 1 m))", ["E307"], ["E307"]),
+        ("always@[0, 1 s] once[1 s, 2 s] x > 1 m", ["E309"], None),
+        ("always[0, 1 s] once[0, 1 s] eventually[0, 1 s] x > 1 m", ["E309"], None),
     ],
 )
-def test_other_absolute_forms(text: str, train: list[str], check: list[str] | None) -> None:
+def test_what_cannot_be_trained_for(text: str, train: list[str], check: list[str] | None) -> None:
     assert errors(f"require a: {text}") == train
     if check is None:
-        assert compiled(f"require a: {text}", purpose="check").requirements[0].absolute
+        assert compiled(f"require a: {text}", purpose="check").requirements
     else:
         assert errors(f"require a: {text}", purpose="check") == check
 
 
-def test_a_signal_may_not_have_the_name_of_the_clock() -> None:
-    assert errors("signal clock [s]\nrequire a: always@[0, 1 s] x > 1 m") == ["E102"]
+def test_the_clock_gives_way_to_a_signal_of_its_name() -> None:
+    spec = compiled("signal clock [s]\nsignal a [m]\nrequire a: always@[0, 1 s] x > 1 m")
+    assert [timer.name for timer in spec.timers] == ["clock_2", "a_2"]
     assert compiled("signal clock [s]\nrequire a: always[0, 1 s] clock > 1 s").timers == ()
+
+
+REWRITTEN = {
+    "eventually@[0, 1 s] x > 1 m": "a >= 0.5 or eventually[0..25] (clock <= 10 and x > 1)",
+    "eventually@[1 s, 4 s) x > 1 m": (
+        "a >= 0.5 or clock <= 13 or eventually[0..25] (clock >= 10 and clock <= 39 and x > 1)"
+    ),
+    "not always@[0, 1 s] x > 1 m": "a >= 0.5 or eventually[0..25] (clock <= 10 and x <= 1)",
+    "x > 1 m until@[0, 1 s] y > 1 m": (
+        "a >= 0.5 or (a >= -0.5 and (x > 1 until[0..25] (clock <= 10 and y > 1)))"
+    ),
+    "x > 0 m or always@[0, 1 s] x > 1 m": (
+        "(a >= -0.5 and (clock > 0 or x > 0)) or (a_2 >= -0.5 and always[0..25] (clock > 10 or x > 1))"
+    ),
+    "always[0, T] (y > 1 m -> always@[0, 1 s] x > 1 m)": (
+        "(a >= -0.5 and always[0..25] (clock > 10 or x > 1))"
+        " or (a_2 >= -0.5 and always[0..25] (clock > 25 or y <= 1))"
+    ),
+    "always[0, T] (x > 1 m -> once[0, 1 s] y > 1 m)": ("always[0..25] (x <= 1 or y > 1 or a_since <= 10)"),
+    "always[0, T] historically[0, 1 s] y > 1 m": "always[0..25] (y > 1 and a_held >= 10)",
+    "always[0, T] rise(y > 1 m)": "always[0..25] (y > 1 and a_before >= 1)",
+    "always[0, T] (x > 1 m since y > 1 m)": "always[0..25] (x > 1 and (y > 1 or a_since >= 1))",
+}
+
+
+@pytest.mark.parametrize(("written", "rewritten"), REWRITTEN.items())
+def test_time_becomes_state(written: str, rewritten: str) -> None:
+    (rule,) = compiled(f"require a: {written}").requirements
+    assert show_formula(rule.formula) == rewritten
+
+
+def test_equal_states_are_kept_once() -> None:
+    spec = compiled(
+        "require a: always[0, T] (x > 1 m -> once[0, 1 s] y > 1 m)\n"
+        "require b: always[0, T] (x < 0 m -> once[0, 1 s] y > 1 m)\n"
+        "require c: eventually@[0, 1 s] x > 1 m\nrequire d: y > 0 m or eventually@[0, 1 s] x > 1 m"
+    )
+    assert [timer.name for timer in spec.timers] == ["clock", "a_since", "c", "d"]
 
 
 GOLDEN = {

@@ -10,8 +10,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stlc.compile import ir
 from stlc.compile.switch import Hard, StraightThrough, Switch, Tanh
-from stlc.compile.timers import Timer
+from stlc.compile.timers import Timer, clock_of
 from stlc.dynamics.system import System
 
 Make = Callable[..., System]
@@ -189,16 +190,40 @@ init: {mixture: [{draw: {x: 1, held: 0, left: 4}}]}
 
 
 def test_clocks_are_appended_and_count_whole_steps(car: System) -> None:
-    system = car.augmented((Timer("clock", saturation=30),))
+    system = car.augmented((clock_of("clock", 15),))
     assert system.names == (*car.names, "clock")
     assert system.observed_count == 8
     x0 = system.sample(4000, seed=3)
     assert torch.equal(x0[:, :7], car.sample(4000, seed=3))
-    assert set(x0[:, 7].tolist()) == set(map(float, range(31)))
+    assert set(x0[:, 7].tolist()) == {0.0}
     clock = system.rollout_columns(x0, torch.zeros(4000, 25, 1))["clock"]
-    want = torch.minimum(x0[:, 7] + torch.arange(26.0)[:, None], torch.tensor(30.0))
+    want = torch.arange(26.0).clamp(max=15.0)[:, None].expand(26, 4000)
     assert torch.equal(clock, want)
     assert torch.equal(system.step(x0, torch.zeros(4000, 1))[:, 7], want[1])
+
+
+def test_timers_follow_from_the_states_before(car: System) -> None:
+    """A rollout is its steps, `timers_later` is what a step does, and no gradient goes through a timer."""
+    moving = ir.Where(ir.Atom(ir.Op("sub", (ir.Col("v"), ir.Lit(2.0)))), ir.Lit(1.0), ir.Col("fast"))
+    fast = Timer("fast", "latch", 0.0, moving, 0.0, 1.0)
+    system = car.augmented((clock_of("clock", 40), fast))
+    x0 = system.sample(64, seed=5, dtype=torch.float64)
+    u = torch.randn(64, 25, 1, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 8
+    u.requires_grad_()
+    x = system.rollout(x0, u)
+    state = x0
+    for k in range(25):
+        assert torch.equal(system.timers_later(state), x[:, k + 1, 7:])
+        state = system.step(state, u[:, k])
+        torch.testing.assert_close(state, x[:, k + 1])
+    ever = (x[:, :-1, 1] >= 2.0).cumsum(1) > 0
+    assert torch.equal(x[:, 1:, 8] > 0.5, ever)
+    assert 0 < int(ever[:, -1].sum()) < 64
+    assert x[..., :7].requires_grad
+    (grad,) = torch.autograd.grad(x.sum(), u)
+    (bare,) = torch.autograd.grad(car.rollout(x0[:, :7], u).sum(), u)
+    torch.testing.assert_close(grad, bare)
+    assert car.timers_later(x0[:, :7]).shape == (64, 0)
 
 
 def test_plans_of_the_wrong_shape_are_refused(car: System) -> None:
