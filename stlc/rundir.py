@@ -11,6 +11,7 @@ import json
 import os
 import re
 import secrets
+import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -215,6 +216,30 @@ def every_run(root: Path = RUNS) -> list[RunDir]:
     """All runs below `root` that have a record, by spec and number."""
     paths = (path for path in root.glob("*/*") if not path.is_symlink() and _NUMBERED.fullmatch(path.name))
     return [RunDir(path) for path in sorted(paths) if (path / RECORD).is_file()]
+
+
+def remove_run(run: RunDir) -> None:
+    """Delete the folder of a run. A link that pointed to it points to the newest run that is left.
+
+    Raises:
+        MissingError: R201, it cannot be deleted.
+    """
+    home = run.path.parent
+    try:
+        shutil.rmtree(run.path)
+    except OSError as error:
+        reason = (error.strerror or type(error).__name__).lower()
+        raise MissingError(Diagnostic("R201", f"cannot remove `{run.shown}`: {reason}")) from error
+    runs = every_run(home.parent)
+    for folder in (home, home.parent):
+        link = folder / LATEST
+        if not link.is_symlink() or link.exists():
+            continue
+        left = [entry for entry in runs if folder in entry.path.parents]
+        link.unlink()
+        if left:
+            newest = max(left, key=lambda entry: entry.path.stat().st_mtime)
+            _point(link, newest.path.relative_to(folder).as_posix())
 
 
 def now() -> str:

@@ -2,10 +2,10 @@
 
 What the others do, from their grammars:
 
-    RTAMT      `or` binds tighter than `and`, temporal words loosest of all, `->` from the left
-    MoonLight  `->` binds tighter than `or`, `or` tighter than `and`, temporal words loosest, `->` from the left
+    RTAMT      `or` binds tighter than `and`, temporal words loosest of all, `->` from left
+    MoonLight  `->` binds tighter than `or`, that tighter than `and`, temporal words loosest, `->` from left
     STLRom     `and`, `or` and `=>` have one rank, temporal words bind tightest
-    FalCAuN    `&&`, `||` and `->` have one rank, from the left; `!` and temporal words bind loosest
+    FalCAuN    `&&`, `||` and `->` have one rank, from left; `!` and temporal words bind loosest
 """
 
 from __future__ import annotations

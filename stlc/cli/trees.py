@@ -1,0 +1,100 @@
+"""Syntax trees as text, as values for JSON, and as a graph for Graphviz."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from fractions import Fraction
+from typing import Any
+
+from stlc.grammar import ast
+from stlc.grammar.children import children
+
+_HIDDEN = frozenset({"span", "name_span", "system_span", "source", "quoted"})
+
+
+def as_tree(spec: ast.Spec) -> str:
+    """One node a line, children indented below it."""
+    lines: list[str] = []
+    stack: list[tuple[int, ast.Node]] = [(0, spec)]
+    while stack:
+        depth, node = stack.pop()
+        lines.append("  " * depth + " ".join([type(node).__name__, *_facts(node)]))
+        stack.extend((depth + 1, child) for child in reversed(list(children(node))))
+    return "\n".join(lines)
+
+
+def _facts(node: ast.Node) -> Iterator[str]:
+    """What a node says itself, without its children."""
+    for name, value in _own(node):
+        if name == "clock" and value == "now":
+            continue
+        text = _short(value)
+        yield text if name in ("name", "op", "kind", "value", "var", "target") else f"{name}={text}"
+
+
+def _own(node: ast.Node) -> Iterator[tuple[str, Any]]:
+    for part in fields(node):
+        value = getattr(node, part.name)
+        if part.name in _HIDDEN or isinstance(value, ast.Node) or value in (None, "", (), False):
+            continue
+        plain = [item for item in value if not _holds_nodes(item)] if isinstance(value, tuple) else value
+        if plain != []:
+            yield part.name, plain
+
+
+def _holds_nodes(value: object) -> bool:
+    if isinstance(value, tuple):
+        return any(map(_holds_nodes, value))
+    return isinstance(value, ast.Node)
+
+
+def _short(value: object) -> str:
+    match value:
+        case list():
+            return " ".join(map(_short, value))
+        case tuple():
+            return "=".join(map(_short, value))
+        case Fraction():
+            return str(value.numerator) if value.denominator == 1 else f"{float(value):.12g}"
+        case str() if " " in value or "\n" in value:
+            return '"' + value.replace("\n", " / ") + '"'
+        case _:
+            return str(value)
+
+
+def as_values(node: ast.Node) -> dict[str, Any]:
+    """`{"node", "line", "column", …}` with the children under the names of the parts."""
+    values: dict[str, Any] = {"node": type(node).__name__, "line": node.span.line, "column": node.span.column}
+    for part in fields(node):
+        if part.name not in _HIDDEN:
+            values[part.name] = _value(getattr(node, part.name))
+    return values
+
+
+def _value(value: object) -> Any:
+    match value:
+        case ast.Node():
+            return as_values(value)
+        case tuple():
+            return [_value(item) for item in value]
+        case Fraction():
+            return int(value) if value.denominator == 1 else float(value)
+        case _:
+            return value
+
+
+def as_dot(specs: Sequence[ast.Spec]) -> str:
+    """A directed graph, a node for each node."""
+    lines = ["digraph stlc {", '  node [shape=box, fontname="monospace"];']
+    count = 0
+    stack: list[tuple[int | None, ast.Node]] = [(None, spec) for spec in reversed(specs)]
+    while stack:
+        parent, node = stack.pop()
+        label = " ".join([type(node).__name__, *_facts(node)]).replace("\\", "\\\\").replace('"', '\\"')
+        lines.append(f'  n{count} [label="{label}"];')
+        if parent is not None:
+            lines.append(f"  n{parent} -> n{count};")
+        own, count = count, count + 1
+        stack.extend((own, child) for child in reversed(list(children(node))))
+    return "\n".join([*lines, "}"])

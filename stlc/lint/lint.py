@@ -1,0 +1,104 @@
+"""A specification -> everything that is to be said about it: what is wrong, then what is worth a thought."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from stlc.compile.interface import Grid, Interface
+from stlc.compile.resolve import resolve
+from stlc.diagnostics import CODES, Diagnostic, SpecError, UsageError
+from stlc.grammar import ast
+from stlc.grammar.parser import parse
+from stlc.lint.rules import RULES
+from stlc.registry import closest
+from stlc.source import Source
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Which warnings to look for; errors are always told.
+
+    Attributes:
+        select: prefixes of codes; none means the usual ones, "ALL" every one.
+        ignore: prefixes of codes to leave out.
+    """
+
+    select: tuple[str, ...] = ()
+    ignore: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for prefix in (*self.select, *self.ignore):
+            if prefix != "ALL" and not any(code.startswith(prefix) for code in CODES):
+                near = closest(prefix, CODES)
+                advice = f"did you mean `{near}`?" if near else "stlc explain  lists the codes"
+                raise UsageError(Diagnostic("U101", f"there is no code `{prefix}`", help=(advice,)))
+
+    def wants(self, code: str) -> bool:
+        """Whether findings of this code are told."""
+        if not code.startswith("W"):
+            return True
+        if self.ignore and code.startswith(self.ignore):
+            return False
+        if not self.select:
+            return code not in RULES or RULES[code].usual
+        return "ALL" in self.select or code.startswith(self.select)
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """The system that a specification is looked at with."""
+
+    interface: Interface
+    grid: Grid
+
+
+EVERYTHING_USUAL = Selection()
+
+
+def lint(
+    source: Source, *, within: Surroundings | None = None, selection: Selection = EVERYTHING_USUAL
+) -> tuple[Diagnostic, ...]:
+    """All findings in a text, in its order.
+
+    Args:
+        source: the text.
+        within: a system; without one what only a system can say is not looked at.
+        selection: of warnings.
+    """
+    try:
+        spec = parse(source)
+    except SpecError as error:
+        return error.diagnostics
+    found = [*_compiled(spec, within), *_written(spec, selection)]
+    kept = [finding for finding in found if selection.wants(finding.code)]
+    return tuple(sorted(kept, key=lambda finding: _place(finding, source)))
+
+
+def _compiled(spec: ast.Spec, within: Surroundings | None) -> Sequence[Diagnostic]:
+    """What the compiler says."""
+    warnings: list[Diagnostic] = []
+    try:
+        resolve(spec, interface=within.interface if within else None, sink=warnings)
+    except SpecError as error:
+        return [*warnings, *error.diagnostics]
+    if within is None:
+        return warnings
+    from stlc.compile.pipeline import compile_spec
+
+    try:
+        return compile_spec(spec, grid=within.grid, interface=within.interface).warnings
+    except SpecError as error:
+        return [*warnings, *error.diagnostics]
+
+
+def _written(spec: ast.Spec, selection: Selection) -> Iterator[Diagnostic]:
+    for code, rule in RULES.items():
+        if selection.wants(code):
+            yield from rule.check(spec)
+
+
+def _place(finding: Diagnostic, source: Source) -> tuple[bool, int]:
+    """Findings in the text itself by place, then the others."""
+    own = finding.span is not None and finding.span.source is source
+    return not own, finding.span.start if own and finding.span else 0
