@@ -24,7 +24,7 @@ format: environment
 	$(BIN)/ruff format .
 
 docs: environment
-	$(BIN)/python -m pytest -q tests/test_docs.py --regenerate
+	$(BIN)/python -m pytest -q tests/test_docs.py tests/editor/test_textmate.py --regenerate
 
 environment:
 	@$(PYTHON) tools/environment.py

@@ -292,10 +292,12 @@ ROOMS = {
     "": "The ground floor",
     "grammar": "grammar: what was written",
     "compile": "compile: what satisfied means",
+    "lint": "lint: what is worth saying about a valid specification",
     "dynamics": "dynamics: how state moves",
     "monitor": "monitor: how a recorded trace is judged and explained",
     "controller": "controller: who acts",
     "view": "view: what is drawn",
+    "editor": "editor: what an editor asks",
     "cli": "cli: the terminal",
 }
 

@@ -27,10 +27,12 @@ ROOMS = (
     {"rundir", "files", "provenance", "trace", *TRACE_FORMATS},
     {"grammar"},
     {"compile"},
+    {"lint"},
     {"dynamics"},
     {"monitor"},
     {"controller"},
     {"view"},
+    {"editor"},
     {"cli", "__main__"},
     {"__init__"},
 )
@@ -46,6 +48,8 @@ HOMES = {
     "yaml": ("stlc.dynamics.yaml_nodes",),
     "pydantic": ("stlc.dynamics",),
     "matplotlib": ("stlc.view",),
+    "pygls": ("stlc.editor",),
+    "lsprotocol": ("stlc.editor",),
     "PIL": ("stlc.view",),
     "numpy": (
         "stlc.trace",

@@ -16,7 +16,7 @@ from typing import Annotated
 
 import typer
 
-from stlc.cli import check, compile, report, simulate, train
+from stlc.cli import check, compile, lsp, report, simulate, train
 from stlc.cli.errors import TERMINATED
 from stlc.cli.errors import report as report_error
 from stlc.cli.options import describe
@@ -35,7 +35,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (train, simulate, check, compile, report):
+for group in (train, simulate, check, compile, report, lsp):
     group.register(app)
 
 

@@ -30,7 +30,7 @@ from stlc.diagnostics import (
 )
 from stlc.version import __version__
 
-COMMANDS = ("train", "simulate", "check", "compile", "report")
+COMMANDS = ("train", "simulate", "check", "compile", "report", "lsp")
 HEAVY = {"torch", "numpy", "matplotlib", "lark", "yaml", "rich"}
 
 

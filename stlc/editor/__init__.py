@@ -1,0 +1,1 @@
+"""What an editor asks of a specification while it is written."""

@@ -1,0 +1,193 @@
+"""What can be written at a cursor: the words that the grammar takes there, and the names that it takes.
+
+The parser reads the declaration up to the cursor and says which terminals may follow; where it cannot read
+that far, everything is offered.
+"""
+
+from __future__ import annotations
+
+import re
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from stlc.compile.functions import callable_names
+from stlc.editor.document import Document
+from stlc.editor.hover import about, summary
+from stlc.editor.symbols import inside
+from stlc.editor.vocabulary import BUILT_IN, FUNCTIONS, KEYWORDS, TAGS, TEMPORAL, TYPES
+from stlc.grammar.parser_accepts import acceptable
+from stlc.grammar.printer_expr import own_name
+from stlc.grammar.scan import declaration_starts, lexemes
+from stlc.grammar.words import BINARY_TEMPORAL, PRAGMAS, RESERVED, ROLES, UNARY_TEMPORAL
+from stlc.units import SYMBOLS
+
+Kind: TypeAlias = Literal[
+    "keyword", "function", "unit", "tag", "type", "signal", "constant", "name", "member"
+]
+
+_PREFIX = re.compile(r"@?`?\w*\Z")
+_UNIT_PREFIX = re.compile(r"(?:[A-Za-zµ°Ω%][\w/^*·.°]*)?\Z")
+_SILENT = re.compile(r"""[^"\n]*(?:"[^"\n]*"[^"\n]*)*(?:(?:\#|//).*|"[^"\n]*)""")
+_PLAIN_WORDS = RESERVED | {*PRAGMAS, "as", "fn", "from"}
+_OPERATORS = {"AND": ("and",), "OR": ("or", "xor"), "IFF": ("iff",), "IMPLIES": ("implies",)}
+_KINDS: dict[str, Kind] = {"signal": "signal", "param": "signal", "const": "constant", "member": "member"}
+_FIRST_UNITS = ("s", "steps", "ms", "min", "m", "m/s", "m/s^2", "rad", "deg", "1")
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """Something that may be written.
+
+    Attributes:
+        text: as it is inserted, in place of what is written already.
+        kind: of what.
+        detail: one line beside it.
+        doc: Markdown for the one that is looked at.
+        order: offers with smaller numbers come first.
+    """
+
+    text: str
+    kind: Kind
+    detail: str = ""
+    doc: str = ""
+    order: int = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Completion:
+    """The offers at a cursor, and the offset at which they would begin."""
+
+    start: int
+    offers: tuple[Offer, ...]
+
+
+def complete(document: Document, offset: int) -> Completion:
+    """What can be written at `offset`, whatever stands behind it."""
+    text = document.source.text[:offset]
+    if _SILENT.fullmatch(text[text.rfind("\n") + 1 :]):
+        return Completion(offset, ())
+    match = _PREFIX.search(text)
+    assert match is not None
+    start = match.start()
+    if match[0].startswith("@"):
+        return Completion(start, tuple(_tags()))
+    piece = text[_piece_start(text) : start]
+    units = _units_at(piece, text)
+    if units is not None:
+        return Completion(offset - len(units), tuple(_units()))
+    accepted = acceptable(piece)
+    offers = (
+        _everything(document, offset) if accepted is None else _fitting(document, offset, piece, accepted)
+    )
+    unique = {offer.text: offer for offer in reversed(list(offers))}
+    return Completion(start, tuple(sorted(unique.values(), key=lambda offer: (offer.order, offer.text))))
+
+
+def _piece_start(text: str) -> int:
+    """Where the declaration begins that the end of a text stands in."""
+    starts = declaration_starts(text)
+    return starts[bisect_right(starts, len(text)) - 1]
+
+
+def _units_at(piece: str, text: str) -> str | None:
+    """What is written of a unit in brackets, or None where no unit stands."""
+    head, bracket, tail = piece.rpartition("[")
+    written = _UNIT_PREFIX.search(text)
+    assert written is not None
+    if not bracket or "]" in tail or _UNIT_PREFIX.fullmatch(tail) is None:
+        return None
+    accepted = acceptable(head)
+    return written[0] if accepted is not None and "UNIT_BRACKET" in accepted else None
+
+
+# ------------------------------------------------------------------------- offers
+
+
+def _fitting(document: Document, offset: int, piece: str, accepted: frozenset[str]) -> Iterator[Offer]:
+    """What the parser would take."""
+    yield from _keywords(accepted)
+    if "UNIT" in accepted:
+        yield from _units()
+    if "TIME_UNIT" in accepted:
+        yield from (Offer(unit, "unit", order=1) for unit in ("s", "ms", "us", "ns", "min", "h", "steps"))
+    if "NAME" not in accepted:
+        return
+    if "NUMBER" in accepted:
+        yield from _names(document, offset)
+        yield from _functions()
+    else:
+        yield from _new_names(document, piece)
+
+
+def _everything(document: Document, offset: int) -> Iterator[Offer]:
+    yield from _names(document, offset)
+    yield from _functions()
+    yield from (Offer(word, "keyword", doc=KEYWORDS.get(word, ""), order=7) for word in sorted(_preferred()))
+
+
+def _preferred() -> set[str]:
+    """Reserved words, each in the spelling that the language prefers."""
+    aliases = {**UNARY_TEMPORAL, **BINARY_TEMPORAL}
+    return {word for word in RESERVED if aliases.get(word, word) == word}
+
+
+def _keywords(accepted: frozenset[str]) -> Iterator[Offer]:
+    """Terminals that are words."""
+    words: list[str] = []
+    for terminal in accepted:
+        words.extend(_OPERATORS.get(terminal, ()))
+        if terminal == "UNARY":
+            words.extend(dict.fromkeys(UNARY_TEMPORAL.values()))
+        elif terminal == "BINARY":
+            words.extend(dict.fromkeys(BINARY_TEMPORAL.values()))
+        elif terminal == "QUANTIFIER":
+            words.extend(("forall", "exists"))
+        elif terminal == "ROLE":
+            words.extend(ROLES)
+        elif terminal == "_NOT_IN":
+            words.append("not in")
+        elif terminal.startswith("_") and terminal[1:].lower() in _PLAIN_WORDS:
+            words.append(terminal[1:].lower())
+    for word in words:
+        yield Offer(word, "keyword", doc=TEMPORAL.get(word) or KEYWORDS.get(word, ""), order=4)
+
+
+def _names(document: Document, offset: int) -> Iterator[Offer]:
+    """Values that can be used here, nearest first."""
+    for symbol in inside(document.spec, offset):
+        yield Offer(own_name(symbol.name), "name", about(document, symbol), order=1)
+    for symbol in document.names.values.values():
+        kind = _KINDS.get(symbol.kind, "name")
+        yield Offer(own_name(symbol.name), kind, summary(document, symbol), about(document, symbol), 2)
+    yield from (Offer(name, "constant", text, order=3) for name, text in BUILT_IN.items())
+
+
+def _functions() -> Iterator[Offer]:
+    yield from (Offer(name, "function", doc=FUNCTIONS.get(name, ""), order=6) for name in callable_names())
+
+
+def _new_names(document: Document, piece: str) -> Iterator[Offer]:
+    """Where only a name can stand: a type, or a state of the system that is not declared yet."""
+    words = [lexeme.text for lexeme in lexemes(piece)]
+    if words[-1:] in ([":"], [">"], ["->"]):
+        yield from (Offer(name, "type", text) for name, text in TYPES.items())
+        yield from (Offer(own_name(name), "type", "enum") for name in document.names.types)
+    elif document.system is not None and "signal" in words:
+        declared = document.names.values
+        for column in document.system.signature.columns:
+            if column.name not in declared and "[" not in column.name:
+                unit = f" [{column.unit}]" if column.unit.text else ""
+                text = f"{own_name(column.name)}{unit}"
+                yield Offer(text, "signal", f"a state of {document.system.path.name}")
+
+
+def _units() -> Iterator[Offer]:
+    rest: Iterable[str] = (unit for unit in SYMBOLS if unit not in _FIRST_UNITS)
+    yield from (Offer(unit, "unit", order=1) for unit in _FIRST_UNITS)
+    yield from (Offer(unit, "unit", order=8) for unit in rest)
+
+
+def _tags() -> Iterator[Offer]:
+    yield from (Offer(f"@{name}", "tag", text) for name, text in sorted(TAGS.items()))

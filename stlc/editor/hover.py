@@ -1,0 +1,234 @@
+"""What there is to say about the word under a cursor: sort, unit, range, value, time in seconds and steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from fractions import Fraction
+
+from stlc.compile import typed
+from stlc.compile.bounds import in_words
+from stlc.compile.interface import Grid
+from stlc.compile.ir import Window
+from stlc.compile.values import Number, Value, Vector, describe
+from stlc.editor.document import Document
+from stlc.editor.symbols import Symbol
+from stlc.editor.vocabulary import BUILT_IN, FUNCTIONS, KEYWORDS, TAGS, TEMPORAL, TYPES
+from stlc.grammar import ast
+from stlc.grammar.printer import show
+from stlc.grammar.scan import Lexeme, lexemes
+from stlc.grammar.words import BINARY_TEMPORAL, UNARY_TEMPORAL
+from stlc.signature import Column
+from stlc.source import Span
+
+_ALIASES = {**UNARY_TEMPORAL, **BINARY_TEMPORAL}
+_PAST = ("once", "historically", "since")
+
+
+def hover(document: Document, offset: int) -> tuple[Span, str] | None:
+    """The place that a cursor touches and what to say about it, in Markdown."""
+    found = document.names.at(offset)
+    if found is not None:
+        return found.span, about(document, found.symbol)
+    lexeme, before = _lexeme(document.source.text, offset)
+    node = _temporal_at(document.spec, offset)
+    if node is not None and (lexeme is None or lexeme.kind != "word" or _is_temporal(lexeme)):
+        return (node.interval or node).span, _about_temporal(document, node)
+    if lexeme is None or lexeme.kind != "word":
+        return None
+    text = _about_word(document, lexeme.text, tag=before == "@")
+    return None if text is None else (document.source.span(lexeme.start, lexeme.end), text)
+
+
+def _lexeme(text: str, offset: int) -> tuple[Lexeme | None, str]:
+    """The lexeme at an offset, a word where two meet, and the text of the one before."""
+    found, before, last = None, "", ""
+    for lexeme in lexemes(text):
+        if lexeme.start > offset:
+            break
+        if lexeme.end >= offset and (found is None or found.kind == "sign"):
+            found, before = lexeme, last
+        last = lexeme.text
+    return found, before
+
+
+def _is_temporal(lexeme: Lexeme) -> bool:
+    return lexeme.text.rstrip("_") in _ALIASES
+
+
+def _about_word(document: Document, word: str, *, tag: bool) -> str | None:
+    if tag:
+        return TAGS.get(word)
+    if word in BUILT_IN:
+        return f"{BUILT_IN[word]}{_grid_value(word, document.grid)}"
+    for table in (FUNCTIONS, TYPES, KEYWORDS):
+        if word in table:
+            return table[word]
+    return TEMPORAL.get(_ALIASES.get(word.rstrip("_"), ""))
+
+
+def _grid_value(word: str, grid: Grid) -> str:
+    if word == "dt" and grid.dt is not None:
+        return f"\n\n{in_words(Fraction(1), grid)}"
+    if word == "T" and grid.horizon is not None:
+        return f"\n\n{duration(grid.horizon, grid)}"
+    return ""
+
+
+def duration(steps: int, grid: Grid) -> str:
+    """`2.5 s = 25 steps`."""
+    count = f"{steps} step{'' if steps == 1 else 's'}"
+    return count if grid.dt is None else f"{in_words(Fraction(steps), grid)} = {count}"
+
+
+# ------------------------------------------------------------------------- symbols
+
+
+def about(document: Document, symbol: Symbol) -> str:
+    """The declaration of a symbol, its `##` comment, and what it comes to."""
+    item = symbol.item
+    parts = [] if item is None else [f"```stlc\n{show(replace(item, doc='', tags=()))}\n```"]
+    parts += list(_facts(document, symbol))
+    if item is not None and item.doc and symbol.kind not in ("argument", "member"):
+        parts.append(item.doc)
+    return "\n\n".join(parts)
+
+
+def summary(document: Document, symbol: Symbol) -> str:
+    """One line: sort, unit, range."""
+    return next(iter(_facts(document, symbol)), symbol.kind)
+
+
+def _facts(document: Document, symbol: Symbol) -> Iterator[str]:
+    match symbol.kind:
+        case "signal" | "param":
+            yield from _about_column(document, symbol)
+        case "const" | "region" | "def":
+            value = document.meaning.value(symbol.name)
+            if value is not None:
+                yield "".join((describe(value), _constant(value), _ahead(document, symbol.name)))
+        case "require" | "assume":
+            tags = getattr(symbol.item, "tags", ())
+            yield " ".join(("requirement" if symbol.kind == "require" else "assumption", *map(show, tags)))
+            steps = document.meaning.steps(symbol.name)
+            if steps is not None:
+                yield f"horizon {duration(steps, document.grid)}"
+        case "member":
+            item = symbol.item
+            value_ = dict(item.members).get(symbol.name) if isinstance(item, ast.Enum) else None
+            yield f"member of `{symbol.item.name if symbol.item else ''}`, {value_}"
+        case "argument":
+            yield f"argument of `{symbol.item.name if symbol.item else ''}`"
+        case _:
+            yield symbol.kind
+
+
+def _about_column(document: Document, symbol: Symbol) -> Iterator[str]:
+    columns = document.meaning.columns.get(symbol.name, ())
+    if not columns:
+        return
+    first = columns[0]
+    unit = f" [{first.unit}]" if first.unit.text else ""
+    size = f" vector of {len(columns)}" if len(columns) > 1 or first.name.endswith("[0]") else ""
+    yield f"{first.role} {first.kind}{size}{unit}{_range(first)}"
+    system = document.system
+    if system is not None and first.name.removesuffix("[0]") in system.places:
+        place = system.places[first.name.removesuffix("[0]")]
+        yield f"a state of {system.path.name}, line {place.line}"
+
+
+def _range(column: Column) -> str:
+    if column.labels:
+        return f": {', '.join(f'{name} = {value:g}' for name, value in column.labels)}"
+    if column.kind == "bool" or column.low is None or column.high is None:
+        return ""
+    unit = f" {column.unit}" if column.unit.text else ""
+    return f", {column.low:g} to {column.high:g}{unit} ({'enforced' if column.fact else 'nominal'})"
+
+
+def _constant(value: Value) -> str:
+    match value:
+        case Number() if value.constant is not None:
+            return f" = {_amount(value)}"
+        case Vector(items) if all(item.constant is not None for item in items):
+            return f" = [{', '.join(map(_amount, items))}]"
+        case _:
+            return ""
+
+
+def _amount(number: Number) -> str:
+    unit = number.unit.text
+    return f"{(number.constant or 0.0) / number.unit.scale:.6g} {unit}".rstrip()
+
+
+def _ahead(document: Document, name: str) -> str:
+    steps = document.meaning.steps(name)
+    return f", looks {duration(steps, document.grid)} ahead" if steps else ""
+
+
+# ------------------------------------------------------------------- temporal words
+
+
+def _temporal_at(node: object, offset: int) -> ast.Temporal | ast.Until | None:
+    """The innermost temporal operator whose word or interval a cursor touches."""
+    found: ast.Temporal | ast.Until | None = None
+    for part in _parts(node):
+        if isinstance(part, ast.Node) and part.span.start <= offset <= part.span.end:
+            if isinstance(part, ast.Temporal | ast.Until) and _touches(part, offset):
+                found = part
+            found = _temporal_at(part, offset) or found
+        elif isinstance(part, tuple):
+            found = _temporal_at(part, offset) or found
+    return found
+
+
+def _touches(node: ast.Temporal | ast.Until, offset: int) -> bool:
+    if isinstance(node, ast.Temporal):
+        return node.span.start <= offset <= (node.interval or node.body).span.start or _within(node, offset)
+    return node.left.span.end < offset <= (node.interval or node.right).span.start or _within(node, offset)
+
+
+def _within(node: ast.Temporal | ast.Until, offset: int) -> bool:
+    return node.interval is not None and node.interval.span.start <= offset <= node.interval.span.end
+
+
+def _parts(node: object) -> Iterator[object]:
+    if isinstance(node, tuple):
+        yield from node
+    elif isinstance(node, ast.Node):
+        yield from (getattr(node, one.name) for one in fields(node) if one.name not in ("span", "name_span"))
+
+
+def _about_temporal(document: Document, node: ast.Temporal | ast.Until) -> str:
+    found = None if node.interval is None else document.meaning.interval(node.interval.span)
+    if node.interval is None:
+        time = "up to now" if node.op in _PAST else "from now to the end of the trace"
+    else:
+        time = "" if found is None else _time(node.op, found, document.grid)
+    return "\n\n".join(filter(None, (TEMPORAL[node.op], time)))
+
+
+def _time(op: str, found: tuple[typed.Interval, Window | None], grid: Grid) -> str:
+    interval, window = found
+    if window is None:
+        return ""
+    samples = f"samples {window.lo}..{'end' if window.hi is None else window.hi}"
+    if op in _PAST:
+        samples += " back"
+    if interval.clock == "start":
+        samples += " of the mission"
+    if grid.dt is None:
+        return samples
+    last = "end" if window.hi is None else in_words(Fraction(window.hi), grid)
+    opening, closing = "(" if interval.lo_open else "[", ")" if interval.hi_open else "]"
+    lo = _seconds(interval.lo, grid) or in_words(Fraction(window.lo), grid)
+    hi = last if interval.hi is None else _seconds(interval.hi, grid) or last
+    return f"{opening}{lo}, {hi}{closing} = {samples}"
+
+
+def _seconds(time: typed.Time, grid: Grid) -> str:
+    """A bound in seconds, exactly."""
+    if grid.dt is None or (time.horizons and grid.horizon is None):
+        return ""
+    seconds = time.seconds + grid.dt * (time.steps + time.horizons * (grid.horizon or 0))
+    return f"{float(seconds):g} s"

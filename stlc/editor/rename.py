@@ -1,0 +1,96 @@
+"""A new name for a symbol, everywhere, such that nothing else changes its meaning."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from stlc.diagnostics import SpecError
+from stlc.editor.document import Document
+from stlc.editor.symbols import Names, Occurrence, names_of
+from stlc.grammar import ast
+from stlc.grammar.parser import parse
+from stlc.grammar.printer_expr import own_name
+from stlc.source import Source, Span
+
+Edit = tuple[Span, str]
+
+_NAME = re.compile(r"[^\W\d]\w*")
+
+
+class RenameError(Exception):
+    """Why a name cannot be changed to that."""
+
+
+def can_rename(document: Document, offset: int) -> Occurrence | None:
+    """What would be renamed: modules keep their names."""
+    found = document.names.at(offset)
+    return None if found is None or found.symbol.kind == "module" else found
+
+
+def rename(document: Document, offset: int, new: str) -> tuple[Edit, ...]:
+    """The edits that give the symbol at `offset` the name `new`.
+
+    A signal goes on to read the same column: `from "old"` is added to its declaration.
+
+    Raises:
+        RenameError: there is nothing to rename, the text has errors, or `new` would mean something else.
+    """
+    found = can_rename(document, offset)
+    if found is None:
+        raise RenameError("there is no name of yours here")
+    if document.unread:
+        raise RenameError(f"the text has an error in line {_line(document)}; mend it first")
+    name = new.strip().strip("`")
+    if not _NAME.fullmatch(name):
+        raise RenameError(f"`{new}` is not a name: letters, digits and _, no digit first")
+    symbol = found.symbol
+    edits = [(one.span, own_name(name)) for one in document.names.of(symbol)]
+    edits += _column(document, symbol.item, symbol.name)
+    _refuse_capture(document, edits, name)
+    return tuple(edits)
+
+
+def _line(document: Document) -> int:
+    spans = [finding.span for finding in document.unread if finding.span is not None]
+    return spans[0].line if spans else 1
+
+
+def _column(document: Document, item: ast.Item | None, name: str) -> list[Edit]:
+    """Where the data of a renamed signal comes from."""
+    if not isinstance(item, ast.Signal) or item.column is not None:
+        return []
+    together = [other.name for other in document.spec.items if other.span == item.span]
+    if len(together) > 1:
+        raise RenameError(f"`{', '.join(together)}` share a declaration; give `{name}` one of its own first")
+    end = item.span.end
+    return [(item.span.source.span(end, end), f' from "{name}"')]
+
+
+def _refuse_capture(document: Document, edits: Sequence[Edit], name: str) -> None:
+    """Every name must be bound to what it was bound to before."""
+    text = apply(document.source.text, edits)
+    try:
+        after = names_of(parse(Source(document.source.name, text)))
+    except SpecError as error:
+        raise RenameError(f"`{name}` cannot stand everywhere: {error.diagnostics[0].message}") from None
+    if _bindings(after) != _bindings(document.names) or _declared(after) != _declared(document.names):
+        raise RenameError(f"`{name}` has a meaning already where this would be written")
+
+
+def apply(text: str, edits: Sequence[Edit]) -> str:
+    """The text with all edits done."""
+    for span, replacement in sorted(edits, key=lambda edit: edit[0].start, reverse=True):
+        text = text[: span.start] + replacement + text[span.end :]
+    return text
+
+
+def _bindings(names: Names) -> list[int]:
+    """For every occurrence, in order, the index of the first one of the same symbol."""
+    first: dict[Span, int] = {}
+    return [first.setdefault(one.symbol.span, index) for index, one in enumerate(names.occurrences)]
+
+
+def _declared(names: Names) -> tuple[int, int, int]:
+    """How many names there are: two declarations of one name count once."""
+    return len(names.values), len(names.types), len(names.rules)

@@ -1,0 +1,266 @@
+"""What the names of a specification are bound to: every place where a symbol is declared or used."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Literal, TypeAlias
+
+from stlc.grammar import ast
+from stlc.grammar.scan import Lexeme, lexemes
+from stlc.source import Span
+
+Kind: TypeAlias = Literal[
+    "signal",
+    "const",
+    "param",
+    "enum",
+    "member",
+    "region",
+    "def",
+    "extern",
+    "require",
+    "assume",
+    "argument",
+    "variable",
+    "module",
+]
+
+_KINDS: Mapping[type[ast.Item], Kind] = {
+    ast.Signal: "signal",
+    ast.Const: "const",
+    ast.Param: "param",
+    ast.Enum: "enum",
+    ast.Region: "region",
+    ast.Def: "def",
+    ast.Extern: "extern",
+    ast.Require: "require",
+    ast.Assume: "assume",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Symbol:
+    """Something that a specification names.
+
+    Attributes:
+        name: without backticks.
+        kind: of what.
+        span: where its name is declared.
+        item: the declaration that it is, or stands in; None for a module and for a variable.
+    """
+
+    name: str
+    kind: Kind
+    span: Span
+    item: ast.Item | None = field(default=None, compare=False, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Occurrence:
+    """A place where the name of a symbol is written."""
+
+    span: Span
+    symbol: Symbol
+
+    @property
+    def declares(self) -> bool:
+        """Whether the symbol is declared here."""
+        return self.span == self.symbol.span
+
+
+@dataclass(frozen=True, slots=True)
+class Names:
+    """The symbols of a specification, by the three kinds of names that do not see each other.
+
+    Attributes:
+        values: signals, constants, definitions and whatever else stands in expressions.
+        types: enums.
+        rules: requirements and assumptions.
+        occurrences: in the order of the text.
+    """
+
+    values: Mapping[str, Symbol]
+    types: Mapping[str, Symbol]
+    rules: Mapping[str, Symbol]
+    occurrences: tuple[Occurrence, ...]
+
+    def at(self, offset: int) -> Occurrence | None:
+        """The occurrence that a cursor at `offset` touches."""
+        touching = [one for one in self.occurrences if one.span.start <= offset <= one.span.end]
+        return max(touching, key=lambda one: one.span.start, default=None)
+
+    def of(self, symbol: Symbol) -> tuple[Occurrence, ...]:
+        """All places of a symbol."""
+        return tuple(one for one in self.occurrences if one.symbol == symbol)
+
+
+Scope: TypeAlias = Mapping[str, Symbol]
+
+
+def names_of(spec: ast.Spec) -> Names:
+    """All names of a specification and where they are written. The first declaration of a name has it."""
+    values: dict[str, Symbol] = {}
+    types: dict[str, Symbol] = {}
+    rules: dict[str, Symbol] = {}
+    for module in spec.imports:
+        symbol = _module(module)
+        values.setdefault(symbol.name, symbol)
+    for item in spec.items:
+        space = {ast.Enum: types, ast.Require: rules, ast.Assume: rules}.get(type(item), values)
+        space.setdefault(item.name, Symbol(item.name, _KINDS[type(item)], item.name_span, item))
+        if isinstance(item, ast.Enum):
+            for lexeme in _member_names(item):
+                member = _symbol(lexeme, "member", item.span, item)
+                values.setdefault(member.name, member)
+    names = Names(values, types, rules, ())
+    found = {one.span: one for one in _all(spec, names)}
+    ordered = sorted(found.values(), key=lambda one: (one.span.start, one.span.end))
+    return replace(names, occurrences=tuple(ordered))
+
+
+def inside(spec: ast.Spec, offset: int) -> tuple[Symbol, ...]:
+    """Arguments and variables that can be used at `offset`, innermost last."""
+    found: list[Symbol] = []
+    for item in spec.items:
+        if item.span.start <= offset <= item.span.end:
+            found.extend(_arguments(item).values())
+            found.extend(
+                symbol
+                for node in _nodes(item)
+                if node.span.start <= offset <= node.span.end
+                for symbol in _bound(node).values()
+            )
+    return tuple(found)
+
+
+# ------------------------------------------------------------------------- symbols
+
+
+def _symbol(lexeme: Lexeme, kind: Kind, near: Span, item: ast.Item | None = None) -> Symbol:
+    return Symbol(lexeme.text.strip("`"), kind, near.source.span(lexeme.start, lexeme.end), item)
+
+
+def _words(span: Span, start: int | None = None, end: int | None = None) -> list[Lexeme]:
+    """The words of a part of a text."""
+    first = span.start if start is None else start
+    last = span.end if end is None else end
+    return [one for one in lexemes(span.source.text, first, last) if one.kind in ("word", "quoted")]
+
+
+def _module(module: ast.Import) -> Symbol:
+    """The name under which a module is used: the last word, or the file where no other name is given."""
+    words = _words(module.span)
+    if module.alias is None and module.is_file:
+        name = module.target.replace("\\", "/").rpartition("/")[2].removesuffix(".stl").removesuffix(".stlc")
+        return Symbol(name, "module", module.span)
+    return _symbol(words[-1], "module", module.span)
+
+
+def _member_names(item: ast.Enum) -> Iterator[Lexeme]:
+    before = ""
+    for lexeme in lexemes(item.span.source.text, item.name_span.end, item.span.end):
+        if lexeme.kind in ("word", "quoted") and before in ("{", ","):
+            yield lexeme
+        before = lexeme.text
+
+
+def _arguments(item: ast.Item) -> dict[str, Symbol]:
+    if not isinstance(item, ast.Def | ast.Extern):
+        return {}
+    return {
+        formal.name: _symbol(_words(formal.span)[0], "argument", formal.span, item) for formal in item.formals
+    }
+
+
+def _bound(node: ast.Node) -> dict[str, Symbol]:
+    """The variables that a quantifier or a freeze binds."""
+    match node:
+        case ast.Quantifier(span, _, var):
+            return {var: _symbol(_words(span)[1], "variable", span)}
+        case ast.Freeze(span, bindings):
+            found = {}
+            start = span.start
+            for name, value in bindings:
+                found[name] = _symbol(_words(span, start, value.span.start)[-1], "variable", span)
+                start = value.span.end
+            return found
+        case _:
+            return {}
+
+
+# --------------------------------------------------------------------- occurrences
+
+
+def _all(spec: ast.Spec, names: Names) -> Iterator[Occurrence]:
+    for module in spec.imports:
+        symbol = _module(module)
+        yield Occurrence(symbol.span, symbol)
+    for item in spec.items:
+        yield from _of_item(item, names)
+
+
+def _of_item(item: ast.Item, names: Names) -> Iterator[Occurrence]:
+    own = Symbol(item.name, _KINDS[type(item)], item.name_span, item)
+    yield Occurrence(item.name_span, own)
+    if isinstance(item, ast.Enum):
+        for lexeme in _member_names(item):
+            member = _symbol(lexeme, "member", item.span, item)
+            yield Occurrence(member.span, member)
+    arguments = _arguments(item)
+    yield from (Occurrence(symbol.span, symbol) for symbol in arguments.values())
+    scope = {**names.values, **arguments}
+    for part in _parts(item):
+        yield from _uses(part, scope, names)
+
+
+def _uses(node: object, scope: Scope, names: Names) -> Iterator[Occurrence]:
+    """Names in a part of a declaration that are bound to something; built-in names are not."""
+    match node:
+        case ast.Name(span, name, quoted):
+            if name in scope and (quoted or name not in ("T", "end", "dt")):
+                yield Occurrence(span, scope[name])
+            return
+        case ast.TypeRef(span, name):
+            if name in names.types:
+                word = _words(span)[0]
+                yield Occurrence(span.source.span(word.start, word.end), names.types[name])
+            return
+        case ast.Tag(_, name) if name in ("group", "scale", "id"):
+            return
+        case ast.Call(_, ast.Name(_, name), args) if name in scope:
+            yield from _named_arguments(args, scope[name])
+        case _:
+            pass
+    bound = _bound(node) if isinstance(node, ast.Node) else {}
+    yield from (Occurrence(symbol.span, symbol) for symbol in bound.values())
+    for part in _parts(node):
+        yield from _uses(part, {**scope, **bound} if _sees(node, part) else scope, names)
+
+
+def _sees(node: object, part: object) -> bool:
+    """Whether the variables that a node binds can be used in this part of it."""
+    return isinstance(node, ast.Quantifier | ast.Freeze) and part is node.body
+
+
+def _named_arguments(args: tuple[ast.Arg, ...], called: Symbol) -> Iterator[Occurrence]:
+    formals = {} if called.item is None else _arguments(called.item)
+    for arg in args:
+        if arg.name in formals:
+            word = _words(arg.span)[0]
+            yield Occurrence(arg.span.source.span(word.start, word.end), formals[arg.name])
+
+
+def _nodes(node: object) -> Iterator[ast.Node]:
+    for part in _parts(node):
+        if isinstance(part, ast.Node):
+            yield part
+        yield from _nodes(part)
+
+
+def _parts(node: object) -> Iterator[object]:
+    """What stands inside of a node."""
+    if isinstance(node, tuple):
+        yield from node
+    elif isinstance(node, ast.Node):
+        yield from (getattr(node, one.name) for one in fields(node) if one.name not in ("span", "name_span"))

@@ -1,0 +1,145 @@
+"""The words of the language as a TextMate grammar, which editors colour texts by.
+
+Made from the same lists as the parser's grammar (`stlc.grammar.words`, `stlc.units`, the function table), so
+that a word that the language gains is coloured without anybody thinking of it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Any
+
+from stlc.compile.functions import REGIONS, callable_names
+from stlc.editor.vocabulary import FUNCTIONS
+from stlc.grammar.words import (
+    BINARY_TEMPORAL,
+    BUILT_IN,
+    DECLARATIONS,
+    PATTERNS,
+    PRAGMAS,
+    RESERVED,
+    ROLES,
+    UNARY_TEMPORAL,
+)
+
+_TYPES = ("real", "int", "bool", "formula")
+_CONSTANTS = ("true", "false", "inf")
+_NAME = r"`[^`\n]+`|[^\W\d]\w*"
+
+
+def textmate() -> dict[str, Any]:
+    """The grammar, as the JSON of a `.tmLanguage.json` file."""
+    parts = _repository()
+    return {
+        "name": "Signal Temporal Logic",
+        "scopeName": "source.stlc",
+        "fileTypes": ["stl", "stlc"],
+        "patterns": [{"include": f"#{name}"} for name in parts],
+        "repository": parts,
+    }
+
+
+def _repository() -> dict[str, Any]:
+    """Named groups of patterns; where several match, the first one wins."""
+    return {
+        "comment": {
+            "patterns": [_of("comment.line.documentation", r"##(?!#).*$"), _of("comment.line", _COMMENT)]
+        },
+        "string": _of("string.quoted.double", r'"[^"\n]*"'),
+        "declaration": {"patterns": _declarations()},
+        "pragma": {"patterns": _pragmas()},
+        "tag": _of("storage.modifier.tag", r"(?<!\w)@\s*[A-Za-z_]\w*"),
+        "quoted": _of("variable.other", r"`[^`\n]+`"),
+        "temporal": _of("keyword.operator.temporal", rf"\b{_any(_temporal())}_?(?!\w)"),
+        "role": _of("storage.modifier.role", rf"\b{_any(ROLES)}(?=\s+signal\b)"),
+        "constant": _of("constant.language", _words(_CONSTANTS)),
+        "time": _of("variable.language", _words(BUILT_IN)),
+        "keyword": _of("keyword.operator.word", _words(_logic())),
+        "number": _numbers(),
+        "unit": _captures(rf"(\[)\s*({_unit()})\s*(\])", {"2": "keyword.other.unit"}),
+        "region": _of("support.class.region", rf"{_words(REGIONS)}(?=\s*\()"),
+        "function": _of("support.function", rf"{_words(_functions())}(?=\s*\()"),
+        "type": _captures(rf"(:|->)\s*({_any(_TYPES)})\b", {"2": "support.type"}),
+        "operator": _of("keyword.operator", r"<->|<=>|->|=>|<=|>=|==|!=|\.\.|&&?|\|\|?|[-+*/%^<>=!~]"),
+    }
+
+
+_COMMENT = r"(?:#|//).*$"
+
+
+def _declarations() -> list[dict[str, Any]]:
+    """Keyword and name: requirements stand out from what only names something."""
+    rules = ("require", "assume")
+    callables = ("def", "region", "enum")
+    rest = [word for word in DECLARATIONS if word not in (*rules, *callables, "extern", "import")]
+    kinds = (
+        (rules, "entity.name.section"),
+        (callables, "entity.name.function"),
+        (rest, "variable.other.declaration"),
+    )
+    named = [
+        _captures(rf"\b({_any(words)})\s+({_NAME})", {"1": "keyword.declaration", "2": scope})
+        for words, scope in kinds
+    ]
+    extern = _captures(
+        rf"\b(extern)\s+(fn)\s+({_NAME})",
+        {"1": "keyword.declaration", "2": "keyword.declaration", "3": "entity.name.function"},
+    )
+    return [extern, *named, _of("keyword.declaration", _words(DECLARATIONS))]
+
+
+def _pragmas() -> list[dict[str, Any]]:
+    """`spec name`, `system "file"`, `time s`: words of the language only where a line begins."""
+    head = rf"^\s*({_any(PRAGMAS)})\s+"
+    return [
+        _captures(rf"{head}({_NAME})", {"1": "keyword.control.pragma", "2": "entity.name.type"}),
+        _captures(rf"{head}(?=\")", {"1": "keyword.control.pragma"}),
+    ]
+
+
+def _numbers() -> dict[str, Any]:
+    number = r"(?:\d[\d_]*\.(?!\.)\d*|\.\d+|\d[\d_]*)(?:[eE][+-]?\d+)?"
+    return _captures(
+        rf"(?<![\w.])({number})(?:\s*(steps?\b|{_unit()}(?!\w)))?",
+        {"1": "constant.numeric", "2": "keyword.other.unit"},
+    )
+
+
+def _unit() -> str:
+    """A product of powers of units, without blanks."""
+    one = f"(?:{PATTERNS['UNITS']}|%|1(?=/)){PATTERNS['EXPONENT']}?"
+    return rf"{one}(?:[*/·]{PATTERNS['UNITS']}{PATTERNS['EXPONENT']}?)*"
+
+
+def _temporal() -> list[str]:
+    return [*UNARY_TEMPORAL, *BINARY_TEMPORAL]
+
+
+def _logic() -> list[str]:
+    """Reserved words that are nothing else."""
+    other = {*DECLARATIONS, *_temporal(), *_CONSTANTS}
+    return [*sorted(RESERVED - other), "from", "as"]
+
+
+def _functions() -> set[str]:
+    return {*callable_names(), *FUNCTIONS} - {*REGIONS}
+
+
+def _any(words: Iterable[str]) -> str:
+    return "(?:" + "|".join(sorted(map(re.escape, set(words)), key=lambda word: (-len(word), word))) + ")"
+
+
+def _words(words: Iterable[str]) -> str:
+    return rf"\b{_any(words)}\b"
+
+
+def _of(scope: str, pattern: str) -> dict[str, Any]:
+    return {"name": f"{scope}.stlc", "match": pattern}
+
+
+def _captures(pattern: str, scopes: dict[str, str]) -> dict[str, Any]:
+    return {
+        "match": pattern,
+        "captures": {group: {"name": f"{scope}.stlc"} for group, scope in scopes.items()},
+    }

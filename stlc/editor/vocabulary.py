@@ -1,0 +1,127 @@
+"""What the words of the language mean, in one sentence each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+TEMPORAL: Mapping[str, str] = MappingProxyType(
+    {
+        "always": "`always[a, b] p`: p holds at every sample from a to b ahead.",
+        "eventually": "`eventually[a, b] p`: p holds at some sample from a to b ahead.",
+        "until": "`p until[a, b] q`: q holds at some sample from a to b ahead, and p from now to it.",
+        "release": "`p release[a, b] q`: q holds from a to b ahead, except once p has held.",
+        "unless": "`p unless[a, b] q`: p holds from now to b ahead, or `p until[a, b] q`.",
+        "once": "`once[a, b] p`: p held at some sample from a to b ago.",
+        "historically": "`historically[a, b] p`: p held at every sample from a to b ago.",
+        "since": "`p since[a, b] q`: q held at some sample from a to b ago, and p from there up to now.",
+    }
+)
+
+BUILT_IN: Mapping[str, str] = MappingProxyType(
+    {
+        "T": "The planning horizon of the system.",
+        "end": "The last sample of the trace.",
+        "dt": "The time between two samples.",
+    }
+)
+
+TAGS: Mapping[str, str] = MappingProxyType(
+    {
+        "safety": "Part of phi_safe, which even an emergency plan keeps.",
+        "liveness": "Something good that must happen; not part of phi_safe.",
+        "weight": "`@weight(w)`: its robustness counts w times in the whole.",
+        "scale": "`@scale(s)`: its robustness is divided by s in the whole.",
+        "id": '`@id("R1")`: what it is called elsewhere.',
+        "group": "`@group(name)`: requirements that belong together.",
+    }
+)
+
+FUNCTIONS: Mapping[str, str] = MappingProxyType(
+    {
+        "abs": "`abs(x)`: without its sign.",
+        "min": "`min(a, b, …)`: the least.",
+        "max": "`max(a, b, …)`: the greatest.",
+        "clip": "`clip(x, low, high)`: x, kept between low and high.",
+        "relu": "`relu(x)`: x where it is positive, else 0.",
+        "floor": "`floor(x)`: the next whole number below.",
+        "ceil": "`ceil(x)`: the next whole number above.",
+        "round": "`round(x)`: the nearest whole number.",
+        "sign": "`sign(x)`: -1, 0 or 1.",
+        "sqrt": "`sqrt(x)`: the square root; of a unit too.",
+        "exp": "`exp(x)` of a plain number.",
+        "log": "`log(x)`: the natural logarithm of a plain number.",
+        "sin": "`sin(x)` of an angle.",
+        "cos": "`cos(x)` of an angle.",
+        "tan": "`tan(x)` of an angle.",
+        "asin": "`asin(x)`: an angle.",
+        "acos": "`acos(x)`: an angle.",
+        "atan": "`atan(x)`: an angle.",
+        "atan2": "`atan2(y, x)`: the angle of the vector [x, y].",
+        "norm": "`norm(v)`: the Euclidean length.",
+        "norm1": "`norm1(v)`: the sum of the absolute values.",
+        "norminf": "`norminf(v)`: the greatest absolute value.",
+        "dot": "`dot(a, b)`: the scalar product.",
+        "cross": "`cross(a, b)`: the vector product; a number in the plane.",
+        "dist": "`dist(a, b)`: the Euclidean distance of two points.",
+        "deg": "`deg(x)`: a plain number of degrees as an angle, or an angle as a plain number.",
+        "rad": "`rad(x)`: a plain number of radians as an angle, or an angle as a plain number.",
+        "sdist": "`sdist(p, R)`: the signed distance of a point to a region, positive inside.",
+        "ind": "`ind(p)`: 1 where a formula about one instant holds, else 0.",
+        "circle": "`circle(center, radius)`: a disc of the plane.",
+        "ball": "`ball(center, radius)`: the points within a distance.",
+        "box": "`box(lower, upper)`: the points between two corners.",
+        "polygon": "`polygon(p1, p2, …)`: the polygon with these corners, in order.",
+        "halfspace": "`halfspace(a, b)`: the points p with dot(a, p) <= b.",
+        "union": "`union(R1, R2, …)`: the points of any of the regions.",
+        "intersect": "`intersect(R1, R2, …)`: the points of all of the regions.",
+        "complement": "`complement(R)`: the points outside.",
+        "dilate": "`dilate(R, d)`: the region grown by d.",
+        "next": "`next(p)`: p at the sample after this one.",
+        "prev": "`prev(p)`: p at the sample before this one.",
+        "rise": "`rise(p)`: p has just become true; false at the first sample.",
+        "fall": "`fall(p)`: p has just become false; false at the first sample.",
+        "shift": "`shift(x, time)`: the value of a signal that much later.",
+        "delta": "`delta(x)`: how much a signal has changed since the sample before.",
+        "sweep": "`sweep(p)`: the straight segment from a point's sample to the next one.",
+    }
+)
+
+KEYWORDS: Mapping[str, str] = MappingProxyType(
+    {
+        "require": "`require NAME: formula`: what must hold.",
+        "assume": "`assume NAME: formula`: where the specification applies.",
+        "def": "`def NAME(arguments) = expression`: a name for an expression.",
+        "const": "`const NAME [unit] = value`: known when compiling; `--set NAME=VALUE` changes it.",
+        "param": "`param NAME [unit] in [low, high]`: drawn once for every trajectory.",
+        "signal": "`signal NAME [unit] in [low, high]`: a column of the trace.",
+        "region": "`region NAME = circle(…)`: a set of points.",
+        "enum": "`enum NAME { a = 0, b = 1 }`: a type with these values.",
+        "extern": "`extern fn NAME(q: real[7]) -> real[3] [m]`: a function that the system provides.",
+        "import": '`import "file.stl" as m`, `import std`: the definitions of another file.',
+        "spec": "`spec NAME`: what the specification is called.",
+        "system": '`system "file.yaml"`: the system that it is about.',
+        "time": "`time UNIT`: the unit of bare numbers in intervals.",
+        "forall": "`forall i in 0..6: p`: p for every i.",
+        "exists": "`exists i in 0..6: p`: p for some i.",
+        "freeze": "`freeze a = x in p`: p, where a is x as it is now.",
+        "if": "`if p then a else b`: for numbers and for formulas.",
+        "in": "`p in R`: a point in a region, a number in `[low, high]` or in `{1, 2}`.",
+        "inf": "Without end.",
+        "xor": "One of both, and not the other.",
+        "not": "Negation.",
+        "state": "A signal that the dynamics move.",
+        "env": "A signal of the world around; its range is a fact.",
+        "input": "A signal that is given.",
+        "output": "A signal that is produced.",
+    }
+)
+
+TYPES: Mapping[str, str] = MappingProxyType(
+    {
+        "real": "A number; `real[3]` is a vector.",
+        "int": "A whole number.",
+        "bool": "True or false; stored as 1 and 0.",
+        "formula": "Something that holds or does not; of an argument of a `def`.",
+    }
+)
