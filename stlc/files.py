@@ -15,7 +15,15 @@ from stlc.registry import closest
 from stlc.source import Source
 
 MAX_BYTES = 10_000_000
-LIBRARY = Path(__file__).parent / "library"
+LIBRARY = next(
+    (
+        folder
+        for folder in (Path(__file__).parent / "library", Path(__file__).parents[1] / "examples")
+        if folder.is_dir()
+    ),
+    Path(__file__).parent / "library",
+)
+"""Installed systems; of an editable install those of the source tree."""
 
 _SYSTEM_SUFFIXES = ("", ".yaml", ".yml")
 _MESH = re.compile(r"\s*(solid\b[^\n]*)\n\s*(facet|endsolid)\b")

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from stlc.cli.options import JsonOption, describe
+from stlc.cli.options import JsonOption, RunsOption, describe
 from stlc.cli.output import emit, emit_json
 
 
@@ -26,13 +27,14 @@ def report(
     run: Annotated[
         str, typer.Argument(metavar="RUN", help="A run's folder, number, words, spec, or latest.")
     ] = "latest",
+    runs: RunsOption = Path("runs"),
     as_json: JsonOption = False,
 ) -> None:
     """Write the report of `run` and print where it is."""
     from stlc.rundir import RunDir
     from stlc.view.report import write_report
 
-    folder = RunDir.open(run)
+    folder = RunDir.open(run, runs)
     write_report(folder)
     path = f"{folder.shown}/report.html"
     if as_json:

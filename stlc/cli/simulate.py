@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
-from stlc.cli.options import JsonOption, describe
+from stlc.cli.options import JsonOption, RunsOption, describe
 from stlc.diagnostics import Diagnostic, UsageError
 
 if TYPE_CHECKING:
@@ -57,6 +57,7 @@ def simulate(
     fail_under: Annotated[
         float | None, typer.Option(metavar="SHARE", help="Exit with 1 if the plan accuracy is less.")
     ] = None,
+    runs: RunsOption = Path("runs"),
     pictures: Annotated[bool, typer.Option(help="Draw the animation and the report.")] = True,
     json: JsonOption = False,
 ) -> None:
@@ -65,27 +66,33 @@ def simulate(
     from stlc.controller.drive import Setting
     from stlc.controller.run import Run
 
-    opened = Run.open(run)
+    opened = Run.open(run, root=runs)
     test = opened.task.system.decl.test
     setting = Setting(
         tuple(range(seed, seed + seeds)), agents or test.agents, steps or test.steps, test.replan
     )
     found = {mode: _deploy(opened, setting, mode, record) for mode in GUARDS[chosen]}
     document = _save(opened, setting, found, record)
-    drawn = _draw(opened) if pictures else {}
     accuracy = found[chosen].metrics["plan_accuracy"].mean
     code = 1 if fail_under is not None and accuracy < fail_under else 0
+    if not json:
+        _print(_screen(document))  # before the pictures: what was measured must not depend on them
+    drawn = _draw(opened) if pictures else {}
     if json:
         from stlc.cli.output import emit_json
 
         emit_json("simulate/1", ok=code == 0, exit_code=code, result=document | drawn)
     else:
-        from stlc.cli.output import emit
-
-        for line in _screen(document, drawn, record):
-            emit(line)
+        _print(_closing(document["trace"], drawn, record))
     if code:
         raise typer.Exit(code)
+
+
+def _print(lines: Iterator[str]) -> None:
+    from stlc.cli.output import emit
+
+    for line in lines:
+        emit(line)
 
 
 def _guard(backup: bool | None, guard: str | None) -> Mode:
@@ -179,8 +186,8 @@ ROWS = {
 }
 
 
-def _screen(document: Record, drawn: Mapping[str, str], record: Path | None) -> Iterator[str]:
-    """The result as a person reads it; the last line is the next command."""
+def _screen(document: Record) -> Iterator[str]:
+    """What was measured, as a person reads it."""
     from stlc.cli.output import table
 
     guards = document["guards"]
@@ -196,11 +203,23 @@ def _screen(document: Record, drawn: Mapping[str, str], record: Path | None) -> 
     foreseen = list(guards.values())[-1]["metrics"].get("foreseen")
     if foreseen:
         yield f"  foreseen: the {foreseen['mean']:.0%} of starts from which the world did as the model says"
+
+
+def _closing(trace: str, drawn: Mapping[str, str], record: Path | None) -> Iterator[str]:
+    """Where things are; the last line is the next command."""
+    from stlc.files import find_trace
+
     yield ""
-    yield f"  trace      {document['trace']}"
+    yield f"  trace      {trace}"
     for what, path in drawn.items():
         yield f"  {what:<10} {path}"
-    yield f"  next       stlc check {record or 'trace.npz'}"
+    found = (
+        find_trace("trace.npz")
+        if Path("trace.npz").exists() or Path("runs/latest/trace.npz").exists()
+        else None
+    )
+    short = found is not None and found.resolve() == Path(trace).resolve()
+    yield f"  next       stlc check {record or ('trace.npz' if short else trace)}"
 
 
 def _shares(guards: Record) -> Iterator[tuple[str, ...]]:

@@ -17,7 +17,7 @@ from stlc.dynamics.system import System
 from stlc.files import read_source, write_atomic
 from stlc.grammar.parser import parse
 from stlc.provenance import sha256
-from stlc.rundir import RunDir
+from stlc.rundir import RUNS, RunDir
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -42,15 +42,15 @@ class Run:
     policy: Mlp
 
     @classmethod
-    def open(cls, where: Path | str = "latest", *, device: str = "cpu") -> Run:
-        """Load a run by folder, name, number, or `latest`.
+    def open(cls, where: Path | str = "latest", *, root: Path = RUNS, device: str = "cpu") -> Run:
+        """Load a run by folder, name, number, or `latest`, below the folder `root` of all runs.
 
         Raises:
             UsageError: there is no such run.
             RunError: R101, it is damaged or has no checkpoint yet; R102, its checkpoint is of another task.
             SpecError, SystemFileError: its specification or system is invalid.
         """
-        folder = RunDir.open(where)
+        folder = RunDir.open(where, root)
         task = load_task(folder)
         engine = load_engine(folder)
         saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
