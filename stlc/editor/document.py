@@ -7,9 +7,7 @@ from functools import cached_property
 from pathlib import Path
 
 from stlc.compile.interface import Grid
-from stlc.compile.pipeline import compile_spec
-from stlc.compile.resolve import resolve
-from stlc.diagnostics import Diagnostic, Label, SpecError, StlcError
+from stlc.diagnostics import Diagnostic, Label, StlcError
 from stlc.dynamics.decl import SystemDecl
 from stlc.dynamics.schema import load_system_decl
 from stlc.editor.meaning import Meaning, understand
@@ -17,6 +15,7 @@ from stlc.editor.reading import read
 from stlc.editor.symbols import Names, names_of
 from stlc.files import find_system
 from stlc.grammar import ast
+from stlc.lint.lint import Surroundings, lint
 from stlc.source import Source, Span
 
 _ONLY_FOR_TRAINING = frozenset({"E306", "E307", "E309", "E310", "E312"})
@@ -74,34 +73,19 @@ class Document:
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
-        """Everything that is wrong with it, or worth saying, in the order of the text."""
-        found = [self._place(one) for one in self.unread]
-        found += [self._about_system(self.missing)] if self.missing else []
-        if not self.unread:
-            found += self._compiled()
+        """Everything that `stlc lint` says of it, in the order of the text.
+
+        Where only training is in the way of it, errors are mild: a monitor takes such a specification.
+        """
+        found = [self._about_system(self.missing)] if self.missing else []
+        said = self.unread or lint(self.source, within=self._surroundings())
+        errors = {one.code for one in said if one.severity == "error"}
+        mild = bool(errors) and errors <= _ONLY_FOR_TRAINING
+        found += [replace(self._place(one), mild=mild and one.severity == "error") for one in said]
         return tuple(sorted(found, key=lambda one: one.span.start))
 
-    def _compiled(self) -> list[Finding]:
-        """What the compiler says; what only training objects to is said mildly."""
-        findings = self._resolved() if self.system is None else self._trained(self.system)
-        errors = {one.code for one in findings if one.severity == "error"}
-        mild = bool(errors) and errors <= _ONLY_FOR_TRAINING
-        return [replace(self._place(one), mild=mild and one.severity == "error") for one in findings]
-
-    def _resolved(self) -> list[Diagnostic]:
-        """Without a system nobody knows the steps: names, sorts and units only."""
-        warnings: list[Diagnostic] = []
-        try:
-            resolve(self.spec, sink=warnings)
-        except SpecError as error:
-            return [*warnings, *error.diagnostics]
-        return warnings
-
-    def _trained(self, system: SystemDecl) -> list[Diagnostic]:
-        try:
-            return list(compile_spec(self.spec, grid=self.grid, interface=system.interface()).warnings)
-        except SpecError as error:
-            return list(error.diagnostics)
+    def _surroundings(self) -> Surroundings | None:
+        return None if self.system is None else Surroundings(self.system.interface(), self.grid)
 
     def _place(self, finding: Diagnostic) -> Finding:
         """A finding with its place in this text; one about another file stands where that is named."""
