@@ -35,8 +35,9 @@ class Program:
         externs: functions of the system that `ir.Extern` names.
 
     Calling it takes an environment of arrays that broadcast against each other, each of the columns in
-    `columns` (those of another sample under the keys of `shifted`), and returns one array for every output; an output that is a constant takes the shape of the
-    first array of the environment. Common sub-expressions are computed once.
+    `columns` (those of another sample under the keys of `shifted`), and returns one array for every output;
+    an output that is a constant takes the shape of the first array of the environment. Common
+    sub-expressions are computed once.
     """
 
     def __init__(

@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 
-from stlc.compile import ir, typed
+from stlc.compile import ir
 from stlc.compile.algebra import agree, apply
 from stlc.compile.builders import region
-from stlc.compile.functions import FUNCTIONS, LATER, REGIONS, REWRITTEN, STEPPING
+from stlc.compile.functions import FUNCTIONS, REGIONS, REWRITTEN, STEPPING
 from stlc.compile.regions import signed_distance
 from stlc.compile.scope import Scope
-from stlc.compile.sorts import Need, as_formula, as_number, as_state_formula, as_vector, loose_number
+from stlc.compile.sorts import Need, as_number, as_state_formula, as_vector, loose_number
+from stlc.compile.stepping import stepping
 from stlc.compile.values import REGION_TYPES, Number, Value, Vector, literal, noun
 from stlc.compile.vectors import broadcast, cross, dot, minus, norm
 from stlc.diagnostics import Diagnostic
@@ -25,15 +26,16 @@ _FLATTENING = ("min", "max", "norm", "norm1", "norminf")
 
 def builtin(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
     """`name(values)` for a built-in function. Raises Failed; E101 where there is no such function."""
-    if name in LATER:
-        scope.fail(unsupported(f"`{name}`", call.span, scope))
     if name in REGIONS:
         return region(name, call, values, scope)
     if name == "ind":
         return _indicator(call, values, scope)
     _positional(name, call, scope)
     if name in STEPPING:
-        return _neighbour(name, call, values, scope)
+        count_arguments(name, call, STEPPING[name], scope)
+        if not scope.temporal:
+            scope.fail(unsupported(f"`{name}`", call.span, scope))
+        return stepping(name, call, values, scope)
     if name in REWRITTEN:
         count_arguments(name, call, REWRITTEN[name], scope)
         return _rewritten(name, call, values, scope)
@@ -154,27 +156,3 @@ def _indicator(call: ast.Call, values: Sequence[Value], scope: Scope) -> Number:
     if isinstance(cond, ir.Truth):
         return replace(literal(int(cond.value), call.span), flexible=False, bare=False)
     return Number(ir.Ind(cond, sharpness), span=call.span)
-
-
-def _neighbour(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> typed.Formula:
-    """`next prev rise fall` of a formula."""
-    count_arguments(name, call, (1, 1), scope)
-    if not scope.temporal:
-        scope.fail(unsupported(f"`{name}`", call.span, scope))
-    value, expr = values[0], call.args[0].value
-    if (
-        name in ("next", "prev")
-        and isinstance(value, Number | Vector)
-        and getattr(value, "kind", "") != "bool"
-    ):
-        scope.fail(unsupported(f"`{name}` of a number", call.span, scope))
-    body = as_formula(value, expr, Need(f"`{name}`"), scope)
-    match name:
-        case "next":
-            return typed.Shift(call.span, 1, body)
-        case "prev":
-            return typed.Shift(call.span, -1, body)
-        case "rise":
-            return typed.Edge(call.span, "rise", body)
-        case _:
-            return typed.Edge(call.span, "fall", body)

@@ -10,7 +10,8 @@ from stlc.compile.algebra import agree, apply, half
 from stlc.compile.regions import signed_distance
 from stlc.compile.scope import Scope
 from stlc.compile.sorts import Need, as_formula, as_number, loose_number
-from stlc.compile.values import REGION_TYPES, Number, Value, Vector, noun
+from stlc.compile.swept import swept_distance
+from stlc.compile.values import REGION_TYPES, Box, Complement, Number, Region, Swept, Value, Vector, noun
 from stlc.compile.values import Label as Member
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
@@ -185,6 +186,30 @@ def in_range(
     above = _above(x, low, False, span, scope)
     below = _above(high, x, False, span, scope)
     return typed.Logic(span, "and", (above, below))
+
+
+def sweeps(
+    expr: ast.Member, segment: Swept, region: Sequence[tuple[ast.Expr, Value]], scope: Scope
+) -> typed.Formula:
+    """`sweep(p) in R`: all of the segment; `not in`: none of it, which is no negation."""
+    if isinstance(expr.region, ast.SetLiteral):
+        help_ = ("write a range `[lo, hi]`, or a region like `circle(center, radius)`",)
+        scope.fail(
+            Diagnostic("E205", "a segment lies in a region, not in a set", expr.region.span, help=help_)
+        )
+    if len(region) == 2:
+        ends = [
+            as_number(value, end, Need("`in [lo, hi]` compares numbers", "a bound"), scope)
+            for end, value in region
+        ]
+        place: Region = Box(Vector((ends[0],)), Vector((ends[1],)), expr.region.span)
+    elif isinstance(region[0][1], REGION_TYPES):
+        place = region[0][1]
+    else:
+        message = f"`in` needs a region, this is {noun(region[0][1])}"
+        scope.fail(Diagnostic("E205", message, region[0][0].span))
+    place = Complement(place) if expr.negated else place
+    return typed.Pred(expr.span, swept_distance(segment.point, place, expr.span, scope).num, strict=False)
 
 
 def in_region(

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from stlc.compile.calls import unsupported
-from stlc.compile.functions import FUNCTIONS, LATER, callable_names
+from stlc.compile.functions import FUNCTIONS, callable_names
 from stlc.compile.interface import Interface
 from stlc.compile.scope import Definition, Entry, Failed, Known, Scope, Sort, column_entries, member_entries
 from stlc.compile.signals import Labels, check_type, columns_of, declared_unit
@@ -86,11 +86,7 @@ def _check_twice(items: Iterable[ast.Item], scope: Scope) -> None:
         if isinstance(item, ast.Enum):
             for name, _ in item.members:
                 _claim(name, item.name_span, item.name, spaces["value"], scope)
-        if (
-            isinstance(item, ast.Def)
-            and item.formals
-            and item.name in (*callable_names(), *FUNCTIONS, *LATER)
-        ):
+        if isinstance(item, ast.Def) and item.formals and item.name in (*callable_names(), *FUNCTIONS):
             help_ = ("give it another name",)
             message = f"`{item.name}` is a built-in function"
             scope.report(Diagnostic("E102", message, item.name_span, help=help_))

@@ -1,8 +1,8 @@
 """Where a formula has a value on a finite trace without cutting any window of the future.
 
 Windows of the past are cut at the start of the trace and so are always defined; `prev`, `next` and `shift`
-are not defined outside the trace, and neither is a window that reaches beyond its last sample. A window "to the end"
-is defined where it has a sample.
+are not defined outside the trace, and neither is a window that reaches beyond its last sample. A window
+"to the end" is defined where it has a sample.
 """
 
 from __future__ import annotations

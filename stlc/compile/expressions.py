@@ -13,14 +13,14 @@ from fractions import Fraction
 from types import MappingProxyType
 from typing import Any
 
-from stlc.compile import comparisons, moments, typed
+from stlc.compile import comparisons, ir, moments, typed
 from stlc.compile.calls import builtin, unsupported
 from stlc.compile.macros import arguments, cycle, finished, too_large
 from stlc.compile.meter import Cost
 from stlc.compile.operations import OPERATIONS
 from stlc.compile.scope import TIME_WORDS, Definition, Failed, Scope, reserved
-from stlc.compile.sorts import Need, as_formula, as_number
-from stlc.compile.values import Number, Origin, Value, at, literal
+from stlc.compile.sorts import Need, as_formula, as_number, loose_number
+from stlc.compile.values import Number, Origin, Value, Vector, at, literal
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
 from stlc.source import Span
@@ -274,6 +274,37 @@ def _quantifier(expr: ast.Quantifier, scope: Scope) -> Value:
     return typed.Logic(expr.span, "and" if expr.kind == "forall" else "or", tuple(items))
 
 
+def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
+    """The body, where the names stand for the values of the instant at which it is judged."""
+    if not scope.temporal:
+        scope.fail(unsupported("`freeze`", expr.span, scope))
+    names = [name for name, _ in expr.bindings]
+    if len(set(names)) < len(names):
+        scope.fail(Diagnostic("E102", "`freeze` binds one name twice", expr.span))
+    bindings: list[tuple[str, ir.Num]] = []
+    bound: dict[str, tuple[Value, Cost]] = {}
+    values = evaluate_all([value for _, value in expr.bindings], scope)
+    for (name, written), value in zip(expr.bindings, values, strict=True):
+        if isinstance(value, Vector):
+            items = [_held(item, f"{name}[{i}]", expr, bindings) for i, item in enumerate(value.items)]
+            bound[name] = (Vector(tuple(items), written.span), Cost(1, 1))
+        else:
+            number = loose_number(value, written, Need("`freeze` binds numbers and vectors"), scope)
+            bound[name] = (_held(number, name, expr, bindings), Cost(1, 1))
+    inner = replace(scope, locals={**scope.locals, **bound})
+    body = formula(expr.body, Need("`freeze`"), inner)
+    return typed.Freeze(expr.span, tuple(bindings), body) if bindings else body
+
+
+def _held(number: Number, name: str, expr: ast.Freeze, bindings: list[tuple[str, ir.Num]]) -> Number:
+    """The number as the body reads it; its key tells it apart from those of other `freeze`s."""
+    if number.constant is not None:
+        return number
+    key = f"{name}#{expr.span.start}@{expr.span.source.name}"
+    bindings.append((key, number.num))
+    return replace(number, num=ir.Held(key), origin=None)
+
+
 def _domain(expr: ast.Quantifier, scope: Scope) -> Iterator[Number]:
     if isinstance(expr.domain, ast.SetLiteral):
         values = evaluate_all(expr.domain.items, scope)
@@ -302,5 +333,6 @@ _HANDLERS: Mapping[type[ast.Node], Callable[[Any, Scope], Value]] = MappingProxy
         ast.Temporal: _temporal,
         ast.Until: _until,
         ast.Quantifier: _quantifier,
+        ast.Freeze: _freeze,
     }
 )

@@ -179,7 +179,7 @@ def without(body: ir.Formula, names: frozenset[str], extent: Extent) -> ir.Formu
             return replace(body, left=left, right=right)
         case ir.Freeze(bindings, inner):
             lost = {name for name, num in bindings if held_by(num) & names}
-            inner = without(inner, names | lost, extent)
+            inner = without(inner, names - {name for name, _ in bindings} | lost, extent)
             kept = tuple((name, num) for name, num in bindings if name not in lost)
             return replace(body, bindings=kept, body=inner) if kept else inner
         case _:

@@ -155,11 +155,18 @@ OPERATORS: Mapping[str, str] = MappingProxyType(
 )
 """The written sign of binary arithmetic -> name of the function."""
 
-STEPPING: tuple[str, ...] = ("next", "prev", "rise", "fall")
-"""Calls on formulas that compare neighbouring samples."""
-
-LATER: tuple[str, ...] = ("shift", "delta", "sweep")
-"""Functions of the language that this version does not compile."""
+STEPPING: Mapping[str, tuple[int, int]] = MappingProxyType(
+    {
+        "next": (1, 1),
+        "prev": (1, 1),
+        "rise": (1, 1),
+        "fall": (1, 1),
+        "shift": (2, 2),
+        "delta": (1, 1),
+        "sweep": (1, 1),
+    }
+)
+"""Calls that look at other samples: least and largest number of arguments."""
 
 
 def callable_names() -> tuple[str, ...]:

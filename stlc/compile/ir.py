@@ -193,7 +193,7 @@ class Shift:
 
 @dataclass(frozen=True, slots=True)
 class Freeze:
-    """`body` now, where each `Held` name stands for the number's value of now, at whatever instant it is read.
+    """`body` now, where each `Held` name stands for its number's value of now, whenever it is read.
 
     Where a number is undefined, so are the predicates that read its name.
     """

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import fields
 
-from stlc.compile.functions import LATER, callable_names, sampler_names
+from stlc.compile.functions import callable_names, sampler_names
 from stlc.compile.scope import TIME_WORDS, Definition, Failed, Scope
 from stlc.grammar import ast
 
 
 def check_names(entry: Definition, scope: Scope) -> None:
     """Report every name in a macro's body that nothing declares (E101)."""
-    functions = {*callable_names(), *sampler_names(), *LATER}
+    functions = {*callable_names(), *sampler_names()}
     for name, called in _free(entry.body, frozenset(entry.formals)):
         if name.name in scope.entries or (name.name in TIME_WORDS and not name.quoted):
             continue

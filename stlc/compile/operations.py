@@ -13,7 +13,7 @@ from stlc.compile.choices import choose_formula, choose_number
 from stlc.compile.functions import OPERATORS
 from stlc.compile.scope import Scope
 from stlc.compile.sorts import Need, as_number
-from stlc.compile.values import Moment, Number, Value, Vector, is_formula, literal
+from stlc.compile.values import Moment, Number, Swept, Value, Vector, is_formula, literal
 from stlc.compile.vectors import broadcast, negate
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
@@ -60,10 +60,6 @@ def _inf(expr: ast.Inf, _values: Sequence[Value], _scope: Scope) -> Value:
 
 def _attr(expr: ast.Attr, _values: Sequence[Value], scope: Scope) -> Value:
     return scope.fail(unsupported(f"`{expr.span.text}`", expr.span, scope))
-
-
-def _freeze(expr: ast.Freeze, _values: Sequence[Value], scope: Scope) -> Value:
-    return scope.fail(unsupported("`freeze`", expr.span, scope))
 
 
 def _vector(expr: ast.Vector, values: Sequence[Value], scope: Scope) -> Value:
@@ -133,6 +129,10 @@ def _compare(expr: ast.Compare, values: Sequence[Value], scope: Scope) -> Value:
 def _member(expr: ast.Member, values: Sequence[Value], scope: Scope) -> Value:
     region = expr.region
     item, rest = (expr.item, values[0]), values[1:]
+    if isinstance(values[0], Swept):
+        return comparisons.sweeps(
+            expr, values[0], list(zip(_member_parts(expr)[1:], rest, strict=True)), scope
+        )
     if isinstance(region, ast.SetLiteral):
         inside = comparisons.in_set(item, list(zip(region.items, rest, strict=True)), expr.span, scope)
     elif isinstance(region, ast.Vector) and len(region.items) == 2:
@@ -166,7 +166,6 @@ OPERATIONS: Mapping[type[ast.Node], Operation] = MappingProxyType(
         ast.Bool: Operation(_nothing, _bool),
         ast.Inf: Operation(_nothing, _inf),
         ast.Attr: Operation(_nothing, _attr),
-        ast.Freeze: Operation(_nothing, _freeze),
         ast.Vector: Operation(lambda expr: expr.items, _vector),
         ast.Index: Operation(lambda expr: (expr.base, expr.index), _index),
         ast.Neg: Operation(lambda expr: (expr.operand,), _neg),

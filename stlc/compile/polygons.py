@@ -45,6 +45,13 @@ def _cross(first: tuple[Point, Point], second: tuple[Point, Point]) -> bool:
     return turn(a, b, c) * turn(a, b, d) < 0 and turn(c, d, a) * turn(c, d, b) < 0
 
 
+def convex(corners: Sequence[Vector]) -> bool:
+    """Whether a simple polygon with known, counter-clockwise corners is convex."""
+    plain = points(corners)
+    assert plain is not None
+    return all(turn(plain[i - 2], plain[i - 1], plain[i]) >= 0 for i in range(len(plain)))
+
+
 def triangles(corners: Sequence[Vector]) -> list[tuple[Vector, ...]]:
     """A convex polygon as it is, any other cut into triangles by clipping ears.
 
@@ -54,7 +61,7 @@ def triangles(corners: Sequence[Vector]) -> list[tuple[Vector, ...]]:
     plain = points(corners)
     assert plain is not None
     left = list(range(len(corners)))
-    if all(turn(plain[i - 2], plain[i - 1], plain[i]) >= 0 for i in left):
+    if convex(corners):
         return [tuple(corners)]
     cut: list[tuple[Vector, ...]] = []
     while len(left) > 3:

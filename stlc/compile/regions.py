@@ -92,7 +92,7 @@ def _box(point: Vector, lower: Vector, upper: Vector, span: Span, scope: Scope) 
 def _polygon(point: Vector, corners: Sequence[Vector], span: Span, scope: Scope) -> Number:
     """The distance to the nearest edge, positive where a triangle of the polygon holds the point."""
     edges = zip(corners, (*corners[1:], corners[0]), strict=True)
-    nearest = apply("min", [_to_segment(point, a, b, span, scope) for a, b in edges], span, scope)
+    nearest = apply("min", [to_segment(point, a, b, span, scope) for a, b in edges], span, scope)
     parts = [_left_of_all(point, triangle, span, scope) for triangle in triangles(corners)]
     inside = parts[0] if len(parts) == 1 else ir.Join("or", tuple(parts), span)
     return Number(
@@ -100,7 +100,8 @@ def _polygon(point: Vector, corners: Sequence[Vector], span: Span, scope: Scope)
     )
 
 
-def _to_segment(point: Vector, start: Vector, end: Vector, span: Span, scope: Scope) -> Number:
+def to_segment(point: Vector, start: Vector, end: Vector, span: Span, scope: Scope) -> Number:
+    """The distance of a point to the segment between two others."""
     along, ahead = minus(end, start, span, scope), minus(point, start, span, scope)
     share = apply("div", (dot(ahead, along, span, scope), dot(along, along, span, scope)), span, scope)
     share = apply("clip", (share, literal(0, span), literal(1, span)), span, scope)

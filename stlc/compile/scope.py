@@ -9,7 +9,7 @@ from fractions import Fraction
 from typing import Literal, NoReturn, TypeAlias
 
 from stlc.compile import ir
-from stlc.compile.functions import LATER, STEPPING, callable_names, sampler_names
+from stlc.compile.functions import callable_names, sampler_names
 from stlc.compile.meter import Cost, Meter
 from stlc.compile.values import Label, Number, Origin, Value, Vector
 from stlc.diagnostics import Diagnostic, SpecError, StlcError, SystemFileError
@@ -213,4 +213,4 @@ def enforced(columns: Iterable[Column]) -> dict[str, Bounds]:
 
 def reserved(name: str) -> bool:
     """Whether a call of `name` means a built-in function."""
-    return name in (*callable_names(), *sampler_names(), *STEPPING, *LATER)
+    return name in (*callable_names(), *sampler_names())

@@ -25,6 +25,8 @@ def thaw(formula: typed.Formula, values: Mapping[str, ir.Num]) -> typed.Formula:
             return replace(formula, left=thaw(formula.left, values), right=thaw(formula.right, values))
         case typed.Freeze():
             bindings = tuple((name, thawed(num, values)) for name, num in formula.bindings)
-            return replace(formula, bindings=bindings, body=thaw(formula.body, values))
+            own = {name for name, _ in bindings}
+            outer = {name: value for name, value in values.items() if name not in own}
+            return replace(formula, bindings=bindings, body=thaw(formula.body, outer))
         case _:
             assert_never(formula)

@@ -83,6 +83,14 @@ class Moment:
 
 
 @dataclass(frozen=True, slots=True)
+class Swept:
+    """`sweep(p)`: the segment from a point to where it is at the next sample."""
+
+    point: Vector
+    span: Span | None = field(default=None, compare=False, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
 class Ball:
     """Points at most `radius` from `center`; a circle in the plane."""
 
@@ -145,7 +153,7 @@ class Complement:
 
 Region: TypeAlias = Ball | Box | Polygon | HalfSpace | Combined | Dilated | Complement
 REGION_TYPES = (Ball, Box, Polygon, HalfSpace, Combined, Dilated, Complement)
-Value: TypeAlias = Number | Vector | Label | Moment | Region | typed.Formula
+Value: TypeAlias = Number | Vector | Swept | Label | Moment | Region | typed.Formula
 
 
 def is_formula(value: Value) -> bool:
@@ -178,6 +186,8 @@ def describe(value: Value) -> str:
         case Vector():
             unit = unit_text(value.items[0]) if value.items else ""
             return f"vector of {len(value.items)} {unit}".rstrip()
+        case Swept():
+            return "segment"
         case Label():
             return "enum member"
         case Moment():

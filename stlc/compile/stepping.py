@@ -1,0 +1,81 @@
+"""Calls that look at other samples: `next prev rise fall shift delta sweep`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
+
+from stlc.compile import typed
+from stlc.compile.samples import later
+from stlc.compile.scope import Scope
+from stlc.compile.sorts import Need, as_formula, as_number
+from stlc.compile.values import Moment, Number, Swept, Value, Vector
+from stlc.compile.vectors import broadcast
+from stlc.diagnostics import Diagnostic
+from stlc.grammar import ast
+from stlc.source import Span
+
+_MOST = 1_000_000
+"""How many samples `shift` may be away."""
+
+
+def stepping(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
+    """`name(values)`, with as many values as it takes. Raises Failed (E201, E205)."""
+    value, expr = values[0], call.args[0].value
+    match name:
+        case "rise":
+            return typed.Edge(call.span, "rise", as_formula(value, expr, Need("`rise`"), scope))
+        case "fall":
+            return typed.Edge(call.span, "fall", as_formula(value, expr, Need("`fall`"), scope))
+        case "sweep":
+            return Swept(_vector(value, expr, Need("`sweep` follows a point"), scope), call.span)
+        case "delta":
+            return _delta(value, expr, call.span, scope)
+    steps = {"next": 1, "prev": -1}.get(name)
+    if steps is None:
+        steps = _steps(values[1], call.args[1].value, scope)
+    return _shifted(value, steps, (expr, call.span), f"`{name}`", scope)
+
+
+def _shifted(value: Value, steps: int, places: tuple[ast.Expr, Span], name: str, scope: Scope) -> Value:
+    """A number, a vector or a formula `steps` samples later."""
+    expr, span = places
+    match value:
+        case Number() if value.kind != "bool":
+            return replace(value, num=later(value.num, steps), origin=None)
+        case Vector(items):
+            moved = tuple(replace(item, num=later(item.num, steps)) for item in items)
+            return Vector(moved, span)
+        case _:
+            return typed.Shift(span, steps, as_formula(value, expr, Need(name), scope))
+
+
+def _delta(value: Value, expr: ast.Expr, span: Span, scope: Scope) -> Value:
+    """What changed since the sample before."""
+    now = value if isinstance(value, Vector) else as_number(value, expr, Need("`delta` takes numbers"), scope)
+    before = _shifted(now, -1, (expr, span), "`delta`", scope)
+    assert isinstance(before, Number | Vector)
+    return broadcast("sub", (now, before), span, scope)
+
+
+def _vector(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> Vector:
+    if isinstance(value, Vector):
+        return value
+    return Vector((as_number(value, expr, need, scope),), expr.span)
+
+
+def _steps(value: Value, expr: ast.Expr, scope: Scope) -> int:
+    """`3`, `-1` or `3 steps`."""
+    match value:
+        case Moment(seconds, steps, horizons, False) if not seconds and not horizons:
+            exact: Fraction | None = steps
+        case Number(bare=True, exact=known) if known is not None:
+            exact = known
+        case _:
+            exact = None
+    if exact is None or exact.denominator != 1 or abs(exact) > _MOST:
+        message = "`shift` goes a whole number of samples, known at compile time"
+        help_ = ("shift(x, 2) is x two samples later, shift(x, -2) two samples earlier",)
+        scope.fail(Diagnostic("E205", message, expr.span, help=help_))
+    return int(exact)
