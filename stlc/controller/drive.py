@@ -117,26 +117,33 @@ class _Worlds:
     """The worlds of all seeds, as one."""
 
     def __init__(self, task: Task, make: WorldType, setting: Setting) -> None:
-        self.size = (len(setting.seeds) * setting.agents, len(task.names))
+        self.system = task.system
+        self.size = (len(setting.seeds) * setting.agents, len(task.plain.names))
         self.parts = [setting.agents] * len(setting.seeds)
         with _blame("be made"):
             self.worlds = [
-                make(task.system, setting.agents, torch.Generator().manual_seed(seed))
+                make(task.plain, setting.agents, torch.Generator().manual_seed(seed))
                 for seed in setting.seeds
             ]
 
     def reset(self) -> Tensor:
-        """The first states, (rows, n)."""
+        """The first states, (rows, n); timers are as at the start of a mission."""
         with _blame("begin"):
             states = [world.reset() for world in self.worlds]
-        return self._checked(states, 0)
+        x = self._checked(states, 0)
+        begun = torch.tensor([timer.initial for timer in self.system.timers]).to(x)
+        return torch.cat((x, begun.expand(len(x), -1)), 1)
 
     def advance(self, x: Tensor, action: Tensor, step: int) -> Tensor:
-        """(rows, n), (rows, m) -> the (rows, n) states after step number `step`."""
-        each = zip(self.worlds, torch.split(x, self.parts), torch.split(action, self.parts), strict=True)
+        """(rows, n), (rows, m) -> the (rows, n) states after step number `step`.
+
+        Worlds know no timers: those follow from the true states.
+        """
+        known = x[:, : self.size[1]]
+        each = zip(self.worlds, torch.split(known, self.parts), torch.split(action, self.parts), strict=True)
         with _blame(f"take step {step}"):
             states = [world.advance(before, act) for world, before, act in each]
-        return self._checked(states, step)
+        return torch.cat((self._checked(states, step), self.system.timers_later(x)), 1)
 
     def _checked(self, states: list[Tensor], step: int) -> Tensor:
         with _blame(f"give states at step {step}"):

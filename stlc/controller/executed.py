@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,8 +11,12 @@ import torch
 from numpy.typing import NDArray
 
 from stlc.compile.graph import evaluate
+from stlc.compile.horizon import reach
+from stlc.compile.lift import recorded
+from stlc.compile.lower import lower
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.semantics import TOLERANCE
+from stlc.compile.simplify import simplify
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import Rule
@@ -54,9 +58,17 @@ def judge_executed(task: Task, recording: Recording) -> Executed:
     """Judge what happened. Without a window that fits, there are no starts."""
     columns = dict(zip(task.names, np.moveaxis(recording.states, -1, 0).transpose(0, 2, 1), strict=True))
     starts = max(recording.steps + 1 - task.horizon, 0)
-    rules = {rule.name: _held(rule, columns, task.horizon) for rule in task.rules}
+    rules = {rule.name: _held(_driven(rule, task), columns, task.horizon) for rule in task.rules}
     safety = tuple(rule.name for rule in task.compiled.safety)
     return Executed(rules, safety, _foreseen(task, recording, starts))
+
+
+def _driven(rule: Rule, task: Task) -> Rule:
+    """A requirement on the mission clock is judged as it was written, once, on all that was driven."""
+    if not rule.absolute:
+        return rule
+    written = simplify(lower(recorded(rule.typed.formula, []), task.compiled.grid, []))
+    return replace(rule, formula=written, reach=reach(written).future, windowed=False)
 
 
 def _held(rule: Rule, columns: Mapping[str, NDArray[Any]], horizon: int) -> Mask:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from stlc.controller.config import HELD_OUT, HELD_OUT_SEED
+from stlc.controller.missions import visited
 from stlc.controller.search import DEEP, QUICK, Searcher
 from stlc.controller.task import satisfied
 from stlc.files import write_atomic
@@ -59,9 +60,12 @@ class Score:
 
 
 def score(policy: Mlp, *, n: int = HELD_OUT, seed: int = HELD_OUT_SEED) -> Score:
-    """Judge a policy on `n` held-out states of seed `seed`."""
+    """Judge a policy on `n` held-out states of seed `seed`; of missions, on states along held-out ones."""
     task = policy.task
-    states = task.sample(n, seed=seed, dtype=torch.float64)
+    if task.compiled.timers:
+        states = visited(policy, n, seed)
+    else:
+        states = task.sample(n, seed=seed, dtype=torch.float64)
     plans, judged = policy.plan_judged(states)
     good = satisfied(judged.rho)
     shares = satisfied(judged.requirements).double().mean(0)

@@ -96,7 +96,7 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Loss:
     hinge = (objective.margin - rho).clamp(min=0.0)
     if objective.saturation is not None:
         hinge = objective.saturation * torch.log1p(hinge / objective.saturation)
-    cost = task.system.performance(columns, torch.ones_like(rho), rho.detach(), u)
+    cost = task.performance(columns, rho, u)
     total = objective.stl_weight * hinge + objective.performance_weight * torch.where(
         good, cost, torch.zeros_like(cost)
     )

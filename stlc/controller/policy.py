@@ -55,10 +55,16 @@ class PlanNetwork(nn.Module):
         self.register_buffer("spread", torch.ones(widths[0]))
 
     def normalise(self, x0: Tensor) -> None:
-        """Take the centre and the spread of the inputs from a sample of initial states, (n, dim)."""
+        """Take the centre and the spread of the inputs from a sample of states, (n, dim).
+
+        Those of timers are taken from their ranges: at first no mission gets far.
+        """
         observed = self._task.system.observe(x0)
-        spread = observed.std(0)
-        self.centre.copy_(observed.mean(0))
+        centre, spread = observed.mean(0), observed.std(0)
+        for index, timer in enumerate(reversed(self._task.compiled.timers), start=1):
+            centre[-index] = 0.5 * (timer.low + timer.high)
+            spread[-index] = 0.25 * (timer.high - timer.low)
+        self.centre.copy_(centre)
         self.spread.copy_(torch.where(spread > 1e-6, spread, torch.ones_like(spread)))
 
     def forward(self, x0: Tensor) -> Tensor:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from torch import Tensor
 
     from stlc.controller.task import Task
@@ -14,8 +16,24 @@ if TYPE_CHECKING:
 BLOCK = 8192
 
 
-class Supply:
-    """Hands out states that were never handed out before.
+class Supply(Protocol):
+    """Where training states come from."""
+
+    def take(self, n: int) -> Tensor:
+        """`n` states that were not handed out before, (n, dim), float32."""
+
+    def follow(self, states: Tensor, plans: Tensor) -> None:
+        """Take note of plans that solve states which a policy fails on: (k, n), (k, T, m)."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All that goes on counting, by name."""
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Go on where `tensors` were taken."""
+
+
+class Draws:
+    """Independent initial states.
 
     Attributes:
         block: drawn and not yet handed out, (k, n).
@@ -34,3 +52,14 @@ class Supply:
             self.block = torch.cat((self.block, drawn))
         taken, self.block = self.block[:n], self.block[n:]
         return taken
+
+    def follow(self, states: Tensor, plans: Tensor) -> None:
+        """Where a plan leads does not matter to independent draws."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What was drawn and not yet handed out."""
+        return {"block": self.block}
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Go on where `tensors` were taken."""
+        self.block = tensors["block"].to(self._device)

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.compile.graph import RobustnessGraph
+from stlc.compile.arith import Program
+from stlc.compile.graph import RobustnessGraph, evaluate
 from stlc.compile.interface import Grid
 from stlc.compile.ops_torch import TORCH
 from stlc.compile.pipeline import compile_spec
@@ -28,6 +29,8 @@ FLOAT32_SLACK = 1e-5
 """Rounding that a float32 rollout may add to a margin that is 0 by construction."""
 TIE = 1e-4
 """What cost may weigh where robustness does not differ: it is flat where a deadline cannot be met."""
+PULL = 0.1
+"""Weight of the pull towards the next goal among the performance terms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +70,7 @@ class Task:
 
     Attributes:
         compiled: the specification in steps, its timers included.
+        plain: the system as it is.
         system: the system, with the timers as its last columns.
         graph: robustness of the whole specification.
         safety: robustness of phi_safe.
@@ -74,6 +78,7 @@ class Task:
 
     def __init__(self, compiled: Compiled, system: System) -> None:
         self.compiled = compiled
+        self.plain = system
         self.system = system.augmented(compiled.timers) if compiled.timers else system
         self.graph = RobustnessGraph(compiled.requirements, self.system.signature)
         self.safety = RobustnessGraph(compiled.safety, self.system.signature)
@@ -173,8 +178,32 @@ class Task:
     def cost(self, judged: Judged) -> Tensor:
         """Performance terms of judged plans, as if every one were satisfying, without gradient: (batch,)."""
         with torch.no_grad():
-            ones = torch.ones_like(judged.rho)
-            return self.system.performance(judged.columns, ones, judged.rho, judged.plans)
+            return self.performance(judged.columns, judged.rho, judged.plans)
+
+    def performance(self, columns: Mapping[str, Tensor], rho: Tensor, u: Tensor) -> Tensor:
+        """Performance terms as if every plan were satisfying, and the pull of the next goal: (batch,).
+
+        Args:
+            columns: states over time, name -> (time, batch).
+            rho: robustness, (batch,).
+            u: controls, (batch, T, m).
+        """
+        cost = self.system.performance(columns, torch.ones_like(rho), rho.detach(), u)
+        if self._pull is None:
+            return cost
+        gap: Tensor = self._pull(columns, TORCH, HARD)["gap"]
+        return cost + PULL * gap.mean(0)
+
+    @cached_property
+    def _pull(self) -> Program | None:
+        """How far the next goal of the mission is, sample by sample."""
+        return None if self.compiled.pull is None else Program({"gap": self.compiled.pull})
+
+    def alive(self, x: Tensor) -> Tensor:
+        """Whether the mission so far leaves a way to satisfy every requirement: (B, n) -> (B,) booleans."""
+        env = {name: column[None] for name, column in zip(self.names, x.unbind(1), strict=True)}
+        margins = evaluate([rule.alive for rule in self.rules], env, ops=TORCH)
+        return torch.stack([margin[0].expand(len(x)) >= 0.0 for margin in margins]).all(0)
 
 
 def rank(rho: Tensor, cost: Tensor, safe: Tensor | None = None) -> Tensor:

@@ -16,10 +16,11 @@ import torch
 from torch import Tensor
 
 from stlc.controller.buffer import Buffer
+from stlc.controller.missions import Missions
 from stlc.controller.objective import Objective, guided_objective, loss, paper_objective
 from stlc.controller.policy import Mlp, PlanNetwork
 from stlc.controller.search import QUICK, Searcher
-from stlc.controller.supply import Supply
+from stlc.controller.supply import Draws, Supply
 from stlc.controller.task import satisfied
 
 if TYPE_CHECKING:
@@ -63,8 +64,8 @@ class Trainer:
         self.step = 0
         self.next_look = engine.every
         self.generator = torch.Generator(device=device).manual_seed(engine.seed)
-        self.supply = Supply(task, self.generator, device)
         self.network = _network(task, engine, device)
+        self.supply = self._supply()
         self.average = _network(task, engine, device)
         self.network.normalise(self.supply.take(4096))
         self.average.load_state_dict(self.network.state_dict())
@@ -122,6 +123,7 @@ class Trainer:
         found = self._searcher().repair(x0[failing], plans[failing], self.buffer.bank)
         solved = found.solved
         self.buffer.add(x0[failing][solved], found.plans[solved])
+        self.supply.follow(x0[failing][solved], found.plans[solved])
         repaired = int(solved.sum())
         rate = repaired / max(1, len(failing))
         if rate < BUSY:
@@ -167,6 +169,13 @@ class Trainer:
             return MARGIN_RANGE[0]
         return min(max(MARGIN_SHARE * float(reached.median()), MARGIN_RANGE[0]), MARGIN_RANGE[1])
 
+    def _supply(self) -> Supply:
+        """States that missions pass through where the specification has memory, else independent ones."""
+        if not self.task.compiled.timers:
+            return Draws(self.task, self.generator, self.device)
+        policy = Mlp(self.task, self.network)
+        return Missions(self.task, self.generator, self.device, lambda x0: policy.plan_judged(x0)[1])
+
     def _searcher(self) -> Searcher:
         return Searcher(self.task, self.generator, enough=MARGIN_SHARE * self.margin)
 
@@ -187,7 +196,7 @@ class Trainer:
         for index, state in self.optimizer.state_dict()["state"].items():
             found.update({f"adam.{index}.{name}": value for name, value in state.items()})
         kept = len(self.buffer)
-        found["supply"] = self.supply.block
+        found.update({f"supply.{name}": value for name, value in self.supply.tensors().items()})
         found["buffer.states"], found["buffer.plans"] = self.buffer.states[:kept], self.buffer.plans[:kept]
         return found
 
@@ -218,7 +227,7 @@ class Trainer:
         self.buffer.states[:kept] = tensors["buffer.states"]
         self.buffer.plans[:kept] = tensors["buffer.plans"]
         self.buffer.count = int(facts["solved"])
-        self.supply.block = tensors["supply"].to(self.device)
+        self.supply.restore(_below(tensors, "supply"))
         self.generator.set_state(tensors["generator"].cpu())
 
 
