@@ -21,6 +21,7 @@ from stlc.monitor.grid import Times, given_times, named_times, recorded_times, s
 from stlc.monitor.instants import At, require_length, rule_bounds, rule_signal, rules_at, starts_of
 from stlc.monitor.judgement import Judgement, Status, Verdict, unknown_requirement
 from stlc.monitor.needs import needs_of
+from stlc.monitor.online import How, Online
 from stlc.monitor.prepared import Prepared
 from stlc.monitor.signals import Given, arrange
 from stlc.monitor.values import Ends, Record, by_truth
@@ -174,6 +175,22 @@ class Monitor:
             whole = Exact().join(weighed, "min", ready.signals.ops)
             ends.append(ready.signals.like_given(whole) if at is None else ready.signals.at_one(whole))
         return ends[0], ends[1]
+
+    def online(self, how: How | None = None, *, require: Sequence[str] = ()) -> Online:
+        """A monitor that takes samples one by one: verdicts as soon as they are decided, bounds before.
+
+        Args:
+            how: which instants are judged, what happens at the end, and the tolerance.
+            require: names of the requirements to judge; none means all.
+
+        Raises:
+            UsageError: U101, an unknown requirement, or none at all.
+        """
+        compiled = self._ready(Times())
+        rules = _chosen(compiled.requirements, require)
+        if not rules:
+            raise UsageError(Diagnostic("U101", f"`{compiled.name}` has no requirement to judge"))
+        return Online(compiled, rules, how)
 
     # ------------------------------------------------------------------- compiling
 

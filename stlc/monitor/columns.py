@@ -1,0 +1,194 @@
+"""Columns that grow sample by sample, in memory that the windows of a formula bound.
+
+Every column is kept twice, as the least and as the greatest value over all continuations; where nothing is
+unknown the two agree.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias, assert_never
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile import ir
+from stlc.compile.graph import execute
+from stlc.compile.horizon import columns as names_of_columns
+from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.schedule import Extent, Run, Schedule, schedule
+from stlc.compile.semantics import Exact
+from stlc.compile.windows import Windows
+from stlc.monitor.streams import Latch, Latched, Leaf, Plan, column, read_by
+
+Floats: TypeAlias = NDArray[np.float64]
+End: TypeAlias = Literal["lower", "upper", "truncate"]
+
+NOTHING = ""
+"""A column for formulas that read none."""
+
+_REMEMBERED = 256
+_EXACT = Windows(Exact(), NUMPY)
+
+
+class Reader:
+    """Evaluates the same formulas again and again; what has to be done is remembered for each extent.
+
+    Args:
+        formulas: over columns.
+        end: what stands beyond the last row.
+    """
+
+    def __init__(self, formulas: Sequence[ir.Formula], end: End) -> None:
+        self.formulas = tuple(formulas)
+        self.end = end
+        self.names = frozenset().union(*map(names_of_columns, self.formulas)) or frozenset({NOTHING})
+        self._known: dict[tuple[int, int, int], Schedule] = {}
+
+    def __call__(self, env: Mapping[str, Floats], start: int, count: int) -> list[Floats]:
+        """Values (count, traces) from row `start` on; columns may be longer than the shortest of them."""
+        length = min(len(env[name]) for name in self.names)
+        key = (length, start, count)
+        if key not in self._known:
+            if len(self._known) >= _REMEMBERED:
+                self._known.clear()
+            self._known[key] = schedule(self.formulas, Run(start, count), Extent(length, self.end))
+        inner = {name: env[name] if len(env[name]) == length else env[name][:length] for name in self.names}
+        return execute(self._known[key], inner, _EXACT)
+
+
+@dataclass(slots=True)
+class Side:
+    """The columns of a plan, at one end of what is possible.
+
+    Attributes:
+        plan: what there is to compute.
+        end: which end: least, greatest, or with windows cut at the last sample.
+        beyond: rows after the last sample that the formula over the columns reads.
+        truth: predicates are true or false, +inf or -inf.
+        base: number of the first sample that is kept.
+        rows: column -> values from `base` on, (kept + beyond, traces).
+    """
+
+    plan: Plan
+    end: End
+    beyond: int
+    truth: bool = False
+    base: int = 0
+    rows: dict[str, Floats] = field(default_factory=dict)
+    _settled: dict[str, int] = field(default_factory=dict)
+    _pads: dict[str, int] = field(default_factory=dict)
+    _leaves: list[tuple[list[Leaf], Reader]] = field(default_factory=list)
+    _latched: list[tuple[Latched, Reader]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        leaves = [stream for stream in self.plan.streams if isinstance(stream, Leaf)]
+        for reads in dict.fromkeys((leaf.back, leaf.ahead) for leaf in leaves):
+            alike = [leaf for leaf in leaves if (leaf.back, leaf.ahead) == reads]
+            self._leaves.append((alike, Reader([leaf.formula for leaf in alike], self.end)))
+        latched = [stream for stream in self.plan.streams if isinstance(stream, Latched)]
+        self._latched = [(stream, Reader(stream.parts, self.end)) for stream in latched]
+        if self.end == "truncate":
+            self._pads = dict.fromkeys((stream.name for stream in self.plan.streams), 0)
+            return
+        self._pads = dict.fromkeys((stream.name for stream in self.plan.streams), self.beyond)
+        for stream in reversed(self.plan.streams):
+            wanted = self._pads[stream.name] + stream.ahead
+            for name in read_by(stream):
+                self._pads[name] = max(self._pads[name], wanted)
+
+    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
+        """Take new samples in.
+
+        Args:
+            signals: columns (kept, traces) that end with the last sample.
+            first: number of their first row.
+            samples: how many there are by now.
+        """
+        traces = next(iter(signals.values())).shape[1]
+        self.rows[NOTHING] = np.zeros((samples + self.beyond - self.base, traces))
+        for leaves, reader in self._leaves:
+            self._grow_leaves(leaves, reader, (signals, first), samples)
+        for stream, reader in self._latched:
+            self._grow_latched(stream, reader, samples)
+
+    def values(self, reader: Reader, start: int, count: int) -> list[Floats]:
+        """Values (count, traces) of formulas over the columns, from sample `start` on."""
+        return reader(self.rows, start - self.base, count)
+
+    def drop(self, first: int) -> None:
+        """Forget rows before sample `first`, as far as no column needs them."""
+        needs = [self._settled[stream.name] - max(stream.back, 1) for stream, _ in self._latched]
+        base = max(min([first, *needs]), self.base)
+        if base > self.base:
+            self.rows = {name: values[base - self.base :] for name, values in self.rows.items()}
+            self.base = base
+
+    def _grow_leaves(
+        self, leaves: Sequence[Leaf], reader: Reader, signals: tuple[Mapping[str, Floats], int], samples: int
+    ) -> None:
+        env, first = signals
+        start, ahead = self._settled.get(leaves[0].name, 0), leaves[0].ahead
+        known = samples if self.end == "truncate" else max(samples - ahead, start)
+        traces = self.rows[NOTHING].shape[1]
+        found: list[Floats] = [np.zeros((0, traces))] * len(leaves)
+        if known > start:
+            found = reader(env, start - first, known - start)
+        for leaf, values in zip(leaves, found, strict=True):
+            values = _true_or_false(values, leaf.formula) if self.truth else values
+            missing = samples + self._pads[leaf.name] - known
+            tail = np.full((missing, traces), self._unknown)
+            self._put(leaf.name, start, np.concatenate([values, tail]))
+            self._settled[leaf.name] = max(samples - ahead, start)
+
+    @property
+    def _unknown(self) -> float:
+        return math.inf if self.end == "upper" else -math.inf
+
+    def _grow_latched(self, stream: Latched, reader: Reader, samples: int) -> None:
+        start = self._settled.get(stream.name, 0)
+        count = samples + self._pads[stream.name] - start
+        parts = self.values(reader, start, count)
+        last = self.rows[stream.name][start - 1 - self.base] if start else None
+        self._put(stream.name, start, _continued(stream.op, parts, last))
+        lags = [samples - self._settled[name] for name in read_by(stream)]
+        self._settled[stream.name] = max(samples - max(lags, default=0) - stream.ahead, start)
+
+    def _put(self, name: str, start: int, values: Floats) -> None:
+        """Replace all rows from sample `start` on."""
+        kept = self.rows.get(name)
+        self.rows[name] = values if kept is None else np.concatenate([kept[: start - self.base], values])
+
+
+def _true_or_false(values: Floats, formula: ir.Formula) -> Floats:
+    strict = isinstance(formula, ir.Atom) and formula.strict
+    return np.where(values > 0 if strict else values >= 0, math.inf, -math.inf)
+
+
+def _continued(op: Latch, parts: Sequence[Floats], last: Floats | None) -> Floats:
+    """The values of a past operator, given its operands and the value before them."""
+    match op:
+        case "once":
+            found = np.maximum.accumulate(parts[0], axis=0)
+            return found if last is None else np.maximum(found, last)
+        case "historically":
+            found = np.minimum.accumulate(parts[0], axis=0)
+            return found if last is None else np.minimum(found, last)
+        case "since":
+            return _since(parts[0], parts[1], last)
+        case "trigger":
+            return -_since(-parts[0], -parts[1], None if last is None else -last)
+    assert_never(op)
+
+
+_SINCE = Reader([ir.Since("since", ir.Window(0, None), column("left"), column("right"))], "truncate")
+
+
+def _since(left: Floats, right: Floats, last: Floats | None) -> Floats:
+    """`s(k) = min(left(k), max(right(k), s(k - 1)))`."""
+    (found,) = _SINCE({"left": left, "right": right}, 0, len(left))
+    if last is None:
+        return np.asarray(found)
+    return np.maximum(found, np.minimum(np.minimum.accumulate(left, axis=0), last))

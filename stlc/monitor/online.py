@@ -1,0 +1,348 @@
+"""Samples one by one: verdicts as soon as they are decided, bounds before, in bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.pipeline import Compiled, Rule
+from stlc.compile.semantics import TOLERANCE
+from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.monitor.instants import check_length, starts_of
+from stlc.monitor.judgement import Status, unknown_requirement
+from stlc.monitor.needs import Need, needs_of
+from stlc.monitor.signals import arrange
+from stlc.monitor.tally import Tally
+from stlc.monitor.tracking import Asked, Bounds, Tracker, tracker_of
+
+Floats: TypeAlias = NDArray[np.float64]
+Sample: TypeAlias = Mapping[str, Any]
+"""Signal -> number; a vector is a list of them."""
+
+_UNKNOWN, _HOLDS, _FAILS = 0, 1, 2
+_OF_STATUS = {"inconclusive": _UNKNOWN, "satisfied": _HOLDS, "violated": _FAILS}
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """A verdict that cannot change any more.
+
+    Attributes:
+        requirement: its name.
+        start: sample at which the requirement was judged.
+        time: of that sample in seconds; its number where no time step is known.
+        status: satisfied or violated.
+        low: least robustness over all continuations.
+        high: greatest robustness.
+        sample: the sample that decided it.
+    """
+
+    requirement: str
+    start: int
+    time: float
+    status: Status
+    low: float
+    high: float
+    sample: int
+
+
+@dataclass(frozen=True, slots=True)
+class How:
+    """How a stream of samples is judged.
+
+    Attributes:
+        at: "all" judges every requirement at every sample; None as each asks for.
+        end: where the stream is too short at its end: bounds, a refusal, or cut windows.
+        tolerance: a robustness of at least minus this is satisfied; 0 makes strictness count.
+        t0: time of the first sample in seconds.
+    """
+
+    at: Literal["all"] | None = None
+    end: Literal["open", "strict", "truncate"] = "open"
+    tolerance: float = TOLERANCE
+    t0: float = 0.0
+
+
+@final
+@dataclass(slots=True)
+class Watched:
+    """A requirement and what is known of it so far."""
+
+    rule: Rule
+    everywhere: bool
+    values: Tracker
+    truths: Tracker | None
+    tolerance: float
+    tally: Tally = field(default_factory=Tally)
+    decided: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, dtype=np.int8))
+
+    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
+        """Take new samples in."""
+        if self.over:
+            return
+        self.values.grow(signals, first, samples)
+        if self.truths is not None:
+            self.truths.grow(signals, first, samples)
+
+    @property
+    def over(self) -> bool:
+        """Whether it was judged once and for all."""
+        return not self.everywhere and self.tally.instants > 0
+
+    def judged(self, start: int, stop: int) -> tuple[Bounds, NDArray[np.int8]]:
+        """Bounds and verdicts at instants while the trace goes on."""
+        bounds = self.values.live(start, stop)
+        return bounds, self._verdicts(bounds, None if self.truths is None else self.truths.live(start, stop))
+
+    def ended(self, starts: range) -> tuple[Bounds, NDArray[np.int8]]:
+        """The same where the trace is over."""
+        bounds = self.values.ended(starts)
+        return bounds, self._verdicts(bounds, None if self.truths is None else self.truths.ended(starts))
+
+    def _verdicts(self, bounds: Bounds, truths: Bounds | None) -> NDArray[np.int8]:
+        if truths is None:
+            holds, fails = bounds.low >= -self.tolerance, bounds.high < -self.tolerance
+        else:
+            holds, fails = truths.low > 0, truths.high < 0
+        return np.where(fails, _FAILS, np.where(holds, _HOLDS, _UNKNOWN)).astype(np.int8)
+
+    def drop(self) -> int:
+        """Forget what has been counted; the first sample that is still needed."""
+        needed = [self.values.drop(self.tally.instants)]
+        if self.truths is not None:
+            needed.append(self.truths.drop(self.tally.instants))
+        return min(needed)
+
+
+class Online:
+    """A monitor for samples that come one after the other; see `Monitor.online`.
+
+    What is kept is bounded by the windows of the requirements, not by the length of the stream. A window to
+    the end of the trace costs nothing where it stands outermost or under other such windows; a requirement
+    that has one under a window with an end is judged on all samples, which are kept for it.
+    """
+
+    def __init__(self, compiled: Compiled, rules: Sequence[Rule], how: How | None = None) -> None:
+        self.how = how or How()
+        self.compiled = compiled
+        self.samples = 0
+        self._needs = needs_of(compiled, [*rules, *compiled.assumptions])
+        self._first = 0
+        self._signals: dict[str, Floats] = {}
+        self._watched = [self._watch(rule) for rule in rules]
+        self._scope = [self._watch(rule, once=True) for rule in compiled.assumptions]
+
+    def _watch(self, rule: Rule, *, once: bool = False) -> Watched:
+        horizon = self.compiled.grid.horizon
+        always = self.how.at == "all" and not rule.absolute
+        everywhere = not once and (always or (rule.windowed and horizon is not None and not rule.absolute))
+        if everywhere and not rule.windowed and rule.uses_end:
+            message = f"`{rule.name}` runs to the end: at every start it would stay open until then"
+            raise UsageError(Diagnostic("U101", message, help=("judge it once, without `--at all`",)))
+        ending: Literal["open", "truncate"] = "truncate" if self.how.end == "truncate" else "open"
+        trackers = [
+            tracker_of(rule, horizon, Asked(ending, truth), everywhere=everywhere)
+            for truth in ((False, True) if self.how.tolerance == 0 else (False,))
+        ]
+        return Watched(
+            rule, everywhere, trackers[0], trackers[1] if trackers[1:] else None, self.how.tolerance
+        )
+
+    # ------------------------------------------------------------------------ samples
+
+    def push(self, sample: Sample) -> tuple[Decision, ...]:
+        """Take one sample in; the verdicts that it decides, in the order of the requirements.
+
+        Raises:
+            TraceError: E601, a signal is missing; E604, one is not finite.
+        """
+        self.grow({need.column.name: np.full((1, 1), _number(sample, need)) for need in self._needs})
+        found = [self._decisions(watched) for watched in self._watched if not watched.over]
+        for watched in self._scope:
+            if not watched.over:
+                self._decisions(watched)
+        self._trim()
+        return tuple(decision for some in found for decision in some)
+
+    def feed(self, signals: Mapping[str, Any]) -> None:
+        """Take many samples in at once, arrays (time,) by name; verdicts are counted, not reported.
+
+        Raises:
+            TraceError: as `push`.
+        """
+        laid = arrange(signals, self._needs, plain=True)
+        self.grow({name: np.asarray(values).reshape(laid.samples, 1) for name, values in laid.env.items()})
+        for watched in self._watched:
+            if not watched.over:
+                self._count(watched, *self._settled(watched))
+        for watched in self._scope:
+            if not watched.over:
+                self._count(watched, *self._settled(watched))
+        self._trim()
+
+    def grow(self, columns: Mapping[str, Floats]) -> None:
+        """Append columns (time, 1) and bring every requirement up to date."""
+        count = len(next(iter(columns.values()))) if columns else 1
+        bad = [(i, need) for need in self._needs if (i := _not_finite(columns[need.column.name])) is not None]
+        if bad:
+            i, need = bad[0]
+            value = columns[need.column.name][i, 0]
+            message = f"`{need.column.name}` is {value} at sample {self.samples + i}"
+            raise TraceError(Diagnostic("E604", message, note=(f"needed by: {', '.join(need.by)}",)))
+        columns = columns or {"": np.zeros((count, 1))}
+        kept = self._signals
+        self._signals = {n: np.concatenate([kept[n], x]) if n in kept else x for n, x in columns.items()}
+        self.samples += count
+        for watched in (*self._watched, *self._scope):
+            watched.grow(self._signals, self._first, self.samples)
+
+    def _trim(self) -> None:
+        alive = [watched for watched in (*self._watched, *self._scope) if not watched.over]
+        needed = min((watched.drop() for watched in alive), default=self.samples)
+        if needed > self._first:
+            self._signals = {name: x[needed - self._first :] for name, x in self._signals.items()}
+            self._first = needed
+
+    # ----------------------------------------------------------------------- verdicts
+
+    def _pending(self, watched: Watched) -> tuple[int, int]:
+        """The instants that are not counted yet."""
+        start = watched.tally.instants
+        return (start, self.samples) if watched.everywhere else (start, 1)
+
+    def _decisions(self, watched: Watched) -> list[Decision]:
+        """What the last sample has decided."""
+        start, stop = self._pending(watched)
+        bounds, verdicts = watched.judged(start, stop)
+        before = np.zeros(len(verdicts), dtype=np.int8)
+        before[: len(watched.decided)] = watched.decided[: len(before)]
+        now = np.flatnonzero((before == _UNKNOWN) & (verdicts != _UNKNOWN))
+        watched.decided = np.where(before == _UNKNOWN, verdicts, before)
+        found = [
+            Decision(
+                watched.rule.name,
+                start + int(i),
+                self.time(start + int(i)),
+                "satisfied" if verdicts[i] == _HOLDS else "violated",
+                float(bounds.low[i]),
+                float(bounds.high[i]),
+                self.samples - 1,
+            )
+            for i in now
+        ]
+        self._count(watched, bounds, verdicts)
+        return found
+
+    def _settled(self, watched: Watched) -> tuple[Bounds, NDArray[np.int8]]:
+        start, stop = self._pending(watched)
+        return watched.judged(start, min(stop, self._countable(watched)))
+
+    def _countable(self, watched: Watched) -> int:
+        """The first instant that is not to be counted yet: unsettled, or without a whole window."""
+        if not watched.everywhere:
+            return watched.values.settled
+        window = self.compiled.grid.horizon if watched.rule.windowed else watched.rule.reach
+        return min(watched.values.settled, max(self.samples - (window or 0), 0))
+
+    def _count(self, watched: Watched, bounds: Bounds, verdicts: NDArray[np.int8]) -> None:
+        count = min(max(self._countable(watched) - watched.tally.instants, 0), len(verdicts))
+        watched.tally.add(bounds.low[:count], bounds.high[:count], verdicts[:count])
+        watched.decided = watched.decided[count:]
+
+    def time(self, sample: int) -> float:
+        """Time of a sample in seconds; its number where no time step is known."""
+        dt = self.compiled.grid.dt
+        return float(sample) if dt is None else self.how.t0 + sample * float(dt)
+
+    # ------------------------------------------------------------------------- answers
+
+    @property
+    def requirements(self) -> tuple[str, ...]:
+        """Names of the requirements, in order."""
+        return tuple(watched.rule.name for watched in self._watched)
+
+    @property
+    def kept(self) -> int:
+        """How many samples of the signals are kept."""
+        return self.samples - self._first
+
+    def open_starts(self, name: str) -> list[tuple[int, float, float]]:
+        """Sample, least and greatest robustness of every start that is not settled yet."""
+        watched = self._find(name)
+        if watched.over:
+            return []
+        start, stop = self._pending(watched)
+        bounds = watched.values.live(start, min(stop, self.samples))
+        return [(start + i, float(a), float(b)) for i, (a, b) in enumerate(zip(*bounds, strict=True))]
+
+    def standing(self, name: str) -> Tally:
+        """What is known of a requirement so far, its open starts included."""
+        return self._standing(self._find(name))
+
+    def _standing(self, watched: Watched) -> Tally:
+        if watched.over:
+            return watched.tally
+        start, stop = self._pending(watched)
+        return watched.tally.with_more(*watched.judged(start, min(stop, self.samples)))
+
+    @property
+    def in_scope(self) -> bool | None:
+        """Whether the assumptions hold at the first sample: yes, no, or not known yet."""
+        if not self.samples:
+            return None if self._scope else True
+        verdicts = [_OF_STATUS[self._standing(watched).status] for watched in self._scope]
+        if _FAILS in verdicts:
+            return False
+        return True if all(v == _HOLDS for v in verdicts) else None
+
+    def finish(self) -> dict[str, Tally]:
+        """The trace is over: what `Monitor.check` says of it, requirement by requirement.
+
+        Raises:
+            TraceError: E306 where `end` is "strict" and it is too short; E605, there was no sample.
+        """
+        if not self.samples:
+            raise TraceError(Diagnostic("E605", "there are no samples"))
+        horizon = self.compiled.grid.horizon
+        found: dict[str, Tally] = {}
+        refused: list[Diagnostic] = []
+        dt = None if self.compiled.grid.dt is None else float(self.compiled.grid.dt)
+        for watched in self._watched:
+            starts = starts_of(watched.rule, self.samples, horizon, self.how.at)
+            if self.how.end == "strict":
+                last = range(starts.stop - 1, starts.stop)
+                finding = check_length(watched.rule, self.samples, last, dt)
+                refused += [] if finding is None else [finding]
+            rest = range(min(watched.tally.instants, starts.stop), starts.stop)
+            found[watched.rule.name] = (
+                watched.tally.with_more(*watched.ended(rest)) if rest else watched.tally
+            )
+        if refused:
+            raise TraceError(*refused)
+        return found
+
+    def _find(self, name: str) -> Watched:
+        for watched in self._watched:
+            if watched.rule.name == name:
+                return watched
+        raise unknown_requirement(name, list(self.requirements))
+
+
+def _not_finite(values: Floats) -> int | None:
+    finite = np.isfinite(values[:, 0])
+    return None if finite.all() else int(np.argmin(finite))
+
+
+def _number(sample: Sample, need: Need) -> float:
+    """The value of a signal in a sample; `q[0]` is also a component of `q`."""
+    value = sample.get(need.column.name)
+    if isinstance(value, (int, float)) and not isinstance(value, complex):
+        return float(value)
+    names = (need.column.name, need.column.name.partition("[")[0])
+    given = {name: [sample[name]] for name in names if name in sample}
+    laid = arrange(given or dict.fromkeys(sample, [0.0]), [need], plain=True)
+    return float(laid.env[need.column.name][0, 0])

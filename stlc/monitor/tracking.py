@@ -1,0 +1,325 @@
+"""One requirement while its signals come in: what is known of it at which instants."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile import ir
+from stlc.compile.horizon import nodes, reach
+from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.pipeline import Rule
+from stlc.monitor.columns import End, Reader, Side
+from stlc.monitor.frontier import Frontier, Skeleton, skeleton
+from stlc.monitor.instants import rule_bounds, window_of
+from stlc.monitor.streams import EndlessError, Plan, endless, looks_on, plan
+from stlc.monitor.values import Record, by_truth, history, window_bounds
+
+Floats: TypeAlias = NDArray[np.float64]
+Ending: TypeAlias = Literal["open", "truncate"]
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """How values are taken.
+
+    Attributes:
+        ending: what becomes of windows that the end of the trace cuts.
+        truth: predicates are true or false (+inf or -inf), without any tolerance.
+    """
+
+    ending: Ending = "open"
+    truth: bool = False
+
+
+class Bounds(NamedTuple):
+    """Least and greatest robustness at consecutive instants, each (instants,)."""
+
+    low: Floats
+    high: Floats
+
+
+class Tracker(Protocol):
+    """What is known of a requirement.
+
+    Instants are settled one after the other: from then on their value cannot change.
+    """
+
+    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
+        """Take new samples in; the arguments are those of `Side.grow`."""
+
+    @property
+    def settled(self) -> int:
+        """The first instant whose value may still change."""
+
+    def live(self, start: int, stop: int) -> Bounds:
+        """Bounds over all continuations at instants that are not settled, or just were."""
+
+    def ended(self, starts: range) -> Bounds:
+        """The same where the trace is over and windows to its end end with the last sample."""
+
+    def drop(self, start: int) -> int:
+        """Forget instants before `start`; the number of the first sample that is still needed."""
+
+
+def tracker_of(rule: Rule, horizon: int | None, asked: Asked, *, everywhere: bool) -> Tracker:
+    """The tracker of a requirement that needs the least memory.
+
+    Args:
+        rule: the requirement.
+        horizon: what `T` means, in steps.
+        asked: how its values are taken.
+        everywhere: it is judged at every instant, and not only at the first one.
+    """
+    window = window_of(rule, horizon)
+    try:
+        planned = plan(rule.formula)
+        if window is not None:
+            if planned.lag or not everywhere:
+                raise EndlessError
+            return Everywhere(planned, asked, window)
+        if endless(planned.formula):
+            if everywhere:
+                raise EndlessError
+            return FromTheStart(planned, asked, skeleton(planned.formula))
+        return Everywhere(planned, asked, None)
+    except EndlessError:
+        return Whole(rule, horizon, asked.ending, asked.truth)
+
+
+def _sides(planned: Plan, beyond: int, asked: Asked) -> list[Side]:
+    """Both ends of what is possible, and the ending where it is another one."""
+    ends: list[End] = ["lower", "upper"] if asked.ending == "open" else ["lower", "upper", "truncate"]
+    return [Side(planned, end, 0 if end == "truncate" else beyond, asked.truth) for end in ends]
+
+
+@dataclass(slots=True)
+class Everywhere:
+    """A formula whose windows have an end, at consecutive instants.
+
+    With a `window`, the windows to the end of the trace end so many samples after their instant.
+    """
+
+    planned: Plan
+    asked: Asked
+    window: int | None
+    samples: int = 0
+    _sides: list[Side] = field(default_factory=list)
+    _readers: list[Reader] = field(default_factory=list)
+    _ahead: int = 0
+    _back: int = 0
+
+    def __post_init__(self) -> None:
+        formula = self.planned.formula
+        self._ahead = reach(formula).future if self.window is None else self.window
+        self._back = history(formula)
+        self._sides = _sides(self.planned, self._ahead, self.asked)
+        self._readers = [Reader([formula], side.end) for side in self._sides]
+
+    @property
+    def settled(self) -> int:
+        """The first instant whose value may still change."""
+        return max(self.samples - self._ahead - self.planned.lag, 0)
+
+    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
+        """Take new samples in."""
+        for side in self._sides:
+            side.grow(signals, first, samples)
+        self.samples = samples
+
+    def live(self, start: int, stop: int) -> Bounds:
+        """Bounds over all continuations."""
+        return Bounds(self._values(0, start, stop), self._values(1, start, stop))
+
+    def ended(self, starts: range) -> Bounds:
+        """Where the trace is over."""
+        if self.asked.ending == "open":
+            if self.window is not None and starts.stop + self.window > self.samples:
+                return Bounds(self._cut_short(0, starts), self._cut_short(1, starts))
+            return self.live(starts.start, starts.stop)
+        values = self._values(2, starts.start, starts.stop)
+        return Bounds(values, values)
+
+    def drop(self, start: int) -> int:
+        """Forget instants before `start`."""
+        for side in self._sides:
+            side.drop(start - self._back)
+        return _first_needed(self.planned, self.samples)
+
+    def _cut_short(self, which: int, starts: range) -> Floats:
+        """Of a trace shorter than the window: its last sample is the end."""
+        side, stop = self._sides[which], self.samples - self._sides[which].base
+        known = {name: rows[:stop] for name, rows in side.rows.items()}
+        return self._readers[which](known, starts.start - side.base, len(starts))[0][:, 0]
+
+    def _values(self, which: int, start: int, stop: int) -> Floats:
+        side = self._sides[which]
+        if stop <= start:
+            return np.zeros(0)
+        if self.window is None:
+            return side.values(self._readers[which], start, stop - start)[0][:, 0]
+        record = Record(side.rows, NUMPY)
+        starts = range(start - side.base, stop - side.base)
+        low, _ = window_bounds(self.planned.formula, record, starts, self.window, "truncate")
+        return np.asarray(low[:, 0])
+
+
+def _first_needed(planned: Plan, samples: int) -> int:
+    """The first sample whose signals a column still reads."""
+    reads = [samples - stream.ahead - stream.back for stream in planned.streams if hasattr(stream, "formula")]
+    return max(min(reads, default=samples), 0)
+
+
+@dataclass(slots=True)
+class FromTheStart:
+    """A formula with endless windows, at the first sample."""
+
+    planned: Plan
+    asked: Asked
+    bones: Skeleton
+    samples: int = 0
+    _fronts: list[Frontier] = field(default_factory=list)
+    _lag: int = 0
+    _back: int = 0
+
+    def __post_init__(self) -> None:
+        self._lag = self.bones.reach + self.planned.lag + 1
+        self._back = self.bones.back
+        beyond = self.bones.reach + self.bones.unsure(self.planned)
+        sides = _sides(self.planned, beyond, self.asked)
+        self._fronts = [Frontier(self.bones, side) for side in sides]
+
+    @property
+    def settled(self) -> int:
+        """Never before the end of the trace."""
+        return 0
+
+    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
+        """Take new samples in."""
+        self.samples = samples
+        for front in self._fronts:
+            front.side.grow(signals, first, samples)
+            front.advance(samples - self._lag)
+
+    def live(self, start: int, stop: int) -> Bounds:
+        """Bounds over all continuations."""
+        if stop <= start:
+            return Bounds(np.zeros(0), np.zeros(0))
+        low, high = self._fronts[:2]
+        return Bounds(low.value(self.samples)[0], high.value(self.samples)[0])
+
+    def ended(self, starts: range) -> Bounds:
+        """Where the trace is over."""
+        fronts = self._fronts[:2] if self.asked.ending == "open" else [self._fronts[2]] * 2
+        found = [front.ended(self.planned.formula, self.samples)[0] for front in fronts]
+        return Bounds(found[0][: len(starts)], found[1][: len(starts)])
+
+    def drop(self, start: int) -> int:  # noqa: ARG002 - only the first instant is judged
+        """Forget what the frontier has passed."""
+        for front in self._fronts:
+            front.side.drop(front.at - self._back)
+        return _first_needed(self.planned, self.samples)
+
+
+@dataclass(slots=True)
+class Whole:
+    """A requirement that has to be judged on the whole trace: nothing is forgotten."""
+
+    rule: Rule
+    horizon: int | None
+    ending: Ending
+    truth: bool = False
+    samples: int = 0
+    _signals: Mapping[str, Floats] = field(default_factory=dict)
+
+    @property
+    def settled(self) -> int:
+        """The first instant whose value may still change."""
+        if window_of(self.rule, self.horizon) is None and endless(self.rule.formula):
+            return 0
+        ahead = self.horizon or 0 if window_of(self.rule, self.horizon) is not None else self.rule.reach
+        return max(self.samples - ahead - looks_on(self.rule.formula), 0)
+
+    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:  # noqa: ARG002
+        """Take new samples in."""
+        self._signals, self.samples = signals, samples
+
+    def live(self, start: int, stop: int) -> Bounds:
+        """Bounds over all continuations."""
+        if stop <= start:
+            return Bounds(np.zeros(0), np.zeros(0))
+        rule, record = self._subject()
+        window = window_of(rule, self.horizon)
+        if window is None:
+            formula = lengthened(rule.formula, self.samples)
+            low, high = (record.values([formula], start, stop - start, end)[0] for end in ("lower", "upper"))
+            return Bounds(low[:, 0], high[:, 0])
+        whole = min(stop, max(self.samples - window, start))
+        known = range(start, whole)
+        low, high = rule_bounds(rule, record, known, self.horizon, "open") if known else (_NONE, _NONE)
+        unknown = np.full(stop - whole, math.inf)
+        return Bounds(np.concatenate([low[:, 0], -unknown]), np.concatenate([high[:, 0], unknown]))
+
+    def ended(self, starts: range) -> Bounds:
+        """Where the trace is over."""
+        rule, record = self._subject()
+        low, high = rule_bounds(rule, record, starts, self.horizon, self.ending)
+        return Bounds(low[:, 0], high[:, 0])
+
+    def _subject(self) -> tuple[Rule, Record]:
+        record = Record(self._signals, NUMPY)
+        if not self.truth:
+            return self.rule, record
+        formula = by_truth(self.rule.formula)
+        return replace(self.rule, formula=formula), record
+
+    def drop(self, start: int) -> int:  # noqa: ARG002
+        """Nothing can be forgotten."""
+        return 0
+
+
+_NONE = np.zeros((0, 1))
+
+
+def lengthened(formula: ir.Formula, samples: int) -> ir.Formula:
+    """The formula where windows to the end of the trace reach beyond all of which anything is known."""
+    bounds = [abs(node.steps) if isinstance(node, ir.Shift) else _farthest(node) for node in nodes(formula)]
+    return _long(formula, samples + sum(bounds) + 1)
+
+
+def _farthest(node: ir.Formula) -> int:
+    match node:
+        case (
+            ir.Over(window=window)
+            | ir.Until(window=window)
+            | ir.Past(window=window)
+            | ir.Since(window=window)
+        ):
+            return window.lo if window.hi is None else window.hi
+        case _:
+            return 0
+
+
+def _long(formula: ir.Formula, length: int) -> ir.Formula:
+    match formula:
+        case ir.Join(items=items):
+            return replace(formula, items=tuple(_long(item, length) for item in items))
+        case ir.Over(window=window, body=body):
+            return replace(formula, window=_longer(window, length), body=_long(body, length))
+        case ir.Until(window=window, left=left, right=right):
+            left, right = _long(left, length), _long(right, length)
+            return replace(formula, window=_longer(window, length), left=left, right=right)
+        case ir.Past(body=body) | ir.Shift(body=body):
+            return replace(formula, body=_long(body, length))
+        case ir.Since(left=left, right=right):
+            return replace(formula, left=_long(left, length), right=_long(right, length))
+    return formula
+
+
+def _longer(window: ir.Window, length: int) -> ir.Window:
+    return window if window.hi is not None else ir.Window(window.lo, window.lo + length)

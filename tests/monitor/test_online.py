@@ -1,0 +1,277 @@
+"""Samples one by one against the evaluator that sees the whole trace: values, bounds, verdicts and memory."""
+
+from __future__ import annotations
+
+import os
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
+
+import formula_strategies as random_formulas
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stlc.compile import ir
+from stlc.compile.horizon import reach, uses_end
+from stlc.compile.lower import lower
+from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.simplify import simplify
+from stlc.diagnostics import StlcError
+from stlc.monitor.online import How
+from stlc.monitor.tracking import Asked, Everywhere, FromTheStart, Whole, lengthened, tracker_of
+from stlc.monitor.values import Record, bounds
+from stlc.monitor.verdict import Monitor
+
+EXAMPLES = int(os.environ.get("STLC_CASES", "150"))
+"""How many random formulas and traces are tried."""
+
+
+def a_rule(formula: ir.Formula) -> Any:
+    return SimpleNamespace(
+        name="r",
+        formula=formula,
+        reach=reach(formula).future,
+        windowed=False,
+        uses_end=uses_end(formula),
+        absolute=False,
+    )
+
+
+def at_ends(
+    formula: ir.Formula, known: dict[str, np.ndarray], starts: range
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds over all continuations, by the evaluator: endless windows run over many unknown samples."""
+    record = Record(known, NUMPY)
+    longer = lengthened(formula, record.samples + 60)
+    low, high = (
+        record.values([longer], starts.start, len(starts), end)[0][:, 0] for end in ("lower", "upper")
+    )
+    return low, high
+
+
+@settings(max_examples=EXAMPLES, deadline=None)
+@given(
+    written=random_formulas.formulas(),
+    trace=random_formulas.traces(1, 24, 1),
+    ending=st.sampled_from(["open", "truncate"]),
+    steps=st.lists(st.sampled_from([1, 1, 1, 3]), min_size=24, max_size=24),
+)
+def test_a_stream_gives_what_the_whole_trace_gives(written, trace, ending, steps) -> None:
+    formula = simplify(lower(written, random_formulas.GRID, []))
+    rule = a_rule(formula)
+    everywhere = not rule.uses_end
+    samples = len(trace["x"])
+    tracker = tracker_of(rule, None, Asked(ending), everywhere=everywhere)
+    kept, first, now, done = {name: x[:0] for name, x in trace.items()}, 0, 0, 0
+    for step in steps:
+        more = {name: x[now : now + step] for name, x in trace.items()}
+        now = min(now + step, samples)
+        kept = {name: np.concatenate([kept[name], more[name]]) for name in kept}
+        tracker.grow(kept, first, now)
+        stop = now if everywhere else 1
+        if done < stop:
+            found = tracker.live(done, stop)
+            wanted = at_ends(formula, {name: x[:now] for name, x in trace.items()}, range(done, stop))
+            np.testing.assert_array_equal(found, wanted)
+        done = max(done, min(tracker.settled, stop)) if everywhere else 0
+        needed = tracker.drop(done)
+        kept, first = {name: x[needed - first :] for name, x in kept.items()}, needed
+        if now == samples:
+            break
+    starts = range(done, samples) if everywhere else range(1)
+    if starts:
+        wanted = [end[:, 0] for end in bounds(formula, Record(trace, NUMPY), starts, ending)]
+        np.testing.assert_array_equal(tracker.ended(starts), wanted)
+
+
+# ------------------------------------------------------------------ through the monitor
+
+HEAD = "spec small\nsignal a\nsignal b\nsignal q: real[2]\n"
+REQUIREMENTS = {
+    "state": "a > 0",
+    "windowed": "a > 0 -> eventually[0, T] b > 0",
+    "nested": "always[0, T] (a > 0 or eventually[0.1 s, 0.3 s] b > 0)",
+    "beyond_the_window": "always[0, T] (a > -1 or eventually[0 s, 0.4 s] b > 0)",
+    "bounded": "always[0 s, 0.4 s] (a > 0 or b > 0)",
+    "always": "always (a > 1 -> eventually[0 s, 0.3 s] b > 0)",
+    "response": "always (a > 1 -> eventually b > 0)",
+    "infinitely_often": "always eventually (a > 0 and eventually[0.2 s, 0.4 s] b > 0)",
+    "until": "a > -1 until b > 1",
+    "late_until": "a > -1 until[0.3 s, inf] b > 0",
+    "past": "always[0, T] (once[0 s, 0.2 s] a > 0 or historically[0 s, 0.3 s] b > 0)",
+    "whole_past": "always (once a > 1 or historically b > -1)",
+    "since": "always[0, T] (a > -1 since b > 0)",
+    "window_to_end": "always[0, T] (a > 0 or eventually[0, end] b > 0)",
+    "window_to_end_with_past": "always[0, T] (once[0 s, 0.2 s] a > 0 or eventually[0, end] b > 0)",
+    "end_under_a_window": "eventually[0 s, 0.4 s] always a > -1",
+    "edge": "always (rise(a > 0) -> b > -1)",
+    "vector": "always norm(q) < 3",
+}
+T = 6
+
+
+def monitor_of(*names: str) -> Monitor:
+    body = "".join(f"require r_{name}: {REQUIREMENTS[name]}\n" for name in names)
+    return Monitor(HEAD + body, dt=0.1, horizon=T / 10)
+
+
+def signals(samples: int, seed: int) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    columns = {name: rng.integers(-16, 16, samples) / 8 for name in ("a", "b")}
+    return columns | {"q": rng.integers(-16, 16, (samples, 2)) / 8}
+
+
+@pytest.mark.parametrize("name", REQUIREMENTS)
+@pytest.mark.parametrize("tolerance", [1e-6, 0.0])
+@settings(max_examples=6, deadline=None)
+@given(samples=st.integers(1, 30), seed=st.integers(0, 2**32 - 1), end=st.sampled_from(["open", "truncate"]))
+def test_the_end_of_a_stream_is_the_verdict_of_the_monitor(
+    name: str, tolerance: float, samples: int, seed: int, end: Any
+) -> None:
+    monitor, whole = monitor_of(name), signals(samples, seed)
+    wanted = monitor.check(whole, end=end, tolerance=tolerance)["r_" + name]
+    pushed = monitor.online(How(end=end, tolerance=tolerance))
+    fed = monitor.online(How(end=end, tolerance=tolerance))
+    decided: dict[int, str] = {}
+    for k in range(samples):
+        for decision in pushed.push({key: values[k].tolist() for key, values in whole.items()}):
+            assert decision.start not in decided
+            decided[decision.start] = decision.status
+    cuts = [0, samples // 3, samples // 2, samples]
+    for low, high in pairwise(cuts):
+        if high > low:
+            fed.feed({key: values[low:high] for key, values in whole.items()})
+    for online in (pushed, fed):
+        tally = online.finish()["r_" + name]
+        assert (tally.status, tally.instants) == (wanted.overall, wanted.instants)
+        np.testing.assert_array_equal(tally.robustness, wanted.robustness)
+        assert tally.share == wanted.share
+        if wanted.overall != "inconclusive":
+            assert tally.worst == wanted.worst[1]
+    if end == "open":  # what was decided stays so
+        for i in range(wanted.instants):
+            if i in decided:
+                assert decided[i] == ("satisfied" if wanted.holds[i, 0] else "violated")
+
+
+@pytest.mark.parametrize("name", ["bounded", "always", "windowed", "until"])
+def test_verdicts_come_as_soon_as_they_are_decided(name: str) -> None:
+    monitor, whole = monitor_of(name), signals(40, 3)
+    online = monitor.online()
+    seen = 0
+    for k in range(40):
+        found = online.push({key: values[k] for key, values in whole.items()})
+        for decision in found:
+            known = {key: values[: k + 1] for key, values in whole.items()}
+            before = {key: values[:k] for key, values in whole.items()}
+            rule = monitor.compiled.requirements[0]
+            low, high = lasting(rule.formula, known, decision.start)
+            assert (decision.low, decision.high, decision.sample) == (low, high, k)
+            assert decision.time == pytest.approx(0.1 * decision.start)
+            if k > decision.start:
+                low, high = lasting(rule.formula, before, decision.start)
+                assert low < -1e-6 <= high
+            seen += 1
+    assert seen
+
+
+def lasting(formula: ir.Formula, known: dict[str, np.ndarray], start: int) -> tuple[float, float]:
+    columns = {name: values[:, None] for name, values in known.items() if values.ndim == 1}
+    low, high = at_ends(formula, columns, range(start, start + 1))
+    return float(low[0]), float(high[0])
+
+
+def test_memory_is_bounded_by_the_horizon() -> None:
+    names = [name for name in REQUIREMENTS if name not in ("end_under_a_window",)]
+    monitor, whole = monitor_of(*names), signals(400, 0)
+    online = monitor.online()
+    most = 0
+    for k in range(400):
+        online.push({key: values[k] for key, values in whole.items()})
+        most = max(most, online.kept, *(len(online.open_starts("r_" + name)) for name in names))
+        rows = [
+            len(column)
+            for watched in online._watched
+            for side in getattr(watched.values, "_sides", [])
+            for column in side.rows.values()
+        ]
+        most = max(most, *rows)
+    assert most <= 5 * T
+
+
+def test_which_memory_a_requirement_needs() -> None:
+    kinds = {}
+    for name in REQUIREMENTS:
+        (watched,) = monitor_of(name).online()._watched
+        kinds[name] = type(watched.values)
+    assert kinds["end_under_a_window"] is Whole
+    assert {kinds[n] for n in ("always", "response", "infinitely_often", "until", "late_until")} == {
+        FromTheStart
+    }
+    assert {kinds[n] for n in ("windowed", "whole_past", "since", "window_to_end", "state")} == {
+        Everywhere,
+        FromTheStart,
+    }
+
+
+def test_open_starts_and_standing() -> None:
+    online = monitor_of("windowed", "bounded").online()
+    for k in range(3):
+        assert online.push({"a": 1.0, "b": -1.0, "q": [0.0, 0.0]}) == () or k == 0
+    assert [start for start, _, _ in online.open_starts("r_windowed")] == [0, 1, 2]
+    assert online.standing("r_bounded").status == "inconclusive"
+    assert (online.standing("r_bounded").low, online.standing("r_bounded").high) == (-np.inf, 1.0)
+    with pytest.raises(StlcError, match="no requirement `bound`"):
+        online.standing("bound")
+
+
+def test_every_start() -> None:
+    monitor, whole = monitor_of("bounded"), signals(20, 1)
+    online = monitor.online(How(at="all"))
+    online.feed(whole)
+    wanted = monitor.check(whole, at="all")["r_bounded"]
+    tally = online.finish()["r_bounded"]
+    assert (tally.instants, tally.status, tally.robustness) == (
+        wanted.instants,
+        wanted.overall,
+        wanted.robustness,
+    )
+    with pytest.raises(StlcError, match="runs to the end"):
+        monitor_of("always").online(How(at="all"))
+
+
+def test_strict_ends_and_streams_without_samples() -> None:
+    online = monitor_of("bounded").online(How(end="strict"))
+    with pytest.raises(StlcError, match="E605"):
+        online.finish()
+    online.push({"a": 1, "b": 1, "q": [0, 0]})
+    with pytest.raises(StlcError, match="E306"):
+        online.finish()
+
+
+def test_samples_that_are_refused() -> None:
+    online = monitor_of("vector", "state").online()
+    online.push({"a": 1, "b": 2, "q": [0.0, 1.0], "more": "ignored"})
+    with pytest.raises(StlcError, match=r"E604.*`a` is nan at sample 1"):
+        online.push({"a": float("nan"), "b": 0.0, "q": [0.0, 0.0]})
+    with pytest.raises(StlcError, match="E601"):
+        online.push({"q": [0.0, 0.0]})
+    assert online.samples == 1
+
+
+def test_assumptions_say_what_is_in_scope() -> None:
+    assumed = "assume start: a > 0\nassume soon: eventually[0 s, 0.2 s] a > 1\n"
+    text = f"spec s\nsignal a\n{assumed}require r: always a > -1\n"
+    online = Monitor(text, dt=0.1).online()
+    assert online.in_scope is None
+    online.push({"a": 0.5})
+    assert online.in_scope is None
+    online.push({"a": 2})
+    assert online.in_scope is True
+    online.push({"a": 0})
+    assert online.in_scope is True
+    other = Monitor(text, dt=0.1).online()
+    other.push({"a": -0.5})
+    assert other.in_scope is False
