@@ -21,7 +21,7 @@ from stlc.compile.inputs import inputs
 from stlc.compile.machine import Machine
 from stlc.compile.ops import Array, Ops
 from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.schedule import Batch, End, Extent, Run, Schedule, schedule
+from stlc.compile.schedule import End, Extent, Run, Runner, Schedule, schedule
 from stlc.compile.semantics import Exact, LogSumExp, Semantics
 from stlc.compile.windows import Windows
 from stlc.signature import Signature
@@ -91,21 +91,51 @@ def robustness_signal(
 
 def execute(plan: Schedule, env: Mapping[str, Array], windows: Windows) -> list[Array]:
     """The values of the roots of a schedule, each `(count, batch)`."""
-    outputs = [_batch(batch, env, windows.ops) for batch in plan.batches]
-    machine = Machine(plan.extent, windows, like=next(iter(env.values())))
-    freezer = Freezer(plan.extent, env, windows.ops, partial(_judge, windows=windows))
+    runners = plan.runners.get(windows)
+    if runners is None:
+        machine = Machine(plan.extent, windows)
+        runners = tuple(_runner(plan, index, machine) for index in range(len(plan.steps)))
+        plan.runners[windows] = runners
+    ops, like = windows.ops, next(iter(env.values()))
+    outputs = [batch.program(inputs(batch.program, env, batch.run, ops), ops) for batch in plan.batches]
     values: list[Array] = []
-    for index, step in enumerate(plan.steps):
-        if isinstance(step.node, ir.Atom):
-            known, missing = _rows(plan, index, outputs)
-            values.append(machine.atom(step.node, step.run, known, missing))
-        elif isinstance(step.node, ir.Freeze):
-            values.append(freezer.values(step.node, step.run))
-        else:
-            values.append(
-                machine.value(step, [None if part is None else values[part] for part in step.parts])
-            )
+    for runner in runners:
+        values.append(runner(values, outputs, env, like))
     return [values[root] for root in plan.roots]
+
+
+def _runner(plan: Schedule, index: int, machine: Machine) -> Runner:
+    """What computes a step from those before it, the outputs of the programs, and the columns."""
+    step = plan.steps[index]
+    if isinstance(step.node, ir.Freeze):
+        return _frozen(step.node, step.run, plan.extent, machine.windows)
+    if isinstance(step.node, ir.Atom):
+        return _predicate(step.node, step.run, plan, plan.atoms.get(index), machine)
+    kernel, parts = machine.bind(step), [part for part in step.parts if part is not None]
+    if len(parts) == 1:
+        (only,) = parts
+        return lambda values, _, __, like: kernel([values[only]], like)
+    return lambda values, _, __, like: kernel([values[part] for part in parts], like)
+
+
+def _predicate(
+    node: ir.Atom, run: Run, plan: Schedule, place: tuple[int, str, Run] | None, machine: Machine
+) -> Runner:
+    if place is None:
+        kernel = machine.atom(node, run, Run(run.start, 0))
+        return lambda _, __, ___, like: kernel((), like)
+    number, name, inside = place
+    kernel = machine.atom(node, run, inside)
+    offset = inside.start - plan.batches[number].run.start
+    if offset == 0 and plan.batches[number].run.count == inside.count:
+        return lambda _, outputs, __, like: kernel((outputs[number][name],), like)
+    rows = slice(offset, offset + inside.count)
+    return lambda _, outputs, __, like: kernel((outputs[number][name][rows],), like)
+
+
+def _frozen(node: ir.Freeze, run: Run, extent: Extent, windows: Windows) -> Runner:
+    judge = partial(_judge, windows=windows)
+    return lambda _, __, env, ___: Freezer(extent, env, windows.ops, judge).values(node, run)
 
 
 def _judge(
@@ -118,23 +148,6 @@ def _judge(
 @lru_cache(maxsize=512)
 def _scheduled(formula: ir.Formula, run: Run, extent: Extent) -> Schedule:
     return schedule((formula,), run, extent)
-
-
-def _rows(plan: Schedule, index: int, outputs: Sequence[Mapping[str, Array]]) -> tuple[Array | None, int]:
-    """What the batches know of the predicate of step `index`: its rows, and how many are missing before."""
-    place = plan.atoms.get(index)
-    if place is None:
-        return None, 0
-    number, name, inside = place
-    values = outputs[number][name]
-    offset = inside.start - plan.batches[number].run.start
-    whole = offset == 0 and len(values) == inside.count
-    known = values if whole else values[offset : offset + inside.count]
-    return known, inside.start - plan.steps[index].run.start
-
-
-def _batch(batch: Batch, env: Mapping[str, Array], ops: Ops) -> dict[str, Array]:
-    return batch.program(inputs(batch.program, env, batch.run, ops), ops)
 
 
 class Weighed(Protocol):

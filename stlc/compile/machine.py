@@ -1,17 +1,20 @@
-"""How the value of a formula follows from the values of its parts; one method a kind of node."""
+"""How the value of a formula follows from the values of its parts: steps of a schedule become functions."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import assert_never, final
+from typing import TypeAlias, assert_never, final
 
 from stlc.compile import ir
 from stlc.compile.ops import Array
 from stlc.compile.schedule import Extent, Run, Step
 from stlc.compile.semantics import Pick
 from stlc.compile.windows import Windows, dual, neutral
+
+Kernel: TypeAlias = Callable[[Sequence[Array], Array], Array]
+"""The values of the parts that exist, and any column for shape, dtype and device -> `(count, batch)`."""
 
 _PICK: Mapping[str, Pick] = {
     "and": "min",
@@ -26,118 +29,138 @@ _PICK: Mapping[str, Pick] = {
     "since": "max",
 }
 
+_ENDLESS = 1 << 60
+"""Rows of a window to the end of the trace: more than there are."""
+
 
 @final
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Values `(count, batch)` of formulas on one trace.
+    """Makes functions of steps, for traces of one length.
 
     Attributes:
-        extent: of the trace.
+        extent: of the traces.
         windows: the algorithms, with semantics and array library.
-        like: any column, for shape, dtype and device.
     """
 
     extent: Extent
     windows: Windows
-    like: Array
-
-    def constant(self, rows: int, value: float) -> Array:
-        """`rows` rows of `value`."""
-        return self.windows.ops.full((rows, *self.like.shape[1:]), value, self.like)
 
     @property
     def unknown(self) -> float:
         """What stands for what nobody knows yet."""
         return math.inf if self.extent.end == "upper" else -math.inf
 
-    def atom(self, node: ir.Atom, run: Run, known: Array | None, missing: int = 0) -> Array:
-        """A predicate: `known` are the rows that have a value, `missing` rows after the first of `run`.
+    def atom(self, node: ir.Atom, run: Run, inside: Run) -> Kernel:
+        """A predicate; its one part are the rows at the instants `inside`, signed, if there are any.
 
-        They are signed already. Beyond the trace a predicate is unknown, and false where windows are cut.
+        Beyond the trace a predicate is unknown, and false where windows are cut.
         """
         outside = self.unknown if self.extent.open else -node.sign * math.inf
-        if known is None:
-            return self.constant(run.count, outside)
-        ops = self.windows.ops
-        if node.guard:
-            known = ops.infinite(ops.gt(known, 0.0) if node.strict else ops.ge(known, 0.0), known)
-        known = self.windows.padded(known, run.count - missing, outside)
-        return ops.cat([self.constant(missing, outside), known]) if missing else known
+        if inside.count <= 0:
+            return self._constant(run.count, outside)
+        ops, padded = self.windows.ops, self.windows.padded
+        missing = inside.start - run.start
+        whole = inside.count == run.count
 
-    def value(self, step: Step, parts: Sequence[Array | None]) -> Array:
-        """Any other node, from the values of its parts (None: at no instant)."""
+        def kernel(parts: Sequence[Array], like: Array) -> Array:
+            known = parts[0]
+            if node.guard:
+                known = ops.infinite(ops.gt(known, 0.0) if node.strict else ops.ge(known, 0.0), known)
+            if whole:
+                return known
+            known = padded(known, run.count - missing, outside)
+            if not missing:
+                return known
+            return ops.cat([ops.full((missing, *like.shape[1:]), outside, like), known])
+
+        return kernel
+
+    def bind(self, step: Step) -> Kernel:
+        """Any other node."""
         node, run = step.node, step.run
+        operands = sum(part is not None for part in step.parts)
         match node:
             case ir.Truth(value):
-                return self.constant(run.count, math.inf if value else -math.inf)
+                return self._constant(run.count, math.inf if value else -math.inf)
             case ir.Join(op):
-                items = [part for part in parts if part is not None]
-                return self.windows.semantics.join(items, _PICK[op], self.windows.ops)
-            case ir.Over(op, window):
-                return self._future(window, run, parts, _PICK[op])
-            case ir.Until(op, window):
-                return self._future(window, run, parts, _PICK[op])
-            case ir.Past(op, window):
-                return self._past(window, run, parts, _PICK[op])
-            case ir.Since(op, window):
-                return self._past(window, run, parts, _PICK[op])
+                pick, ops, join = _PICK[op], self.windows.ops, self.windows.semantics.join
+                return lambda parts, _: join(parts, pick, ops)
+            case ir.Over(op, window) | ir.Until(op, window):
+                return self._future(window, run, operands, _PICK[op])
+            case ir.Past(op, window) | ir.Since(op, window):
+                return self._past(window, run, operands, _PICK[op])
             case ir.Shift():
-                return self._shift(node, run, parts[0])
+                return self._shift(node, run, operands)
             case ir.Atom() | ir.Freeze():
                 raise TypeError("predicates and frozen values come from programs")
             case _:
                 assert_never(node)
 
-    def _future(self, window: ir.Window, run: Run, parts: Sequence[Array | None], pick: Pick) -> Array:
+    def _constant(self, rows: int, value: float) -> Kernel:
+        full = self.windows.ops.full
+        return lambda _, like: full((rows, *like.shape[1:]), value, like)
+
+    def _future(self, window: ir.Window, run: Run, operands: int, pick: Pick) -> Kernel:
         """Windows of the future; those "to the end" that start beyond it are unknown on an open trace."""
         rows = run.count
         beyond = neutral(pick)
         if self.extent.open and window.hi is None:
             rows = min(rows, self.extent.samples - window.lo - run.start)
             beyond = self.unknown
-        arrays = [part for part in parts if part is not None]
-        if rows <= 0 or not arrays:
-            return self.constant(run.count, beyond)
-        return self.windows.padded(self._windows(arrays, window, pick, rows), run.count, beyond)
+        if rows <= 0 or not operands:
+            return self._constant(run.count, beyond)
+        inner, padded = self._windows(window, operands, pick, rows), self.windows.padded
+        if rows == run.count:
+            return inner
+        return lambda parts, like: padded(inner(parts, like), run.count, beyond)
 
-    def _past(self, window: ir.Window, run: Run, parts: Sequence[Array | None], pick: Pick) -> Array:
+    def _past(self, window: ir.Window, run: Run, operands: int, pick: Pick) -> Kernel:
         """Windows of the past: the same, with time reversed."""
-        arrays = [part for part in parts if part is not None]
-        if not arrays:
-            return self.constant(run.count, neutral(pick))
-        if run.count == 1 and len(arrays) == 1:
-            return self.windows.semantics.reduce(arrays[0], pick, self.windows.ops)
-        flip = self.windows.ops.flip
-        return flip(self._windows([flip(array) for array in arrays], window, pick, run.count))
+        ops, reduce = self.windows.ops, self.windows.semantics.reduce
+        if not operands:
+            return self._constant(run.count, neutral(pick))
+        if run.count == 1 and operands == 1:
+            return lambda parts, _: reduce(parts[0], pick, ops)
+        inner, flip = self._windows(window, operands, pick, run.count), ops.flip
+        return lambda parts, like: flip(inner([flip(part) for part in parts], like))
 
-    def _windows(self, arrays: list[Array], window: ir.Window, pick: Pick, rows: int) -> Array:
+    def _windows(self, window: ir.Window, operands: int, pick: Pick, rows: int) -> Kernel:
         """One operand: its extrema. Two: `until` from `window.lo` on, and the left one holds up to there."""
-        right = arrays[-1]
-        width = len(right) if window.hi is None else window.hi - window.lo + 1
-        if len(arrays) == 1:
-            return self.windows.extrema(right, pick, count=rows, width=width)
-        left = arrays[0]
-        later = left[window.lo :] if window.lo else left
-        reached = self.windows.until(later, right, pick, count=rows, width=width)
-        if not window.lo:
-            return reached
-        held = self.windows.extrema(left, dual(pick), count=rows, width=window.lo)
-        return self.windows.semantics.pair(held, reached, dual(pick), self.windows.ops)
+        extrema, until = self.windows.extrema, self.windows.until
+        pair, ops, lo = self.windows.semantics.pair, self.windows.ops, window.lo
+        most = _ENDLESS if window.hi is None else window.hi - lo + 1
+        if operands == 1:
+            return lambda parts, _: extrema(parts[0], pick, count=rows, width=most)
+        if not lo:
+            return lambda parts, _: until(parts[0], parts[1], pick, count=rows, width=most)
 
-    def _shift(self, node: ir.Shift, run: Run, body: Array | None) -> Array:
+        def kernel(parts: Sequence[Array], _: Array) -> Array:
+            left, right = parts
+            reached = until(left[lo:], right, pick, count=rows, width=most)
+            held = extrema(left, dual(pick), count=rows, width=lo)
+            return pair(held, reached, dual(pick), ops)
+
+        return kernel
+
+    def _shift(self, node: ir.Shift, run: Run, operands: int) -> Kernel:
         if node.outside is not None:
             outside = math.inf if node.outside else -math.inf
         elif self.extent.open:
             outside = self.unknown
         else:
             outside = math.inf if node.weak else -math.inf
-        if body is None:
-            return self.constant(run.count, outside)
+        if not operands:
+            return self._constant(run.count, outside)
         before = min(max(-(run.start + node.steps), 0), run.count)
-        after = run.count - before - len(body)
-        parts = [self.constant(before, outside)] if before else []
-        parts.append(body)
-        if after:
-            parts.append(self.constant(after, outside))
-        return self.windows.ops.cat(parts) if len(parts) > 1 else body
+        ops = self.windows.ops
+
+        def kernel(parts: Sequence[Array], like: Array) -> Array:
+            body = parts[0]
+            after = run.count - before - body.shape[0]
+            rest = [ops.full((rows, *like.shape[1:]), outside, like) for rows in (before, after) if rows]
+            if not rest:
+                return body
+            return ops.cat([*rest[: bool(before)], body, *rest[bool(before) :]])
+
+        return kernel

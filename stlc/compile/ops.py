@@ -131,14 +131,20 @@ class Ops(Protocol):
     def softmax2(self, a: Array, b: Array, k: float) -> Array:
         """`log(exp(k a) + exp(k b)) / k`: `softmax` of two arrays of one shape."""
 
-    def slides(self, x: Array, window: Sliding) -> bool:
-        """Whether `extrema` and `until` are the fastest way for arrays like `x`."""
+    def join(self, items: Sequence[Array], pick: Pick) -> Array:
+        """Exact extremum of one or more arrays, elementwise."""
 
-    def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array:
-        """Exact extrema of sliding windows: `(time, batch)` -> `(count, batch)`."""
+    def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
+        """Exact extrema of sliding windows: `(time, batch)` -> `(count, batch)`.
 
-    def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array:
-        """Exact `until` ("max") and `release` ("min"): two of `(time, batch)` -> `(count, batch)`."""
+        None where other methods of the library do it faster.
+        """
+
+    def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array | None:
+        """Exact `until` ("max") and `release` ("min"): two of `(time, batch)` -> `(count, batch)`.
+
+        None where other methods of the library do it faster.
+        """
 
     # constants and shapes
     def kind(self, like: Array) -> Hashable:

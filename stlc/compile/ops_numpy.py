@@ -16,7 +16,10 @@ from stlc.compile.extremum import Pick, Sliding
 from stlc.compile.ops import Array, Mask, Ops
 
 _WIDE = 8
-"""From so many columns on sliding windows beat putting pairs together."""
+"""From so many columns on sliding windows beat putting pairs together,"""
+
+_LONG = 1000
+"""and for `until` also from so many rows of a window on."""
 
 
 @final
@@ -113,16 +116,20 @@ class NumpyOps:
         """Running maximum along axis 0."""
         return np.maximum.accumulate(x, axis=0)
 
-    def slides(self, x: Array, window: Sliding) -> bool:  # noqa: ARG002
-        """For rows that are long enough."""
-        return bool(x.ndim == 2 and x.shape[1] >= _WIDE)
+    def join(self, items: Sequence[Array], pick: Pick) -> Array:
+        """Exact extremum of one or more arrays."""
+        return reduce(np.minimum if pick == "min" else np.maximum, items)
 
-    def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array:
-        """Exact extrema of sliding windows."""
+    def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
+        """Exact extrema of sliding windows, for rows that are long enough."""
+        if x.ndim != 2 or x.shape[1] < _WIDE:
+            return None
         return sliding.extrema(x, sliding.Asked(pick, window, NUMPY))
 
-    def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array:
-        """Exact `until` and `release`."""
+    def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array | None:
+        """Exact `until` and `release`, for rows or windows that are long enough."""
+        if left.ndim != 2 or (left.shape[1] < _WIDE and window.width < _LONG):
+            return None
         return sliding.until(left, right, sliding.Asked(pick, window, NUMPY))
 
     def softmax(self, x: Array, k: float) -> Array:

@@ -16,11 +16,14 @@ from torch.autograd.function import once_differentiable
 
 from stlc.compile.extremum import Pick, Sliding
 from stlc.compile.ops import Mask, Ops
+from stlc.compile.ops_torch_choice import choice, reduction
+from stlc.compile.ops_torch_small import is_small, small_extrema, small_until
 from stlc.compile.ops_torch_windows import SlidingExtremum, SlidingUntil
 from stlc.compile.sliding import Asked
 
-_LARGE = 1 << 14
-"""On a processor, from so many numbers on a gradient of our own beats those that torch puts together."""
+_LARGE, _LARGE_BLOCK, _LARGE_UNTIL = 1 << 13, 1 << 16, 1 << 12
+"""From so many numbers on, on a processor, scans in place beat what torch's own operations can do: for
+windows, for windows that all reach the last row, and for `until`."""
 
 
 class _SafeSqrt(torch.autograd.Function):
@@ -184,11 +187,11 @@ class TorchOps:
 
     def amin(self, x: Tensor) -> Tensor:
         """Minimum over axis 0, kept; ties share the gradient."""
-        return x.amin(dim=0, keepdim=True)
+        return reduction(x, "min")
 
     def amax(self, x: Tensor) -> Tensor:
         """Maximum over axis 0, kept; ties share the gradient."""
-        return x.amax(dim=0, keepdim=True)
+        return reduction(x, "max")
 
     def sum(self, x: Tensor) -> Tensor:
         """Sum over axis 0, kept."""
@@ -202,19 +205,29 @@ class TorchOps:
         """Running maximum along axis 0."""
         return torch.cummax(x, dim=0).values
 
-    def slides(self, x: Tensor, window: Sliding) -> bool:
-        """For large arrays on a processor; elsewhere many small operations are what costs."""
-        return (
-            x.ndim == 2 and x.device.type == "cpu" and min(x.numel(), window.covered * x.shape[1]) >= _LARGE
-        )
+    def join(self, items: Sequence[Tensor], pick: Pick) -> Tensor:
+        """Exact extremum of one or more arrays; one of several equal operands may get all of the gradient."""
+        return choice(items, pick)
 
-    def extrema(self, x: Tensor, pick: Pick, window: Sliding) -> Tensor:
-        """Exact extrema of sliding windows; one of several equal operands gets the gradient."""
+    def extrema(self, x: Tensor, pick: Pick, window: Sliding) -> Tensor | None:
+        """Exact extrema of sliding windows; one of several equal operands may get all of the gradient."""
+        if x.ndim != 2:
+            return None
+        if is_small(x, window):
+            return small_extrema(x, pick, window)
+        if x.is_cuda or x.numel() < (_LARGE_BLOCK if window.to_end else _LARGE):
+            return None
         out: Tensor = SlidingExtremum.apply(x, Asked(pick, window, TORCH))  # type: ignore[no-untyped-call]
         return out
 
-    def until(self, left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Tensor:
-        """Exact `until` and `release`; one of several equal operands gets the gradient."""
+    def until(self, left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Tensor | None:
+        """Exact `until` and `release`; one of several equal operands may get all of the gradient."""
+        if left.ndim != 2 or left.is_cuda:
+            return None
+        if is_small(left, window):
+            return small_until(left, right, pick, window)
+        if left.numel() < _LARGE_UNTIL and not window.to_end:
+            return None
         out: Tensor = SlidingUntil.apply(left, right, Asked(pick, window, TORCH))  # type: ignore[no-untyped-call]
         return out
 

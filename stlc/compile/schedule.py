@@ -7,12 +7,13 @@ same instants are one program.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias, assert_never
 
 from stlc.compile import ir
 from stlc.compile.arith import Program
+from stlc.compile.ops import Array
 from stlc.compile.samples import Reach, reach_of
 
 End: TypeAlias = Literal["strict", "truncate", "lower", "upper"]
@@ -117,6 +118,10 @@ class Batch:
     program: Program
 
 
+Runner: TypeAlias = Callable[..., Array]
+"""What computes a step."""
+
+
 @dataclass(frozen=True, slots=True)
 class Schedule:
     """What to compute, in order.
@@ -128,6 +133,7 @@ class Schedule:
         atoms: step of a predicate -> (batch, name of the output, at which instants it has a value); absent
             where it has none.
         roots: steps of the formulas that were asked for.
+        runners: what computes the steps, by semantics and array library; made when it is first needed.
     """
 
     extent: Extent
@@ -135,6 +141,7 @@ class Schedule:
     steps: tuple[Step, ...]
     atoms: dict[int, tuple[int, str, Run]]
     roots: tuple[int, ...]
+    runners: dict[Hashable, tuple[Runner, ...]] = field(default_factory=dict, compare=False, repr=False)
 
 
 def schedule(formulas: Sequence[ir.Formula], run: Run, extent: Extent) -> Schedule:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
 from typing import ClassVar, final
 
 from stlc.compile.extremum import Pick
@@ -28,11 +27,11 @@ class Exact(Associative):
 
     def pair(self, a: Array, b: Array, pick: Pick, ops: Ops) -> Array:
         """The extremum of two values."""
-        return ops.minimum(a, b) if pick == "min" else ops.maximum(a, b)
+        return ops.join([a, b], pick)
 
     def join(self, items: Sequence[Array], pick: Pick, ops: Ops) -> Array:
         """The extremum of one or more values."""
-        return reduce(ops.minimum if pick == "min" else ops.maximum, items)
+        return ops.join(items, pick)
 
     def reduce(self, x: Array, pick: Pick, ops: Ops) -> Array:
         """The extremum over time."""

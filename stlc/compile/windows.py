@@ -29,21 +29,21 @@ class Windows:
 
     def padded(self, x: Array, rows: int, value: float) -> Array:
         """The first `rows` rows of `x`, with rows of `value` behind it where it is shorter."""
-        if len(x) >= rows:
-            return x[:rows] if len(x) > rows else x
-        missing = self.ops.full((rows - len(x), *x.shape[1:]), value, x)
-        return self.ops.cat([x, missing]) if len(x) else missing
+        if x.shape[0] >= rows:
+            return x[:rows] if x.shape[0] > rows else x
+        missing = self.ops.full((rows - x.shape[0], *x.shape[1:]), value, x)
+        return self.ops.cat([x, missing]) if x.shape[0] else missing
 
     def extrema(self, x: Array, pick: Pick, *, count: int, width: int) -> Array:
         """`count` windows of `width` rows: `(time, batch)` -> `(count, batch)`."""
-        rows = len(x)
+        rows = x.shape[0]
         width = min(width, max(rows, 1))
         if count == 1 and rows:
             return self.semantics.reduce(self.padded(x, width, neutral(pick)), pick, self.ops)
         if self.semantics.exact and rows:
-            window = Sliding(rows, min(count, rows), width)
-            if self.ops.slides(x, window):
-                return self.padded(self.ops.extrema(x, pick, window), count, neutral(pick))
+            found = self.ops.extrema(x, pick, Sliding(rows, min(count, rows), width))
+            if found is not None:
+                return self.padded(found, count, neutral(pick))
         if width >= rows > 1 and self.semantics.idempotent:
             return self.padded(self._to_end(x, pick), count, neutral(pick))
         return self._doubling(self.padded(x, count + width - 1, neutral(pick)), pick, width)
@@ -74,7 +74,7 @@ class Windows:
 
     def _merged(self, a: Parts, b: Parts, shift: int, pick: Pick) -> Parts:
         """The pieces that start at a row, and `shift` rows later."""
-        rows = min(len(a[0]), len(b[0]) - shift)
+        rows = min(a[0].shape[0], b[0].shape[0] - shift)
         return self.semantics.merge(
             tuple(part[:rows] for part in a), tuple(part[shift : shift + rows] for part in b), pick, self.ops
         )
@@ -95,16 +95,16 @@ class Windows:
         Returns:
             `(count, batch)`
         """
-        rows = len(left)
+        rows = left.shape[0]
         width = min(width, max(rows, 1))
         if not self.semantics.associative:
             return self._until_by_offset(left, right, pick, count, width)
         if count == 1 and rows:
             return self._until_once(left[:width], right[:width], pick)
         if self.semantics.exact and rows:
-            window = Sliding(rows, min(count, rows), width)
-            if self.ops.slides(left, window):
-                return self.padded(self.ops.until(left, right, pick, window), count, neutral(pick))
+            found = self.ops.until(left, right, pick, Sliding(rows, min(count, rows), width))
+            if found is not None:
+                return self.padded(found, count, neutral(pick))
         if width >= rows > 0 and (rows <= _SCAN_BATCH or left[0].shape[0] >= _SCAN_BATCH):
             return self.padded(self._until_to_end(left, right, pick, min(rows, count)), count, neutral(pick))
         left = self.padded(left, count + width - 1, neutral(dual(pick)))
@@ -114,7 +114,7 @@ class Windows:
     def _until_once(self, left: Array, right: Array, pick: Pick) -> Array:
         pair, other = self.semantics.pair, dual(pick)
         if not self.semantics.idempotent:
-            return self._until_doubling(left, pair(left, right, other, self.ops), pick, len(left))
+            return self._until_doubling(left, pair(left, right, other, self.ops), pick, left.shape[0])
         held = (self.ops.cummin if pick == "max" else self.ops.cummax)(left)
         return self.semantics.reduce(pair(held, right, other, self.ops), pick, self.ops)
 
@@ -137,7 +137,7 @@ class Windows:
         pair, other = self.semantics.pair, dual(pick)
         row = pair(left[-1:], right[-1:], other, self.ops)
         out = [row]
-        for t in range(len(left) - 2, -1, -1):
+        for t in range(left.shape[0] - 2, -1, -1):
             reached = pair(right[t : t + 1], row, pick, self.ops)
             row = pair(left[t : t + 1], reached, other, self.ops)
             out.append(row)
@@ -163,7 +163,7 @@ class Windows:
 
     def _composed(self, a: tuple[Array, Array], b: tuple[Array, Array], pick: Pick) -> tuple[Array, Array]:
         """First window `a`, then window `b`: `left` holds through both, or it is met in one of them."""
-        rows = min(len(a[0]), len(b[0]))
+        rows = min(a[0].shape[0], b[0].shape[0])
         pair, other = self.semantics.pair, dual(pick)
         later = pair(a[0][:rows], b[1][:rows], other, self.ops)
         met = pair(a[1][:rows], later, pick, self.ops)

@@ -15,6 +15,11 @@ from stlc.compile import extremum, scans
 from stlc.compile.extremum import Pick, Sliding
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.ops_torch import TORCH
+from stlc.compile.ops_torch_small import small_extrema, small_until
+from stlc.compile.ops_torch_windows import SlidingExtremum, SlidingUntil
+from stlc.compile.semantics import Exact
+from stlc.compile.sliding import Asked, extrema, until
+from stlc.compile.windows import Windows
 
 BOTH = pytest.mark.parametrize("pick", ["min", "max"])
 
@@ -53,6 +58,14 @@ def until_by_loops(left: torch.Tensor, right: torch.Tensor, pick: Pick, window: 
     return torch.stack(out)
 
 
+def sliding_extrema(x: torch.Tensor, pick: Pick, window: Sliding) -> torch.Tensor:
+    return SlidingExtremum.apply(x, Asked(pick, window, TORCH))
+
+
+def sliding_until(left: torch.Tensor, right: torch.Tensor, pick: Pick, window: Sliding) -> torch.Tensor:
+    return SlidingUntil.apply(left, right, Asked(pick, window, TORCH))
+
+
 def gradients(
     function: Callable[..., torch.Tensor], operands: list[torch.Tensor], seed: int
 ) -> list[torch.Tensor]:
@@ -73,20 +86,57 @@ def random(window: Sliding, seed: int, batch: int = 3) -> torch.Tensor:
 @given(window=windows(), seed=st.integers(0, 999))
 def test_values_and_gradients_are_those_of_loops(pick: Pick, window: Sliding, seed: int) -> None:
     x, y = random(window, seed).requires_grad_(), random(window, seed + 1).requires_grad_()
-    value, wanted = TORCH.extrema(x, pick, window), extrema_by_loops(x, pick, window)
+    value, wanted = sliding_extrema(x, pick, window), extrema_by_loops(x, pick, window)
     assert torch.equal(value, wanted)
-    np.testing.assert_array_equal(NUMPY.extrema(x.detach().numpy(), pick, window), wanted.detach())
-    mine = gradients(lambda x: TORCH.extrema(x, pick, window), [x], seed)
+    np.testing.assert_array_equal(extrema(x.detach().numpy(), Asked(pick, window, NUMPY)), wanted.detach())
+    mine = gradients(lambda x: sliding_extrema(x, pick, window), [x], seed)
     theirs = gradients(lambda x: extrema_by_loops(x, pick, window), [x], seed)
     torch.testing.assert_close(mine, theirs, atol=1e-12, rtol=1e-12)
 
-    value, wanted = TORCH.until(x, y, pick, window), until_by_loops(x, y, pick, window)
+    value, wanted = sliding_until(x, y, pick, window), until_by_loops(x, y, pick, window)
     assert torch.equal(value, wanted)
-    plain = NUMPY.until(x.detach().numpy(), y.detach().numpy(), pick, window)
+    plain = until(x.detach().numpy(), y.detach().numpy(), Asked(pick, window, NUMPY))
     np.testing.assert_array_equal(plain, wanted.detach())
-    mine = gradients(lambda x, y: TORCH.until(x, y, pick, window), [x, y], seed)
+    mine = gradients(lambda x, y: sliding_until(x, y, pick, window), [x, y], seed)
     theirs = gradients(lambda x, y: until_by_loops(x, y, pick, window), [x, y], seed)
     torch.testing.assert_close(mine, theirs, atol=1e-12, rtol=1e-12)
+
+
+@BOTH
+@settings(max_examples=40)
+@given(window=windows(), seed=st.integers(0, 999))
+def test_windows_side_by_side_are_those_of_loops(pick: Pick, window: Sliding, seed: int) -> None:
+    x, y = random(window, seed).requires_grad_(), random(window, seed + 1).requires_grad_()
+    assert torch.equal(small_extrema(x, pick, window), extrema_by_loops(x, pick, window))
+    assert torch.equal(small_until(x, y, pick, window), until_by_loops(x, y, pick, window))
+    mine = gradients(lambda x, y: small_until(x, y, pick, window), [x, y], seed)
+    theirs = gradients(lambda x, y: until_by_loops(x, y, pick, window), [x, y], seed)
+    torch.testing.assert_close(mine, theirs, atol=1e-12, rtol=1e-12)
+
+
+@pytest.mark.parametrize("batch", [1, 40, 3000])
+@pytest.mark.parametrize("width", [3, 40, 200])
+@BOTH
+def test_every_size_goes_the_same_way(pick: Pick, width: int, batch: int) -> None:
+    """Small, middling and large arrays take different methods, or leave it to others: all agree."""
+    window = Sliding(70, 70, width)
+    x, y = random(window, 0, batch).requires_grad_(), random(window, 1, batch).requires_grad_()
+    for ops, p, q in ((TORCH, x, y), (NUMPY, x.detach().numpy(), y.detach().numpy())):
+        exact = Windows(Exact(), ops)
+        value = exact.extrema(p, pick, count=70, width=width)
+        np.testing.assert_array_equal(plain(value), extrema_by_loops(x, pick, window).detach())
+        value = exact.until(p, q, pick, count=70, width=width)
+        np.testing.assert_array_equal(plain(value), until_by_loops(x, y, pick, window).detach())
+    mine = gradients(lambda x: Windows(Exact(), TORCH).extrema(x, pick, count=70, width=width), [x], 5)
+    theirs = gradients(lambda x: extrema_by_loops(x, pick, window), [x], 5)
+    torch.testing.assert_close(mine, theirs, atol=1e-10, rtol=1e-10)
+    mine = gradients(lambda x, y: Windows(Exact(), TORCH).until(x, y, pick, count=70, width=width), [x, y], 5)
+    theirs = gradients(lambda x, y: until_by_loops(x, y, pick, window), [x, y], 5)
+    torch.testing.assert_close(mine, theirs, atol=1e-10, rtol=1e-10)
+
+
+def plain(value: torch.Tensor | np.ndarray) -> np.ndarray:
+    return value.detach().numpy() if isinstance(value, torch.Tensor) else value
 
 
 @pytest.mark.usefixtures("_layout")
@@ -97,13 +147,13 @@ def test_gradients_where_operands_tie_are_subgradients(pick: Pick, window: Slidi
     """The gradient of every window goes, whole, to operands that have its value."""
     x, y = random(window, seed).round_().requires_grad_(), random(window, seed + 1).round_().requires_grad_()
     for j in range(window.count):
-        (row,) = torch.autograd.grad(TORCH.extrema(x, pick, window)[j].sum(), [x])
+        (row,) = torch.autograd.grad(sliding_extrema(x, pick, window)[j].sum(), [x])
         assert (row.sum(0) == 1).all()
         inside = torch.zeros(window.rows, 1, dtype=torch.bool)
         inside[j : j + window.width] = True
         value = extrema_by_loops(x, pick, window)[j]
         assert ((row == 0) | inside & (x == value)).all()
-        left, right = torch.autograd.grad(TORCH.until(x, y, pick, window)[j].sum(), [x, y])
+        left, right = torch.autograd.grad(sliding_until(x, y, pick, window)[j].sum(), [x, y])
         assert (left.sum(0) + right.sum(0) == 1).all()
         value = until_by_loops(x, y, pick, window)[j]
         assert ((left == 0) | inside & (x == value)).all()
@@ -115,8 +165,8 @@ def test_gradients_where_operands_tie_are_subgradients(pick: Pick, window: Slidi
 def test_gradients_are_central_differences(pick: Pick, width: int) -> None:
     window = Sliding(50, 48, width)
     x, y = random(window, 0).requires_grad_(), random(window, 1).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: TORCH.extrema(x, pick, window), (x,))
-    assert torch.autograd.gradcheck(lambda x, y: TORCH.until(x, y, pick, window), (x, y))
+    assert torch.autograd.gradcheck(lambda x: sliding_extrema(x, pick, window), (x,))
+    assert torch.autograd.gradcheck(lambda x, y: sliding_until(x, y, pick, window), (x, y))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -126,16 +176,16 @@ def test_any_layout_of_the_operands_will_do(dtype: torch.dtype) -> None:
     x = random(window, 2, batch=4).to(dtype)
     wanted = extrema_by_loops(x, "min", window)
     turned = x.T.contiguous().T.requires_grad_()
-    value = TORCH.extrema(turned, "min", window)
+    value = sliding_extrema(turned, "min", window)
     assert value.dtype == dtype
     assert torch.equal(value, wanted)
     value.sum().backward()
     assert torch.equal(turned.grad.sum(0), torch.full((4,), 30.0, dtype=dtype))
     one = x[:, :1].expand(-1, 4)
-    assert torch.equal(TORCH.until(one, x, "max", window), until_by_loops(one, x, "max", window))
+    assert torch.equal(sliding_until(one, x, "max", window), until_by_loops(one, x, "max", window))
     with torch.inference_mode():
-        assert torch.equal(TORCH.extrema(x, "min", window), wanted)
-    assert torch.equal(TORCH.extrema(x, "min", window), wanted)
+        assert torch.equal(sliding_extrema(x, "min", window), wanted)
+    assert torch.equal(sliding_extrema(x, "min", window), wanted)
 
 
 def test_infinite_operands_are_neutral() -> None:
@@ -143,7 +193,7 @@ def test_infinite_operands_are_neutral() -> None:
     window = Sliding(6, 6, 3)
     inf = torch.inf
     x = torch.tensor([inf, 2.0, inf, inf, inf, 1.0], dtype=torch.float64)[:, None].requires_grad_()
-    value = TORCH.extrema(x, "min", window)
+    value = sliding_extrema(x, "min", window)
     assert value.flatten().tolist() == [2.0, 2.0, inf, 1.0, 1.0, 1.0]
     value[torch.isfinite(value)].sum().backward()
     assert x.grad.flatten().tolist() == [0.0, 2.0, 0.0, 0.0, 0.0, 3.0]
