@@ -118,6 +118,8 @@ CODES: dict[str, str] = {
     "E103": "a signal that the system does not have",
     "E104": "a constant that differs between specification and system",
     "E105": "a definition that refers to itself, or wrong arguments",
+    "W105": "a name that is declared and never used",
+    "W106": "a word or sign of another tool, where the language has its own",
     # types and units
     "E201": "a number where a formula is needed",
     "E202": "a formula where a number is needed",
@@ -126,6 +128,8 @@ CODES: dict[str, str] = {
     "E205": "an operation that its operands do not have",
     # time
     "E301": "an interval that ends before it starts",
+    "W301": "a formula that other tools read differently without parentheses",
+    "W302": "an implication beside `and` or `or` without parentheses",
     "E302": "a future operator with a negative bound",
     "E303": "an interval bound that is not a constant",
     "W304": "an interval bound that is not a whole number of steps",
@@ -145,6 +149,7 @@ CODES: dict[str, str] = {
     "E501": "an unknown or misplaced tag",
     "W502": "a safety requirement that cannot constrain a prefix",
     "W503": "a requirement that is satisfied vacuously",
+    "W504": "a specification that requires nothing",
     # traces
     "E601": "a trace that lacks a signal",
     "E602": "a trace whose time is not uniform",

@@ -79,7 +79,9 @@ def show(run: _Run = "latest", runs: _Runs = RUNS, as_json: JsonOption = False) 
         emit_json("runs/1", ok=True, exit_code=0, result=result)
         return
     emit(folder.shown)
-    emit(table([(key, value) for key, value in flattened(record).items()]))
+    facts = flattened(record)
+    width = max(map(len, facts), default=0)
+    emit("\n".join(f"  {key:<{width}}  {value}" for key, value in facts.items()))
     emit("files\n" + "\n".join(f"  {name}" for name in files))
 
 
