@@ -24,7 +24,7 @@ ROOMS = (
     {"diagnostics"},
     {"registry", "units", "words", "jsontext"},
     {"signature"},
-    {"rundir", "files", "provenance", "trace", *TRACE_FORMATS},
+    {"rundir", "files", "provenance", "native", "trace", *TRACE_FORMATS},
     {"grammar"},
     {"compile"},
     {"lint"},
@@ -53,6 +53,7 @@ HOMES = {
     "PIL": ("stlc.view",),
     "numpy": (
         "stlc.trace",
+        "stlc.native",
         "stlc.compile",
         "stlc.dynamics",
         "stlc.monitor",

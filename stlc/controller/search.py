@@ -71,7 +71,7 @@ class Searcher:
             bank: plans that solved other states, (k, T, m); may be empty.
             efforts: one after the other; each works on what is still unsolved.
         """
-        found = Repaired(plans.clone(), self.task.judge(x0, plans).rho.clone())
+        found = Repaired(plans.clone(), self.task.judge(x0, plans, states=False).rho.clone())
         for effort in efforts:
             for _ in range(effort.rounds):
                 still = (found.rho < self.enough).nonzero()[:, 0]
@@ -84,7 +84,7 @@ class Searcher:
     def _keep_better(self, x0: Tensor, found: Repaired, still: Tensor, tried: Tensor) -> None:
         """Judge plans (k, tries, T, m) for the states `still`, (k,), and update `found` in place."""
         tries = tried.shape[1]
-        judged = self.task.judge(x0[still].repeat_interleave(tries, 0), tried.flatten(0, 1))
+        judged = self.task.judge(x0[still].repeat_interleave(tries, 0), tried.flatten(0, 1), states=False)
         value, which = judged.rho.view(-1, tries).max(1)
         better = (value > found.rho[still]).nonzero()[:, 0]
         rows = still[better]

@@ -16,6 +16,7 @@ from stlc.compile.ops_torch import TORCH
 from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics import TOLERANCE
 from stlc.compile.switch import Hard, Switch
+from stlc.controller.kernel import NativeJudge
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -152,20 +153,24 @@ class Task:
         each: Tensor = self.graph.per_requirement(x, smoothing)
         return each
 
-    def judge(self, x0: Tensor, u: Tensor) -> Judged:
+    @cached_property
+    def _native(self) -> NativeJudge | None:
+        return NativeJudge.of(self)
+
+    def judge(self, x0: Tensor, u: Tensor, *, states: bool = True) -> Judged:
         """Roll plans out exactly and judge them, without gradient.
 
         Args:
             x0: initial states, (B, n).
             u: plans in physical units, (B, T, m).
+            states: whether the predicted states are wanted; `cost` needs them.
 
         Returns:
             The verdicts, in the dtype of `x0`. A plan that holds NaN counts as violated (robustness -inf).
         """
         with torch.no_grad():
             u = u.to(x0.dtype)
-            columns = self.system.rollout_columns(x0, u, HARD)
-            each = self.graph.per_requirement_columns(columns, ops=TORCH)
+            each, columns = self._judged(x0, u, states=states)
             rho = self.graph.overall(each)
             safe = self.safety.overall(each[:, self._safe_indices])
         broken = ~torch.isfinite(u).all(2).all(1) | torch.isnan(rho)
@@ -174,6 +179,13 @@ class Task:
             rho, safe = torch.where(broken, lost, rho), torch.where(broken, lost, safe)
             each = torch.where(broken[:, None], lost[:, None], each)
         return Judged(rho, safe, each, u, columns)
+
+    def _judged(self, x0: Tensor, u: Tensor, *, states: bool) -> tuple[Tensor, Mapping[str, Tensor]]:
+        """Robustness per requirement and states, by the native kernel where it can."""
+        if x0.device.type == "cpu" and self._native is not None:
+            return self._native.judge(x0, u, columns=states)
+        columns = self.system.rollout_columns(x0, u, HARD)
+        return self.graph.per_requirement_columns(columns, ops=TORCH), columns
 
     def cost(self, judged: Judged) -> Tensor:
         """Performance terms of judged plans, as if every one were satisfying, without gradient: (batch,)."""

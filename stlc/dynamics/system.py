@@ -171,6 +171,12 @@ class System:
         """What moves the timers."""
         return Stepper(Step((), {timer.name: timer.update for timer in self.timers}))
 
+    @cached_property
+    def exact_step(self) -> Step:
+        """One exact step in the IR, timers included, for those who compile it."""
+        step = build_step(self.decl, soft=False)
+        return Step(step.lets, {**step.next, **{timer.name: timer.update for timer in self.timers}})
+
     def _stepper(self, switch: Switch) -> Stepper:
         soft = not switch.exact
         if soft not in self._steppers:

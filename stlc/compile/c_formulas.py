@@ -1,0 +1,129 @@
+"""Formulas of the IR as C: exact robustness at the first sample, over columns that a rollout has filled.
+
+Values of a sub-formula at `count` instants stand in a buffer `[count][LANES]`; the innermost loop runs over
+trajectories, so every line of it becomes vector code. Only the instants that the root needs are computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import assert_never
+
+from stlc.compile import ir
+from stlc.compile.c_numbers import NumberWriter, Untranslatable
+
+
+@dataclass(slots=True)
+class FormulaWriter:
+    """Writes formulas over trajectories of `samples` samples.
+
+    Attributes:
+        samples: T + 1.
+        column: C expression of an environment entry at sample `k`, lane `j`.
+        lines: statements written so far.
+        size: doubles that the buffers take per lane.
+    """
+
+    samples: int
+    column: Callable[[str], str]
+    lines: list[str] = field(default_factory=list)
+    size: int = 0
+    _known: dict[tuple[ir.Formula, int, int], str] = field(default_factory=dict)
+
+    def value(self, formula: ir.Formula, start: int = 0, count: int = 1) -> str:
+        """The buffer with the robustness of a formula at `count` instants from `start` on."""
+        key = (formula, start, count)
+        known = self._known.get(key)
+        if known is None:
+            if start < 0 or start + count > self.samples:
+                raise Untranslatable("a window that leaves the plan")
+            known = self._known[key] = self._value(formula, start, count)
+        return known
+
+    def _value(self, formula: ir.Formula, start: int, count: int) -> str:
+        match formula:
+            case ir.Truth(value):
+                return self._fill(count, "INFINITY" if value else "(-INFINITY)")
+            case ir.Atom():
+                return self._atom(formula, start, count)
+            case ir.Join(op, items):
+                pick = "MIN" if op == "and" else "MAX"
+                parts = [self.value(item, start, count) for item in items]
+                text = f"{parts[0]}[k][j]"
+                for part in parts[1:]:
+                    text = f"{pick}({text}, {part}[k][j])"
+                return self._fill(count, text)
+            case ir.Over(op, window, body):
+                return self._window("MIN" if op == "always" else "MAX", window, body, start, count)
+            case ir.Until(op, window, left, right):
+                return self._until(op == "until", window, (left, right), (start, count))
+            case ir.Past() | ir.Since() | ir.Shift() | ir.Freeze():
+                raise Untranslatable(type(formula).__name__)
+            case _:
+                assert_never(formula)
+
+    def _atom(self, atom: ir.Atom, start: int, count: int) -> str:
+        writer = NumberWriter(self.column)
+        margin = writer.number(atom.num)
+        value = margin if atom.sign > 0 else f"(-{margin})"
+        if atom.guard:
+            value = f"({value} {'>' if atom.strict else '>='} 0.0 ? INFINITY : -INFINITY)"
+        return self._fill(count, value, before=[*writer.lines, f"bad[j] += NAN_IN({value});"], first=start)
+
+    def _last(self, window: ir.Window, start: int, count: int) -> int:
+        """Last sample that the window of the last instant reaches."""
+        return self.samples - 1 if window.hi is None else start + count - 1 + window.hi
+
+    def _window(self, pick: str, window: ir.Window, body: ir.Formula, start: int, count: int) -> str:
+        first, last = start + window.lo, self._last(window, start, count)
+        inner = self.value(body, first, last - first + 1)
+        end = f"{last - first + 1}" if window.hi is None else f"k + {window.hi - window.lo + 1}"
+        name = self._buffer(count)
+        self.lines += [
+            f"for (int k = 0; k < {count}; ++k) {{",
+            f"  LANE {name}[k][j] = {inner}[k][j];",
+            f"  for (int i = k + 1; i < {end}; ++i) LANE {name}[k][j] = {pick}({name}[k][j], {inner}[i][j]);",
+            "}",
+        ]
+        return name
+
+    def _until(
+        self, until: bool, window: ir.Window, sides: tuple[ir.Formula, ir.Formula], at: tuple[int, int]
+    ) -> str:
+        (left, right), (start, count) = sides, at
+        last = self._last(window, start, count)
+        span = last - start + 1
+        hold, goal = self.value(left, start, span), self.value(right, start, span)
+        inner, outer, worst = ("MIN", "MAX", "-INFINITY") if until else ("MAX", "MIN", "INFINITY")
+        end = f"{span}" if window.hi is None else f"k + {window.hi + 1}"
+        name, run = self._buffer(count), self._buffer(1)
+        self.lines += [
+            f"for (int k = 0; k < {count}; ++k) {{",
+            f"  LANE {{ {name}[k][j] = {worst}; {run}[0][j] = -({worst}); }}",
+            f"  for (int i = k; i < {end}; ++i) LANE {{",
+            f"    {run}[0][j] = {inner}({run}[0][j], {hold}[i][j]);",
+            f"    const double both = {inner}({goal}[i][j], {run}[0][j]);",
+            f"    {name}[k][j] = i >= k + {window.lo} ? {outer}({name}[k][j], both) : {name}[k][j];",
+            "  }",
+            "}",
+        ]
+        return name
+
+    def _fill(self, count: int, value: str, *, before: list[str] | None = None, first: int = 0) -> str:
+        name = self._buffer(count)
+        body = " ".join([*(before or []), f"{name}[s][j] = {value};"])
+        if first or before is not None:
+            loop = f"for (int s = 0, k = {first}; s < {count}; ++s, ++k) LANE {{ {body} }}"
+        else:
+            loop = f"for (int k = 0; k < {count}; ++k) LANE {name}[k][j] = {value};"
+        self.lines.append(loop)
+        return name
+
+    def _buffer(self, count: int) -> str:
+        name = f"b{len(self._known)}_{self.size}"
+        self.lines.append(
+            f"double (*restrict {name})[LANES] = (double (*)[LANES])(room + {self.size} * LANES);"
+        )
+        self.size += count
+        return name

@@ -1,0 +1,141 @@
+"""Numbers and state formulas of the IR as C expressions, common parts once.
+
+A writer turns `ir.Num` into statements `const double r7 = …;` on scalars, free of branches, so that a
+compiler can run a loop over trajectories around them as vector code.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import reduce
+from typing import assert_never
+
+from stlc.compile import ir
+
+UNARY = {
+    "neg": "(-{0})",
+    "abs": "fabs({0})",
+    "square": "({0} * {0})",
+    "relu": "MAX({0}, 0.0)",
+    "sign": "(double)(({0} > 0.0) - ({0} < 0.0))",
+    "floor": "floor({0})",
+    "ceil": "ceil({0})",
+    "round": "rint({0})",
+    "sqrt": "sqrt({0})",
+    "exp": "exp({0})",
+    "log": "log({0})",
+    "sin": "sin({0})",
+    "cos": "cos({0})",
+    "tan": "tan({0})",
+    "asin": "asin({0})",
+    "acos": "acos({0})",
+    "atan": "atan({0})",
+}
+BINARY = {
+    "add": "({0} + {1})",
+    "sub": "({0} - {1})",
+    "mul": "({0} * {1})",
+    "div": "({0} / {1})",
+    "mod": "floored_mod({0}, {1})",
+    "pow": "pow({0}, {1})",
+    "atan2": "atan2({0}, {1})",
+    "min": "MIN({0}, {1})",
+    "max": "MAX({0}, {1})",
+}
+
+
+class Untranslatable(Exception):  # noqa: N818 - not an error: another back end takes over
+    """The IR holds something that has no C form, such as a function that the system provides."""
+
+
+class NumberWriter:
+    """Writes numbers as C statements; equal numbers get one register.
+
+    Args:
+        column: C expression of an environment entry.
+    """
+
+    def __init__(self, column: Callable[[str], str]) -> None:
+        self.lines: list[str] = []
+        self._column = column
+        self._known: dict[ir.Num, str] = {}
+        self._texts: dict[str, str] = {}
+
+    def number(self, num: ir.Num) -> str:
+        """The C name of a number, its statements written."""
+        known = self._known.get(num)
+        if known is None:
+            known = self._known[num] = self._number(num)
+        return known
+
+    def assign(self, name: str, value: str) -> None:
+        """From now on the environment entry `name` is the C expression `value`."""
+        self._known[ir.Col(name)] = value
+
+    def truth(self, cond: ir.Formula) -> str:
+        """A C condition, 0 or 1: exact, every atom with its own strictness."""
+        match cond:
+            case ir.Truth(value):
+                return "1" if value else "0"
+            case ir.Atom(num, sign, strict):
+                op = (">" if sign > 0 else "<") + ("" if strict else "=")
+                return f"({self.number(num)} {op} 0.0)"
+            case ir.Join(op, items):
+                return "(" + (" & " if op == "and" else " | ").join(map(self.truth, items)) + ")"
+            case _:
+                raise Untranslatable(type(cond).__name__)
+
+    def _number(self, num: ir.Num) -> str:
+        match num:
+            case ir.Lit(value):
+                return literal(value)
+            case ir.Col(name):
+                return self._register(self._column(name))
+            case ir.Op(name, args):
+                return self._op(name, [self.number(arg) for arg in args])
+            case ir.Ind(cond):
+                return self._register(f"(double){self.truth(cond)}")
+            case ir.Where(cond, yes, no):
+                return self._register(f"{self.truth(cond)} ? {self.number(yes)} : {self.number(no)}")
+            case ir.Extern(name) | ir.At(name) | ir.Held(name):
+                raise Untranslatable(name)
+            case _:
+                assert_never(num)
+
+    def _op(self, name: str, args: list[str]) -> str:
+        if name in UNARY and len(args) == 1:
+            return self._register(UNARY[name].format(*args))
+        if name in ("min", "max") and len(args) == 1:
+            return args[0]
+        if name in BINARY:
+            return reduce(lambda a, b: self._register(BINARY[name].format(a, b)), args)
+        match name:
+            case "clip":
+                return self._register(f"MIN(MAX({args[0]}, {args[1]}), {args[2]})")
+            case "norm":
+                squares = " + ".join(f"{arg} * {arg}" for arg in args)
+                return self._register(f"sqrt({squares})")
+            case "norm1":
+                return self._register("(" + " + ".join(f"fabs({arg})" for arg in args) + ")")
+            case "norminf":
+                sizes = [self._register(f"fabs({arg})") for arg in args]
+                return reduce(lambda a, b: self._register(f"MAX({a}, {b})"), sizes)
+            case _:
+                raise Untranslatable(name)
+
+    def _register(self, text: str) -> str:
+        known = self._texts.get(text)
+        if known is None:
+            known = self._texts[text] = f"r{len(self._texts)}"
+            self.lines.append(f"const double {known} = {text};")
+        return known
+
+
+def literal(value: float) -> str:
+    """A double as C reads it back, bit for bit."""
+    if math.isnan(value):
+        raise Untranslatable("nan")
+    if math.isinf(value):
+        return "INFINITY" if value > 0 else "(-INFINITY)"
+    return f"({value.hex()})"

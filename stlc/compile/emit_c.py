@@ -1,0 +1,141 @@
+"""Dynamics and requirements -> one C translation unit: rollout, exact robustness, performance.
+
+The same IR as the torch graph, exact switching, double precision, `LANES` trajectories at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from stlc.compile import ir
+from stlc.compile.c_formulas import FormulaWriter
+from stlc.compile.c_numbers import NumberWriter
+
+LANES = 16
+
+_HEAD = f"""
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+
+#define LANES {LANES}
+#define LANE for (int j = 0; j < LANES; ++j)
+#define MIN(a, b) ((b) < (a) ? (b) : (a)) /* a where it is NaN */
+#define MAX(a, b) ((b) > (a) ? (b) : (a))
+#define NAN_IN(a) ((double)((a) != (a)))
+
+static inline double floored_mod(double a, double b) {{
+  const double r = a - b * floor(a / b);
+  return r;
+}}
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """One step of a system, straight-line code that reads states, controls and earlier assignments.
+
+    Attributes:
+        states: names of the state columns, in order.
+        controls: names of the inputs, in order.
+        lets: (name, number), in order.
+        next: name of a state that moves -> what it is one step later.
+        steps: of a plan.
+        dt: seconds of a step.
+    """
+
+    states: tuple[str, ...]
+    controls: tuple[str, ...]
+    lets: tuple[tuple[str, ir.Num], ...]
+    next: Mapping[str, ir.Num]
+    steps: int
+    dt: float
+
+
+def emit(motion: Motion, formulas: Sequence[ir.Formula]) -> str:
+    """The C text of `judge`; see `stlc.native` for its signature.
+
+    Raises:
+        Untranslatable: the IR holds something that has no C form.
+    """
+    checks = FormulaWriter(motion.steps + 1, lambda name: f"x[{motion.states.index(name)}][k][j]")
+    values = [checks.value(formula) for formula in formulas]
+    states, rules, steps = len(motion.states), len(formulas), motion.steps
+    return "\n".join(
+        [
+            _HEAD,
+            f"typedef double lanes[{steps + 1}][LANES];",
+            f"static void roll(lanes *restrict x, const double (*restrict u)[{steps}][LANES],",
+            "                 double *restrict bad) {",
+            f"  for (int k = 0; k < {steps}; ++k) LANE {{",
+            *(f"    {line}" for line in _step(motion)),
+            "  }",
+            "}",
+            "static void check(const lanes *restrict x, double *restrict room, double *restrict bad,",
+            "                  double (*restrict out)[LANES]) {",
+            *(f"  {line}" for line in checks.lines),
+            *(f"  LANE out[{i}][j] = {value}[0][j];" for i, value in enumerate(values)),
+            "}",
+            _DRIVER.format(
+                states=states,
+                controls=len(motion.controls),
+                steps=steps,
+                rules=rules,
+                room=max(checks.size, 1),
+            ),
+        ]
+    )
+
+
+def _step(motion: Motion) -> list[str]:
+    """The body of a step: sample k to sample k + 1 of one lane."""
+    index = {name: i for i, name in enumerate(motion.states)}
+
+    def column(name: str) -> str:
+        if name in index:
+            return f"x[{index[name]}][k][j]"
+        return f"u[{motion.controls.index(name)}][k][j]"
+
+    writer = NumberWriter(column)
+    for name, num in motion.lets:
+        writer.assign(name, writer.number(num))
+    after = {name: writer.number(num) for name, num in motion.next.items()}
+    moved = [
+        f"x[{index[name]}][k + 1][j] = {value}; bad[j] += NAN_IN({value});" for name, value in after.items()
+    ]
+    still = [f"x[{i}][k + 1][j] = x[{i}][k][j];" for name, i in index.items() if name not in after]
+    return [*writer.lines, *moved, *still]
+
+
+_DRIVER = """
+/* x0 (batch, {states}), u (batch, {steps}, {controls}) -> rho (batch, {rules}); columns
+   ({states}, {steps} + 1, batch) where asked for. Rows from `first` up to `last`. 1: no memory. */
+int judge(int64_t batch, int64_t first, int64_t last, const double *x0, const double *u, double *rho,
+          double *columns) {{
+  enum {{ N = {states}, M = {controls}, T = {steps}, R = {rules} }};
+  lanes *x = malloc(sizeof(lanes) * N);
+  double (*v)[T][LANES] = malloc(sizeof(double) * M * T * LANES);
+  double *room = malloc(sizeof(double) * {room} * LANES);
+  double (*out)[LANES] = malloc(sizeof(double) * (R + 1) * LANES);
+  if (!x || !v || !room || !out) {{ free(x); free(v); free(room); free(out); return 1; }}
+  for (int64_t at = first; at < last; at += LANES) {{
+    const int here = last - at < LANES ? (int)(last - at) : LANES;
+    for (int j = 0; j < LANES; ++j) {{
+      const int64_t row = at + (j < here ? j : 0);
+      for (int i = 0; i < N; ++i) x[i][0][j] = x0[row * N + i];
+      for (int k = 0; k < T; ++k) for (int i = 0; i < M; ++i) v[i][k][j] = u[(row * T + k) * M + i];
+    }}
+    double bad[LANES] = {{0}};
+    roll(x, (const double (*)[T][LANES])v, bad);
+    check(x, room, bad, out);
+    for (int j = 0; j < here; ++j) for (int i = 0; i < R; ++i)
+      rho[(at + j) * R + i] = bad[j] > 0.0 ? NAN : out[i][j];
+    if (columns)
+      for (int i = 0; i < N; ++i) for (int k = 0; k <= T; ++k) for (int j = 0; j < here; ++j)
+        columns[((int64_t)i * (T + 1) + k) * batch + at + j] = x[i][k][j];
+  }}
+  free(x); free(v); free(room); free(out);
+  return 0;
+}}
+"""

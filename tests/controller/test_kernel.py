@@ -1,0 +1,58 @@
+"""The native kernel and torch give the same verdicts, and torch takes over where there is no kernel."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from stlc import native
+from stlc.controller.kernel import NativeJudge
+from stlc.controller.task import Judged, Task
+from stlc.dynamics.system import System
+
+
+def _both(
+    task: Task, x0: torch.Tensor, u: torch.Tensor, monkeypatch: pytest.MonkeyPatch
+) -> tuple[Judged, Judged]:
+    fast = task.judge(x0, u)
+    monkeypatch.setattr(native, "compiler", lambda: None)
+    other = Task(task.compiled, System(task.system.decl))
+    assert NativeJudge.of(other) is None
+    return fast, other.judge(x0, u)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-9), (torch.float32, 2e-5)])
+def test_kernel_and_torch_agree(
+    car_task: Task, monkeypatch: pytest.MonkeyPatch, dtype: torch.dtype, tolerance: float
+) -> None:
+    assert NativeJudge.of(car_task) is not None
+    x0 = car_task.sample(3000, seed=1, dtype=dtype)
+    u = (
+        20.0 * torch.rand(3000, car_task.horizon, 1, generator=torch.Generator().manual_seed(2), dtype=dtype)
+        - 10.0
+    )
+    fast, slow = _both(car_task, x0, u, monkeypatch)
+    apart = (fast.requirements - slow.requirements).abs().amax(1)
+    near_tie = apart > tolerance  # a switch within rounding of its edge may fall to either side in float32
+    assert near_tie.double().mean() <= (0.0 if dtype == torch.float64 else 0.03)
+    assert fast.rho.dtype == slow.rho.dtype == dtype
+    for name in car_task.names:
+        gap = (fast.columns[name] - slow.columns[name]).abs().amax(0)
+        assert gap[~near_tie].max() <= tolerance
+    assert torch.allclose(car_task.cost(fast)[~near_tie], car_task.cost(slow)[~near_tie], atol=1e-4)
+
+
+def test_broken_plans_are_violated_in_both(car_task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
+    x0 = car_task.sample(4, seed=1, dtype=torch.float64)
+    x0[1, 1] = torch.nan
+    u = torch.zeros(4, car_task.horizon, 1, dtype=torch.float64)
+    u[2, 0] = torch.inf
+    for judged in _both(car_task, x0, u, monkeypatch):
+        assert torch.isneginf(judged.rho).tolist() == [False, True, True, False]
+
+
+def test_states_are_left_out_where_nobody_wants_them(car_task: Task) -> None:
+    x0 = car_task.sample(4, seed=1)
+    judged = car_task.judge(x0, torch.zeros(4, car_task.horizon, 1), states=False)
+    assert not judged.columns
+    assert torch.equal(judged.rho, car_task.judge(x0, judged.plans).rho)

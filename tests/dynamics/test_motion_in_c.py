@@ -1,0 +1,38 @@
+"""Rollouts of the emitted C equal torch's, for every feature of a system file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from dynamics.test_motion import RICH
+
+from stlc.compile.emit_c import Motion, emit
+from stlc.dynamics.step import build_step
+from stlc.dynamics.system import System
+from stlc.native import Kernel, build
+
+Make = Callable[..., System]
+
+
+@pytest.mark.parametrize("integrator", ["euler", "heun", "rk4"])
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_rollouts_of_a_rich_system_equal_torch(make: Make, integrator: str, substeps: int) -> None:
+    system = make(RICH.format(integrator=integrator, substeps=substeps))
+    step = build_step(system.decl, soft=False)
+    motion = Motion(system.names, system.control_names, step.lets, step.next, system.horizon, system.dt)
+    x0 = system.sample(300, seed=2, dtype=torch.float64)
+    span = system.control_high - system.control_low
+    generator = torch.Generator().manual_seed(3)
+    u = system.control_low + span * torch.rand(
+        300, system.horizon, 2, generator=generator, dtype=torch.float64
+    )
+    path = build(emit(motion, []))
+    assert path is not None
+    kernel = Kernel(path, states=len(motion.states), rules=0, steps=motion.steps)
+    _, columns = kernel.judge(x0.numpy(), u.numpy(), columns=True)
+    assert columns is not None
+    expected = system.rollout(x0, u).permute(2, 1, 0).numpy()
+    np.testing.assert_allclose(columns, expected, rtol=1e-9, atol=1e-9)
