@@ -12,6 +12,7 @@ from stlc.compile import ir
 from stlc.compile.emit_c import LANES, Motion, emit
 
 MOTION = Motion(("x",), ("u",), (), {"x": ir.Op("add", (ir.Col("x"), ir.Col("u")))}, 5, 0.1)
+pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
 RULES = [ir.Over("always", ir.Window(0, None), ir.Atom(ir.Col("x")))]
 
 

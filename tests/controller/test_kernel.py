@@ -10,6 +10,8 @@ from stlc.controller.kernel import NativeJudge
 from stlc.controller.task import Judged, Task
 from stlc.dynamics.system import System
 
+pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
+
 
 def _both(
     task: Task, x0: torch.Tensor, u: torch.Tensor, monkeypatch: pytest.MonkeyPatch

@@ -12,9 +12,10 @@ from dynamics.test_motion import RICH
 from stlc.compile.emit_c import Motion, emit
 from stlc.dynamics.step import build_step
 from stlc.dynamics.system import System
-from stlc.native import Kernel, build
+from stlc.native import Kernel, build, compiler
 
 Make = Callable[..., System]
+pytestmark = pytest.mark.skipif(compiler() is None, reason="there is no C compiler here")
 
 
 @pytest.mark.parametrize("integrator", ["euler", "heun", "rk4"])
