@@ -180,7 +180,7 @@ def in_range(
                 ends[0][0].span.to(ends[1][0].span),
             )
         )
-    if scope.product and "int" not in (x.kind, low.kind, high.kind):
+    if scope.product and x.kind != "int":
         sides = apply("sub", (x, low), span, scope), apply("sub", (high, x), span, scope)
         return typed.Pred(span, apply("mul", sides, span, scope).num, strict=False)
     above = _above(x, low, False, span, scope)

@@ -25,9 +25,12 @@ from stlc.compile.interface import Grid, Interface
 from stlc.compile.lift import recorded
 from stlc.compile.lower import lower
 from stlc.compile.mission import Goal, mission_steps
+from stlc.compile.modulo import jumps
 from stlc.compile.pull import pull
+from stlc.compile.ranges import Facts
 from stlc.compile.resolve import resolve
 from stlc.compile.safety import safe_part
+from stlc.compile.scales import nominal
 from stlc.compile.simplify import simplify
 from stlc.compile.timers import Ledger, Timer
 from stlc.compile.walk import absolute, mentions_horizon
@@ -143,7 +146,8 @@ def compile_spec(
     """
     sink: list[Diagnostic] = []
     resolved = resolve(spec, interface=interface, overrides=overrides or {}, sink=sink)
-    stage = _Stage(grid, purpose, Ledger(_taken(resolved, interface)), sink)
+    ranges = nominal(resolved.signature.columns)
+    stage = _Stage(grid, purpose, Ledger(_taken(resolved, interface)), sink, ranges)
     requirements = tuple(map(stage.rule, resolved.requirements))
     goals = tuple(stage.goals)
     assumptions = tuple(map(stage.rule, resolved.assumptions))
@@ -176,11 +180,14 @@ class _Stage:
     purpose: Purpose
     ledger: Ledger
     sink: list[Diagnostic]
+    ranges: Facts
     goals: list[Goal] = field(default_factory=list)
 
     def rule(self, requirement: typed.Requirement) -> Rule:
         """One requirement, compiled."""
         written = requirement.formula
+        if self.purpose == "train":
+            self.sink.extend(jumps(written, self.ranges))
         rewritten = self._rewritten(requirement)
         if rewritten.goal is not None:
             self.goals.append(rewritten.goal)
@@ -231,7 +238,10 @@ def _leaves(rule: Rule, grid: Grid) -> bool:
 def _too_far(rule: Rule, grid: Grid) -> Diagnostic:
     horizon = Fraction(grid.horizon or 0)
     need = Fraction(rule.reach)
-    if need <= horizon:
+    if reach(rule.formula).past:
+        text = f"`{rule.name}` looks at samples before the start of every plan"
+        label = "`prev`, `delta` or `shift` at the first sample"
+    elif need <= horizon:
         text = f"`{rule.name}` looks beyond the end of every plan"
         label = "a window of fixed length inside of one that runs to the end"
     else:

@@ -13,16 +13,18 @@ from dataclasses import replace
 from pathlib import PurePath
 from typing import TypeVar
 
-from stlc.compile import typed
+from stlc.compile import ir, typed
 from stlc.compile.declare import Declared, declare
 from stlc.compile.expressions import evaluate
 from stlc.compile.formulas import resolve_formula
 from stlc.compile.interface import Interface
 from stlc.compile.names import check_names
 from stlc.compile.overrides import read_overrides
+from stlc.compile.ranges import Facts
+from stlc.compile.scales import nominal, reach_of_formula, reach_of_number
 from stlc.compile.scope import Definition, Failed, Scope, enforced
 from stlc.compile.signals import ranged
-from stlc.compile.tags import read_tags
+from stlc.compile.tags import Tags, read_tags
 from stlc.compile.vacuity import toothless, vacuous
 from stlc.compile.values import Number, Value, Vector
 from stlc.diagnostics import Diagnostic, Label, SpecError
@@ -63,8 +65,9 @@ def resolve(
     scope = replace(scope, facts=enforced(signature.columns))
     constants = _constants(spec, interface, scope)
     _check_definitions(spec, scope)
-    requirements = _requirements(spec, ast.Require, scope)
-    assumptions = _requirements(spec, ast.Assume, scope)
+    ranges = nominal(signature.columns)
+    requirements = _requirements(spec, ast.Require, scope, ranges)
+    assumptions = _requirements(spec, ast.Assume, scope, ranges)
     _finish(findings, spec, sink)
     for requirement, item in zip(requirements, _items(spec, ast.Require), strict=True):
         sink.extend(_warnings(requirement, item, signature, scope))
@@ -205,15 +208,17 @@ def _items(spec: ast.Spec, kind: type[Item]) -> list[Item]:
 
 
 def _requirements(
-    spec: ast.Spec, kind: type[ast.Require | ast.Assume], scope: Scope
+    spec: ast.Spec, kind: type[ast.Require | ast.Assume], scope: Scope, ranges: Facts
 ) -> tuple[typed.Requirement, ...]:
     """The requirements (or assumptions) that can be typed."""
     found: list[typed.Requirement] = []
     for item in _items(spec, kind):
         tags = read_tags(item.tags, scope)
         what = f"`{'require' if kind is ast.Require else 'assume'} {item.name}`"
+        here = scope.as_products() if tags.product else scope
         try:
-            formula = resolve_formula(item.formula, scope, what=what)
+            formula = resolve_formula(item.formula, here, what=what)
+            scale = _scale(tags, formula, ranges, scope)
         except Failed:
             continue
         found.append(
@@ -222,7 +227,7 @@ def _requirements(
                 doc=item.doc,
                 tags=tags.marks,
                 weight=tags.weight,
-                scale=tags.scale,
+                scale=scale,
                 id=tags.id,
                 group=tags.group,
                 formula=formula,
@@ -231,6 +236,16 @@ def _requirements(
             )
         )
     return tuple(found)
+
+
+def _scale(tags: Tags, formula: typed.Formula, ranges: Facts, scope: Scope) -> float:
+    """What the robustness is divided by. Raises Failed (E205) where a range is not known."""
+    if isinstance(tags.scale, ir.Lit):
+        return tags.scale.value
+    place = tags.scale_span or formula.span
+    if tags.scale is None:
+        return reach_of_formula(formula, ranges, place, scope)
+    return reach_of_number(tags.scale, ranges, place, scope)
 
 
 def _warnings(

@@ -16,20 +16,21 @@ class Reach(NamedTuple):
     future: int
 
 
-def leaves(num: ir.Num) -> Iterator[ir.Num]:
-    """The parts of a number without parts of their own, those of its conditions too."""
+def everything(num: ir.Num) -> Iterator[ir.Num]:
+    """A number and its parts, those of its conditions too."""
+    yield num
     match num:
         case ir.Lit() | ir.Col() | ir.At() | ir.Held():
-            yield num
+            return
         case ir.Op(_, args) | ir.Extern(_, args):
             for arg in args:
-                yield from leaves(arg)
+                yield from everything(arg)
         case ir.Ind(cond):
             yield from _in_condition(cond)
         case ir.Where(cond, yes, no):
             yield from _in_condition(cond)
-            yield from leaves(yes)
-            yield from leaves(no)
+            yield from everything(yes)
+            yield from everything(no)
         case _:
             assert_never(num)
 
@@ -37,12 +38,19 @@ def leaves(num: ir.Num) -> Iterator[ir.Num]:
 def _in_condition(cond: ir.Formula) -> Iterator[ir.Num]:
     match cond:
         case ir.Atom(num):
-            yield from leaves(num)
+            yield from everything(num)
         case ir.Join(_, items):
             for item in items:
                 yield from _in_condition(item)
         case _:
             return
+
+
+def leaves(num: ir.Num) -> Iterator[ir.Lit | ir.Col | ir.At | ir.Held]:
+    """The parts of a number without parts of their own, those of its conditions too."""
+    for part in everything(num):
+        if isinstance(part, (ir.Lit, ir.Col, ir.At, ir.Held)):
+            yield part
 
 
 def key_of(leaf: ir.Col | ir.At | ir.Held) -> str:

@@ -32,13 +32,15 @@ def reach_of_formula(formula: typed.Formula, ranges: Facts, place: Span, scope: 
     """The greatest magnitude of a predicate in `formula`. Raises Failed (E205) where a range is missing."""
     known = dict(ranges)
     found = [reach_of_number(pred.num, known, place, scope) for pred in _predicates(formula, known)]
-    return _positive(max(found, default=0.0), place, scope)
+    if not found:
+        scope.fail(Diagnostic("E205", "this has no predicate that varies", place))
+    return max(found)
 
 
 def reach_of_number(num: ir.Num, ranges: Facts, place: Span, scope: Scope) -> float:
     """The greatest magnitude of a number. Raises Failed (E205) where a range is missing."""
     ends = bounds(num, ranges)
-    if ends is not None and all(map(math.isfinite, ends)):
+    if ends is not None and all(map(math.isfinite, ends)) and ends != (0.0, 0.0):
         return max(map(abs, ends))
     missing = sorted(columns_of(num) - ranges.keys())
     help_: tuple[str, ...] = ("say it: `@scale(10)`",)
@@ -48,12 +50,6 @@ def reach_of_number(num: ir.Num, ranges: Facts, place: Span, scope: Scope) -> fl
         message += f": {listed} declares no range"
         help_ = (f"signal {missing[0]} in [low, high]", *help_)
     return scope.fail(Diagnostic("E205", message, place, help=help_))
-
-
-def _positive(value: float, place: Span, scope: Scope) -> float:
-    if value > 0:
-        return value
-    return scope.fail(Diagnostic("E205", "this has no predicate that varies", place))
 
 
 def _predicates(formula: typed.Formula, ranges: dict[str, Bounds]) -> Iterator[typed.Pred]:

@@ -118,6 +118,11 @@ class Scope:
             cache={},
         )
 
+    def as_products(self) -> Scope:
+        """The same scope under `@product`, which definitions are looked at anew for."""
+        broken = {name: None for name, value in self.cache.items() if value is None}
+        return replace(self, product=True, cache=dict(broken))
+
     def report(self, finding: Diagnostic) -> None:
         """Add a finding, once (a macro that is used twice has its faults once)."""
         key = (finding.code, finding.span, finding.message)

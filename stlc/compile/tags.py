@@ -5,26 +5,40 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from stlc.compile.calls import unsupported
+from stlc.compile import ir
 from stlc.compile.expressions import evaluate
 from stlc.compile.scope import Failed, Scope
 from stlc.compile.sorts import Need, as_number
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.registry import closest
+from stlc.source import Span
 
 MARKS = ("safety", "liveness")
-_SHOWN = '@safety @liveness @weight(x) @id("…") @group(name) @scale(x)'
-_KNOWN = (*MARKS, "weight", "id", "group", "scale")
+_SHOWN = '@safety @liveness @weight(x) @id("…") @group(name) @scale(x) @scale(auto) @product'
+_KNOWN = (*MARKS, "weight", "id", "group", "scale", "product")
 
 
 @dataclass(frozen=True, slots=True)
 class Tags:
-    """What the tags of one requirement say; see `typed.Requirement`."""
+    """What the tags of one requirement say; see `typed.Requirement`.
+
+    Attributes:
+        marks: bare tag names.
+        weight: factor of the robustness.
+        scale: its divisor; a number that varies stands for the reach of its range, None for that of the
+            predicates (`@scale(auto)`).
+        scale_span: where that is written.
+        product: `x in [lo, hi]` is `(x - lo) (hi - x)`.
+        id: of `@id("…")`.
+        group: of `@group(name)`.
+    """
 
     marks: frozenset[str] = frozenset()
     weight: float = 1.0
-    scale: float = 1.0
+    scale: ir.Num | None = ir.Lit(1.0)  # noqa: RUF009 - frozen
+    scale_span: Span | None = None
+    product: bool = False
     id: str = ""
     group: str = ""
 
@@ -60,15 +74,16 @@ def _with(found: Tags, tag: ast.Tag, scope: Scope) -> Tags:
         case "weight":
             return replace(found, weight=_positive(tag, scope))
         case "scale":
-            if _word(tag) == "auto":
-                scope.fail(unsupported("`@scale(auto)`", tag.span, scope))
-            return replace(found, scale=_positive(tag, scope))
+            scale = None if _word(tag) == "auto" else _number(tag, scope)
+            return replace(found, scale=scale, scale_span=tag.span)
         case "id":
             return replace(found, id=_text(tag, scope))
         case "group":
             return replace(found, group=_word(tag) or _text(tag, scope))
         case "product":
-            return scope.fail(unsupported("`@product`", tag.span, scope))
+            if tag.args:
+                scope.fail(Diagnostic("E501", "`@product` takes no argument", tag.span))
+            return replace(found, product=True)
         case _:
             return scope.fail(_unknown(tag))
 
@@ -97,10 +112,18 @@ def _text(tag: ast.Tag, scope: Scope) -> str:
 
 
 def _positive(tag: ast.Tag, scope: Scope) -> float:
+    num = _number(tag, scope)
+    if not isinstance(num, ir.Lit):
+        scope.fail(Diagnostic("E205", f"`@{tag.name}` takes a positive constant", tag.args[0].span))
+    return num.value
+
+
+def _number(tag: ast.Tag, scope: Scope) -> ir.Num:
+    """The one number that a tag is given, positive where it is a constant."""
     expr = _only(tag)
     if expr is None:
         scope.fail(Diagnostic("E501", f"`@{tag.name}` takes one number: `@{tag.name}(2)`", tag.span))
-    value = as_number(evaluate(expr, scope), expr, Need(f"`@{tag.name}` takes a number"), scope).constant
-    if value is None or value <= 0:
+    number = as_number(evaluate(expr, scope), expr, Need(f"`@{tag.name}` takes a number"), scope)
+    if number.constant is not None and number.constant <= 0:
         scope.fail(Diagnostic("E205", f"`@{tag.name}` takes a positive constant", expr.span))
-    return value
+    return number.num
