@@ -15,6 +15,7 @@ import pytest
 import typer
 
 from stlc.cli.app import app, main
+from stlc.cli.pages import read_page
 from stlc.diagnostics import CODES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -58,8 +59,18 @@ def hold(page: Path, marker: str, wanted: str, *, regenerate: bool) -> None:
 def test_the_reference_is_what_help_says(regenerate):
     everywhere = [row(param) for param in PROGRAM.params if param.name in ("color", "version")]
     head = "\n".join(["| | default | |", "|---|---|---|", *everywhere, "", ""])
-    text = head + "\n".join(command_section(name, command) for name, command in PROGRAM.commands.items())
+    text = head + "\n".join(command_section(name, command) for name, command in every_command())
     hold(ROOT / "docs/cli.md", "commands", text, regenerate=regenerate)
+
+
+def every_command() -> Iterator[tuple[str, Any]]:
+    """All commands; those of a group under the name of the group."""
+    for name, command in PROGRAM.commands.items():
+        inner = getattr(command, "commands", None)
+        if inner is None:
+            yield name, command
+        else:
+            yield from ((f"{name} {word}", part) for word, part in inner.items())
 
 
 def command_section(name: str, command: Any) -> str:
@@ -135,10 +146,25 @@ def test_every_code_is_listed(regenerate):
     parts = []
     for letter, title in GROUPS.items():
         codes = sorted(code for code in CODES if code[0] in (letter, "W" if letter == "E" else letter))
-        rows = [f"| {code} | {escaped(CODES[code])} |" for code in sorted(codes, key=lambda code: code[1:])]
+        ordered = sorted(codes, key=lambda code: code[1:])
+        rows = [f"| [{code}](#{code.lower()}) | {escaped(CODES[code])} |" for code in ordered]
         parts += [f"## {title}", "", "| code | what is wrong |", "|---|---|", *rows, ""]
+        parts += [line for code in ordered for line in code_section(code)]
     hold(ROOT / "docs/errors.md", "codes", "\n".join(parts), regenerate=regenerate)
     assert {code[0] for code in CODES} <= {*GROUPS, "W"}
+
+
+def code_section(code: str) -> list[str]:
+    """The page of a code (`stlc explain CODE`); its examples are held against the program elsewhere."""
+    page = read_page(code)
+    assert page is not None, code
+    lines = [f'### <a id="{code.lower()}"></a>{page.title}', ""]
+    for line in page.text.splitlines():
+        notes = line.removeprefix("```").split() if line.startswith("```") else []
+        if {"wrong", "right"} & set(notes):
+            lines += [f"{'Wrong' if 'wrong' in notes else 'Right'}:", ""]
+        lines.append("```" if notes else line)
+    return [*lines, ""]
 
 
 def test_every_code_that_is_raised_exists():

@@ -16,7 +16,25 @@ from typing import Annotated
 
 import typer
 
-from stlc.cli import check, compile, lsp, report, simulate, train
+from stlc.cli import (
+    check,
+    compile,
+    doctor,
+    explain,
+    fmt,
+    init,
+    lint,
+    lsp,
+    new,
+    parse,
+    plot,
+    report,
+    runs,
+    schema,
+    simulate,
+    system,
+    train,
+)
 from stlc.cli.errors import TERMINATED
 from stlc.cli.errors import report as report_error
 from stlc.cli.options import describe
@@ -35,7 +53,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (train, simulate, check, compile, report, lsp):
+_DAILY = (train, simulate, check, explain, plot, report, runs)
+_WRITING = (init, new, lint, fmt, parse, compile, system)
+_OTHER = (lsp, schema, doctor)
+for group in (*_DAILY, *_WRITING, *_OTHER):
     group.register(app)
 
 

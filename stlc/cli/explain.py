@@ -49,6 +49,7 @@ def explain(
         Path | None, typer.Option(metavar="FILE", help="Of a trace: instead of its own specification.")
     ] = None,
     system: SystemOption = None,
+    runs: Annotated[Path, typer.Option(help="Folder of all runs.")] = Path("runs"),
     as_json: JsonOption = False,
 ) -> None:
     """Say what `what` means."""
@@ -61,9 +62,11 @@ def explain(
     elif what == "-" or Path(what).suffix in (".stl", ".stlc"):
         _spec(what, require or [], as_json=as_json)
     else:
-        from stlc.cli.explain_trace import Question, explain_trace
+        from stlc.cli.explain_trace import explain_trace
+        from stlc.cli.judge import Question
 
-        explain_trace(what, Question(tuple(require or ()), at, spec, system), as_json=as_json)
+        question = Question(spec=spec, system=system, require=tuple(require or ()), at=at)
+        explain_trace(what, question, runs, as_json=as_json)
 
 
 def _list_codes(*, as_json: bool) -> None:

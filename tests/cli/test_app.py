@@ -30,7 +30,10 @@ from stlc.diagnostics import (
 )
 from stlc.version import __version__
 
-COMMANDS = ("train", "simulate", "check", "compile", "report", "lsp")
+COMMANDS = (
+    *("train", "simulate", "check", "explain", "plot", "report", "runs", "init", "new", "lint", "fmt", "parse"),
+    *("compile", "system", "lsp", "schema", "doctor"),
+)
 HEAVY = {"torch", "numpy", "matplotlib", "lark", "yaml", "rich"}
 
 
