@@ -8,8 +8,8 @@ from typing import Literal, TypeAlias, final
 
 Pick: TypeAlias = Literal["min", "max"]
 
-_CHUNK = 1 << 18
-"""Numbers in one scratch array, about: what stays near the processor."""
+_SCRATCH = 1 << 21
+"""Numbers in the scratch arrays for one signal, about: what stays near the processor."""
 
 _NARROW = 16
 """The fewest columns that are worth a chunk of their own."""
@@ -55,12 +55,12 @@ class Sliding:
         blocks, length = self.shape
         return blocks * length
 
-    def chunks(self, batch: int) -> list[slice]:
-        """The batch in parts whose scratch arrays are small."""
-        parts = max(-(-self.covered * batch // _CHUNK), 1)
+    def chunks(self, batch: int, arrays: int) -> list[slice]:
+        """The batch in parts for which so many scratch arrays a signal are small together."""
+        parts = max(-(-self.covered * batch * arrays // _SCRATCH), 1)
         size = max(-(-batch // parts), min(batch, _NARROW))
         return [slice(first, min(first + size, batch)) for first in range(0, batch, size)]
 
-    def numbers(self, batch: int) -> int:
-        """Numbers of one scratch array."""
-        return self.covered * int(self.chunks(batch)[0].stop)
+    def numbers(self, batch: int, arrays: int) -> int:
+        """Numbers of each of so many scratch arrays."""
+        return self.covered * int(self.chunks(batch, arrays)[0].stop)

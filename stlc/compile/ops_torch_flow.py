@@ -19,30 +19,31 @@ from stlc.compile.scans import ends_of, givers, piece_of, rows_of, split, takers
 from stlc.compile.scratch import Scratch
 
 
-def flow_to_chosen(grad: Tensor, scan: Tensor, memory: Scratch, ops: Ops, *, behind: bool) -> Tensor:
+def flow_to_chosen(
+    grad: Tensor, scan: Tensor, room: tuple[Tensor, Tensor], ops: Ops, *, behind: bool
+) -> Tensor:
     """The gradient of what a running extremum ran over, in place of the gradient of its values.
 
     Where operands tie, the one that was scanned first gets all of it.
 
     Args:
         grad: `(blocks, time, batch)`.
-        scan: the running extremum, the same shape; used up.
-        memory: takes one array of that shape.
+        scan: the running extremum, the same shape.
+        room: two arrays of that shape to work in; the second may be `scan`.
         ops: torch.
         behind: the direction of the scan.
 
     Returns:
         `grad`.
     """
-    with memory.lent(*grad.shape) as passes:
-        taken_over(scan, passes, behind)
-        piece = piece_of(grad)
-        main, _ = split(scan, piece, not behind)
-        if main.shape[1] > 1:
-            first = ends_of(main, behind).clone()
-            main.eq_(first[:, :, None])
-        _flow(grad, passes, main, ops, not behind)
-        return grad.addcmul_(grad, passes, value=-1.0)
+    passes, reach = room
+    taken_over(scan, passes, behind)
+    piece = piece_of(grad)
+    (pieces, _), (reach, _) = split(scan, piece, not behind), split(reach, piece, not behind)
+    if pieces.shape[1] > 1:
+        torch.eq(pieces, ends_of(pieces, behind)[:, :, None].clone(), out=reach)
+    _flow(grad, passes, reach, ops, not behind)
+    return grad.addcmul_(grad, passes, value=-1.0)
 
 
 def taken_over(scan: Tensor, out: Tensor, behind: bool) -> None:

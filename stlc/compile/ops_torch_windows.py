@@ -39,6 +39,7 @@ class SlidingExtremum(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, asked: Asked) -> Tensor:
         ctx.asked = asked
+        x = _by_rows(x)
         if not asked.window.to_end:
             ctx.save_for_backward(x)
             out: Tensor = extrema(x, asked)
@@ -53,22 +54,30 @@ class SlidingExtremum(torch.autograd.Function):
         (x,) = ctx.saved_tensors
         asked: Asked = ctx.asked
         window, batch = asked.window, x.shape[1]
-        back = _to_end_back if window.to_end else _extrema_back
+        grad = _by_rows(grad)
         out = torch.empty_like(x)
-        with scratch(5 * window.numbers(batch), x, asked.ops) as memory:
-            for part in window.chunks(batch):
+        arrays = 2 if window.to_end else 5
+        with scratch(arrays * window.numbers(batch, arrays), x, asked.ops) as memory:
+            for part in window.chunks(batch, arrays):
                 memory.clear()
-                back(x[:, part], grad[:, part], out[:, part], asked, memory)
+                if window.to_end:
+                    _to_end_back(x[:, part], grad[:, part], out[:, part], asked, memory)
+                else:
+                    _extrema_back(x[:, part], grad[:, part], out[:, part], asked, memory)
         return out, None
 
 
-def _to_end_back(values: Tensor, grad: Tensor, out: Tensor, asked: Asked, memory: Scratch) -> None:
+def _by_rows(x: Tensor) -> Tensor:
+    """The same numbers, those of an instant beside each other: turning all of them at once is cheap."""
+    return x if x.stride(1) <= 1 or x.shape[1] == 1 else x.contiguous()
+
+
+def _to_end_back(scan: Tensor, grad: Tensor, out: Tensor, asked: Asked, memory: Scratch) -> None:
     window = asked.window
-    scan = memory.take(*window.shape, grad.shape[1])
-    flat(scan)[:] = values
-    into = _room(window, 0, grad, memory)
-    starts(into, window)[:] = grad
-    out[:] = flat(flow_to_chosen(into, scan, memory, asked.ops, behind=True))
+    out[: window.count] = grad
+    out[window.count :] = 0.0
+    room = memory.take(*window.shape, out.shape[1]), memory.take(*window.shape, out.shape[1])
+    flow_to_chosen(out[None], scan[None], room, asked.ops, behind=True)
 
 
 def _extrema_back(x: Tensor, grad: Tensor, out: Tensor, asked: Asked, memory: Scratch) -> None:
@@ -78,8 +87,9 @@ def _extrema_back(x: Tensor, grad: Tensor, out: Tensor, asked: Asked, memory: Sc
     mine, others = starts(to_tails, window), stops(to_heads, window)
     _wins(starts(tails, window), stops(heads, window), asked.pick, mine).mul_(grad)
     torch.sub(grad, mine, out=others)
-    flow_to_chosen(to_tails, tails, memory, ops, behind=True)
-    flow_to_chosen(to_heads, heads, memory, ops, behind=False)
+    passes = memory.take(*tails.shape)
+    flow_to_chosen(to_tails, tails, (passes, tails), ops, behind=True)
+    flow_to_chosen(to_heads, heads, (passes, heads), ops, behind=False)
     seen = min(window.rows, window.covered)
     torch.add(flat(to_tails)[:seen], flat(to_heads)[:seen], out=out[:seen])
     out[seen:] = 0.0
@@ -106,6 +116,7 @@ class SlidingUntil(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, left: Tensor, right: Tensor, asked: Asked) -> Tensor:
         ctx.asked = asked
+        left, right = _by_rows(left), _by_rows(right)
         ctx.save_for_backward(left, right)
         out: Tensor = until(left, right, asked)
         return out
@@ -116,9 +127,10 @@ class SlidingUntil(torch.autograd.Function):
         left, right = ctx.saved_tensors
         asked: Asked = ctx.asked
         window, batch = asked.window, left.shape[1]
+        grad = _by_rows(grad)
         out = torch.empty_like(left), torch.empty_like(right)
-        with scratch(10 * window.numbers(batch), left, asked.ops) as memory:
-            for part in window.chunks(batch):
+        with scratch(10 * window.numbers(batch, 5), left, asked.ops) as memory:
+            for part in window.chunks(batch, 5):
                 memory.clear()
                 operands = left[:, part], right[:, part]
                 _until_back(operands, grad[:, part], (out[0][:, part], out[1][:, part]), asked, memory)
@@ -145,11 +157,12 @@ def _until_back(operands: Pair, grad: Tensor, out: Pair, asked: Asked, memory: S
     _met_back(to_met, met, operands, out, (asked, memory))
     seen = min(window.rows, window.covered)
     to_left, to_right = out[0][:seen], out[1][:seen]
-    to_left.add_(flat(flow_to_chosen(to_held, held, memory, ops, behind=True))[:seen])
-    to_then = flow_to_chosen(to_reach, reach, memory, ops, behind=False)
+    passes = memory.take(*held.shape)
+    to_left.add_(flat(flow_to_chosen(to_held, held, (passes, held), ops, behind=True))[:seen])
+    to_then = flow_to_chosen(to_reach, reach, (passes, reach), ops, behind=False)
     to_heads = _wins(heads, then, asked.other, met).mul_(to_then)
     to_right.add_(flat(to_then.sub_(to_heads))[:seen])
-    to_left.add_(flat(flow_to_chosen(to_heads, heads, memory, ops, behind=False))[:seen])
+    to_left.add_(flat(flow_to_chosen(to_heads, heads, (passes, heads), ops, behind=False))[:seen])
 
 
 def _met_back(grad: Tensor, met: Tensor, operands: Pair, out: Pair, how: tuple[Asked, Scratch]) -> None:

@@ -40,8 +40,8 @@ def extrema(x: Array, asked: Asked) -> Array:
     if window.to_end:
         return to_end(x, asked)[: window.count]
     out = ops.empty((window.count, batch), x)
-    with scratch(2 * window.numbers(batch), x, ops) as memory:
-        for part in window.chunks(batch):
+    with scratch(2 * window.numbers(batch, 2), x, ops) as memory:
+        for part in window.chunks(batch, 2):
             memory.clear()
             tails, heads = tails_and_heads(x[:, part], asked, memory)
             chooser(asked.pick, ops)(starts(tails, window), stops(heads, window), out=out[:, part])
@@ -52,8 +52,8 @@ def until(left: Array, right: Array, asked: Asked) -> Array:
     """Two of `(time, batch)` -> `(count, batch)`."""
     window, batch, ops = asked.window, left.shape[1], asked.ops
     out = ops.empty((window.count, batch), left)
-    with scratch(5 * window.numbers(batch), left, ops) as memory:
-        for part in window.chunks(batch):
+    with scratch(5 * window.numbers(batch, 3), left, ops) as memory:
+        for part in window.chunks(batch, 3):
             memory.clear()
             operands = left[:, part], right[:, part]
             held, met = held_and_met(operands, asked, memory)

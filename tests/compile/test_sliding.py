@@ -30,7 +30,7 @@ def _layout(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(scans, "_LONG_ROW", 1 if request.param == "one piece" else 1 << 30)
     monkeypatch.setattr(scans, "_FEW_ROWS", 2)
     if request.param == "chunks":
-        monkeypatch.setattr(extremum, "_CHUNK", 8)
+        monkeypatch.setattr(extremum, "_SCRATCH", 8)
         monkeypatch.setattr(extremum, "_NARROW", 1)
 
 
@@ -205,8 +205,8 @@ def test_memory_does_not_grow_with_the_width() -> None:
         window = Sliding(1000, 1000, width)
         assert window.covered <= 2 * 1000 + width
         assert window.covered <= 3 * 1000
-        assert window.numbers(1000) <= extremum._CHUNK + window.covered * extremum._NARROW
-        chunks = window.chunks(1000)
+        assert 4 * window.numbers(1000, 4) <= extremum._SCRATCH + 4 * window.covered * extremum._NARROW
+        chunks = window.chunks(1000, 4)
         assert chunks[0].start == 0
         assert chunks[-1].stop == 1000
         assert all(a.stop == b.start for a, b in pairwise(chunks))
