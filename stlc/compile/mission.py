@@ -99,9 +99,9 @@ def _decided(formula: Absolute, clock: ir.Col) -> ir.Num:
         case "always":
             return choose(both(inside, denied(right)), _FALSE, choose(over, _TRUE, _OPEN))
         case "eventually":
-            return choose(both(inside, right), _TRUE, choose(over, _FALSE, _OPEN))
+            return choose(both(inside, right), _TRUE, choose(denied(over), _OPEN, _FALSE))
         case "until":
-            met = choose(both(inside, right), _TRUE, choose(over, _FALSE, _OPEN))
+            met = choose(both(inside, right), _TRUE, choose(denied(over), _OPEN, _FALSE))
             return choose(denied(left), _FALSE, met)
         case "release":
             failed = choose(both(inside, denied(right)), _FALSE, choose(over, _TRUE, _OPEN))

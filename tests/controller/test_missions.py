@@ -10,6 +10,7 @@ import torch
 from mission_strategies import augmented
 from torch import Tensor
 
+from stlc.compile.ops_torch import TORCH
 from stlc.controller.config import TrainConfig, decide
 from stlc.controller.deploy import Guard
 from stlc.controller.drive import Recorder, Recording, Setting, drive
@@ -179,6 +180,17 @@ def test_held_out_states_are_visited_ones(task: Task) -> None:
     assert len(states[:, task.names.index("clock")].unique()) > 3
 
 
+def test_kernel_and_torch_agree_on_memory(task: Task) -> None:
+    generator = torch.Generator().manual_seed(7)
+    states = missions(task).take(2000).double()
+    plans = 10.0 * torch.rand(2000, task.horizon, 1, generator=generator, dtype=torch.float64) - 5.0
+    judged = task.judge(states, plans)
+    columns = task.system.rollout_columns(states, plans)
+    for name in task.names:
+        torch.testing.assert_close(judged.columns[name], columns[name], msg=name)
+    torch.testing.assert_close(judged.requirements, task.graph.per_requirement_columns(columns, ops=TORCH))
+
+
 # ----------------------------------------------------------------- deployment, verdicts
 
 
@@ -198,6 +210,7 @@ def test_deployment_carries_memory_from_the_true_states(task: Task) -> None:
     again = augmented(task.compiled.timers, true)
     for name in task.names:
         np.testing.assert_array_equal(columns[name], again[name], err_msg=name)
+        assert not (np.signbit(columns[name]) & (columns[name] == 0)).any(), "0 is written without a sign"
 
 
 def test_what_was_driven_is_judged_as_it_was_written(task: Task) -> None:
