@@ -33,7 +33,7 @@ def hover(document: Document, offset: int) -> tuple[Span, str] | None:
     lexeme, before = _lexeme(document.source.text, offset)
     node = _temporal_at(document.spec, offset)
     if node is not None and (lexeme is None or lexeme.kind != "word" or _is_temporal(lexeme)):
-        return (node.interval or node).span, _about_temporal(document, node)
+        return _place_of(document, node, lexeme, offset), _about_temporal(document, node)
     if lexeme is None or lexeme.kind != "word":
         return None
     text = _about_word(document, lexeme.text, tag=before == "@")
@@ -54,6 +54,15 @@ def _lexeme(text: str, offset: int) -> tuple[Lexeme | None, str]:
 
 def _is_temporal(lexeme: Lexeme) -> bool:
     return lexeme.text.rstrip("_") in _ALIASES
+
+
+def _place_of(document: Document, node: ast.Temporal | ast.Until, lexeme: Lexeme | None, offset: int) -> Span:
+    """From the word that a cursor touches to the end of the interval behind it."""
+    word = (offset, offset) if lexeme is None else (lexeme.start, lexeme.end)
+    if node.interval is None:
+        return document.source.span(*word)
+    span = node.interval.span
+    return document.source.span(min(word[0], span.start), max(word[1], span.end))
 
 
 def _about_word(document: Document, word: str, *, tag: bool) -> str | None:

@@ -14,7 +14,7 @@ from stlc.compile.horizon import reach
 from stlc.compile.interface import Grid, Interface
 from stlc.compile.ir import Window
 from stlc.compile.lower import lower
-from stlc.compile.scope import Failed, Known, Scope
+from stlc.compile.scope import Definition, Failed, Known, Scope
 from stlc.compile.signals import ranged
 from stlc.compile.simplify import simplify
 from stlc.compile.values import Value
@@ -50,7 +50,7 @@ class Meaning:
         entry = self.scope.entries.get(name)
         if isinstance(entry, Known):
             return entry.value
-        if entry is None or entry.formals or entry.span is None:
+        if not isinstance(entry, Definition) or entry.formals or entry.span is None:
             return None
         try:
             with self.scope.meter.fresh():

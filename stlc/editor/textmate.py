@@ -57,7 +57,7 @@ def _repository() -> dict[str, Any]:
         "time": _of("variable.language", _words(BUILT_IN)),
         "keyword": _of("keyword.operator.word", _words(_logic())),
         "number": _numbers(),
-        "unit": _captures(rf"(\[)\s*({_unit()})\s*(\])", {"2": "keyword.other.unit"}),
+        "unit": _captures(rf"(\[)\s*({_unit()}|[%1])\s*(\])", {"2": "keyword.other.unit"}),
         "region": _of("support.class.region", rf"{_words(REGIONS)}(?=\s*\()"),
         "function": _of("support.function", rf"{_words(_functions())}(?=\s*\()"),
         "type": _captures(rf"(:|->)\s*({_any(_TYPES)})\b", {"2": "support.type"}),
@@ -99,16 +99,18 @@ def _pragmas() -> list[dict[str, Any]]:
 
 
 def _numbers() -> dict[str, Any]:
+    """A number and its unit; a `%` that an operand follows is the modulo."""
     number = r"(?:\d[\d_]*\.(?!\.)\d*|\.\d+|\d[\d_]*)(?:[eE][+-]?\d+)?"
+    percent = rf"%(?!\s*(?!{PATTERNS['AFTER_PERCENT']}\b)[\w(.`])"
     return _captures(
-        rf"(?<![\w.])({number})(?:\s*(steps?\b|{_unit()}(?!\w)))?",
+        rf"(?<![\w.])({number})(?:\s*(steps?\b|{percent}|{_unit()}(?!\w)))?",
         {"1": "constant.numeric", "2": "keyword.other.unit"},
     )
 
 
 def _unit() -> str:
     """A product of powers of units, without blanks."""
-    one = f"(?:{PATTERNS['UNITS']}|%|1(?=/)){PATTERNS['EXPONENT']}?"
+    one = f"(?:{PATTERNS['UNITS']}|[%1](?=/)){PATTERNS['EXPONENT']}?"
     return rf"{one}(?:[*/·]{PATTERNS['UNITS']}{PATTERNS['EXPONENT']}?)*"
 
 

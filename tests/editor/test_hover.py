@@ -58,7 +58,7 @@ def test_the_horizon(traffic):
 def test_the_inner_of_two_intervals(write):
     document, offset = write("time s\nsignal x\nrequire r: always[0, 2] eventually│(0, 3 steps] x > 0")
     found, text = hover(document, offset)
-    assert found.text == "(0, 3 steps]"
+    assert found.text == "eventually(0, 3 steps]"
     assert "eventually" in text
 
 

@@ -99,6 +99,12 @@ def test_words_within_names_are_names():
     assert "spec" not in colours("x > spec")
 
 
+def test_percent_is_a_unit_unless_an_operand_follows():
+    assert colours("x > 5 % and y")["%"] == "keyword.other.unit"
+    assert colours("signal s [%]")["%"] == "keyword.other.unit"
+    assert colours("x > 5 % 3")["%"] == "keyword.operator"
+
+
 def test_the_mission_clock():
     found = colours("always@(5 s, 10 steps] home")
     assert found["always"] == "keyword.operator.temporal"
