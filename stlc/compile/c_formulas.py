@@ -36,7 +36,7 @@ class FormulaWriter:
         key = (formula, start, count)
         known = self._known.get(key)
         if known is None:
-            if start < 0 or start + count > self.samples:
+            if count < 1 or start < 0 or start + count > self.samples:
                 raise Untranslatable("a window that leaves the plan")
             known = self._known[key] = self._value(formula, start, count)
         return known
