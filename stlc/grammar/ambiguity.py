@@ -48,26 +48,27 @@ def ambiguities(spec: ast.Spec, *, implications: bool = False) -> Iterator[Ambig
         implications: also those beside `->`.
     """
     words = _Words(spec)
-    seen: set[tuple[int, int]] = set()
-    for node in descendants(spec):
-        if not isinstance(node, ast.Logic | ast.Until):
-            continue
-        for found in (*_operands(node, words), *_scope(node, words)):
-            place = (found.span.start, found.span.end)
-            if place not in seen and (implications or found.kind != "implication"):
-                seen.add(place)
-                yield found
+    pairs = [node for node in descendants(spec) if isinstance(node, ast.Logic | ast.Until)]
+    clashes = [part for node in pairs for part in _operands(node, words)]
+    kept = [part for part in clashes if implications or part.kind != "implication"]
+    words.parenthesised.update((part.span.start, part.span.end) for part in kept)
+    found = [*kept, *(part for node in pairs for part in _scope(node, words))]
+    unique = {(part.span.start, part.span.end): part for part in reversed(found)}
+    yield from sorted(unique.values(), key=lambda part: (part.span.start, -part.span.end))
 
 
 class _Words:
-    """What stands beside a part of the text."""
+    """What stands beside a part of the text, and which parts will be in parentheses."""
 
     def __init__(self, spec: ast.Spec) -> None:
         self.items: list[Lexeme] = list(lexemes(spec.source.text))
         self.starts = [item.start for item in self.items]
+        self.parenthesised: set[tuple[int, int]] = set()
 
     def closed(self, node: ast.Node, *, left: bool) -> bool:
         """Whether an operand stands in parentheses; `left` says on which side of its operator."""
+        if (node.span.start, node.span.end) in self.parenthesised:
+            return True
         at = bisect_left(self.starts, node.span.end if left else node.span.start)
         if left:
             return at < len(self.items) and self.items[at].text == ")"

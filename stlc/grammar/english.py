@@ -9,13 +9,15 @@ from stlc.grammar.children import descendants
 from stlc.grammar.printer_expr import show_expr, show_set
 
 _EDGES = {"rise": "{} becomes true", "fall": "{} becomes false"}
+_OPENINGS = frozenset({"at", "if", "for", "let", "it", "either", "nothing"})
 _EQUAL = {"==": "is", "!=": "is not"}
 
 
 def sentence(item: ast.Require | ast.Assume) -> str:
     """What a requirement demands, as one sentence."""
     text = say(item.formula)
-    return f"{text[:1].upper()}{text[1:]}." if text[1:2].islower() or " " in text[:2] else f"{text}."
+    begins = text.partition(" ")[0] in _OPENINGS
+    return f"{text[0].upper()}{text[1:]}." if begins else f"{text}."
 
 
 def definitions_of(item: ast.Require | ast.Assume, spec: ast.Spec) -> list[tuple[str, str]]:
@@ -57,7 +59,7 @@ def say(expr: ast.Expr) -> str:
         case ast.Quantifier() | ast.Freeze() | ast.IfThenElse():
             return _binder(expr)
         case ast.Call(func=ast.Name(name=name), args=(ast.Arg(value=body),)) if name in _EDGES:
-            return _EDGES[name].format(_inner(body))
+            return _EDGES[name].format(show_expr(body))
         case ast.Bool(value=value):
             return "nothing is demanded" if value else "nothing can satisfy this"
         case ast.Name(name=name):

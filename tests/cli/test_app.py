@@ -31,8 +31,8 @@ from stlc.diagnostics import (
 from stlc.version import __version__
 
 COMMANDS = (
-    *("train", "simulate", "check", "explain", "plot", "report", "runs", "init", "new", "lint", "fmt", "parse"),
-    *("compile", "system", "lsp", "schema", "doctor"),
+    *("train", "simulate", "check", "explain", "plot", "report", "runs"),
+    *("init", "new", "lint", "fmt", "parse", "compile", "system", "lsp", "schema", "doctor"),
 )
 HEAVY = {"torch", "numpy", "matplotlib", "lark", "yaml", "rich"}
 

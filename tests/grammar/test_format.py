@@ -88,3 +88,101 @@ def hold(text: str) -> None:
 @given(written())
 def test_the_laws_hold_for_random_specifications(text):
     hold(text)
+
+
+# ---------------------------------------------------------------------- layouts
+
+RULE = "@safety\n@weight(2)\nrequire r: always[0, 5 s] (x > 0 and not y)\n"
+
+
+@pytest.mark.parametrize("path", DATA, ids=lambda path: path.stem)
+def test_the_benchmarks_keep_what_they_say(path):
+    hold(read_source(path).text)
+
+
+@pytest.mark.parametrize(
+    ("written", "laid_out"),
+    [
+        ("", ""),
+        ("\n\n# a\n\n\n\n# b", "# a\n\n# b\n"),
+        ("const a=1;const b = 2 // c\n;", "const a = 1\nconst b = 2  // c\n"),
+        (
+            "@safety@weight( 2 )require r:G[0:5 s](x>0&&!y)",
+            RULE,
+        ),
+        (RULE, RULE),
+        ("require r: alw_[0,1 s] p=>F q", "require r: (always[0, 1 s] p) -> eventually q\n"),
+        ("require r: always @ (1 s , 2 s) [x,y] not  in A", "require r: always@(1 s, 2 s) [x, y] not in A\n"),
+        (
+            "def f( a,b:real[3] ):bool=if a>b then a else b",
+            "def f(a, b: real[3]): bool = if a > b then a else b\n",
+        ),
+        (
+            'state signal q:real [7] [ rad ] in[-1,+1] from"p"',
+            'state signal q : real[7] [rad] in [-1, 1] from "p"\n',
+        ),
+        ("enum S{a=0,b}", "enum S { a = 0, b }\n"),
+        ("const c = ((5 m)) ^2+- -3%2", "const c = (5 m)^2 + --3 % 2\n"),
+        ("const c = 5 m ^2 + 5% - 3", "const c = 5 m ^2 + 5 % - 3\n"),
+        ("require r: forall i in 0 .. 6:x[ i ]in{1,2}", "require r: forall i in 0..6: x[i] in {1, 2}\n"),
+        (
+            "require r: freeze a=x,b=y in always(x<a+b)",
+            "require r: freeze a = x, b = y in always (x < a + b)\n",
+        ),
+        ("require r: a|b&c", "require r: a or (b and c)\n"),
+        ("require r: a->b->c", "require r: a -> (b -> c)\n"),
+        ("require r: a and b U c", "require r: a and (b until c)\n"),
+        ("require r: x ≤ 3 ∧ □[0,5 s] y", "require r: x <= 3 and always[0, 5 s] y\n"),
+        ("const a = 1\nconst long [m] = 2  # x\n", "const a    = 1\nconst long [m] = 2  # x\n"),
+        ("env signal a # x\nstate signal b [m] # y\n", "env   signal a      # x\nstate signal b [m]  # y\n"),
+        ("def a = x\n\ndef long = y", "def a = x\n\ndef long = y\n"),
+        (
+            "@safety\nrequire a: x\n@safety\nrequire bcd: y",
+            "@safety\nrequire a:   x\n@safety\nrequire bcd: y\n",
+        ),
+    ],
+)
+def test_a_layout(written, laid_out):
+    assert formatted(written) == laid_out
+    hold(written if "≤" not in written else laid_out)
+
+
+def test_long_formulas_break_before_their_loosest_operator():
+    text = (
+        "require r: " + " and ".join(f"(some_signal_{i} > 12.5 m/s or other_{i})" for i in range(4)) + " -> z"
+    )
+    lines = formatted(text).splitlines()
+    assert lines[0] == "require r:"
+    assert [line.split()[0] for line in lines[2:]] == ["and", "and", "and", "->"]
+    assert max(map(len, lines)) <= WIDTH
+
+
+def test_long_lists_break_within_their_brackets():
+    text = "region r = union(" + ", ".join(f"circle([{i}, {i}], radius = 3)" for i in range(6)) + ")"
+    lines = formatted(text).splitlines()
+    assert (lines[0], lines[-1]) == ("region r = union(", ")")
+    assert len(lines) == 8
+
+
+def test_comments_stay_within_a_formula():
+    text = "require r:\n  # first\n  p # one\n  and # two\n\n  q\n# last\nconst c = 1"
+    wanted = "require r:\n    # first\n    p  # one\n    and  # two\n    q\n# last\nconst c = 1\n"
+    assert formatted(text) == wanted
+
+
+def test_a_comment_behind_a_line_does_not_become_documentation():
+    (first, second) = tree(formatted("const a = 1 # x\n; ## y\nconst b = 2")).items
+    assert (first.doc, second.doc) == ("", "")
+
+
+def test_deep_brackets_are_a_finding():
+    assert formatted(f"const c = {'(' * 900}1{')' * 900}") == "const c = (1)\n"
+    with pytest.raises(SpecError) as caught:
+        formatted("const c = " + "(  # c\n" * 400 + "1" + ")" * 400)
+    assert caught.value.diagnostics[0].code == "E005"
+
+
+def test_what_cannot_be_read_is_told_about_the_text_that_was_given():
+    with pytest.raises(SpecError) as caught:
+        formatted("require r: x ≤ ∧")
+    assert caught.value.diagnostics[0].span.source.text == "require r: x ≤ ∧"

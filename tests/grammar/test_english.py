@@ -1,0 +1,52 @@
+"""Requirements read aloud."""
+
+from __future__ import annotations
+
+import pytest
+
+from stlc.grammar import ast
+from stlc.grammar.english import definitions_of, sentence
+from stlc.grammar.parser import parse
+from stlc.source import Source
+
+
+def told(formula: str) -> str:
+    (item,) = parse(Source("text", f"require r: {formula}")).items
+    assert isinstance(item, ast.Require)
+    return sentence(item)
+
+
+@pytest.mark.parametrize(
+    ("formula", "english"),
+    [
+        ("always[0, T] x > 1 m", "At all times in the next T: x > 1 m."),
+        ("eventually[1 s, 2 s] x > 1 m", "At some time between 1 s and 2 s from now: x > 1 m."),
+        ("once[0 s, 3 s] p", "At some time in the last 3 s: p holds."),
+        ("historically p", "At all times so far: p holds."),
+        (
+            "always@[5 s, 9 s) a",
+            "At all times between 5 s and 9 s of the mission (the end excluded): a holds.",
+        ),
+        ("always[2 s, inf] p", "At all times from 2 s from now on: p holds."),
+        ("a -> not b", "If a holds, then it is not so that b holds."),
+        ("p until[0, T] q", "p holds, until q holds, which happens at some time in the next T."),
+        ("p since[0, 2 s] q", "q holds at some time in the last 2 s, and from then on p holds."),
+        ("sign == stop and x in [0, 2]", "sign is stop and x is between 0 and 2."),
+        ("p not in pond", "p is not in pond."),
+        ("x in {1, 2}", "x is one of {1, 2}."),
+        ("forall i in 0..6: q[i] > 0", "For every i in 0 to 6: q[i] > 0."),
+        ("always (rise(p) -> q)", "At all times from now on: (if p becomes true, then q holds)."),
+        ("a xor b", "Either a holds or b holds, not both."),
+        ("if a then b else c", "If a holds, then b holds, otherwise c holds."),
+        ("freeze x0 = x in always x >= x0", "Let x0 be x as it is now: at all times from now on: x >= x0."),
+    ],
+)
+def test_a_sentence(formula, english):
+    assert told(formula) == english
+
+
+def test_definitions_are_followed():
+    spec = parse(Source("text", "def a = b > 1\ndef b = x + 1\nrequire r: a"))
+    item = spec.items[-1]
+    assert isinstance(item, ast.Require)
+    assert definitions_of(item, spec) == [("a", "b > 1"), ("b", "x + 1")]
