@@ -26,7 +26,16 @@ from stlc.trace_resample import resampled
 from stlc.trace_table import GROUPS
 from stlc.trace_time import RESAMPLE, read_clock
 
-__all__ = ["Reading", "Trace", "TraceMeta", "as_fraction", "load_trace", "save_trace"]
+__all__ = [
+    "Reading",
+    "Trace",
+    "TraceMeta",
+    "as_fraction",
+    "load_trace",
+    "read_recording",
+    "save_trace",
+    "trace_of",
+]
 
 Floats = NDArray[np.float64]
 
@@ -121,7 +130,15 @@ def load_trace(path: Path | str, reading: Reading = AS_IT_IS) -> Trace:
         TraceError: E601, no time, or no such signal; E602, time is not uniform; E603, the file cannot be read
             safely; E605, its arrays do not fit together.
     """
-    recording = read_recording(Path(path))
+    return trace_of(read_recording(Path(path)), reading)
+
+
+def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
+    """The trace of a file that was read: renamed, and on one uniform grid.
+
+    Raises:
+        TraceError: as `load_trace`.
+    """
     names = dict(reading.names)
     clock = names.pop(CLOCK, None)
     if clock is not None:

@@ -51,7 +51,12 @@ def read_csv(path: Path) -> Table:
         UsageError: U102, the file does not exist or cannot be opened.
         TraceError: E603, not text, or a cell that is no number; E605, a header or line that does not fit.
     """
-    sheet = _open_sheet(path)
+    return table_of_text(path, _read(path))
+
+
+def table_of_text(path: Path, data: bytes) -> Table:
+    """The columns of a text; `path` is for messages. Raises TraceError as `read_csv`."""
+    sheet = _sheet(path, data)
     names, units = _read_header(sheet)
     values = _read_fast(sheet, len(names))
     if values is None:
@@ -60,7 +65,7 @@ def read_csv(path: Path) -> Table:
     return Table(columns, units)
 
 
-def _open_sheet(path: Path) -> _Sheet:
+def _read(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -69,6 +74,10 @@ def _open_sheet(path: Path) -> _Sheet:
         raise UsageError(Diagnostic("U102", f"cannot read `{path}`: {reason}")) from None
     if len(data) > MAX_BYTES:
         raise unreadable(path, f"it is larger than {MAX_BYTES / 1e9:.0f} GB", advice="save it as `.npz`")
+    return data
+
+
+def _sheet(path: Path, data: bytes) -> _Sheet:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

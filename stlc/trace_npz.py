@@ -13,6 +13,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any
 
@@ -94,6 +95,47 @@ def _check_magic(path: Path, file: IO[bytes]) -> None:
     raise unreadable(path, "it is empty" if not start else "it is not an `.npz` archive")
 
 
+class Member:
+    """One array of an open archive, read from its start on, so many values along the time axis at a time.
+
+    Attributes:
+        length: samples: of the last axis of (samples,) and (1, samples), else of the first one.
+    """
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, stack: ExitStack) -> None:
+        self._path, self._name = path, info.filename.removesuffix(".npy")
+        self._stream = stack.enter_context(archive.open(info))
+        self._shape, fortran, self._dtype = _checked_header(path, self._stream, info, self._name)
+        row = self._shape[:1] == (1,) or len(self._shape) == 1
+        self._width = 1 if row else math.prod(self._shape[1:])
+        self.length = self._shape[-1] if row and self._shape else (self._shape or (0,))[0]
+        if fortran and not row and len(self._shape) > 1:
+            self.length = -1
+
+    def read(self, count: int) -> Array:
+        """The next `count` samples: (count,) or (count, …)."""
+        size = count * self._width * self._dtype.itemsize
+        data = self._stream.read(size)
+        if len(data) != size:
+            raise unreadable(self._path, f"`{self._name}` is cut short")
+        values = np.frombuffer(data, dtype=self._dtype)
+        return values if self._width == 1 else values.reshape(count, *self._shape[1:])
+
+    def whole(self) -> Array:
+        """All of it, in its own shape."""
+        data = self._stream.read(math.prod(self._shape) * self._dtype.itemsize)
+        return np.frombuffer(data, dtype=self._dtype).reshape(self._shape)
+
+
+def open_members(path: Path, stack: ExitStack) -> dict[str, Member]:
+    """The arrays of an archive that stays open as long as the stack. Raises as `read_npz`."""
+    archive = stack.enter_context(zipfile.ZipFile(path))
+    members = archive.infolist()
+    if len(members) > MAX_ARRAYS:
+        raise unreadable(path, f"it holds {len(members)} arrays, more than {MAX_ARRAYS}")
+    return {info.filename.removesuffix(".npy"): Member(path, archive, info, stack) for info in members}
+
+
 def _read_members(path: Path, archive: zipfile.ZipFile) -> dict[str, Array]:
     members = archive.infolist()
     if len(members) > MAX_ARRAYS:
@@ -114,25 +156,34 @@ def _read_members(path: Path, archive: zipfile.ZipFile) -> dict[str, Array]:
 
 def _read_array(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) -> Array:
     with archive.open(member) as stream:
-        shape, fortran, dtype = _read_header(stream)
-        if dtype.hasobject:
-            raise unreadable(
-                path,
-                f"`{name}` holds Python objects, and unpickling them can run code",
-                advice="save it as an array of numbers, one array per signal",
-            )
-        if dtype.kind not in _NUMERIC + _TEXT or (dtype.kind == "f" and dtype.itemsize > 8):
-            raise unreadable(path, f"`{name}` holds `{dtype}`, not numbers")
+        shape, fortran, dtype = _checked_header(path, stream, member, name)
         size = math.prod(shape) * dtype.itemsize
-        room = member.file_size - stream.tell()
-        if min(shape, default=1) < 0 or size != room:
-            shown = " x ".join(map(str, shape))
-            raise unreadable(path, f"`{name}` declares {shown} values, but {max(room, 0)} bytes follow")
         data = stream.read(size)
     if len(data) != size:
         raise unreadable(path, f"`{name}` is cut short")
     flat = np.frombuffer(bytearray(data), dtype=dtype) if size else np.zeros(0, dtype)
     return flat.reshape(shape, order="F" if fortran else "C")
+
+
+def _checked_header(
+    path: Path, stream: IO[bytes], member: zipfile.ZipInfo, name: str
+) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """The header of an array of numbers or texts, of which as much follows as it declares."""
+    shape, fortran, dtype = _read_header(stream)
+    if dtype.hasobject:
+        raise unreadable(
+            path,
+            f"`{name}` holds Python objects, and unpickling them can run code",
+            advice="save it as an array of numbers, one array per signal",
+        )
+    if dtype.kind not in _NUMERIC + _TEXT or (dtype.kind == "f" and dtype.itemsize > 8):
+        raise unreadable(path, f"`{name}` holds `{dtype}`, not numbers")
+    size = math.prod(shape) * dtype.itemsize
+    room = member.file_size - stream.tell()
+    if min(shape, default=1) < 0 or size != room:
+        shown = " x ".join(map(str, shape))
+        raise unreadable(path, f"`{name}` declares {shown} values, but {max(room, 0)} bytes follow")
+    return shape, fortran, dtype
 
 
 def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:

@@ -39,15 +39,15 @@ def read_parquet(path: Path) -> Recording:
     return of_table(path, table_of(path, table))
 
 
-def open_parquet(path: Path) -> Any:
-    """The file, opened, and small enough to be read."""
+def open_parquet(path: Path, *, whole: bool = True) -> Any:
+    """The file, opened, and small enough to be read where it is wanted as a whole."""
     parquet = needed("pyarrow.parquet")
     if not path.is_file():
         raise UsageError(Diagnostic("U102", f"cannot read `{path}`: no such file or directory"))
     with damage(path):
         file = parquet.ParquetFile(path, memory_map=True)
         size = file.metadata.num_rows * max(file.metadata.num_columns, 1) * 8
-    if size > MAX_BYTES or size < 0:
+    if whole and not 0 <= size <= MAX_BYTES:
         why = f"it unpacks to {size / 1e9:.1f} GB, more than {MAX_BYTES / 1e9:.0f} GB"
         raise unreadable(path, why, advice="split it")
     return file

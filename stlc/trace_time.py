@@ -92,6 +92,11 @@ def _step(name: str, times: Floats, dt: float | None) -> float:
     return _snap(mean, dt)
 
 
+def snapped(step: float) -> float:
+    """A measured time step as the plain fraction that was probably meant."""
+    return _snap(step, None) if np.isfinite(step) and step > 0 else step
+
+
 def _snap(mean: float, dt: float | None) -> float:
     """The recorded step if the times agree with it, else the mean, as a plain fraction if one is near."""
     if dt is not None and abs(dt - mean) <= 1e-3 * mean:

@@ -14,7 +14,16 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "stlc"
 
 TRACE_FORMATS = (
-    *("trace_csv", "trace_extras", "trace_formats", "trace_mat", "trace_mat5", "trace_mcap", "trace_meta"),
+    *(
+        "trace_chunks",
+        "trace_csv",
+        "trace_extras",
+        "trace_formats",
+        "trace_mat",
+        "trace_mat5",
+        "trace_mcap",
+        "trace_meta",
+    ),
     *("trace_npz", "trace_parquet", "trace_recording", "trace_resample", "trace_table", "trace_time"),
 )
 
@@ -33,13 +42,21 @@ ROOMS = (
     {"controller"},
     {"view"},
     {"editor"},
+    {"bench"},
     {"cli", "__main__"},
     {"__init__"},
 )
 
 # Where a library may be imported, as prefixes of module names. What is not listed may be used anywhere.
 HOMES = {
-    "torch": ("stlc.compile.ops_torch", "stlc.dynamics", "stlc.controller", "stlc.view", "stlc.cli"),
+    "torch": (
+        "stlc.compile.ops_torch",
+        "stlc.dynamics",
+        "stlc.controller",
+        "stlc.view",
+        "stlc.bench",
+        "stlc.cli",
+    ),
     "safetensors": ("stlc.controller",),
     "lark": ("stlc.grammar.parser",),
     "rich": ("stlc.cli", "stlc.view"),

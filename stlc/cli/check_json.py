@@ -6,24 +6,23 @@ import hashlib
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from stlc.cli.checked import Checked
+from stlc.cli.outcome import Outcome, overall
 from stlc.monitor.explain import Cause
 from stlc.monitor.judgement import Judgement
 
 
-def document(results: Sequence[Checked], end: str) -> dict[str, Any]:
+def document(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """What `--json` says: the result of one trace; of several, one verdict and the list of them."""
-    entries = [_entry(result, end) for result in results]
-    if len(entries) == 1:
-        return entries[0]
-    found = {result.verdict.overall for result in results}
-    overall = (
-        "violated" if "violated" in found else "inconclusive" if "inconclusive" in found else "satisfied"
-    )
-    return {"verdict": overall, "files": entries}
+    entries = [outcome.entry for outcome in outcomes]
+    return entries[0] if len(entries) == 1 else {"verdict": overall(outcomes), "files": entries}
 
 
-def _entry(result: Checked, end: str) -> dict[str, Any]:
+def entry_of(result: Checked, end: str) -> dict[str, Any]:
+    """Everything about one trace."""
     verdict = result.verdict
     horizon = verdict.subject.horizon
     return {
@@ -35,8 +34,9 @@ def _entry(result: Checked, end: str) -> dict[str, Any]:
         "end": end,
         "traces": verdict.traces,
         "samples": result.trace.samples,
-        "verdict": verdict.overall,
-        "robustness": float(verdict.robustness.min()),
+        "in_scope": verdict.in_scope,
+        "verdict": verdict.overall if verdict.in_scope else "out of scope",
+        "robustness": _least(verdict.requirements[0].counted(np.atleast_1d(verdict.robustness))),
         "satisfied_traces": verdict.satisfied_traces,
         "satisfied_share": verdict.share,
         "requirements": [_requirement(judged, result) for judged in verdict],
@@ -44,8 +44,7 @@ def _entry(result: Checked, end: str) -> dict[str, Any]:
 
 
 def _requirement(judged: Judgement, result: Checked) -> dict[str, Any]:
-    low, high = judged.bounds
-    least = judged.least
+    low, high, least = (judged.counted(end) for end in (judged.low, judged.high, judged.least))
     trace, sample = judged.worst
     cause = result.causes.get(judged.name)
     time = result.verdict.subject.time(sample)
@@ -55,10 +54,10 @@ def _requirement(judged: Judgement, result: Checked) -> dict[str, Any]:
         "tags": sorted(judged.rule.tags),
         "verdict": judged.overall,
         "robustness": {
-            "min": float(least.min()),
-            "mean": float(least.mean()),
-            "low": float(low.min()),
-            "high": float(high.min()),
+            "min": _least(least),
+            "mean": float(least.mean()) if least.size else None,
+            "low": _least(low),
+            "high": _least(high),
             "argmin": {"trace": trace, "start": time, "time": time if cause is None else cause.time},
         },
         "starts": judged.instants,
@@ -66,6 +65,10 @@ def _requirement(judged: Judgement, result: Checked) -> dict[str, Any]:
         "violated_traces": judged.statuses.count("violated"),
         "cause": None if cause is None else _cause(cause),
     }
+
+
+def _least(values: NDArray[np.float64]) -> float | None:
+    return float(values.min()) if values.size else None
 
 
 def _cause(cause: Cause) -> dict[str, Any]:

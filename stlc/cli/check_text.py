@@ -6,14 +6,15 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from stlc.cli.checked import Checked
+from stlc.cli.outcome import WORDS, Row
 from stlc.cli.output import table
 from stlc.cli.render import render_place
 from stlc.compile.semantics import TOLERANCE
 from stlc.monitor.explain import Cause
 from stlc.monitor.judgement import Judgement, Verdict
-
-_WORDS = {"satisfied": "satisfied", "violated": "VIOLATED", "inconclusive": "inconclusive"}
 
 
 def describe_result(result: Checked, *, color: bool) -> str:
@@ -30,7 +31,7 @@ def _parts(result: Checked, color: bool) -> Iterator[str]:
         if cause is not None:
             yield ""
             yield _violation(judged, cause, result, color).rstrip("\n")
-        elif judged.overall == "inconclusive":
+        elif judged.overall == "inconclusive" and result.verdict.in_scope:
             yield ""
             yield _inconclusive(judged, result)
     yield ""
@@ -59,25 +60,28 @@ def _table(result: Checked) -> str:
 
 
 def _row(judged: Judgement, result: Checked) -> tuple[str, ...]:
-    share = "" if judged.holds.size == 1 else _percent(judged.share)
-    return (judged.name, _WORDS[judged.overall], _robustness(judged), share, _where(judged, result))
+    share = "" if judged.holds.size == 1 else percent(judged.share)
+    return (judged.name, WORDS[judged.overall], _robustness(judged), share, _where(judged, result))
 
 
 def _robustness(judged: Judgement) -> str:
-    low, high = (float(end.min()) for end in judged.bounds)
+    low, high = (float(judged.counted(end).min(initial=np.inf)) for end in (judged.low, judged.high))
+    if not judged.counted(judged.holds).size:
+        return ""
     if judged.overall == "inconclusive":
-        return f"[{_signed(low)}, {_signed(high)}]"
-    value = float(judged.least.min())
-    return "boundary" if abs(value) <= TOLERANCE else _signed(value)
+        return f"[{signed(low)}, {signed(high)}]"
+    value = float(judged.counted(judged.least).min())
+    return "boundary" if abs(value) <= TOLERANCE else signed(value)
 
 
-def _signed(value: float) -> str:
+def signed(value: float) -> str:
+    """A robustness, three digits behind the point, or what there is of a tiny one."""
     if math.isfinite(value) and 0 < abs(value) < 0.0005:
         return f"{value:+.1e}"
     return f"{value:+.3f}"
 
 
-def _percent(share: float) -> str:
+def percent(share: float) -> str:
     """Rounded so that only all is 100 %, and only nothing 0 %."""
     percent = 100 * share
     if 0 < percent < 0.1 or 99.9 < percent < 100:
@@ -96,6 +100,21 @@ def _where(judged: Judgement, result: Checked) -> str:
     return ", ".join(words)
 
 
+def rows_of(result: Checked) -> tuple[Row, ...]:
+    """The table as data, with a reason for what is not satisfied."""
+    return tuple(
+        Row(judged.name, judged.overall, _robustness(judged), _where(judged, result), _why(judged, result))
+        for judged in result.verdict
+    )
+
+
+def _why(judged: Judgement, result: Checked) -> str:
+    cause = result.causes.get(judged.name)
+    if cause is not None:
+        return cause.because
+    return _inconclusive(judged, result) if judged.overall == "inconclusive" else ""
+
+
 # ------------------------------------------------------------------------ reasons
 
 
@@ -110,9 +129,10 @@ def _violation(judged: Judgement, cause: Cause, result: Checked, color: bool) ->
 def _count(judged: Judgement, verdict: Verdict) -> str:
     headline = f"{judged.name} is violated"
     if verdict.traces > 1:
-        headline += f" in {judged.statuses.count('violated')} of {verdict.traces} traces"
+        headline += f" in {judged.statuses.count('violated')} of {verdict.in_scope} traces"
     if judged.instants > 1:
-        headline += f", at {int(judged.fails.sum()):,} of {judged.fails.size:,} starts"
+        fails = judged.counted(judged.fails)
+        headline += f", at {int(fails.sum()):,} of {fails.size:,} starts"
     return f"{headline}."
 
 
@@ -126,11 +146,20 @@ def _inconclusive(judged: Judgement, result: Checked) -> str:
 
 
 def _summary(verdict: Verdict) -> str:
-    count = max(judged.instants for judged in verdict) * verdict.traces
-    starts = f"{_percent(verdict.share)} of {count:,} starts"
+    outside = verdict.traces - verdict.in_scope
+    if not verdict.in_scope:
+        return "out of scope: the assumptions do not hold"
+    if outside:
+        return _summary_of(verdict, verdict.in_scope) + f"; {outside} out of scope"
+    return _summary_of(verdict, verdict.traces)
+
+
+def _summary_of(verdict: Verdict, traces: int) -> str:
+    count = max(judged.instants for judged in verdict) * traces
+    starts = f"{percent(verdict.share)} of {count:,} starts"
     if verdict.traces == 1:
         return f"{verdict.overall}; all requirements hold at {starts}" if count > 1 else verdict.overall
-    return f"{verdict.satisfied_traces} of {verdict.traces} traces satisfy every requirement; {starts}"
+    return f"{verdict.satisfied_traces} of {traces} traces satisfy every requirement; {starts}"
 
 
 def _run_of(result: Checked) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -53,15 +54,15 @@ def given_times(dt: float | Fraction | None, horizon: float | Fraction | None) -
     return Times(None if dt is None else as_fraction(dt), None if horizon is None else as_fraction(horizon))
 
 
-def system_of(name: str, spec: ast.Spec) -> tuple[Times, Interface]:
+def system_of(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, Interface]:
     """Times and interface of a system file. Raises UsageError (U102) or SystemFileError."""
     from stlc.dynamics.schema import load_system_decl
 
-    decl = load_system_decl(find_system(name, Path(spec.source.name)))
+    decl = load_system_decl(find_system(name, Path(spec.source.name)), overrides)
     return Times(decl.dt, decl.dt * decl.horizon), decl.interface()
 
 
-def named_times(spec: ast.Spec) -> Times | None:
+def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
     """Times of the system that the specification names; None without one, or without its file."""
     from stlc.dynamics.schema import load_system_decl
 
@@ -71,7 +72,7 @@ def named_times(spec: ast.Spec) -> Times | None:
         path = find_system(spec.system, Path(spec.source.name))
     except UsageError:
         return None
-    decl = load_system_decl(path)
+    decl = load_system_decl(path, overrides)
     return Times(decl.dt, decl.dt * decl.horizon)
 
 

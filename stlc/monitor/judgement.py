@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -14,7 +14,7 @@ from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.prepared import Prepared
 from stlc.registry import closest
 
-Status: TypeAlias = Literal["satisfied", "violated", "inconclusive"]
+Status: TypeAlias = Literal["satisfied", "violated", "inconclusive", "out of scope"]
 Floats: TypeAlias = NDArray[np.float64]
 Bools: TypeAlias = NDArray[np.bool_]
 
@@ -31,6 +31,7 @@ class Judgement:
         holds: certainly satisfied, (instants, traces).
         fails: certainly violated, (instants, traces).
         shape: of the signals before their time axis; () for a single trace.
+        scope: which traces the assumptions allow, (traces,); None means all. Others count for nothing.
     """
 
     rule: Rule
@@ -40,6 +41,7 @@ class Judgement:
     holds: Bools = field(repr=False)
     fails: Bools = field(repr=False)
     shape: tuple[int, ...]
+    scope: Bools | None = field(default=None, repr=False)
 
     @property
     def name(self) -> str:
@@ -49,10 +51,15 @@ class Judgement:
     @property
     def statuses(self) -> list[Status]:
         """One for each trace."""
-        return [_status(bool(fails.any()), bool(holds.all())) for fails, holds in self._per_trace()]
+        inside = np.ones(self.holds.shape[1], dtype=bool) if self.scope is None else self.scope
+        return [
+            _status(bool(fails.any()), bool(holds.all())) if counts else "out of scope"
+            for fails, holds, counts in zip(self.fails.T, self.holds.T, inside, strict=True)
+        ]
 
-    def _per_trace(self) -> Iterator[tuple[Bools, Bools]]:
-        return zip(self.fails.T, self.holds.T, strict=True)
+    def counted(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Of values (…, traces) those of the traces that count."""
+        return values if self.scope is None else values[..., self.scope]
 
     @property
     def status(self) -> Any:
@@ -62,7 +69,8 @@ class Judgement:
     @property
     def overall(self) -> Status:
         """Over all traces: violated if one is, satisfied if all are."""
-        return _status(bool(self.fails.any()), bool(self.holds.all()))
+        holds = self.counted(self.holds)
+        return _status(bool(self.counted(self.fails).any()), bool(holds.size and holds.all()))
 
     @property
     def satisfied(self) -> bool | None:
@@ -93,7 +101,8 @@ class Judgement:
     @property
     def share(self) -> float:
         """Share of the judged instants of all traces at which it certainly holds."""
-        return float(self.holds.mean())
+        holds = self.counted(self.holds)
+        return float(holds.mean()) if holds.size else 0.0
 
     @property
     def instants(self) -> int:
@@ -103,7 +112,9 @@ class Judgement:
     @property
     def worst(self) -> tuple[int, int]:
         """(trace, sample) of the least robustness; of a violation where there is one."""
-        values = self.high if self.fails.any() else self.low
+        values = self.high if self.counted(self.fails).any() else self.low
+        if self.scope is not None and self.scope.any():
+            values = np.where(self.scope, values, np.inf)
         instant, trace = np.unravel_index(int(np.argmin(values)), values.shape)
         return int(trace), self.start + int(instant)
 
@@ -145,13 +156,28 @@ class Verdict:
         """One for each trace: violated if a requirement is, satisfied if all are."""
         rows = [judgement.statuses for judgement in self.requirements]
         return [
-            _status("violated" in column, {*column} <= {"satisfied"}) for column in zip(*rows, strict=True)
+            "out of scope"
+            if "out of scope" in column
+            else _status("violated" in column, {*column} <= {"satisfied"})
+            for column in zip(*rows, strict=True)
         ]
 
     @property
     def status(self) -> Any:
         """`satisfied`, `violated` or `inconclusive`; an array of them for a batch."""
         return _shaped(np.array(self.statuses), self.shape)
+
+    def within(self, scope: Bools) -> Verdict:
+        """The same where only the traces that the assumptions allow count, (traces,)."""
+        if scope.all():
+            return self
+        return replace(self, requirements=tuple(replace(j, scope=scope) for j in self.requirements))
+
+    @property
+    def in_scope(self) -> int:
+        """How many traces the assumptions allow."""
+        scope = self.requirements[0].scope
+        return self.traces if scope is None else int(scope.sum())
 
     @property
     def overall(self) -> Status:
@@ -176,12 +202,16 @@ class Verdict:
 
         Requirements that are judged once hold, or not, at every instant.
         """
-        return float(np.logical_and.reduce([self._spread(j, j.holds) for j in self.requirements]).mean())
+        return self._mean(np.logical_and.reduce([self._spread(j, j.holds) for j in self.requirements]))
 
     @property
     def failed_share(self) -> float:
         """Share of the instants of all traces at which a requirement is certainly violated."""
-        return float(np.logical_or.reduce([self._spread(j, j.fails) for j in self.requirements]).mean())
+        return self._mean(np.logical_or.reduce([self._spread(j, j.fails) for j in self.requirements]))
+
+    def _mean(self, truth: Bools) -> float:
+        counted = self.requirements[0].counted(truth)
+        return float(counted.mean()) if counted.size else 0.0
 
     def _spread(self, judgement: Judgement, truth: Bools) -> Bools:
         """At as many instants as the requirement that has most of them: (instants, traces)."""
@@ -207,6 +237,13 @@ def unknown_requirement(name: str, names: list[str]) -> UsageError:
 
 def _status(violated: bool, satisfied: bool) -> Status:
     return "violated" if violated else "satisfied" if satisfied else "inconclusive"
+
+
+def _together(statuses: tuple[Status, ...]) -> Status:
+    """Of all requirements on one trace."""
+    if "out of scope" in statuses:
+        return "out of scope"
+    return _status("violated" in statuses, {*statuses} <= {"satisfied"})
 
 
 def _known(status: Status) -> bool | None:

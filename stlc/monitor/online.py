@@ -18,6 +18,7 @@ from stlc.monitor.needs import Need, needs_of
 from stlc.monitor.signals import arrange
 from stlc.monitor.tally import Tally
 from stlc.monitor.tracking import Asked, Bounds, Tracker, tracker_of
+from stlc.trace import Trace
 
 Floats: TypeAlias = NDArray[np.float64]
 Sample: TypeAlias = Mapping[str, Any]
@@ -168,8 +169,10 @@ class Online:
         self._trim()
         return tuple(decision for some in found for decision in some)
 
-    def feed(self, signals: Mapping[str, Any]) -> None:
-        """Take many samples in at once, arrays (time,) by name; verdicts are counted, not reported.
+    def feed(self, signals: Mapping[str, Any] | Trace) -> None:
+        """Take many samples in at once, arrays (time,) by name or a piece of a trace.
+
+        Verdicts are counted, not reported.
 
         Raises:
             TraceError: as `push`.
@@ -265,6 +268,10 @@ class Online:
         """Names of the requirements, in order."""
         return tuple(watched.rule.name for watched in self._watched)
 
+    def repeats(self, name: str) -> bool:
+        """Whether a requirement is judged at every start, and not only at the first sample."""
+        return self._find(name).everywhere
+
     @property
     def kept(self) -> int:
         """How many samples of the signals are kept."""
@@ -344,5 +351,5 @@ def _number(sample: Sample, need: Need) -> float:
         return float(value)
     names = (need.column.name, need.column.name.partition("[")[0])
     given = {name: [sample[name]] for name in names if name in sample}
-    laid = arrange(given or dict.fromkeys(sample, [0.0]), [need], plain=True)
+    laid = arrange(given or {name: [0.0] for name in sample}, [need], plain=True)
     return float(laid.env[need.column.name][0, 0])

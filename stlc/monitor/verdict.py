@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import numpy as np
 
 from stlc.compile.interface import Grid
 from stlc.compile.ops import Array
@@ -19,14 +21,16 @@ from stlc.grammar import ast
 from stlc.grammar.parser import parse
 from stlc.monitor.grid import Times, given_times, named_times, recorded_times, system_of
 from stlc.monitor.instants import At, require_length, rule_bounds, rule_signal, rules_at, starts_of
-from stlc.monitor.judgement import Judgement, Status, Verdict, unknown_requirement
+from stlc.monitor.judgement import Bools, Judgement, Status, Verdict, unknown_requirement
 from stlc.monitor.needs import needs_of
-from stlc.monitor.online import How, Online
 from stlc.monitor.prepared import Prepared
 from stlc.monitor.signals import Given, arrange
 from stlc.monitor.values import Ends, Record, by_truth
 from stlc.source import Source
 from stlc.trace import Trace, load_trace
+
+if TYPE_CHECKING:
+    from stlc.monitor.online import How, Online
 
 __all__ = ["Judgement", "Monitor", "Status", "Verdict"]
 
@@ -47,6 +51,7 @@ class Monitor:
         horizon: what `T` means, in seconds; by default that of the trace, or of the system.
         system: path or name of a system file; the specification is then checked against it. By default
             the system that the specification names says what is missing of `dt` and `T`.
+        overrides: constant -> its value, as text.
 
     Signals are NumPy arrays or torch tensors, (time,) or (…, time), by name; a vector is (…, time, k) or one
     signal per component, `q[0]`. Results are float64 for NumPy; for torch, dtype, device and gradients stay.
@@ -61,12 +66,14 @@ class Monitor:
         dt: Seconds | None = None,
         horizon: Seconds | None = None,
         system: str | Path | None = None,
+        overrides: Mapping[str, str] | None = None,
     ) -> None:
         self.spec = spec if isinstance(spec, ast.Spec) else parse(_source(spec))
         self._asked = given_times(dt, horizon)
+        self._overrides = dict(overrides or {})
         self._system, self._interface = Times(), None
         if system is not None:
-            self._system, self._interface = system_of(str(system), self.spec)
+            self._system, self._interface = system_of(str(system), self.spec, self._overrides)
         self._compiled: dict[Grid, Compiled] = {}
         try:
             self._compile(Times(self._asked.dt, self._asked.horizon).or_else(self._system))
@@ -124,7 +131,7 @@ class Monitor:
             _judge(rule, ready, its, "truncate" if end == "truncate" else "open", tolerance)
             for rule, its in zip(ready.rules, starts, strict=True)
         ]
-        return Verdict(tuple(judgements), ready)
+        return Verdict(tuple(judgements), ready).within(_scope(ready, tolerance))
 
     def robustness(
         self,
@@ -176,17 +183,29 @@ class Monitor:
             ends.append(ready.signals.like_given(whole) if at is None else ready.signals.at_one(whole))
         return ends[0], ends[1]
 
-    def online(self, how: How | None = None, *, require: Sequence[str] = ()) -> Online:
+    def online(
+        self,
+        how: How | None = None,
+        *,
+        require: Sequence[str] = (),
+        like: Trace | None = None,
+        dt: Seconds | None = None,
+    ) -> Online:
         """A monitor that takes samples one by one: verdicts as soon as they are decided, bounds before.
 
         Args:
             how: which instants are judged, what happens at the end, and the tolerance.
             require: names of the requirements to judge; none means all.
+            like: a trace, or the first piece of one, that says what `dt` and `T` are.
+            dt: time step in seconds, where neither a trace nor this monitor says it.
 
         Raises:
             UsageError: U101, an unknown requirement, or none at all.
         """
-        compiled = self._ready(Times())
+        from stlc.monitor.online import Online
+
+        recorded = given_times(dt, None) if like is None else recorded_times(like, self._asked)
+        compiled = self._ready(recorded)
         rules = _chosen(compiled.requirements, require)
         if not rules:
             raise UsageError(Diagnostic("U101", f"`{compiled.name}` has no requirement to judge"))
@@ -201,7 +220,8 @@ class Monitor:
         rules = _chosen(compiled.requirements, require)
         if not rules:
             raise UsageError(Diagnostic("U101", f"`{compiled.name}` has no requirement to judge"))
-        signals = arrange(given, needs_of(compiled, rules), plain=plain)
+        read = [*rules, *compiled.assumptions] if plain else rules
+        signals = arrange(given, needs_of(compiled, read), plain=plain)
         return Prepared(compiled, rules, signals, Record(signals.env, signals.ops))
 
     def _ready(self, recorded: Times) -> Compiled:
@@ -214,7 +234,7 @@ class Monitor:
         except SpecError as error:
             if all(finding.code != "E311" for finding in error.diagnostics):
                 raise
-            named = named_times(self.spec)
+            named = named_times(self.spec, self._overrides)
             if named is None:
                 raise SpecError(*(self._who_knows(finding) for finding in error.diagnostics)) from None
             return self._compile(known.or_else(named))
@@ -229,7 +249,11 @@ class Monitor:
         grid = times.grid()
         if grid not in self._compiled:
             self._compiled[grid] = compile_spec(
-                self.spec, grid=grid, interface=self._interface, purpose="check"
+                self.spec,
+                grid=grid,
+                interface=self._interface,
+                overrides=self._overrides,
+                purpose="check",
             )
         return self._compiled[grid]
 
@@ -254,6 +278,14 @@ def _rows(ready: Prepared, end: End, at: int | None) -> list[Array]:
     if at is None:
         return [rule_signal(rule, ready.record, ready.horizon, end) for rule in ready.rules]
     return rules_at(ready.rules, ready.record, at, ready.horizon, end)
+
+
+def _scope(ready: Prepared, tolerance: float) -> Bools:
+    """Which traces the assumptions do not exclude: (traces,)."""
+    scope = np.ones(ready.signals.batch, dtype=bool)
+    for rule in ready.compiled.assumptions:
+        scope &= ~_judge(rule, ready, range(1), "open", tolerance).fails[0]
+    return scope
 
 
 def _judge(rule: Rule, ready: Prepared, starts: range, ends: Ends, tolerance: float) -> Judgement:

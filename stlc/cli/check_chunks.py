@@ -1,0 +1,56 @@
+"""A trace that is larger than memory: judged in pieces, in memory that the horizon bounds."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stlc.cli.judge import laid_reading, monitor_of, specification, usage
+from stlc.cli.outcome import Outcome
+from stlc.cli.tallies import Told, outcome_of_tallies
+
+if TYPE_CHECKING:
+    from stlc.cli.many import Work
+
+CHUNK = 250_000
+"""Samples that are read at a time."""
+
+
+def too_large(path: Path) -> bool:
+    """Whether a file is better read in pieces."""
+    from stlc.trace_chunks import LARGE, size_of
+
+    return size_of(path) > LARGE
+
+
+def outcome_in_chunks(path: Path, work: Work) -> Outcome:
+    """Judge a file in pieces.
+
+    Raises:
+        UsageError: U101, an option that needs the whole trace.
+        TraceError: as `stlc.trace_chunks.pieces`.
+    """
+    from stlc.monitor.online import How
+    from stlc.trace_chunks import pieces
+    from stlc.trace_recording import Recording
+
+    question = work.question
+    for option, given in (("--resample", question.resample is not None), ("--out", work.out is not None)):
+        if given:
+            raise usage(f"`{option}` needs the whole trace, and `{path}` is read in pieces")
+    if question.at not in (None, "all"):
+        raise usage(f"`--at {question.at}` needs the whole trace, and `{path}` is read in pieces")
+    begun = time.perf_counter()
+    read = pieces(path, work.chunk or CHUNK, laid_reading(None, question))
+    first = next(read)
+    head = Recording(str(path), (), meta=first.meta)
+    source, note = specification(head, question.spec)
+    monitor = monitor_of(source, question)
+    how = How("all" if question.at else None, question.end, question.tolerance, first.t0)
+    online = monitor.online(how, require=question.require, like=first)
+    online.feed(first)
+    for piece in read:
+        online.feed(piece)
+    told = Told(str(path), source, first.dt, online.samples)
+    return outcome_of_tallies(online, told, (note,) if note else (), time.perf_counter() - begun)

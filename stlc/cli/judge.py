@@ -1,0 +1,220 @@
+"""One recorded trace: read, judged by its specification, and explained."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from stlc.cli.output import say, show_diagnostics
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.files import read_source
+from stlc.source import Source
+
+if TYPE_CHECKING:
+    from stlc.cli.checked import Checked
+    from stlc.monitor.instants import At
+    from stlc.monitor.verdict import Monitor
+    from stlc.signature import Kind
+    from stlc.trace import Reading, Trace
+    from stlc.trace_recording import Recording
+
+End = Literal["open", "strict", "truncate"]
+
+_AT = re.compile(r"(?P<number>\d+(?:\.\d*)?|\.\d+)\s*(?P<unit>[a-zµ]*)")
+_TIME = re.compile(r"(?P<number>\d+(?:\.\d*)?|\.\d+)\s*(?P<unit>[a-zµ]+)")
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What is asked of every trace.
+
+    Attributes:
+        spec: path of a specification; None takes the one in the trace.
+        system: of a system file.
+        names: specification's name of a signal -> its name in the trace.
+        require: names of the requirements; none means all.
+        at: `0`, `all`, a sample or a time; None leaves it to the requirements.
+        end: what to do where a trace is too short.
+        tolerance: a robustness of at least minus this is satisfied.
+        resample: put the signals on a grid of so many seconds.
+        overrides: constant -> its value, as text.
+    """
+
+    spec: Path | None = None
+    system: str | None = None
+    names: Mapping[str, str] = field(default_factory=dict)
+    require: tuple[str, ...] = ()
+    at: str | None = None
+    end: End = "open"
+    tolerance: float = 1e-6
+    resample: float | None = None
+    overrides: Mapping[str, str] = field(default_factory=dict)
+
+
+def usage(message: str, *advice: str) -> UsageError:
+    """U101."""
+    return UsageError(Diagnostic("U101", message, help=advice))
+
+
+def judge(name: str, question: Question, runs: Path, *, talk: bool) -> Checked:
+    """Load, judge and explain one trace; where `talk` says so, tell which one it is and what is to be said.
+
+    Raises:
+        StlcError: of whatever kind fits.
+    """
+    result, said = judged(found(name, runs), question)
+    if talk:
+        for line in [*taken(name, runs), *said]:
+            say(line)
+        show_diagnostics(result.warnings)
+    return result
+
+
+def found(name: str, runs: Path) -> Path:
+    """The file of a trace: as given, or in the newest run."""
+    from stlc.files import find_trace
+
+    path = find_trace(name, runs)
+    return path if path == Path(name) else _below(path.resolve())
+
+
+def taken(name: str, runs: Path) -> list[str]:
+    """What is to be said about where a trace was found."""
+    path = found(name, runs)
+    return [] if path == Path(name) else [f"taking {path}, of the newest run"]
+
+
+def judged(path: Path, question: Question) -> tuple[Checked, list[str]]:
+    """The result for one file, and what is to be said about it."""
+    from stlc.cli.checked import Checked
+    from stlc.monitor.explain import explain
+    from stlc.trace import read_recording
+
+    recording = read_recording(path)
+    source, note = specification(recording, question.spec)
+    monitor = monitor_of(source, question)
+    trace = laid_out(recording, monitor, question)
+    verdict = monitor.check(
+        trace,
+        at=instant(question.at, trace),
+        end=question.end,
+        tolerance=question.tolerance,
+        require=question.require,
+    )
+    causes = {judgement.name: explain(verdict, judgement.name) for judgement in verdict}
+    known = {name: cause for name, cause in causes.items() if cause}
+    return Checked(trace, source, verdict, known), [note] if note else []
+
+
+def laid_out(recording: Recording, monitor: Monitor, question: Question) -> Trace:
+    """The trace of a file, renamed and resampled as was asked."""
+    from stlc.trace import trace_of
+
+    return trace_of(recording, laid_reading(monitor, question))
+
+
+def laid_reading(monitor: Monitor | None, question: Question) -> Reading:
+    """How files are read: names, and the grid, where a monitor says which signals are discrete."""
+    from stlc.trace import Reading
+
+    return Reading(question.names, question.resample, {} if monitor is None else _kinds(monitor))
+
+
+def _kinds(monitor: Monitor) -> dict[str, Kind]:
+    """What the numbers of a signal mean, as far as the specification says so."""
+    from stlc.grammar import ast
+
+    signals = [item for item in monitor.spec.items if isinstance(item, ast.Signal) and item.type is not None]
+    words: dict[str, Kind] = {"real": "real", "int": "int", "bool": "bool"}
+    return {s.column or s.name: words.get(s.type.name, "enum") for s in signals if s.type is not None}
+
+
+def _below(path: Path) -> Path:
+    """Relative to the working folder where it is below it."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
+def specification(recording: Recording, spec: Path | None) -> tuple[Source, str]:
+    """The specification to judge by, and what is to be said about it."""
+    if spec is not None:
+        return read_source(spec), ""
+    meta, name = recording.meta, recording.name
+    if not meta.spec_text:
+        raise usage(
+            f"`{name}` carries no specification", f"stlc check SPEC {name}", f"stlc check {name} --spec SPEC"
+        )
+    source = Source(meta.spec_path or f"{meta.spec_name or 'specification'} in {name}", meta.spec_text)
+    if meta.spec_path and Path(meta.spec_path).is_file() and read_source(meta.spec_path).text != source.text:
+        return source, (
+            f"{meta.spec_path} has changed since; judging by the text in {name} "
+            f"(--spec {meta.spec_path} takes the new one)"
+        )
+    return source, ""
+
+
+def monitor_of(source: Source, question: Question) -> Monitor:
+    """The monitor for a specification; the same for every trace that carries the same one."""
+    return _monitor(source.name, source.text, question.system, tuple(question.overrides.items()))
+
+
+@lru_cache(maxsize=8)
+def _monitor(name: str, text: str, system: str | None, overrides: tuple[tuple[str, str], ...]) -> Monitor:
+    from stlc.grammar.parser import parse
+    from stlc.monitor.verdict import Monitor
+
+    return Monitor(parse(Source(name, text)), system=system, overrides=dict(overrides))
+
+
+# ------------------------------------------------------------------------ instants
+
+
+def instant(text: str | None, trace: Trace) -> At:
+    """A sample of `trace`; "all" and None as they are. Raises UsageError (U101)."""
+    if text is None or text == "all":
+        return "all" if text else None
+    match = _AT.fullmatch(text.strip())
+    help_ = "a sample (0, 46), a time (4.6s) or all"
+    if match is None:
+        raise usage(f"`--at {text}` is not an instant", help_)
+    if not match["unit"]:
+        if not match["number"].isdigit():
+            raise usage(f"`--at {text}` is not a whole number of samples", help_)
+        return int(match["number"])
+    steps = (_seconds("--at", text, help_) - trace.t0) / trace.dt
+    sample = round(steps)
+    if abs(steps - sample) > 0.01 or not 0 <= sample < trace.samples:
+        first, last = trace.t0, trace.t0 + (trace.samples - 1) * trace.dt
+        raise usage(
+            f"`{trace.name}` has no sample at {text}",
+            f"it runs from {first:g} s to {last:g} s every {trace.dt:g} s",
+        )
+    return sample
+
+
+def time_step(option: str, text: str | None) -> float | None:
+    """The seconds that an option gives as a step. Raises UsageError (U101)."""
+    if text is None:
+        return None
+    seconds = _seconds(option, text, "a time with its unit: 0.1s, 20ms")
+    if not 0 < seconds < float("inf"):
+        raise usage(f"`{option} {text}` is not a time above 0")
+    return seconds
+
+
+def _seconds(option: str, text: str, advice: str) -> float:
+    from stlc.units import parse_unit
+
+    match = _TIME.fullmatch(text.strip())
+    if match is None:
+        raise usage(f"`{option} {text}` is not a time", advice)
+    try:
+        unit = parse_unit(match["unit"])
+    except ValueError as error:
+        raise usage(f"`{option} {text}`: {error}", advice) from None
+    if unit.dims != parse_unit("s").dims:
+        raise usage(f"`{option} {text}` is not a time", advice)
+    return float(match["number"]) * unit.scale

@@ -1,0 +1,107 @@
+"""What is left of a trace once it is judged: texts and numbers, small enough to travel between processes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from stlc.diagnostics import Diagnostic
+
+if TYPE_CHECKING:
+    from stlc.monitor.judgement import Status
+
+WORDS: dict[Status, str] = {
+    "satisfied": "satisfied",
+    "violated": "VIOLATED",
+    "inconclusive": "inconclusive",
+    "out of scope": "out of scope",
+}
+
+SATISFIED, VIOLATED, INVALID, INCONCLUSIVE = 0, 1, 3, 4
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One requirement on all traces of a file.
+
+    Attributes:
+        name: of the requirement.
+        status: its verdict.
+        robustness: the least, as text.
+        where: trace and time of it, as text.
+        why: one line for a requirement that is not satisfied.
+    """
+
+    name: str
+    status: Status
+    robustness: str = ""
+    where: str = ""
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """A file that was judged, or could not be.
+
+    Attributes:
+        name: of the file.
+        status: over all traces and requirements.
+        rows: one for each requirement.
+        text: everything as it is printed.
+        entry: the same for a JSON document.
+        traces: how many count.
+        holds: share of the starts at which all requirements hold.
+        fails: share of the starts at which one is violated.
+        seconds: how long it took.
+        warnings: of the compiler.
+        said: what is to be said besides.
+        errors: why the file could not be judged.
+        exit_code: that of the errors.
+    """
+
+    name: str
+    status: Status = "inconclusive"
+    rows: tuple[Row, ...] = ()
+    text: str = ""
+    entry: dict[str, Any] = field(default_factory=dict)
+    traces: int = 0
+    holds: float = 0.0
+    fails: float = 0.0
+    seconds: float = 0.0
+    warnings: tuple[Diagnostic, ...] = ()
+    said: tuple[str, ...] = ()
+    errors: tuple[Diagnostic, ...] = ()
+    exit_code: int = 0
+
+
+def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None) -> int:
+    """0 satisfied, 1 violated, 4 inconclusive; with `fail_under` the share of satisfied starts decides.
+
+    A file that cannot be judged outweighs every answer. Traces out of scope count for nothing.
+    """
+    broken = [outcome.exit_code for outcome in outcomes if outcome.errors]
+    if broken:
+        return max(broken)
+    if fail_under is not None:
+        return _by_share(outcomes, fail_under)
+    return {"violated": VIOLATED, "satisfied": SATISFIED}.get(overall(outcomes), INCONCLUSIVE)
+
+
+def overall(outcomes: Sequence[Outcome]) -> Status:
+    """Over all files that count."""
+    found = {outcome.status for outcome in outcomes if not outcome.errors}
+    if "violated" in found:
+        return "violated"
+    return "satisfied" if found - {"out of scope"} == {"satisfied"} else "inconclusive"
+
+
+def _by_share(outcomes: Sequence[Outcome], least: float) -> int:
+    traces = sum(outcome.traces for outcome in outcomes)
+    if not traces:
+        return INCONCLUSIVE
+    holds = sum(outcome.holds * outcome.traces for outcome in outcomes) / traces
+    fails = sum(outcome.fails * outcome.traces for outcome in outcomes) / traces
+    if holds >= least:
+        return SATISFIED
+    return VIOLATED if 1.0 - fails < least else INCONCLUSIVE

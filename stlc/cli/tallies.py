@@ -1,0 +1,143 @@
+"""What a monitor of samples says at the end of a stream or of a trace that was read in pieces."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from stlc.cli.check_text import percent, signed
+from stlc.cli.outcome import WORDS, Outcome, Row
+from stlc.cli.output import table
+from stlc.compile.semantics import TOLERANCE
+from stlc.source import Source
+
+if TYPE_CHECKING:
+    from stlc.monitor.judgement import Status
+    from stlc.monitor.online import Online
+    from stlc.monitor.tally import Tally
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What was judged.
+
+    Attributes:
+        name: of the trace.
+        source: text of the specification.
+        dt: time step in seconds.
+        samples: how many there were.
+    """
+
+    name: str
+    source: Source
+    dt: float
+    samples: int
+
+
+def outcome_of_tallies(online: Online, told: Told, said: tuple[str, ...], seconds: float) -> Outcome:
+    """The outcome of a stream that is over. Raises TraceError as `Online.finish`."""
+    tallies = online.finish()
+    status = status_of(online, tallies)
+    rows = tuple(_row(name, tally, online) for name, tally in tallies.items())
+    counts = [tally.instants for tally in tallies.values()]
+    most = max(tallies.values(), key=lambda tally: tally.instants)
+    return Outcome(
+        name=told.name,
+        status=status,
+        rows=rows,
+        text="\n".join(_text(told, rows, tallies, status)),
+        entry=_entry(told, online, tallies, status),
+        traces=0 if status == "out of scope" else 1,
+        holds=min(tally.share for tally in tallies.values()) if counts else 0.0,
+        fails=max(tally.fails / max(tally.instants, 1) for tally in tallies.values()) if most else 0.0,
+        seconds=seconds,
+        warnings=online.compiled.warnings,
+        said=said,
+    )
+
+
+def status_of(online: Online, tallies: Mapping[str, Tally]) -> Status:
+    """Over all requirements."""
+    if online.in_scope is False:
+        return "out of scope"
+    found = {tally.status for tally in tallies.values()}
+    return "violated" if "violated" in found else "satisfied" if found == {"satisfied"} else "inconclusive"
+
+
+def robustness_text(tally: Tally) -> str:
+    """The least robustness, or its bounds."""
+    if tally.status == "inconclusive":
+        return f"[{signed(tally.low)}, {signed(tally.high)}]"
+    return "boundary" if abs(tally.robustness) <= TOLERANCE else signed(tally.robustness)
+
+
+def _row(name: str, tally: Tally, online: Online) -> Row:
+    where = f"from t = {online.time(tally.worst):.10g} s" if tally.instants > 1 else ""
+    if tally.status == "satisfied":
+        return Row(name, tally.status, robustness_text(tally), where)
+    if tally.status == "violated":
+        why = f"violated at {tally.fails:,} of {tally.instants:,} starts"
+    else:
+        why = "the trace is too short to say"
+    return Row(name, tally.status, robustness_text(tally), where, why)
+
+
+def _text(told: Told, rows: tuple[Row, ...], tallies: Mapping[str, Tally], status: Status) -> Iterator[str]:
+    yield f"{told.source.name} on {told.name}    1 trace x {told.samples} samples, dt {told.dt:g} s"
+    yield ""
+    head = ("requirement", "verdict", "robustness", "starts", "where")
+    lines = [
+        (row.name, WORDS[row.status], row.robustness, _share(tallies[row.name]), row.where) for row in rows
+    ]
+    yield table(lines, header=head)
+    yield ""
+    yield WORDS[status].lower()
+
+
+def _share(tally: Tally) -> str:
+    return "" if tally.instants == 1 else percent(tally.share)
+
+
+def _entry(told: Told, online: Online, tallies: Mapping[str, Tally], status: Status) -> dict[str, Any]:
+    horizon = online.compiled.grid.horizon
+    known = [tally.robustness for tally in tallies.values()]
+    return {
+        "trace": told.name,
+        "spec": told.source.name,
+        "spec_sha256": hashlib.sha256(told.source.text.encode()).hexdigest(),
+        "dt": told.dt,
+        "horizon": None if horizon is None else {"seconds": horizon * told.dt, "steps": horizon},
+        "end": online.how.end,
+        "traces": 1,
+        "samples": told.samples,
+        "verdict": status,
+        "robustness": math.nan if any(map(math.isnan, known)) else min(known),
+        "satisfied_traces": int(status == "satisfied"),
+        "satisfied_share": min(tally.share for tally in tallies.values()),
+        "requirements": [_requirement(name, tally, online) for name, tally in tallies.items()],
+    }
+
+
+def _requirement(name: str, tally: Tally, online: Online) -> dict[str, Any]:
+    rule = next(rule for rule in online.compiled.requirements if rule.name == name)
+    time = online.time(tally.worst)
+    return {
+        "name": name,
+        "doc": rule.doc,
+        "tags": sorted(rule.tags),
+        "verdict": tally.status,
+        "robustness": {
+            "min": tally.robustness,
+            "mean": tally.robustness,
+            "low": tally.low,
+            "high": tally.high,
+            "argmin": {"trace": 0, "start": time, "time": time},
+        },
+        "starts": tally.instants,
+        "satisfied_share": tally.share,
+        "violated_traces": int(tally.status == "violated"),
+        "cause": None,
+    }
