@@ -73,7 +73,11 @@ class FormulaWriter:
 
     def _last(self, window: ir.Window, start: int, count: int) -> int:
         """Last sample that the window of the last instant reaches."""
-        return self.samples - 1 if window.hi is None else start + count - 1 + window.hi
+        latest = start + count - 1
+        last = self.samples - 1 if window.hi is None else latest + window.hi
+        if latest + window.lo > last:
+            raise Untranslatable("a window that begins beyond the plan")
+        return last
 
     def _window(self, pick: str, window: ir.Window, body: ir.Formula, start: int, count: int) -> str:
         first, last = start + window.lo, self._last(window, start, count)
