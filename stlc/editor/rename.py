@@ -22,10 +22,14 @@ class RenameError(Exception):
     """Why a name cannot be changed to that."""
 
 
+_FROM_ELSEWHERE = ("module", "extern", "param")
+"""What other files call by its name, and nothing here can say so."""
+
+
 def can_rename(document: Document, offset: int) -> Occurrence | None:
-    """What would be renamed: modules keep their names."""
+    """What would be renamed, if that is possible."""
     found = document.names.at(offset)
-    return None if found is None or found.symbol.kind == "module" else found
+    return None if found is None or found.symbol.kind in _FROM_ELSEWHERE else found
 
 
 def rename(document: Document, offset: int, new: str) -> tuple[Edit, ...]:
@@ -38,7 +42,7 @@ def rename(document: Document, offset: int, new: str) -> tuple[Edit, ...]:
     """
     found = can_rename(document, offset)
     if found is None:
-        raise RenameError("there is no name of yours here")
+        raise RenameError("there is no name here that this file alone decides")
     if document.unread:
         raise RenameError(f"the text has an error in line {_line(document)}; mend it first")
     name = new.strip().strip("`")

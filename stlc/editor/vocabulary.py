@@ -31,7 +31,8 @@ TAGS: Mapping[str, str] = MappingProxyType(
         "safety": "Part of phi_safe, which even an emergency plan keeps.",
         "liveness": "Something good that must happen; not part of phi_safe.",
         "weight": "`@weight(w)`: its robustness counts w times in the whole.",
-        "scale": "`@scale(s)`: its robustness is divided by s in the whole.",
+        "scale": "`@scale(s)`, `@scale(auto)`: its robustness is divided by s, or by its reach.",
+        "product": "`x in [lo, hi]` has the robustness `(x - lo) * (hi - x)` of the paper.",
         "id": '`@id("R1")`: what it is called elsewhere.',
         "group": "`@group(name)`: requirements that belong together.",
     }

@@ -57,7 +57,7 @@ def test_the_unit_of_the_file(write):
 
 
 def test_tags(write):
-    assert offers(write, "@│") == ["@group", "@id", "@liveness", "@safety", "@scale", "@weight"]
+    assert offers(write, "@│") == ["@group", "@id", "@liveness", "@product", "@safety", "@scale", "@weight"]
     assert "@safety" in offers(write, "@sa│")
 
 

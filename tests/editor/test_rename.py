@@ -73,8 +73,10 @@ def test_a_reserved_word_gets_backticks(write):
         ("const c│ = 2", "a b", "not a name"),
         ("const c│ = 2\nrequire r: c > ", "d", "error in line"),
         ("signal x│, y\nrequire r: x > y", "z", "share a declaration"),
-        ("signal x\nrequire│ r: x > 0", "z", "no name of yours"),
-        ("import std│\nsignal x", "z", "no name of yours"),
+        ("signal x\nrequire│ r: x > 0", "z", "no name here"),
+        ("import std│\nsignal x", "z", "no name here"),
+        ("param p│ in [0, 1]", "q", "no name here"),
+        ("extern fn f│(x) -> real", "g", "no name here"),
     ],
 )
 def test_what_is_refused(write, text, new, says):
@@ -101,7 +103,7 @@ def test_the_formulas_stay_whatever_is_renamed(path):
     before = formulas(text)
     assert before
     for one in document.names.occurrences:
-        if one.declares and one.symbol.kind not in ("signal", "module"):
+        if one.declares and one.symbol.kind != "signal" and can_rename(document, one.span.start):
             changed = apply(text, rename(document, one.span.start, "another_name"))
             assert changed != text
             assert formulas(changed) == before, one.symbol
