@@ -120,6 +120,8 @@ CODES: dict[str, str] = {
     "E105": "a definition that refers to itself, or wrong arguments",
     "W105": "a name that is declared and never used",
     "W106": "a word or sign of another tool, where the language has its own",
+    "E106": "an import that cannot be read, or that leads back to itself",
+    "E107": "a function from outside that nobody provides",
     # types and units
     "E201": "a number where a formula is needed",
     "E202": "a formula where a number is needed",
@@ -167,6 +169,7 @@ CODES: dict[str, str] = {
     "S204": "a control without a range, or bounds in the wrong order",
     "S206": "a world or plugin that cannot be loaded",
     "S207": "a world that fails while it runs",
+    "S208": "a function from outside that cannot be loaded, or that fails",
     "S301": "initial states that are (nearly) all rejected",
     "S302": "dynamics that give NaN or infinity",
     "W601": "an acceptance rate of initial states below 1 %",

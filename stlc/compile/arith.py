@@ -113,7 +113,8 @@ class Program:
             case "blend":
                 return partial(switch.blend, ops=ops)
             case "extern":
-                function = self._externs[str(instr.params[0])]
+                (given,) = instr.params
+                function: Any = self._externs[given] if isinstance(given, str) else given
                 return lambda *args: function(*args[:-1])
             case "pick":
                 return operator.getitem
@@ -199,8 +200,8 @@ class _Writer:
                 return self._indicator(cond, sharpness)
             case ir.Where(cond, yes, no):
                 return self._where(cond, self.number(yes), self.number(no))
-            case ir.Extern(name, args, output):
-                whole = self.tape.emit("extern", *map(self.number, args), params=(name,))
+            case ir.Extern(name, args, output, function):
+                whole = self.tape.emit("extern", *map(self.number, args), params=(function or name,))
                 return self.tape.emit("pick", whole, params=(output,))
             case _:
                 assert_never(num)

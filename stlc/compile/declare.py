@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from stlc.compile.calls import unsupported
+from stlc.compile.externs import external
 from stlc.compile.functions import FUNCTIONS, callable_names
 from stlc.compile.interface import Interface
 from stlc.compile.scope import Definition, Entry, Failed, Known, Scope, Sort, column_entries, member_entries
@@ -142,8 +143,10 @@ def _entry(
             return Definition(item.name, item.value, sort="region", about=about, span=item.name_span)
         case ast.Def():
             return _macro(item, about, found, scope)
+        case ast.Extern():
+            return external(item, interface, about, scope)
         case _:
-            return scope.fail(unsupported("`extern fn`", item.span, scope))
+            raise AssertionError("enums and requirements are no values")
 
 
 def _column_entry(

@@ -18,7 +18,8 @@ from stlc.compile.calls import builtin, unsupported
 from stlc.compile.macros import arguments, cycle, finished, too_large
 from stlc.compile.meter import Cost
 from stlc.compile.operations import OPERATIONS
-from stlc.compile.scope import TIME_WORDS, Definition, Failed, Scope, reserved
+from stlc.compile.outside import outside
+from stlc.compile.scope import TIME_WORDS, Definition, External, Failed, Scope, reserved
 from stlc.compile.sorts import Need, as_formula, as_number, loose_number
 from stlc.compile.values import Number, Origin, Value, Vector, at, literal
 from stlc.diagnostics import Diagnostic, Label
@@ -30,11 +31,28 @@ def evaluate(expr: ast.Expr, scope: Scope) -> Value:
     """The value of an expression. Raises Failed, with all independent findings in the sink."""
     meter = scope.meter
     meter.enter()
+    before = meter.nodes
     try:
         _refuse_excess(expr.span, scope)
-        return at(_value(expr, scope), expr.span)
+        value = _value(expr, scope)
+        if _is_written_twice(expr, value):
+            _charge(Cost(meter.nodes - before), expr.span, scope)
+        return at(value, expr.span)
     finally:
         meter.leave()
+
+
+def _is_written_twice(expr: ast.Expr, value: Value) -> bool:
+    """Whether parts of a formula appear twice in what it means: `a <-> b` is `a -> b` and `b -> a`."""
+    match expr:
+        case ast.Logic(op="<->" | "xor") | ast.Until(op="unless"):
+            return True
+        case ast.IfThenElse() | ast.Compare():
+            return isinstance(value, typed.Logic)
+        case ast.Call():
+            return isinstance(value, typed.Edge)
+        case _:
+            return False
 
 
 def _value(expr: ast.Expr, scope: Scope) -> Value:
@@ -88,6 +106,8 @@ def _name(expr: ast.Name, scope: Scope) -> Value:
     entry = scope.entries.get(expr.name)
     if entry is None:
         return scope.unknown(expr)
+    if isinstance(entry, External):
+        scope.fail(Diagnostic("E105", f"`{entry.name}` takes arguments", expr.span))
     if isinstance(entry, Definition):
         if entry.formals:
             help_ = (f"{entry.name}({', '.join(entry.formals)})",)
@@ -190,6 +210,8 @@ def _call(expr: ast.Call, scope: Scope) -> Value:
     entry = scope.entries.get(expr.func.name)
     if isinstance(entry, Definition) and entry.formals:
         return _expanded(entry, expr, scope)
+    if isinstance(entry, External):
+        return outside(entry, expr, evaluate_all([arg.value for arg in expr.args], scope), scope)
     if entry is not None and not reserved(expr.func.name):
         if scope.cache.get(expr.func.name, entry) is not None:
             scope.report(Diagnostic("E105", f"`{expr.func.name}` is not a function", expr.func.span))

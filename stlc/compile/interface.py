@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from typing import Any, Protocol
 
 from stlc.signature import Signature
 from stlc.source import Span
@@ -19,6 +20,21 @@ class Grid:
     horizon: int | None = None
 
 
+class Function(Protocol):
+    """A function from outside, such as forward kinematics."""
+
+    def bound(self, arguments: tuple[int | None, ...], result: int | None) -> Callable[..., Sequence[Any]]:
+        """The function on components.
+
+        Args:
+            arguments: the size of each vector that it takes; None for a number.
+            result: the size of the vector that it gives; None for a number.
+
+        Returns:
+            Takes all components as arrays that broadcast, and gives the components of the result.
+        """
+
+
 @dataclass(frozen=True, slots=True)
 class Interface:
     """What a system offers to a specification.
@@ -27,7 +43,8 @@ class Interface:
         name: of the system.
         signature: its states, in order, with the units that are stored.
         constants: name -> (value in SI units, unit).
-        externs: name of a function that the system provides -> (length of its argument, of its result).
+        externs: names of the functions that the system provides.
+        functions: those that have been loaded, by name.
         path: of the system file, as messages show it.
         places: name of a state or constant -> where the system file declares it.
     """
@@ -35,7 +52,8 @@ class Interface:
     name: str
     signature: Signature
     constants: Mapping[str, tuple[float, Unit]] = field(default_factory=dict)
-    externs: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    externs: frozenset[str] = frozenset()
+    functions: Mapping[str, Function] = field(default_factory=dict)
     path: str = ""
     places: Mapping[str, Span] = field(default_factory=dict)
 

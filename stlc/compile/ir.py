@@ -6,8 +6,9 @@ Nodes are immutable and compare by structure, so a common sub-expression is foun
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from stlc.source import Span
 
@@ -78,11 +79,15 @@ class Where:
 
 @dataclass(frozen=True, slots=True)
 class Extern:
-    """Component `output` of a function that the system provides."""
+    """Component `output` of a function that the system provides.
+
+    `function` takes the arguments as arrays and gives all components; None where nobody loaded it.
+    """
 
     name: str
     args: tuple[Num, ...]
     output: int = 0
+    function: Callable[..., Sequence[Any]] | None = field(default=None, repr=False)
 
 
 Num: TypeAlias = Lit | Col | At | Held | Op | Ind | Where | Extern

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Literal, NoReturn, TypeAlias
+from typing import Any, Literal, NoReturn, TypeAlias
 
 from stlc.compile import ir
 from stlc.compile.functions import callable_names, sampler_names
@@ -15,7 +15,7 @@ from stlc.compile.values import Label, Number, Origin, Value, Vector
 from stlc.diagnostics import Diagnostic, SpecError, StlcError, SystemFileError
 from stlc.grammar import ast
 from stlc.registry import closest
-from stlc.signature import Column
+from stlc.signature import Column, Kind
 from stlc.source import Span
 from stlc.units import DIMENSIONLESS, Unit
 
@@ -69,7 +69,32 @@ class Definition:
     span: Span | None = None
 
 
-Entry: TypeAlias = Known | Definition
+@dataclass(frozen=True, slots=True)
+class External:
+    """A function that the system provides.
+
+    Attributes:
+        name: of the function.
+        arguments: size of each vector that it takes; None for a number.
+        result: size of the vector that it gives; None for a number.
+        unit: of the result.
+        kind: of the result.
+        function: takes components and gives components; None where nobody loaded it.
+        about: what it is, for messages.
+        span: where its name was declared.
+    """
+
+    name: str
+    arguments: tuple[int | None, ...]
+    result: int | None
+    unit: Unit
+    kind: Kind
+    function: Callable[..., Sequence[Any]] | None
+    about: str = ""
+    span: Span | None = None
+
+
+Entry: TypeAlias = Known | Definition | External
 Bounds: TypeAlias = tuple[float, float]
 
 

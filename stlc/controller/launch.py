@@ -11,6 +11,7 @@ from stlc.compile.dump import dump
 from stlc.controller.config import TrainConfig, decide
 from stlc.controller.run import SPEC, SYSTEM, Run, spec_hash, system_hash
 from stlc.controller.train import train
+from stlc.dynamics.functions import function_files
 from stlc.files import write_atomic
 from stlc.provenance import git_state, hardware, versions
 from stlc.rundir import RUNS, RunDir, now
@@ -80,6 +81,8 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
     write_atomic(folder.path / SYSTEM, decl.source.text)
     if decl.test.world is not None:
         write_atomic(folder.path / decl.test.world.path.name, decl.test.world.path.read_bytes())
+    for name, path in function_files(decl).items():
+        write_atomic(folder.path / name, path.read_bytes())
     write_atomic(folder.path / "compiled.txt", dump(task.compiled))
     folder.update({"spec_hash": spec_hash(folder), "system_hash": system_hash(folder)})
     return folder

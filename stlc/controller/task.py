@@ -99,7 +99,7 @@ class Task:
         decl = system.decl
         grid = Grid(dt=decl.dt, horizon=decl.horizon)
         return cls(
-            compile_spec(spec, grid=grid, interface=decl.interface(), overrides=overrides or {}), system
+            compile_spec(spec, grid=grid, interface=system.interface(), overrides=overrides or {}), system
         )
 
     @property

@@ -179,6 +179,25 @@ class WorldRef:
 
 
 @dataclass(frozen=True, slots=True)
+class FunctionDecl:
+    """A Python function on arrays that specifications may call.
+
+    Attributes:
+        name: by which `extern fn` knows it.
+        module: the module, or the file beside the system file, that holds it.
+        attribute: its name there.
+        library: the arrays that it takes; None takes what the caller has.
+        span: where it is named.
+    """
+
+    name: str
+    module: str | Path
+    attribute: str
+    library: Literal["numpy", "torch"] | None = None
+    span: Span | None = field(default=None, compare=False, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
 class TestDecl:
     """A deployment: how long, how many agents, how often they plan, and what happens to them."""
 
@@ -222,6 +241,7 @@ class SystemDecl:
         jumps: in file order.
         clamps: columns that are kept within (low, high).
         scenarios: named overlays.
+        functions: from outside, for specifications.
         overrides: what `--set` changed.
         places: name of a state, control, constant or definition -> where it is declared.
         warnings: findings that do not stop anything.
@@ -250,6 +270,7 @@ class SystemDecl:
     backup: BackupDecl
     test: TestDecl
     scenarios: tuple[ScenarioDecl, ...] = ()
+    functions: tuple[FunctionDecl, ...] = ()
     overrides: Mapping[str, str] = field(default_factory=dict)
     places: Mapping[str, Span] = field(default_factory=dict, repr=False)
     warnings: tuple[Diagnostic, ...] = field(default=(), repr=False)
@@ -267,4 +288,6 @@ class SystemDecl:
 
     def interface(self) -> Interface:
         """What the compiler of specifications may know of this system."""
-        return Interface(self.name, self.signature, self.constants, path=self.source.name, places=self.places)
+        names = frozenset(function.name for function in self.functions)
+        path = self.source.name
+        return Interface(self.name, self.signature, self.constants, names, path=path, places=self.places)

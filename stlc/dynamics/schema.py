@@ -10,6 +10,7 @@ from types import MappingProxyType
 from stlc.dynamics.decl import ScenarioDecl, SystemDecl
 from stlc.dynamics.schema_deploy import read_test
 from stlc.dynamics.schema_flow import read_flow, read_jumps, read_timers
+from stlc.dynamics.schema_functions import read_functions
 from stlc.dynamics.schema_init import read_init
 from stlc.dynamics.schema_names import (
     Clockwork,
@@ -58,7 +59,6 @@ TOP_KEYS = [
 LATER = {
     "extends": "one system file extending another",
     "param": "parameters that are drawn for every trajectory",
-    "functions": "functions from outside",
     "plugin": "dynamics from a plugin",
 }
 
@@ -148,6 +148,7 @@ def _declaration(
         backup=read_backup(found.get("backup"), reader, clock.horizon),
         test=read_test(found.get("test"), reader, names, clock.dt),
         scenarios=_scenarios(found.get("scenario"), reader),
+        functions=read_functions(found.get("functions"), reader),
         overrides=MappingProxyType(dict(overrides)),
         places=MappingProxyType(names.places),
         warnings=tuple(finding for finding in reader.findings if finding.severity == "warning"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from stlc.compile import ir
 from stlc.compile.arith import Program
+from stlc.compile.interface import Interface
 from stlc.compile.ops_torch import TORCH
 from stlc.compile.switch import Hard, Switch
 from stlc.compile.timers import Timer
@@ -18,6 +20,7 @@ from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.algebra import add, multiply, names_in
 from stlc.dynamics.decl import ControlDecl, SystemDecl
 from stlc.dynamics.describe import describe
+from stlc.dynamics.functions import load_functions
 from stlc.dynamics.rollout import Columns, Stepper
 from stlc.dynamics.samplers import InitialStates
 from stlc.dynamics.schema import load_system_decl
@@ -62,6 +65,10 @@ class System:
         missions.
         """
         return System(self.decl, (*self.timers, *timers))
+
+    def interface(self) -> Interface:
+        """What the compiler may know of this system, its functions loaded. Raises SystemFileError (S208)."""
+        return replace(self.decl.interface(), functions=load_functions(self.decl))
 
     # ---------------------------------------------------------------- description
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -55,11 +55,13 @@ def given_times(dt: float | Fraction | None, horizon: float | Fraction | None) -
 
 
 def system_of(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, Interface]:
-    """Times and interface of a system file. Raises UsageError (U102) or SystemFileError."""
+    """Times and interface of a system file, its functions loaded. Raises UsageError or SystemFileError."""
+    from stlc.dynamics.functions import load_functions
     from stlc.dynamics.schema import load_system_decl
 
     decl = load_system_decl(find_system(name, Path(spec.source.name)), overrides)
-    return Times(decl.dt, decl.dt * decl.horizon), decl.interface()
+    interface = replace(decl.interface(), functions=load_functions(decl))
+    return Times(decl.dt, decl.dt * decl.horizon), interface
 
 
 def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:

@@ -6,8 +6,11 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from stlc.compile.horizon import columns
+from stlc.compile import ir
+from stlc.compile.horizon import columns, numbers
 from stlc.compile.pipeline import Compiled, Rule
+from stlc.compile.samples import everything
+from stlc.diagnostics import Diagnostic, UsageError
 from stlc.grammar import ast
 from stlc.signature import Column
 from stlc.source import Span
@@ -31,7 +34,12 @@ class Need:
 
 
 def needs_of(compiled: Compiled, rules: Sequence[Rule]) -> tuple[Need, ...]:
-    """The signals that `rules` read, in the order of the specification."""
+    """The signals that `rules` read, in the order of the specification.
+
+    Raises:
+        UsageError: E107, they call functions that nobody loaded.
+    """
+    _require_functions(compiled, rules)
     read = {rule.name: columns(rule.formula) for rule in rules}
     spans = {item.name: item.name_span for item in compiled.spec.items if isinstance(item, ast.Signal)}
     wanted: dict[str, tuple[str, ...]] = {}
@@ -43,3 +51,16 @@ def needs_of(compiled: Compiled, rules: Sequence[Rule]) -> tuple[Need, ...]:
         for column in compiled.signature.columns
         if column.name in wanted
     )
+
+
+def _require_functions(compiled: Compiled, rules: Sequence[Rule]) -> None:
+    parts = (part for rule in rules for num in numbers(rule.formula) for part in everything(num))
+    missing = dict.fromkeys(
+        part.name for part in parts if isinstance(part, ir.Extern) and part.function is None
+    )
+    if not missing:
+        return
+    places = {item.name: item.name_span for item in compiled.spec.items if isinstance(item, ast.Extern)}
+    help_ = ("--system FILE names the system that does; its functions are Python code, and loading runs it",)
+    message = "`{}` is a function from outside, and nobody provides it here"
+    raise UsageError(*(Diagnostic("E107", message.format(n), places.get(n), help=help_) for n in missing))
