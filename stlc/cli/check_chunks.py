@@ -17,13 +17,6 @@ CHUNK = 250_000
 """Samples that are read at a time."""
 
 
-def too_large(path: Path) -> bool:
-    """Whether a file is better read in pieces."""
-    from stlc.trace_chunks import LARGE, size_of
-
-    return size_of(path) > LARGE
-
-
 def outcome_in_chunks(path: Path, work: Work) -> Outcome:
     """Judge a file in pieces.
 

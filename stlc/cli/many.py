@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +12,9 @@ from stlc.cli.judge import Question, found, judged, taken
 from stlc.cli.outcome import WORDS, Outcome, Row, overall
 from stlc.cli.output import COLOR, ColorMode, table
 from stlc.diagnostics import Diagnostic, StlcError, UsageError
+
+SMALL = 1_000_000
+"""Bytes: no file of less unpacks to more than fits into memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +50,8 @@ def all_outcomes(works: Sequence[Work], jobs: int) -> Iterator[Outcome]:
     elif jobs == 1:
         yield from map(safe_outcome, works)
     else:
+        from concurrent.futures import ProcessPoolExecutor
+
         with ProcessPoolExecutor(min(jobs or os.cpu_count() or 1, len(works))) as pool:
             yield from pool.map(safe_outcome, works, chunksize=max(len(works) // 64, 1))
 
@@ -63,14 +67,15 @@ def safe_outcome(work: Work) -> Outcome:
 
 def outcome_of(work: Work) -> Outcome:
     """Judge one file. Raises StlcError where that cannot be done."""
-    from stlc.cli.check_chunks import outcome_in_chunks, too_large
     from stlc.cli.check_json import entry_of
     from stlc.cli.check_text import describe_result, rows_of
 
     COLOR.set(work.mode)
     begun = time.perf_counter()
     path = found(work.name, work.runs)
-    if work.chunk or too_large(path):
+    if work.chunk or _too_large(path):
+        from stlc.cli.check_chunks import outcome_in_chunks
+
         return outcome_in_chunks(path, work)
     result, said = judged(path, work.question)
     if work.out is not None:
@@ -90,6 +95,15 @@ def outcome_of(work: Work) -> Outcome:
         warnings=result.warnings,
         said=(*taken(work.name, work.runs), *said),
     )
+
+
+def _too_large(path: Path) -> bool:
+    """Whether a file is better read in pieces; a small one never is, however well it is compressed."""
+    if path.stat().st_size < SMALL:
+        return False
+    from stlc.trace_chunks import LARGE, size_of
+
+    return size_of(path) > LARGE
 
 
 # -------------------------------------------------------------------------- summary

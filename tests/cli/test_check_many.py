@@ -211,6 +211,7 @@ def test_pieces_that_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_file_that_is_too_large_is_read_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     (name,) = files(a_trace(peak=3))
     monkeypatch.setattr("stlc.trace_chunks.LARGE", 100)
+    monkeypatch.setattr("stlc.cli.many.SMALL", 100)
     monkeypatch.setattr("stlc.trace_npz.MAX_BYTES", 100)
     assert check("s.stl", name, "-q") == 1
 
