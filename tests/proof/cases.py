@@ -1,0 +1,68 @@
+"""One formula, its text and a trace, all from one seed."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import numpy as np
+import pytest
+from proof.draw import DT, HORIZON, Drawing, Taste, rows, trace
+from proof.language import Constant, Formula, nodes
+from proof.levels import End, Record, ahead
+from proof.written import specification
+
+from stlc.grammar.parser import parse
+from stlc.grammar.printer import show
+from stlc.monitor.verdict import Monitor
+from stlc.source import Source
+
+FULL = 10_000
+BLOCK = 500
+FAST = 100
+"""Cases of the ordinary suite, of each kind."""
+
+
+class Case:
+    """A formula with everything that is needed to judge it."""
+
+    def __init__(
+        self, seed: int, taste: Taste | None = None, *, longest: int = 18, generic: bool = False
+    ) -> None:
+        rng = random.Random(seed)
+        self.seed = seed
+        self.formula: Formula = Drawing(rng, taste or Taste()).formula()
+        self.text = specification(self.formula, rng)
+        self.signals: dict[str, Any] = trace(rng, longest=longest, generic=generic)
+        self.samples = len(self.signals["x"])
+        self.folds = any(isinstance(node, Constant) for node in nodes(self.formula))
+
+    def monitor(self) -> Monitor:
+        """Every other one from the text that stlc itself writes."""
+        if self.seed % 2:
+            return Monitor(self.text, dt=DT, horizon=HORIZON * DT)
+        spec = parse(Source("<case>", self.text))
+        again = parse(Source("<again>", show(spec)))
+        assert again == spec, self
+        return Monitor(again, dt=DT, horizon=HORIZON * DT)
+
+    def record(self, end: End, until: int | None = None) -> Record:
+        """The trace up to a sample, with the signals of each sample in a row."""
+        return Record(rows(self.signals)[:until], end, ahead(self.formula))
+
+    def __str__(self) -> str:
+        requirement = self.text[self.text.index("region block") :].split("\n", 1)[1]
+        return f"case {self.seed}: {requirement.strip()}\non {self.signals}"
+
+    def same(self, found: Any, wanted: Any, about: str) -> None:
+        """Equal within 1e-9, infinities and NaN included."""
+        np.testing.assert_allclose(found, wanted, atol=1e-9, rtol=0, err_msg=f"{about}\n{self}")
+
+
+def seeds(count: int, fast: int = FAST) -> list[Any]:
+    """The first ones in the ordinary suite, blocks of all of them behind the marker `slow`."""
+    slow = [range(low, min(low + BLOCK, count)) for low in range(0, count, BLOCK)]
+    return [
+        pytest.param(range(fast), id="some"),
+        *(pytest.param(part, id=f"{part.start}", marks=pytest.mark.slow) for part in slow),
+    ]

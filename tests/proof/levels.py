@@ -1,0 +1,343 @@
+"""Robustness by level sets: a second evaluator, with nothing in common with `reference`.
+
+Only truth is defined here. A formula at level r is the formula with every predicate asked for a margin of r,
+those under a negation for a margin of r on the other side; its *level set* is the set of instants at which
+that holds. Robustness at an instant is then the greatest level whose set contains it: min and max appear
+nowhere. Boolean semantics are the same sets with predicates that are plainly true or false.
+
+A set of instants is an integer, bit t for instant t. Beyond the last sample of a trace that may go on nothing
+is known: pessimists (`lower`) take no predicate there for met nor for failed, optimists (`upper`) take it
+for both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import cached_property, reduce
+from itertools import count
+from typing import Literal, TypeAlias
+
+from proof.language import (
+    Atom,
+    Choice,
+    Constant,
+    Edge,
+    Formula,
+    Many,
+    Meet,
+    Not,
+    Over,
+    Pair,
+    Row,
+    Step,
+    Use,
+    Window,
+    nodes,
+    windows,
+)
+
+Instants: TypeAlias = int
+End: TypeAlias = Literal["truncate", "lower", "upper"]
+Met: TypeAlias = Callable[[Atom, float], bool]
+"""Whether a predicate with this margin counts as true."""
+
+FUTURE = ("always", "eventually", "until", "release", "unless")
+
+
+@dataclass(frozen=True)
+class Record:
+    """A trace, and what is thought of the time after it."""
+
+    rows: Sequence[Row]
+    end: End
+    ahead: int = 0
+
+    @property
+    def samples(self) -> int:
+        return len(self.rows)
+
+    @property
+    def size(self) -> int:
+        """Instants that exist."""
+        return self.samples + (0 if self.end == "truncate" else self.ahead)
+
+    @cached_property
+    def everywhere(self) -> Instants:
+        return (1 << self.size) - 1
+
+    @cached_property
+    def unknown(self) -> Instants:
+        return self.everywhere & ~((1 << self.samples) - 1)
+
+    @property
+    def granted(self) -> Instants:
+        """What optimists take for true where nothing is known."""
+        return self.unknown if self.end == "upper" else 0
+
+
+def inside(window: Window, k: int, *, outward: bool) -> bool:
+    """Whether a window reads the instant k steps away; `outward` adds neighbours of bounds off the grid."""
+    low, high = window.lo, window.hi
+    if outward and low.denominator != 1 and k == math.floor(low):
+        return True
+    if outward and high is not None and high.denominator != 1 and k == math.ceil(high):
+        return True
+    if k < low or (k == low and window.lo_open):
+        return False
+    return high is None or k < high or (k == high and not window.hi_open)
+
+
+def ahead(formula: Formula) -> int:
+    """At least as many steps as `formula` reads beyond its instant through bounded windows."""
+    steps = sum(isinstance(node, Step) for node in nodes(formula))
+    return steps + sum(math.ceil(w.hi if w.hi is not None else w.lo) + 1 for w in windows(formula))
+
+
+class Sets:
+    """Sets of instants at which a formula is met, or failed, for one way to ask of predicates."""
+
+    def __init__(self, record: Record, met: Met, failed: Met) -> None:
+        self.record = record
+        self._asks = {True: met, False: failed}
+        self._known: dict[tuple[int, bool], Instants] = {}
+
+    def of(self, formula: Formula, truth: bool = True) -> Instants:
+        """Where `formula` is met (`truth`), or its negation is."""
+        key = (id(formula), truth)
+        if key not in self._known:
+            self._known[key] = self._of(formula, truth) & self.record.everywhere
+        return self._known[key]
+
+    def _of(self, formula: Formula, truth: bool) -> Instants:  # noqa: C901 - one case a node
+        match formula:
+            case Constant(value):
+                return self.record.everywhere if value is truth else 0
+            case Atom(_, margin):
+                ask = self._asks[truth]
+                found = (t for t, row in enumerate(self.record.rows) if ask(formula, margin(row)))
+                return self.record.granted | sum(1 << t for t in found)
+            case Not(body):
+                return self.of(body, not truth)
+            case Many(op, items):
+                return _joined([self.of(item, truth) for item in items], every=(op == "and") is truth)
+            case Pair():
+                return self._pair(formula, truth)
+            case Choice(cond, yes, no):
+                first = _joined([self.of(cond, not truth), self.of(yes, truth)], every=not truth)
+                second = _joined([self.of(cond, truth), self.of(no, truth)], every=not truth)
+                return _joined([first, second], every=truth)
+            case Over():
+                return self._over(formula, truth)
+            case Meet():
+                return self._meet(formula, truth)
+            case Step(steps, body):
+                return self._step(steps, body, truth)
+            case Edge(op, body):
+                rising = op == "rise"
+                now, before = self.of(body, rising is truth), self.of(body, rising is not truth) << 1
+                return now & before & ~1 if truth else now | before | 1
+            case Use():
+                return self.of(formula.meaning, truth)
+        raise TypeError(formula)
+
+    def _pair(self, formula: Pair, truth: bool) -> Instants:
+        left = {value: self.of(formula.left, value) for value in (True, False)}
+        right = {value: self.of(formula.right, value) for value in (True, False)}
+        if formula.op == "->":
+            return _joined([left[not truth], right[truth]], every=not truth)
+        same = truth is (formula.op == "<->")
+        if same:
+            return (left[False] | right[True]) & (left[True] | right[False])
+        return (left[True] & right[False]) | (left[False] & right[True])
+
+    # ---------------------------------------------------------------- windows
+
+    def _over(self, formula: Over, truth: bool) -> Instants:
+        every = (formula.op in ("always", "historically")) is truth
+        if formula.window.absolute:
+            relative = Over(formula.op, replace(formula.window, absolute=False), formula.body)
+            return self._from_start(self._over(relative, truth))
+        look = _Look(self.record, formula.window, formula.op in FUTURE, every)
+        body = self.of(formula.body, truth)
+        met = [look.at(body, k) for k in look.distances]
+        return look.settled(_joined(met, every=every, empty=self.record.everywhere))
+
+    def _meet(self, formula: Meet, truth: bool) -> Instants:
+        """Until and since: some instant of the window, and all from here to there; release turns it over."""
+        window = formula.window
+        if window.absolute:
+            relative = Meet(formula.op, replace(window, absolute=False), formula.left, formula.right)
+            return self._from_start(self._meet(relative, truth))
+        if formula.op == "unless":
+            held, met = unfolded(formula)
+            return _joined([self._over(held, truth), self._meet(met, truth)], every=not truth)
+        every = (formula.op == "release") is truth
+        look = _Look(self.record, window, formula.op != "since", every)
+        left, right = self.of(formula.left, truth), self.of(formula.right, truth)
+        found = self.record.everywhere if every else 0
+        on_the_way = 0 if every else self.record.everywhere
+        for k in range(max(look.distances, default=-1) + 1):
+            step = look.at(left, k)
+            on_the_way = on_the_way | step if every else on_the_way & step
+            if k in look.distances:
+                here = look.at(right, k)
+                found = found & (here | on_the_way) if every else found | (here & on_the_way)
+        return look.settled(found)
+
+    def _from_start(self, found: Instants) -> Instants:
+        """The mission clock: what holds at the first sample holds whenever it is asked."""
+        return self.record.everywhere if found & 1 else 0
+
+    def _step(self, steps: int, body: Formula, truth: bool) -> Instants:
+        """Outside of a trace that is cut nothing is true; of one that may go on nothing is known."""
+        inner = self.of(body, truth)
+        moved = inner >> 1 if steps > 0 else inner << 1
+        lost = 1 << (self.record.size - 1) if steps > 0 else 1
+        if self.record.end == "truncate":
+            return moved | (0 if truth else lost)
+        return moved & ~lost | (lost if self.record.end == "upper" else 0)
+
+
+@dataclass(frozen=True)
+class _Look:
+    """How the instants of a record look through a window: at all they see (`every`) or for some of it."""
+
+    record: Record
+    window: Window
+    forward: bool
+    every: bool
+
+    @cached_property
+    def distances(self) -> list[int]:
+        return [k for k in range(self.record.size) if inside(self.window, k, outward=self.every)]
+
+    @property
+    def _to_the_end(self) -> bool:
+        return self.forward and self.window.hi is None
+
+    @cached_property
+    def _visible(self) -> Instants:
+        """A window to the end takes the samples there are."""
+        return (1 << self.record.samples) - 1 if self._to_the_end else self.record.everywhere
+
+    def at(self, instants: Instants, k: int) -> Instants:
+        """Who finds himself in the set k steps away; where there is nothing to see, `every` is content."""
+        if self.forward:
+            seen, seeing = (instants & self._visible) >> k, self._visible >> k
+        else:
+            seen, seeing = instants << k, self.record.everywhere >> k << k
+        return seen | (self.record.everywhere & ~seeing) if self.every else seen & seeing
+
+    def settled(self, found: Instants) -> Instants:
+        """Nobody knows what a window to the end holds that starts after the last sample."""
+        if not self._to_the_end or self.record.end == "truncate":
+            return found
+        first = next(k for k in count() if inside(self.window, k, outward=self.every))
+        none = self.record.everywhere & ~(self._visible >> first)
+        return found & ~none | (none if self.record.end == "upper" else 0)
+
+
+def unfolded(formula: Meet) -> tuple[Over, Meet]:
+    """`p unless[a, b] q` is `always[0, b] p` or `p until[a, b] q`."""
+    whole = replace(formula.window, lo=Fraction(0), lo_open=False)
+    held = Over("always", whole, formula.left)
+    return held, Meet("until", formula.window, formula.left, formula.right)
+
+
+def _joined(sets: Sequence[Instants], *, every: bool, empty: Instants = 0) -> Instants:
+    if not sets:
+        return empty if every else 0
+    return reduce(int.__and__ if every else int.__or__, sets)
+
+
+# ------------------------------------------------------------------ what is asked
+
+
+def robustness(formula: Formula, record: Record) -> list[float]:
+    """At every sample: the greatest level whose set has it."""
+    margins = {n.margin(row) for n in nodes(formula) if isinstance(n, Atom) for row in record.rows}
+    levels = sorted({*margins, *(-m for m in margins), math.inf}, reverse=True)
+    found = [-math.inf] * record.samples
+    missing = (1 << record.samples) - 1
+    for level in levels:
+        sets = Sets(record, lambda _, m, r=level: m >= r, lambda _, m, r=level: -m >= r)
+        fresh = sets.of(formula) & missing
+        for t in range(record.samples):
+            if fresh >> t & 1:
+                found[t] = level
+        missing &= ~fresh
+        if not missing:
+            break
+    return found
+
+
+def truth(formula: Formula, record: Record) -> list[bool]:
+    """Boolean semantics at every sample: `>` is strict, `>=` is not, and there is no tolerance."""
+
+    def true(atom: Atom, margin: float) -> bool:
+        return margin > 0 if atom.strict else margin >= 0
+
+    held = Sets(record, true, lambda atom, margin: not true(atom, margin)).of(formula)
+    return [bool(held >> t & 1) for t in range(record.samples)]
+
+
+def defined(formula: Formula, samples: int, positive: bool = True) -> Instants:
+    """Where no window of the future, no `next` and no `prev` leaves a trace of this length."""
+    everywhere = (1 << samples) - 1
+    match formula:
+        case Over() | Meet():
+            return _window_defined(formula, samples, positive)
+        case Not(body):
+            return defined(body, samples, not positive)
+        case Step(steps, body):
+            inner = defined(body, samples, positive)
+            return inner >> 1 if steps > 0 else (inner << 1) & everywhere
+        case Edge(op, body):
+            now = defined(body, samples, (op == "rise") is positive)
+            before = defined(body, samples, (op == "rise") is not positive)
+            return now & ((before << 1) | 1)
+        case Pair("->", left, right):
+            return defined(left, samples, not positive) & defined(right, samples, positive)
+        case Pair(_, left, right):
+            both = [defined(side, samples, sign) for side in (left, right) for sign in (True, False)]
+            return reduce(int.__and__, both)
+        case Choice(cond, yes, no):
+            sides = [defined(part, samples, positive) for part in (yes, no)]
+            return reduce(int.__and__, sides, defined(cond, samples) & defined(cond, samples, False))
+        case Many(_, items):
+            return reduce(int.__and__, [defined(item, samples, positive) for item in items])
+        case Use():
+            return defined(formula.meaning, samples, positive)
+        case _:
+            return everywhere
+
+
+def _window_defined(formula: Over | Meet, samples: int, positive: bool) -> Instants:
+    """Every instant that the window reads, and those on the way there, exist and are defined."""
+    window, forward = formula.window, formula.op in FUTURE
+    if isinstance(formula, Meet) and formula.op == "unless":
+        held, met = unfolded(formula)
+        return _window_defined(held, samples, positive) & _window_defined(met, samples, positive)
+    every = (formula.op in ("always", "historically", "release")) is positive
+    last = samples + 64 if window.hi is None else math.ceil(window.hi) + 1
+    distances = [k for k in range(last + 1) if inside(window, k, outward=every)]
+    target = defined(formula.right if isinstance(formula, Meet) else formula.body, samples, positive)
+    way = defined(formula.left, samples, positive) if isinstance(formula, Meet) else (1 << samples) - 1
+    found = 0
+    for t in range(samples):
+        reads = [t + k if forward else t - k for k in distances]
+        if not forward:
+            reads = [k for k in reads if k >= 0]
+        elif window.hi is None:
+            reads = [k for k in reads if k < samples]
+            if not reads:
+                continue
+        passed = range(min([t, *reads]), max([t, *reads]) + 1) if reads else ()
+        if all(k < samples and target >> k & 1 for k in reads) and all(way >> k & 1 for k in passed):
+            found |= 1 << t
+    if window.absolute:
+        return (1 << samples) - 1 if found & 1 else 0
+    return found
