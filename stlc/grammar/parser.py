@@ -7,6 +7,7 @@ independent errors. Trees are folded bottom-up without recursion: no text can ex
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import islice
 from types import MappingProxyType
 from typing import Any
 
@@ -17,7 +18,7 @@ from stlc.grammar import ast, hints
 from stlc.grammar.builder import EXPRESSIONS, Rule
 from stlc.grammar.declarations import DECLARATIONS, Item, assemble
 from stlc.grammar.parser_tables import load_parser
-from stlc.grammar.scan import declaration_starts
+from stlc.grammar.scan import declaration_starts, lexemes
 from stlc.grammar.stumble import Piece
 from stlc.grammar.tokens import Context, Leaf
 from stlc.source import Source
@@ -25,6 +26,7 @@ from stlc.source import Source
 MAX_ERRORS = 20
 MAX_DEPTH = 150
 MAX_TEXT = 1_000_000
+MAX_LEXEMES = 50_000
 
 _RULES: Mapping[str, Rule] = MappingProxyType({**EXPRESSIONS, **DECLARATIONS})
 
@@ -35,7 +37,7 @@ def parse(source: Source) -> ast.Spec:
     Raises:
         SpecError: with all independent errors, at most `MAX_ERRORS`.
     """
-    _check_size(source, len(source.text))
+    _check_size(source, 0, len(source.text))
     context = Context(source)
     items: list[Item] = []
     starts = declaration_starts(source.text)
@@ -64,7 +66,7 @@ def parse_expr(source: Source, start: int = 0, end: int | None = None) -> ast.Ex
     Spans point into the whole text. Raises SpecError.
     """
     end = len(source.text) if end is None else end
-    _check_size(source, end - start)
+    _check_size(source, start, end)
     context = Context(source)
     piece = Piece(source, start, end, "expr", accepts=_accepts, parses=_parses)
     try:
@@ -83,9 +85,13 @@ class _PieceError(Exception):
         self.finding = finding
 
 
-def _check_size(source: Source, length: int) -> None:
-    if length > MAX_TEXT:
+def _check_size(source: Source, start: int, end: int) -> None:
+    """What takes longer to read than anybody would wait was not written by hand."""
+    if end - start > MAX_TEXT:
         raise SpecError(Diagnostic("E005", f"`{source.name}` is larger than {MAX_TEXT // 1_000_000} MB"))
+    if any(islice(lexemes(source.text, start, end), MAX_LEXEMES, None)):
+        message = f"`{source.name}` has more than {MAX_LEXEMES:,} words and signs"
+        raise SpecError(Diagnostic("E005", message))
 
 
 def _build(piece: Piece, context: Context) -> Any:
@@ -161,4 +167,4 @@ def _parses(text: str, rule: str) -> bool:
     return True
 
 
-__all__: Sequence[str] = ("MAX_DEPTH", "MAX_ERRORS", "MAX_TEXT", "parse", "parse_expr")
+__all__: Sequence[str] = ("MAX_DEPTH", "MAX_ERRORS", "MAX_LEXEMES", "MAX_TEXT", "parse", "parse_expr")

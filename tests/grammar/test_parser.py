@@ -410,6 +410,17 @@ def test_a_text_is_bounded():
     assert caught.value.diagnostics[0].code == "E005"
 
 
+@pytest.mark.parametrize(
+    "text", ["x+" * 400_000, "(" * 900_000, "if x then " * 20_000, "x > 0 and " * 20_000]
+)
+def test_a_text_of_endless_words_is_refused_at_once(text):
+    began = time.process_time()
+    with pytest.raises(SpecError) as caught:
+        parse(Source("big.stl", f"require r: {text} x > 0"))
+    assert [finding.code for finding in caught.value.diagnostics] == ["E005"]
+    assert time.process_time() - began < 1
+
+
 def test_empty_texts():
     assert parse(Source("empty.stl", "")).items == ()
     assert parse(Source("comment.stl", "# nothing\n\n;;")).items == ()
