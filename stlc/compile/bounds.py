@@ -16,6 +16,9 @@ from stlc.compile.interface import Grid
 from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
+MAX_STEPS = 10**12
+"""Bounds beyond are longer than any trace, and sums of them would not fit into 64 bits."""
+
 _EMPTY = ir.Window(0, 0)
 """Stands for a window that could not be made; an error was reported."""
 
@@ -26,7 +29,7 @@ def to_window(interval: typed.Interval, grid: Grid, sink: list[Diagnostic], *, o
     Args:
         interval: in seconds, steps and horizons.
         grid: of time.
-        sink: takes E301, E302, E305, E311 and W304. After an error the window is a stand-in.
+        sink: takes E005, E301, E302, E305, E311 and W304. After an error the window is a stand-in.
         outward: round a bound off the grid away from the interval.
     """
     lo = in_steps(interval.lo, grid, sink, interval.span)
@@ -35,7 +38,7 @@ def to_window(interval: typed.Interval, grid: Grid, sink: list[Diagnostic], *, o
     hi = None if interval.hi is None else in_steps(interval.hi, grid, sink, interval.span)
     if hi is None and interval.hi is not None:
         return _EMPTY
-    if _reversed(interval, lo, hi, sink):
+    if _reversed(interval, lo, hi, sink) or _endless(interval, lo, hi, sink):
         return _EMPTY
     first = _first(lo, outward=outward, excluded=interval.lo_open)
     _note_rounding(interval.lo, lo, first, grid, sink)
@@ -92,6 +95,14 @@ def _reversed(interval: typed.Interval, lo: Fraction, hi: Fraction | None, sink:
         report(sink, Diagnostic("E301", text, interval.span, label=label))
         return True
     return False
+
+
+def _endless(interval: typed.Interval, lo: Fraction, hi: Fraction | None, sink: list[Diagnostic]) -> bool:
+    if max(lo, hi or 0) <= MAX_STEPS:
+        return False
+    text = f"an interval of more than {MAX_STEPS:,} steps"
+    report(sink, Diagnostic("E005", text, interval.span, help=("`inf` means to the end of the trace",)))
+    return True
 
 
 def _note_rounding(time: typed.Time, exact: Fraction, taken: int, grid: Grid, sink: list[Diagnostic]) -> None:

@@ -103,6 +103,8 @@ class _Lowering:
                 assert_never(node.op)
 
     def _until(self, node: typed.Until, sign: Sign) -> ir.Formula:
+        if node.op == "unless":
+            return self._unless(node, sign)
         left, right = self.formula(node.left, sign), self.formula(node.right, sign)
         match node.op:
             case "until" | "release":
@@ -113,8 +115,6 @@ class _Lowering:
             case "since":
                 since = ir.Since("since" if sign > 0 else "trigger", _LATER, left, right)
                 return replace(since, window=self._window(node.interval, since.op), span=node.span)
-            case "unless":
-                return self._unless(node, sign)
             case _:
                 assert_never(node.op)
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import time
 from fractions import Fraction
 
 import pytest
@@ -131,6 +132,8 @@ def test_horizon_steps_and_seconds_add_up() -> None:
         (between("0.2", "0.3", "()"), "E305"),
         (between("0.5", "0.2"), "E301"),
         (between("-0.1", "0.2"), "E302"),
+        (between("0", "1e18"), "E005"),
+        (between("1e30", None), "E005"),
     ],
 )
 def test_intervals_without_samples(interval: typed.Interval, code: str) -> None:
@@ -150,6 +153,15 @@ def test_what_the_grid_must_say() -> None:
     assert codes(always(between("0", "1")), Grid(None, 5)) == ["E311"]
     assert lowered(always(steps), Grid()) == ("always[0..3] x > 0", [])
     assert lowered(always(horizon), Grid(None, 5)) == ("always[0..5] x > 0", [])
+
+
+def test_unless_in_unless_is_lowered_twice_not_three_times() -> None:
+    formula: typed.Formula = X
+    for _ in range(12):
+        formula = typed.Until(SPAN, "unless", between("0", "0.1"), formula, Y)
+    began = time.process_time()
+    lower(formula, GRID, [])
+    assert time.process_time() - began < 2
 
 
 def test_an_absolute_interval_is_a_bug_here() -> None:
