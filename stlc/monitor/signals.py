@@ -82,7 +82,7 @@ def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False)
     missing = [_missing(need, data, name) for need in needs if found[need.column.name] is None]
     if missing:
         raise TraceError(*missing)
-    arrays = found or {key: np.asarray(values) for key, values in list(data.items())[-1:]}
+    arrays = found or _any_one(data)
     tensors = _tensors(arrays)
     if tensors and plain:
         arrays = {key: _as_numpy(values) for key, values in arrays.items()}
@@ -99,6 +99,12 @@ def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False)
         signals = Signals(columns, (given.traces,), samples, NUMPY, name, given.dt, given.t0)
     _check_finite(signals, needs)
     return signals
+
+
+def _any_one(data: Given) -> dict[str, Any]:
+    """Where no signal is read: one that tells how many traces and samples there are, best not a vector."""
+    names = sorted(data, key=lambda name: (name == CLOCK, np.ndim(data[name])))
+    return {name: _find(data, name) for name in names[:1]}
 
 
 def _tensors(arrays: Mapping[str, Any]) -> list[Any]:

@@ -446,6 +446,13 @@ def test_signals_that_do_not_fit(given_signals: dict[str, object], words: str) -
         monitor_of("a > b").check(given_signals)
 
 
+def test_a_constant_formula_counts_samples_where_nothing_is_read() -> None:
+    monitor = Monitor("signal a\nsignal q : real[2]\nrequire r: true\n")
+    for lead in ((), (4,)):
+        given_signals = {"a": np.zeros((*lead, 5)), "q": np.zeros((*lead, 5, 2))}
+        assert monitor.robustness(given_signals).shape == (*lead, 5)
+
+
 def test_units_of_a_trace_are_converted() -> None:
     monitor = Monitor("signal v [m/s]\nrequire r: v < 10\n")
     fast = Trace(Signature((Column("v", parse_unit("km/h")),)), 1.0, {"v": np.array([[30.0, 40.0]])})
