@@ -1,0 +1,270 @@
+"""Nothing that a user gives may end in a traceback, a hang, or a machine without memory.
+
+    python tools/fuzz.py --count 100000 --seed 0
+
+Runs `stlc` in process on random, mutated and malicious inputs (`fuzz_inputs.py`) and prints what came out. An
+input fails if `stlc` crashes (exit code 70, a traceback, a Python warning, a dead process), needs more than
+`--seconds` of processor time, or asks for more than `--memory` MB beyond what the program needs. What failed
+is kept in `--keep`, with a README that says how to run it again. Exit code: 1 if anything failed.
+"""
+
+import argparse
+import collections
+import contextlib
+import io
+import multiprocessing
+import os
+import random
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import fuzz_inputs
+from fuzz_mutation import ROOT
+from fuzz_specs import SMALL
+from fuzz_traces import small_trace
+
+BATCH = 250
+PATIENCE = 60
+"""Seconds of the clock without a sign of life, after which a worker is taken for hung in foreign code."""
+
+ANSWERS = frozenset(range(6))
+MISSING = 5
+"""Exit code of what the machine does not have: memory, for instance."""
+
+
+@dataclass
+class Outcome:
+    """What one input did."""
+
+    index: int
+    kind: str
+    code: int
+    seconds: float
+    fault: str = ""
+
+
+@dataclass
+class Limits:
+    """What an input may need."""
+
+    seconds: float
+    memory: int
+
+
+class HangError(BaseException):
+    """Too much processor time."""
+
+
+def _alarm(_number, _frame):
+    raise HangError
+
+
+def run_one(seed, index, limits):
+    """Run one input in the current, empty folder."""
+    given = fuzz_inputs.draw(random.Random(f"{seed}:{index}"))
+    for name, data in given.files.items():
+        Path(name).write_bytes(data)
+    started = time.process_time()
+    code, text, noise = _call(given.arguments, limits)
+    seconds = time.process_time() - started
+    fault = _fault(code, text, noise)
+    if not fault and seconds > limits.seconds:
+        fault = f"took {seconds:.1f} s"
+    return Outcome(index, given.kind, code, seconds, fault)
+
+
+def _call(arguments, limits):
+    """Exit code, output and Python's warnings of a command line."""
+    from stlc.cli.app import main
+
+    out = io.TextIOWrapper(io.BytesIO(), encoding="utf-8", errors="backslashreplace")
+    noise = []
+    signal.signal(signal.SIGPROF, _alarm)
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out), warnings.catch_warnings():
+            warnings.simplefilter("always")
+            warnings.showwarning = lambda message, *place, **_: noise.append(f"{message} {place[1:]}")
+            signal.setitimer(signal.ITIMER_PROF, limits.seconds)
+            try:
+                code = main(arguments)
+            finally:
+                signal.setitimer(signal.ITIMER_PROF, 0)
+    except HangError:
+        code = 70
+    except BaseException:  # the boundary let something through
+        code, text = -1, traceback.format_exc()
+        return code, text, noise
+    out.flush()
+    return code, out.buffer.getvalue().decode("utf-8", "replace"), noise
+
+
+def _fault(code, text, noise):
+    if "HangError" in text:
+        return "hang"
+    if code not in ANSWERS or "Traceback (most recent call last)" in text:
+        lines = [line for line in text.splitlines() if "B001" in line] or text.splitlines()[-1:] or [""]
+        return f"exit code {code}: {lines[0][:300]}"
+    if code == MISSING and "R202" in text:
+        return "out of memory"
+    return f"a Python warning: {noise[0][:300]}" if noise else ""
+
+
+def worker(seed, indices, limits, results):
+    """Run a batch of inputs, each in the same folder, and send the outcomes one by one."""
+    folder = Path(tempfile.mkdtemp(prefix="stlc-fuzz-"))
+    os.chdir(folder)
+    tempfile.tempdir = str(folder)  # crash reports
+    import_everything()
+    limit_address_space(4 * limits.memory)
+    base = peak()
+    try:
+        for index in indices:
+            results.send(index)
+            before = peak()
+            outcome = run_one(seed, index, limits)
+            if peak() > before and peak() - base > limits.memory << 10:
+                outcome.fault = outcome.fault or f"took {(peak() - base) >> 10} MB"
+            results.send(outcome)
+            for path in folder.iterdir():
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+    finally:
+        results.send(peak())
+        os.chdir("/")
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def peak():
+    """The most memory that this process has had, in kB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def limit_address_space(megabytes):
+    """Let this process ask for so much more than it has: libraries reserve more than they use."""
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + (megabytes << 20),) * 2)
+
+
+def import_everything():
+    """What commands import when they run must not count as their time."""
+    sys.path.insert(0, str(ROOT))
+    limits = Limits(60.0, 0)
+    Path("a.stl").write_text(SMALL)
+    Path("t.npz").write_bytes(small_trace())
+    for suffix in ("csv", "mat", "mcap", "parquet"):
+        Path(f"t.{suffix}").write_bytes(b"t,x\n0,1\n1,2\n")
+        _call(["check", "a.stl", f"t.{suffix}"], limits)
+    for arguments in (["compile", "a.stl"], ["check", "a.stl", "t.npz"], ["lint", "a.stl"], ["fmt", "a.stl"]):
+        _call(arguments, limits)
+
+
+def batch(seed, indices, limits):
+    """The outcomes of a batch, and the peak memory of the process that ran it in kB.
+
+    A worker that dies or falls silent costs the input it was at; another one goes on after it.
+    """
+    outcomes, most = [], 0
+    left = list(indices)
+    while left:
+        ours, theirs = multiprocessing.Pipe(duplex=False)
+        process = multiprocessing.Process(target=worker, args=(seed, left, limits, theirs))
+        process.start()
+        theirs.close()
+        at, why = left[0], "the process died"
+        try:
+            while True:
+                if not ours.poll(PATIENCE):
+                    why = "hang in foreign code"
+                    process.kill()
+                    break
+                match ours.recv():
+                    case Outcome() as outcome:
+                        outcomes.append(outcome)
+                        left.remove(outcome.index)
+                    case int() as number if number in left:
+                        at = number
+                    case number:
+                        most = max(most, number)
+        except EOFError:
+            pass
+        process.join()
+        if left:
+            outcomes.append(Outcome(at, "unknown", process.exitcode or 0, 0.0, why))
+            left.remove(at)
+    return outcomes, most
+
+
+def keep(folder, seed, failed):
+    """Write the inputs that failed, each in a folder of its own."""
+    for outcome in failed:
+        given = fuzz_inputs.draw(random.Random(f"{seed}:{outcome.index}"))
+        place = Path(folder) / f"{seed}-{outcome.index}"
+        place.mkdir(parents=True, exist_ok=True)
+        for name, data in given.files.items():
+            (place / name).write_bytes(data)
+        (place / "README").write_text(
+            f"{outcome.fault}\nstlc {given.arguments!r}\n", errors="backslashreplace"
+        )
+
+
+def fuzz(count, seed, limits, *, first=0, tell=lambda *_: None):
+    """All outcomes, and the peak memory in kB."""
+    outcomes, most = [], 0
+    for low in range(first, first + count, BATCH):
+        found, its_most = batch(seed, range(low, min(low + BATCH, first + count)), limits)
+        outcomes += found
+        most = max(most, its_most)
+        tell(outcomes)
+    return outcomes, most
+
+
+def table(outcomes, most):
+    """What came out, as text."""
+    lines = [f"{'kind':<8} {'inputs':>7} {'faults':>7} {'worst s':>8}  exit codes"]
+    for kind in sorted({outcome.kind for outcome in outcomes}):
+        ours = [outcome for outcome in outcomes if outcome.kind == kind]
+        codes = collections.Counter(outcome.code for outcome in ours)
+        shown = "  ".join(f"{code}: {number}" for code, number in sorted(codes.items()))
+        faults = sum(bool(outcome.fault) for outcome in ours)
+        worst = max(outcome.seconds for outcome in ours)
+        lines.append(f"{kind:<8} {len(ours):>7} {faults:>7} {worst:>8.2f}  {shown}")
+    return "\n".join([*lines, f"peak memory {most / 1024:.0f} MB"])
+
+
+def main():
+    """Fuzz, print the table and the faults."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0, help="index of the first input")
+    parser.add_argument("--seconds", type=float, default=2.0)
+    parser.add_argument("--memory", type=int, default=1024, help="MB beyond what the program needs")
+    parser.add_argument("--keep", default="fuzz-failures")
+    asked = parser.parse_args()
+    started = time.monotonic()
+
+    def tell(outcomes):
+        print(f"{len(outcomes)} inputs, {time.monotonic() - started:.0f} s", file=sys.stderr, flush=True)
+        for outcome in [outcome for outcome in outcomes[-BATCH:] if outcome.fault]:
+            print(f"  {outcome.index} ({outcome.kind}): {outcome.fault}", file=sys.stderr, flush=True)
+
+    outcomes, most = fuzz(
+        asked.count, asked.seed, Limits(asked.seconds, asked.memory), first=asked.first, tell=tell
+    )
+    failed = [outcome for outcome in outcomes if outcome.fault]
+    keep(asked.keep, asked.seed, failed)
+    print(table(outcomes, most))
+    for outcome in failed:
+        print(f"  {outcome.index} ({outcome.kind}): {outcome.fault}")
+    sys.exit(1 if failed else 0)
+
+
+if __name__ == "__main__":
+    main()
