@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import time
+
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from resolving import HEAD
@@ -120,3 +123,15 @@ def test_never_a_crash(text: str, keyword: str) -> None:
         assert finding.code in CODES
         assert finding.span is not None
         assert 0 <= finding.span.start <= finding.span.end <= len(finding.span.source.text)
+
+
+@pytest.mark.parametrize("grown", ["({}) <-> x > 0", "x > 0 xor ({})", "({}) unless x > 1", "rise({})"])
+def test_what_doubles_on_every_level_is_refused(grown: str) -> None:
+    text = "x > 0"
+    for _ in range(40):
+        text = grown.format(text)
+    began = time.process_time()
+    with pytest.raises(SpecError) as caught:
+        resolve(parse(Source("specs/spec.stl", f"{HEAD}\nrequire r: {text}\n")), sink=[])
+    assert [finding.code for finding in caught.value.diagnostics] == ["E005"]
+    assert time.process_time() - began < 1
