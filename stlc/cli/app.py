@@ -35,6 +35,7 @@ from stlc.cli import (
     system,
     train,
 )
+from stlc.cli.coercion import HELP_NAMES, spare_adapters
 from stlc.cli.errors import TERMINATED
 from stlc.cli.errors import report as report_error
 from stlc.cli.options import describe
@@ -51,7 +52,7 @@ app = typer.Typer(
     ),
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": list(HELP_NAMES)},
 )
 _DAILY = (train, simulate, check, explain, plot, report, runs)
 _WRITING = (init, new, lint, fmt, parse, compile, system)
@@ -92,6 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with _terminable():
             command = typer.main.get_command(app)
+            spare_adapters(command)
             code = command.main(args=[*front, *rest], prog_name="stlc", standalone_mode=False)
     except BaseException as error:  # the boundary
         code = report_error(error, rest)

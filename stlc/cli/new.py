@@ -18,7 +18,10 @@ _Force = Annotated[bool, typer.Option("--force", help="Overwrite a file that is 
 def register(app: typer.Typer) -> None:
     """Add the commands to the program."""
     group = typer.Typer(
-        name="new", help="Make a specification or a system.", no_args_is_help=True, rich_markup_mode=None
+        name="new",
+        help=describe("Make a specification or a system.", "stlc new spec parking"),
+        no_args_is_help=True,
+        rich_markup_mode=None,
     )
     group.command(
         help=describe(

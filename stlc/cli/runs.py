@@ -23,7 +23,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands to the program."""
     group = typer.Typer(
         name="runs",
-        help="List, show, compare and remove runs.",
+        help=describe("List, show, compare and remove runs.", "stlc runs"),
         invoke_without_command=True,
         rich_markup_mode=None,
     )

@@ -21,7 +21,10 @@ _File = Annotated[str, typer.Argument(metavar="SYSTEM", help="As given, in examp
 def register(app: typer.Typer) -> None:
     """Add the commands to the program."""
     group = typer.Typer(
-        name="system", help="Show, check and list system files.", no_args_is_help=True, rich_markup_mode=None
+        name="system",
+        help=describe("Show, check and list system files.", "stlc system show car.yaml"),
+        no_args_is_help=True,
+        rich_markup_mode=None,
     )
     group.command(
         help=describe(
