@@ -241,9 +241,9 @@ class Robustness:
             case typed.Shift(_, steps, body):
                 return self._shift(body, t + steps, positive)
             case typed.Edge(_, op, body):
-                if t == 0:
-                    return FALSE if self.at(body, t, positive) is not None else None
                 now = self.at(body, t, positive if op == "rise" else not positive)
+                if t == 0:
+                    return None if now is None else FALSE
                 before = self.at(body, t - 1, not positive if op == "rise" else positive)
                 return _most([now, _negated(before)] if op == "rise" else [_negated(now), before], "min")
             case typed.Freeze():

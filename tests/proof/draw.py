@@ -274,7 +274,7 @@ class Drawing:
             ("[x, y] in dilate(block, level)", lambda row: _in_block(row["x"], row["y"]) + 0.5),
         ]
         text, margin = self.rng.choice(options)
-        return Atom(text, margin, False)
+        return Atom(text, margin, "not in" in text)
 
     def _whole(self) -> Formula:
         """Whole numbers, truth values and enums: half a step of margin."""
