@@ -17,6 +17,7 @@ from typing import Annotated
 import typer
 
 from stlc.cli import (
+    bench,
     check,
     compile,
     doctor,
@@ -56,7 +57,7 @@ app = typer.Typer(
 )
 _DAILY = (train, simulate, check, explain, plot, report, runs)
 _WRITING = (init, new, lint, fmt, parse, compile, system)
-_OTHER = (lsp, schema, doctor)
+_OTHER = (lsp, schema, doctor, bench)
 for group in (*_DAILY, *_WRITING, *_OTHER):
     group.register(app)
 

@@ -110,22 +110,28 @@ def _runner(plan: Schedule, index: int, machine: Machine) -> Runner:
     if isinstance(step.node, ir.Freeze):
         return _frozen(step.node, step.run, plan.extent, machine.windows)
     if isinstance(step.node, ir.Atom):
-        return _predicate(step.node, step.run, plan, plan.atoms.get(index), machine)
+        return _predicate(plan, index, machine)
     kernel, parts = machine.bind(step), [part for part in step.parts if part is not None]
     if len(parts) == 1:
         (only,) = parts
-        return lambda values, _, __, like: kernel([values[only]], like)
+        return lambda values, _, __, like: kernel((values[only],), like)
     return lambda values, _, __, like: kernel([values[part] for part in parts], like)
 
 
-def _predicate(
-    node: ir.Atom, run: Run, plan: Schedule, place: tuple[int, str, Run] | None, machine: Machine
-) -> Runner:
+def _predicate(plan: Schedule, index: int, machine: Machine) -> Runner:
+    """Its rows come from a program, or are those of a column."""
+    step, place = plan.steps[index], plan.atoms.get(index)
+    assert isinstance(step.node, ir.Atom)
     if place is None:
-        kernel = machine.atom(node, run, Run(run.start, 0))
+        kernel = machine.atom(step.node, step.run, Run(step.run.start, 0))
         return lambda _, __, ___, like: kernel((), like)
     number, name, inside = place
-    kernel = machine.atom(node, run, inside)
+    kernel = machine.atom(step.node, step.run, inside)
+    if number is None:
+        if inside.count == plan.extent.samples:
+            return lambda _, __, env, like: kernel((env[name],), like)
+        first, stop = inside.start, inside.start + inside.count
+        return lambda _, __, env, like: kernel((env[name][first:stop],), like)
     offset = inside.start - plan.batches[number].run.start
     if offset == 0 and plan.batches[number].run.count == inside.count:
         return lambda _, outputs, __, like: kernel((outputs[number][name],), like)

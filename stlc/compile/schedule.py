@@ -130,8 +130,8 @@ class Schedule:
         extent: of the trace.
         batches: programs of the predicates.
         steps: values, parts first.
-        atoms: step of a predicate -> (batch, name of the output, at which instants it has a value); absent
-            where it has none.
+        atoms: step of a predicate -> (batch, name of the output, at which instants it has a value); without
+            a batch the name is that of a column; absent where it has no value.
         roots: steps of the formulas that were asked for.
         runners: what computes the steps, by semantics and array library; made when it is first needed.
     """
@@ -139,7 +139,7 @@ class Schedule:
     extent: Extent
     batches: tuple[Batch, ...]
     steps: tuple[Step, ...]
-    atoms: dict[int, tuple[int, str, Run]]
+    atoms: dict[int, tuple[int | None, str, Run]]
     roots: tuple[int, ...]
     runners: dict[Hashable, tuple[Runner, ...]] = field(default_factory=dict, compare=False, repr=False)
 
@@ -166,19 +166,22 @@ def schedule(formulas: Sequence[ir.Formula], run: Run, extent: Extent) -> Schedu
 
 def _batches(
     steps: Sequence[Step], extent: Extent
-) -> tuple[tuple[Batch, ...], dict[int, tuple[int, str, Run]]]:
-    """One program for all predicates that are needed over the same stretch of the trace."""
+) -> tuple[tuple[Batch, ...], dict[int, tuple[int | None, str, Run]]]:
+    """One program for all predicates over the same stretch of the trace; bare columns need none."""
     wanted: dict[ir.Num, list[tuple[Run, int]]] = {}
+    atoms: dict[int, tuple[int | None, str, Run]] = {}
     for index, step in enumerate(steps):
         if isinstance(step.node, ir.Atom):
             inside = within(reach_of(step.node.num), step.run, extent)
-            if inside.count > 0:
+            if inside.count > 0 and isinstance(step.node.num, ir.Col) and step.node.sign > 0:
+                atoms[index] = (None, step.node.num.name, inside)
+            elif inside.count > 0:
                 wanted.setdefault(_signed(step.node), []).append((inside, index))
     grouped: dict[Run, dict[ir.Num, list[tuple[Run, int]]]] = {}
     for num, asked in wanted.items():
         for stretch, indices in _stretches(asked):
             grouped.setdefault(stretch, {})[num] = indices
-    batches, atoms = [], {}
+    batches = []
     for number, (stretch, nums) in enumerate(grouped.items()):
         outputs = {str(i): num for i, num in enumerate(nums)}
         batches.append(Batch(stretch, Program(outputs)))

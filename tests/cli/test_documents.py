@@ -93,6 +93,7 @@ DOCUMENTS = {
     "init": ["init", "elsewhere"],
     "new": ["new", "spec", "parking", "--from", "systems/cart.yaml"],
     "doctor": ["doctor", "--quick"],
+    "bench": ["bench", "robustness", "--samples", "20", "--traces", "1", "--seconds", "0"],
     "runs": ["runs", "list"],
     "runs show": ["runs", "show", "7"],
     "system list": ["system", "list"],

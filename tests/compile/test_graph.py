@@ -262,6 +262,21 @@ def test_predicates_are_read_only_where_they_are_needed() -> None:
     x, y = ir.Col("x"), ir.Col("y")
     node = ir.Join("or", (ir.Atom(x), ir.Over("always", ir.Window(0, 25), ir.Atom(y))))
     plan = planned((node,), 51, Run(0, 1), "strict")
+    assert sorted(inside.count for _, _, inside in plan.atoms.values()) == [1, 26]
+    assert not plan.batches
+
+
+def test_predicates_over_one_stretch_share_a_program() -> None:
+    twice = ir.Op("mul", (ir.Col("x"), ir.Lit(2.0)))
+    more = ir.Atom(ir.Op("sub", (twice, ir.Lit(1.0))))
+    node = ir.Join(
+        "or",
+        (
+            ir.Atom(twice, sign=-1),
+            ir.Over("always", ir.Window(0, 25), ir.Join("and", (ir.Atom(twice), more))),
+        ),
+    )
+    plan = planned((node,), 51, Run(0, 1), "strict")
     assert sorted(batch.run.count for batch in plan.batches) == [1, 26]
 
 
