@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias, assert_never
 
 import numpy as np
@@ -50,6 +50,8 @@ class Reader:
     def __call__(self, env: Mapping[str, Floats], start: int, count: int) -> list[Floats]:
         """Values (count, traces) from row `start` on; columns may be longer than the shortest of them."""
         length = min(len(env[name]) for name in self.names)
+        if count <= 0:
+            return [next(iter(env.values()))[:0]] * len(self.formulas)
         key = (length, start, count)
         if key not in self._known:
             if len(self._known) >= _REMEMBERED:
@@ -78,6 +80,8 @@ class Side:
     truth: bool = False
     base: int = 0
     rows: dict[str, Floats] = field(default_factory=dict)
+    _over: bool = False
+    _seen: tuple[Mapping[str, Floats], int, int] | None = None
     _settled: dict[str, int] = field(default_factory=dict)
     _pads: dict[str, int] = field(default_factory=dict)
     _leaves: list[tuple[list[Leaf], Reader]] = field(default_factory=list)
@@ -107,12 +111,23 @@ class Side:
             first: number of their first row.
             samples: how many there are by now.
         """
+        self._seen = (signals, first, samples)
         traces = next(iter(signals.values())).shape[1]
         self.rows[NOTHING] = np.zeros((samples + self.beyond - self.base, traces))
         for leaves, reader in self._leaves:
             self._grow_leaves(leaves, reader, (signals, first), samples)
         for stream, reader in self._latched:
             self._grow_latched(stream, reader, samples)
+
+    def over(self) -> Side:
+        """The columns where the last sample is the end: what looks on then does without."""
+        if self._seen is None or all(stream.ahead == 0 for stream in self.plan.streams):
+            return self
+        last = replace(
+            self, rows=dict(self.rows), _settled=dict(self._settled), _leaves=[], _latched=[], _over=True
+        )
+        last.grow(*self._seen)
+        return last
 
     def values(self, reader: Reader, start: int, count: int) -> list[Floats]:
         """Values (count, traces) of formulas over the columns, from sample `start` on."""
@@ -131,7 +146,7 @@ class Side:
     ) -> None:
         env, first = signals
         start, ahead = self._settled.get(leaves[0].name, 0), leaves[0].ahead
-        known = samples if self.end == "truncate" else max(samples - ahead, start)
+        known = samples if self._over or self.end == "truncate" else max(samples - ahead, start)
         traces = self.rows[NOTHING].shape[1]
         found: list[Floats] = [np.zeros((0, traces))] * len(leaves)
         if known > start:

@@ -181,9 +181,9 @@ class Frontier:
     side: Side
     at: int = 0
     coefficients: dict[Subset, Floats] | None = None
-    _parts: dict[int, tuple[list[str], Reader]] = field(default_factory=dict)
-    _readers: dict[tuple[bool, bool], Reader] = field(default_factory=dict)
-    _unsure: int = 0
+    _parts: dict[int, tuple[list[str], Reader]] = field(default_factory=dict, init=False)
+    _readers: dict[tuple[bool, bool], Reader] = field(default_factory=dict, init=False)
+    _unsure: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
         for steps in dict.fromkeys(part.steps for part in self.bones.parts.values()):

@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 
 from stlc.compile import ir
 from stlc.compile.horizon import columns as names_of_columns
-from stlc.compile.horizon import nodes, reach
+from stlc.compile.horizon import nodes, numbers, reach
 from stlc.compile.samples import leaves as readings
 from stlc.monitor.values import history
 
@@ -147,8 +147,11 @@ class _Planner:
 
     def _leaf(self, formula: ir.Formula) -> ir.Formula:
         if formula not in self.streams:
-            found = reach(formula)
-            back, ahead = max(found.past, history(formula)), max(found.future, looks_on(formula))
+            back = max(reach(formula).past, history(formula)) + looks_back(formula)
+            ahead = reach(formula).future
+            ahead = (
+                max(ahead, looks_on(formula)) if isinstance(formula, ir.Atom) else ahead + looks_on(formula)
+            )
             self.streams[formula] = Leaf(f"#{len(self.streams)}", formula, back, ahead)
         return column(self.streams[formula].name)
 
@@ -195,9 +198,15 @@ def unbounded_past(node: ir.Formula) -> bool:
 
 
 def looks_on(formula: ir.Formula) -> int:
-    """How far the predicates look ahead at samples that they do without at the end of the trace."""
-    steps = [0]
-    for node in nodes(formula):
-        if isinstance(node, ir.Atom):
-            steps += [leaf.steps for leaf in readings(node.num) if isinstance(leaf, ir.At)]
-    return max(steps)
+    """How far the predicates look ahead, at samples that some do without at the end of the trace."""
+    return max(0, *_offsets(formula))
+
+
+def looks_back(formula: ir.Formula) -> int:
+    """How far the predicates look back, at samples that some do without at the start of the trace."""
+    return max(0, *(-steps for steps in _offsets(formula)))
+
+
+def _offsets(formula: ir.Formula) -> list[int]:
+    found = [leaf.steps for num in numbers(formula) for leaf in readings(num) if isinstance(leaf, ir.At)]
+    return [0, *found]

@@ -138,6 +138,14 @@ class Everywhere:
 
     def ended(self, starts: range) -> Bounds:
         """Where the trace is over."""
+        sides = self._sides
+        self._sides = [side.over() for side in sides]
+        try:
+            return self._ended(starts)
+        finally:
+            self._sides = sides
+
+    def _ended(self, starts: range) -> Bounds:
         if self.asked.ending == "open":
             if self.window is not None and starts.stop + self.window > self.samples:
                 return Bounds(self._cut_short(0, starts), self._cut_short(1, starts))
@@ -216,7 +224,8 @@ class FromTheStart:
     def ended(self, starts: range) -> Bounds:
         """Where the trace is over."""
         fronts = self._fronts[:2] if self.asked.ending == "open" else [self._fronts[2]] * 2
-        found = [front.ended(self.planned.formula, self.samples)[0] for front in fronts]
+        last = [replace(front, side=front.side.over()) for front in fronts]
+        found = [front.ended(self.planned.formula, self.samples)[0] for front in last]
         return Bounds(found[0][: len(starts)], found[1][: len(starts)])
 
     def drop(self, start: int) -> int:  # noqa: ARG002 - only the first instant is judged

@@ -86,6 +86,30 @@ def test_a_stream_gives_what_the_whole_trace_gives(written, trace, ending, steps
         np.testing.assert_array_equal(tracker.ended(starts), wanted)
 
 
+@settings(max_examples=EXAMPLES // 3, deadline=None)
+@given(
+    written=random_formulas.formulas(held=()),
+    trace=random_formulas.traces(1, 14, 1),
+    ending=st.sampled_from(["open", "truncate"]),
+)
+def test_frozen_values_and_other_samples_are_sound_and_end_alike(written, trace, ending) -> None:
+    formula = simplify(lower(written, random_formulas.GRID, []))
+    rule = a_rule(formula)
+    everywhere = not rule.uses_end
+    samples = len(trace["x"])
+    tracker = tracker_of(rule, None, Asked(ending), everywhere=everywhere)
+    for now in range(1, samples + 1):
+        known = {name: x[:now] for name, x in trace.items()}
+        tracker.grow(known, 0, now)
+        starts = range(now if everywhere else 1)
+        low, high = tracker.live(starts.start, starts.stop)
+        least, most = at_ends(formula, known, starts)
+        assert (low <= least).all()
+        assert (high >= most).all()
+    wanted = [end[:, 0] for end in bounds(formula, Record(trace, NUMPY), starts, ending)]
+    np.testing.assert_array_equal(tracker.ended(starts), wanted)
+
+
 # ------------------------------------------------------------------ through the monitor
 
 HEAD = "spec small\nsignal a\nsignal b\nsignal q: real[2]\n"
