@@ -164,10 +164,10 @@ def arranged(monkeypatch):
         match code:
             case "R202":
                 shutil.copy("trace.npz", "huge.npz")
-                monkeypatch.setattr("stlc.trace.load_trace", no_memory)
+                monkeypatch.setattr("stlc.trace.read_recording", no_memory)
             case "B001":
                 shutil.copy("trace.npz", "crash.npz")
-                monkeypatch.setattr("stlc.trace.load_trace", bug)
+                monkeypatch.setattr("stlc.trace.read_recording", bug)
             case "R301":
                 monkeypatch.setattr("stlc.view.find_spec", no_package)
             case "R402":

@@ -1,4 +1,4 @@
-"""Where the hand of a planar arm is: a function outside, for tests. It asks for nothing but array operators."""
+"""Forward kinematics of a Panda arm for tests, NumPy or torch: links in a plane, so that values are known."""
 
 
 def hand(q):
