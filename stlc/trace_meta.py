@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,12 @@ from stlc.signature import Column, Signature
 from stlc.trace_npz import unreadable
 from stlc.units import DIMENSIONLESS, parse_unit
 
-_KINDS: dict[str, tuple[type, ...]] = {"seed": (int,), "horizon": (int,), "dt": (int, float)}
+_KINDS: dict[str, tuple[type, ...]] = {
+    "seed": (int,),
+    "horizon": (int,),
+    "dt": (int, float),
+    "spec_library": (dict,),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +31,8 @@ class TraceMeta:
         spec_name: name of the specification.
         spec_path: its path as the user gave it.
         spec_text: its whole text, so that `stlc check` needs no other file.
-        spec_hash: SHA-256 of that text, hexadecimal.
+        spec_library: texts of the files that it imports, by key (`stlc.compile.modules`).
+        spec_hash: SHA-256 of those texts, hexadecimal.
         system_name: name of the system.
         system_path: its path as the user gave it.
         system_text: the text of its file.
@@ -42,6 +48,7 @@ class TraceMeta:
     spec_name: str = ""
     spec_path: str = ""
     spec_text: str = ""
+    spec_library: Mapping[str, str] = field(default_factory=dict)
     spec_hash: str = ""
     system_name: str = ""
     system_path: str = ""
@@ -81,9 +88,11 @@ def meta_array(meta: TraceMeta, signature: Signature) -> NDArray[Any]:
 def _meta_of(written: Mapping[str, Any]) -> TraceMeta:
     known = {f.name: written[f.name] for f in fields(TraceMeta) if f.name in written}
     for name, value in known.items():
-        optional = name in _KINDS and value is None
+        optional = name in _KINDS and value is None and name != "spec_library"
         if not optional and (not isinstance(value, _KINDS.get(name, (str,))) or isinstance(value, bool)):
             raise ValueError(f"`{name}` is {value!r:.40}")
+    if not all(isinstance(text, str) for text in known.get("spec_library", {}).values()):
+        raise ValueError("`spec_library` does not hold texts")
     return TraceMeta(**known)
 
 

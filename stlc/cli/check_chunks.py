@@ -39,7 +39,7 @@ def outcome_in_chunks(path: Path, work: Work) -> Outcome:
     first = next(read)
     head = Recording(str(path), (), meta=first.meta)
     source, note = specification(head, question.spec)
-    monitor = monitor_of(source, question)
+    monitor = monitor_of(source, question, first.meta.spec_library)
     how = How("all" if question.at else None, question.end, question.tolerance, first.t0)
     online = monitor.online(how, require=question.require, like=first)
     online.feed(first)

@@ -25,7 +25,7 @@ def write_robustness(path: Path, result: Checked, question: Question) -> None:
     from stlc.trace import Trace, save_trace
 
     trace = result.trace
-    monitor = monitor_of(result.source, question)
+    monitor = monitor_of(result.source, question, result.trace.meta.spec_library)
     values = monitor.requirement_robustness(trace, end="truncate" if question.end == "truncate" else "strict")
     chosen = {judgement.name for judgement in result.verdict}
     data = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -96,7 +96,7 @@ def judged(path: Path, question: Question) -> tuple[Checked, list[str]]:
 
     recording = read_recording(path)
     source, note = specification(recording, question.spec)
-    monitor = monitor_of(source, question)
+    monitor = monitor_of(source, question, recording.meta.spec_library)
     trace = laid_out(recording, monitor, question)
     verdict = monitor.check(
         trace,
@@ -156,17 +156,28 @@ def specification(recording: Recording, spec: Path | None) -> tuple[Source, str]
     return source, ""
 
 
-def monitor_of(source: Source, question: Question) -> Monitor:
-    """The monitor for a specification; the same for every trace that carries the same one."""
-    return _monitor(source.name, source.text, question.system, tuple(question.overrides.items()))
+def monitor_of(source: Source, question: Question, library: Mapping[str, str] | None = None) -> Monitor:
+    """The monitor for a specification; the same for every trace that carries the same one.
+
+    `library` holds the texts that a trace keeps of imported files; where the specification was given as a
+    file they are read.
+    """
+    kept = tuple(library.items()) if library and question.spec is None else ()
+    return _monitor((source.name, source.text, kept), question.system, tuple(question.overrides.items()))
 
 
 @lru_cache(maxsize=8)
-def _monitor(name: str, text: str, system: str | None, overrides: tuple[tuple[str, str], ...]) -> Monitor:
+def _monitor(
+    spec: tuple[str, str, tuple[tuple[str, str], ...]],
+    system: str | None,
+    overrides: tuple[tuple[str, str], ...],
+) -> Monitor:
     from stlc.grammar.parser import parse
     from stlc.monitor.verdict import Monitor
 
-    return Monitor(parse(Source(name, text)), system=system, overrides=dict(overrides))
+    name, text, library = spec
+    parsed = replace(parse(Source(name, text)), library=dict(library) or None)
+    return Monitor(parsed, system=system, overrides=dict(overrides))
 
 
 # ------------------------------------------------------------------------ instants

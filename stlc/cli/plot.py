@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -116,7 +117,9 @@ def _monitor(trace: Trace, spec: Path | None, system: str | None) -> Monitor:
         advice = (f"stlc plot {trace.name} --spec SPEC",)
         raise UsageError(Diagnostic("U101", f"`{trace.name}` carries no specification", help=advice))
     name = meta.spec_path or f"{meta.spec_name or 'specification'} in {trace.name}"
-    return Monitor(parse(Source(name, meta.spec_text)), system=system)
+    return Monitor(
+        replace(parse(Source(name, meta.spec_text)), library=meta.spec_library or None), system=system
+    )
 
 
 def _margins(monitor: Monitor, trace: Trace, wanted: list[str]) -> Margins:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from stlc.compile.calls import unsupported
 from stlc.compile.externs import external
 from stlc.compile.functions import FUNCTIONS, callable_names
 from stlc.compile.interface import Interface
@@ -42,7 +41,7 @@ class Declared:
 def declare(
     spec: ast.Spec, interface: Interface | None, overrides: Mapping[str, ast.Expr], scope: Scope
 ) -> Declared:
-    """Every name of the file, with findings in the scope (E015, E101, E102, E103, E104, E203, E501).
+    """Every name of the file, with findings in the scope (E101, E102, E103, E104, E203, E501).
 
     Args:
         spec: as parsed.
@@ -51,9 +50,7 @@ def declare(
         scope: where findings go; its names are not read.
     """
     found = Declared()
-    for module in spec.imports:
-        scope.report(unsupported("`import`", module.span, scope))
-    _check_twice(spec.items, scope)
+    _check_twice(spec, scope)
     for item in spec.items:
         if isinstance(item, ast.Enum):
             refuse_tags(item.tags, "an enum", scope)
@@ -78,10 +75,13 @@ def _keyword(item: ast.Item) -> str:
     return type(item).__name__.lower()
 
 
-def _check_twice(items: Iterable[ast.Item], scope: Scope) -> None:
-    """E102, for values, for types, and for requirements."""
-    spaces: dict[str, dict[str, tuple[Span, str]]] = {"value": {}, "type": {}, "rule": {}}
-    for item in items:
+def _check_twice(spec: ast.Spec, scope: Scope) -> None:
+    """E102, for values, for types, for requirements, and for imported files."""
+    spaces: dict[str, dict[str, tuple[Span, str]]] = {"value": {}, "type": {}, "rule": {}, "file": {}}
+    for written in spec.imports:
+        if written.alias is not None:
+            _claim(written.alias, written.span, "", spaces["file"], scope)
+    for item in spec.items:
         space = {ast.Enum: "type", ast.Require: "rule", ast.Assume: "rule"}.get(type(item), "value")
         _claim(item.name, item.name_span, "", spaces[space], scope)
         if isinstance(item, ast.Enum):

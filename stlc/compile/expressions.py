@@ -16,6 +16,7 @@ from typing import Any
 from stlc.compile import comparisons, ir, moments, typed
 from stlc.compile.calls import builtin, unsupported
 from stlc.compile.macros import arguments, cycle, finished, too_large
+from stlc.compile.members import member
 from stlc.compile.meter import Cost
 from stlc.compile.operations import OPERATIONS
 from stlc.compile.outside import outside
@@ -103,16 +104,27 @@ def _name(expr: ast.Name, scope: Scope) -> Value:
         return value
     if scope.in_spec and expr.name in TIME_WORDS and not expr.quoted:
         return moments.time_word(expr.name, expr.span)
-    entry = scope.entries.get(expr.name)
+    return _named(expr, scope, scope)
+
+
+def _attr(expr: ast.Attr, scope: Scope) -> Value:
+    """A name of an imported file."""
+    name, home = member(expr, scope)
+    return _named(name, home, scope)
+
+
+def _named(expr: ast.Name, home: Scope, scope: Scope) -> Value:
+    """What a name of `home` is worth in `scope`."""
+    entry = home.entries.get(expr.name)
     if entry is None:
-        return scope.unknown(expr)
+        return home.unknown(expr)
     if isinstance(entry, External):
         scope.fail(Diagnostic("E105", f"`{entry.name}` takes arguments", expr.span))
     if isinstance(entry, Definition):
         if entry.formals:
             help_ = (f"{entry.name}({', '.join(entry.formals)})",)
             scope.fail(Diagnostic("E105", f"`{entry.name}` takes arguments", expr.span, help=help_))
-        value = _defined(entry, expr.span, scope)
+        value = _defined(entry, expr.span, home)
     else:
         value = entry.value
     if isinstance(value, Number) and entry.span is not None:
@@ -142,12 +154,12 @@ def _defined(entry: Definition, place: Span, scope: Scope) -> Value:
     return found[0]
 
 
-def _expanded(entry: Definition, call: ast.Call, scope: Scope) -> Value:
-    """A macro with its arguments put in."""
-    if scope.cache.get(entry.name, entry) is None:
+def _expanded(entry: Definition, call: ast.Call, scope: Scope, home: Scope) -> Value:
+    """A macro of `home` with its arguments put in."""
+    if home.cache.get(entry.name, entry) is None:
         raise Failed
-    if entry.name in scope.open:
-        scope.fail(cycle(entry, scope))
+    if entry.name in home.open:
+        scope.fail(cycle(entry, home))
     bound: dict[str, tuple[Value, Cost]] = {}
     failed = False
     for formal, expr in arguments(entry, call, scope).items():
@@ -159,7 +171,7 @@ def _expanded(entry: Definition, call: ast.Call, scope: Scope) -> Value:
             failed = True
     if failed:
         raise Failed
-    inner = replace(scope, locals=bound, open=(*scope.open, entry.name))
+    inner = replace(home, locals=bound, open=(*home.open, entry.name))
     with _traced(entry, call, scope):
         return finished(entry, evaluate(entry.body, inner), inner)
 
@@ -198,26 +210,33 @@ def _refuse_excess(place: Span, scope: Scope) -> None:
 
 
 def _call(expr: ast.Call, scope: Scope) -> Value:
+    if scope.in_spec and isinstance(expr.func, ast.Attr):
+        return _called(expr, *member(expr.func, scope), scope)
     if not isinstance(expr.func, ast.Name):
-        if scope.in_spec:
-            scope.fail(unsupported("a call into an imported module", expr.span, scope))
         note = ("expressions are parsed, never evaluated as Python; for Python dynamics use `plugin:`",)
         message = "calls to attributes are not part of the expression language"
         place = expr.func.span
         if isinstance(expr.func, ast.Attr):
             place = place.source.span(expr.func.base.span.end, place.end)
         scope.fail(Diagnostic("S201", message, place, note=note))
-    entry = scope.entries.get(expr.func.name)
+    return _called(expr, expr.func, scope, scope)
+
+
+def _called(expr: ast.Call, name: ast.Name, home: Scope, scope: Scope) -> Value:
+    """A call of something that `home` declares, or of a built-in function."""
+    entry = home.entries.get(name.name)
     if isinstance(entry, Definition) and entry.formals:
-        return _expanded(entry, expr, scope)
+        return _expanded(entry, expr, scope, home)
     if isinstance(entry, External):
         return outside(entry, expr, evaluate_all([arg.value for arg in expr.args], scope), scope)
-    if entry is not None and not reserved(expr.func.name):
-        if scope.cache.get(expr.func.name, entry) is not None:
-            scope.report(Diagnostic("E105", f"`{expr.func.name}` is not a function", expr.func.span))
+    if entry is not None and (home is not scope or not reserved(name.name)):
+        if home.cache.get(name.name, entry) is not None:
+            scope.report(Diagnostic("E105", f"`{name.name}` is not a function", name.span))
         raise Failed
+    if home is not scope:
+        return home.unknown(name, called=True)
     values = evaluate_all([arg.value for arg in expr.args], scope)
-    return builtin(expr.func.name, expr, values, scope)
+    return builtin(name.name, expr, values, scope)
 
 
 # ------------------------------------------------------------------- formulas
@@ -349,6 +368,7 @@ def _domain(expr: ast.Quantifier, scope: Scope) -> Iterator[Number]:
 _HANDLERS: Mapping[type[ast.Node], Callable[[Any, Scope], Value]] = MappingProxyType(
     {
         ast.Name: _name,
+        ast.Attr: _attr,
         ast.Call: _call,
         ast.Not: _not,
         ast.Logic: _logic,

@@ -58,10 +58,6 @@ def _inf(expr: ast.Inf, _values: Sequence[Value], _scope: Scope) -> Value:
     return Moment(end=True, span=expr.span)
 
 
-def _attr(expr: ast.Attr, _values: Sequence[Value], scope: Scope) -> Value:
-    return scope.fail(unsupported(f"`{expr.span.text}`", expr.span, scope))
-
-
 def _vector(expr: ast.Vector, values: Sequence[Value], scope: Scope) -> Value:
     need = Need("a vector holds numbers", "this component")
     pairs = zip(values, expr.items, strict=True)
@@ -165,7 +161,6 @@ OPERATIONS: Mapping[type[ast.Node], Operation] = MappingProxyType(
         ast.String: Operation(_nothing, _string),
         ast.Bool: Operation(_nothing, _bool),
         ast.Inf: Operation(_nothing, _inf),
-        ast.Attr: Operation(_nothing, _attr),
         ast.Vector: Operation(lambda expr: expr.items, _vector),
         ast.Index: Operation(lambda expr: (expr.base, expr.index), _index),
         ast.Neg: Operation(lambda expr: (expr.operand,), _neg),

@@ -14,23 +14,24 @@ from pathlib import PurePath
 from typing import TypeVar
 
 from stlc.compile import ir, typed
-from stlc.compile.declare import Declared, declare
+from stlc.compile.declare import Declared
 from stlc.compile.expressions import evaluate
 from stlc.compile.formulas import resolve_formula
+from stlc.compile.imported import File, declared, signature_of, with_facts
 from stlc.compile.interface import Interface
+from stlc.compile.modules import load_modules
 from stlc.compile.names import check_names
 from stlc.compile.overrides import read_overrides
 from stlc.compile.ranges import Facts
 from stlc.compile.scales import nominal, reach_of_formula, reach_of_number
 from stlc.compile.scope import Definition, Failed, Scope, enforced
-from stlc.compile.signals import ranged
 from stlc.compile.tags import Tags, read_tags
 from stlc.compile.vacuity import toothless, vacuous
 from stlc.compile.values import Number, Value, Vector
 from stlc.diagnostics import Diagnostic, Label, SpecError
 from stlc.grammar import ast
 from stlc.grammar.parser import MAX_ERRORS
-from stlc.signature import Column, Signature
+from stlc.signature import Signature
 from stlc.units import same_dims
 
 Item = TypeVar("Item")
@@ -58,13 +59,13 @@ def resolve(
     values = read_overrides(overrides or {}, spec, interface)
     findings: list[Diagnostic] = []
     scope = Scope(sink=findings, temporal=True, time_unit=spec.time_unit, elsewhere=_elsewhere(interface))
-    found = declare(spec, interface, values, scope)
-    scope = replace(scope, entries=found.entries, cache=dict.fromkeys(found.broken))
-    _adopt_units(spec, values, found, scope)
-    signature = _signature(found, scope)
-    scope = replace(scope, facts=enforced(signature.columns))
+    file = declared(spec, load_modules(spec), interface, values, scope)
+    _adopt_units(spec, values, file.found, file.scope)
+    signature = signature_of(file)
+    file = with_facts(file, enforced(signature.columns))
+    scope = file.scope
     constants = _constants(spec, interface, scope)
-    _check_definitions(spec, scope)
+    _check_definitions(file)
     ranges = nominal(signature.columns)
     requirements = _requirements(spec, ast.Require, scope, ranges)
     assumptions = _requirements(spec, ast.Assume, scope, ranges)
@@ -93,17 +94,6 @@ def _finish(findings: Sequence[Diagnostic], spec: ast.Spec, sink: list[Diagnosti
 
 
 # ----------------------------------------------------------------- declarations
-
-
-def _signature(found: Declared, scope: Scope) -> Signature:
-    """The declared columns with their ranges."""
-    columns: list[Column] = []
-    for decl, plain, unit in found.columns:
-        try:
-            columns.extend(ranged(plain, unit, decl, scope))
-        except Failed:
-            columns.extend(plain)
-    return Signature(tuple(columns))
 
 
 def _elsewhere(interface: Interface | None) -> dict[str, str]:
@@ -184,9 +174,12 @@ def _amount(value: float, unit: str) -> str:
     return f"{value:.12g} {unit}".rstrip()
 
 
-def _check_definitions(spec: ast.Spec, scope: Scope) -> None:
-    """Look at every definition, used or not."""
-    for item in spec.items:
+def _check_definitions(file: File) -> None:
+    """Look at every definition, used or not, of every file."""
+    for part in file.files:
+        _check_definitions(part)
+    scope = file.scope
+    for item in file.spec.items:
         entry = scope.entries.get(item.name)
         if not isinstance(item, ast.Def | ast.Region) or not isinstance(entry, Definition):
             continue

@@ -111,6 +111,7 @@ class Scope:
         time_unit: unit of bare numbers in intervals; "" where no pragma says so.
         facts: enforced ranges of columns, in stored units.
         elsewhere: names that only the system knows, with the advice to give.
+        modules: what imported files know, by alias.
         product: `x in [lo, hi]` is `(x - lo) (hi - x)` (`@product`).
         locals: arguments of the macro and quantifier variables at hand, with what they cost.
     """
@@ -123,6 +124,7 @@ class Scope:
     time_unit: str = ""
     facts: Mapping[str, Bounds] = field(default_factory=dict)
     elsewhere: Mapping[str, str] = field(default_factory=dict)
+    modules: Mapping[str, Scope] = field(default_factory=dict, compare=False)
     product: bool = False
     locals: Mapping[str, tuple[Value, Cost]] = field(default_factory=dict)
     meter: Meter = field(default_factory=Meter, compare=False, repr=False)
@@ -146,7 +148,8 @@ class Scope:
     def as_products(self) -> Scope:
         """The same scope under `@product`, which definitions are looked at anew for."""
         broken = {name: None for name, value in self.cache.items() if value is None}
-        return replace(self, product=True, cache=dict(broken))
+        modules = {alias: module.as_products() for alias, module in self.modules.items()}
+        return replace(self, product=True, cache=dict(broken), modules=modules)
 
     def report(self, finding: Diagnostic) -> None:
         """Add a finding, once (a macro that is used twice has its faults once)."""

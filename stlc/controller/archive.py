@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stlc.controller.run import SPEC, SYSTEM
+from stlc.compile.modules import spec_sha256
+from stlc.controller.run import SPEC, SYSTEM, read_library
 from stlc.files import atomic_path, read_source
-from stlc.provenance import sha256
 from stlc.trace import Trace, TraceMeta, save_trace
 from stlc.version import __version__
 
@@ -65,11 +65,13 @@ def save_trace_of(run: Run, recording: Recording, setting: Setting, also: Path |
 
 def _meta(run: Run, setting: Setting) -> TraceMeta:
     record, spec = run.dir.record(), read_source(run.dir.path / SPEC).text
+    library = read_library(run.dir)
     return TraceMeta(
         spec_name=run.task.compiled.name,
         spec_path=str(record.get("spec_path", "")),
         spec_text=spec,
-        spec_hash=sha256(spec),
+        spec_library=library,
+        spec_hash=spec_sha256(spec, library),
         system_name=run.task.system.name,
         system_path=str(record.get("system_path", "")),
         system_text=read_source(run.dir.path / SYSTEM).text,

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import torch
 
 from stlc.compile.dump import dump
+from stlc.compile.modules import library_of
 from stlc.controller.config import TrainConfig, decide
-from stlc.controller.run import SPEC, SYSTEM, Run, spec_hash, system_hash
+from stlc.controller.run import SPEC, SYSTEM, Run, save_library, spec_hash, system_hash
 from stlc.controller.train import train
 from stlc.dynamics.functions import function_files
 from stlc.files import write_atomic
@@ -78,6 +79,7 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
         }
     )
     write_atomic(folder.path / SPEC, task.compiled.spec.source.text)
+    save_library(folder, library_of(task.compiled.spec))
     write_atomic(folder.path / SYSTEM, decl.source.text)
     if decl.test.world is not None:
         write_atomic(folder.path / decl.test.world.path.name, decl.test.world.path.read_bytes())

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 
+from stlc.compile.modules import file_of
 from stlc.controller.checkpoint import load_checkpoint, weights
 from stlc.controller.config import Engine
 from stlc.controller.policy import Mlp, PlanNetwork
@@ -20,10 +21,13 @@ from stlc.provenance import sha256
 from stlc.rundir import RUNS, RunDir
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
 SPEC = "spec.stl"
 SYSTEM = "system.yaml"
+LIB = "lib"
+INDEX = f"{LIB}/index.json"
 CONFIG = "config.resolved.yaml"
 
 
@@ -69,13 +73,13 @@ class Run:
 def load_task(folder: RunDir) -> Task:
     """Compile the specification and the system that lie in a run's folder."""
     overrides = folder.record().get("overrides") or {}
-    spec = parse(read_source(folder.path / SPEC))
+    spec = replace(parse(read_source(folder.path / SPEC)), library=read_library(folder))
     return Task.of(spec, System.load(folder.path / SYSTEM, overrides), overrides=overrides)
 
 
 def spec_hash(folder: RunDir) -> str:
     """SHA-256 of the specification in a run's folder and of what `--set` changed in it."""
-    return _hash(folder, SPEC)
+    return _hash(folder, SPEC, read_library(folder))
 
 
 def system_hash(folder: RunDir) -> str:
@@ -83,9 +87,29 @@ def system_hash(folder: RunDir) -> str:
     return _hash(folder, SYSTEM)
 
 
-def _hash(folder: RunDir, name: str) -> str:
+def _hash(folder: RunDir, name: str, library: Mapping[str, str] | None = None) -> str:
     overrides = folder.record().get("overrides") or {}
-    return sha256(read_source(folder.path / name).text + json.dumps(overrides, sort_keys=True))
+    kept = json.dumps(dict(sorted(library.items()))) if library else ""
+    return sha256(read_source(folder.path / name).text + json.dumps(overrides, sort_keys=True) + kept)
+
+
+def save_library(folder: RunDir, library: Mapping[str, str]) -> None:
+    """Keep what a specification imports: the texts below `lib/`, and which is which."""
+    for key, text in library.items():
+        write_atomic(folder.path / LIB / file_of(key), text)
+    if library:
+        folder.write_json(INDEX, {key: file_of(key) for key in library})
+
+
+def read_library(folder: RunDir) -> dict[str, str]:
+    """The texts that `save_library` kept, by key. Raises RunError (R101) where one is damaged."""
+    if not (folder.path / INDEX).is_file():
+        return {}
+    index = folder.read_json(INDEX)
+    names = index.values() if isinstance(index, dict) else [None]
+    if any(not isinstance(name, str) or name.startswith("/") or ".." in name.split("/") for name in names):
+        raise RunError(Diagnostic("R101", f"`{folder.shown}/{INDEX}` is damaged"))
+    return {key: read_source(folder.path / LIB / name).text for key, name in index.items()}
 
 
 def save_engine(folder: RunDir, engine: Engine) -> None:

@@ -5,6 +5,7 @@ Every node carries a span, which says where and not what: equality ignores it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Literal, TypeAlias
@@ -382,6 +383,7 @@ class Spec(Node):
         imports: in order.
         items: declarations in order.
         source: the text itself.
+        library: texts of what it imports, by key (`stlc.compile.modules`); None where the files are read.
     """
 
     name: str
@@ -391,3 +393,4 @@ class Spec(Node):
     imports: tuple[Import, ...]
     items: tuple[Item, ...]
     source: Source = field(compare=False, repr=False)
+    library: Mapping[str, str] | None = field(default=None, compare=False, repr=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,9 +30,8 @@ def driven_section(material: Material) -> Section | None:
     if trace is None:
         return None
     try:
-        monitor = Monitor(
-            parse(Source("spec.stl", trace.meta.spec_text or material.texts.get("spec.stl", "")))
-        )
+        text = trace.meta.spec_text or material.texts.get("spec.stl", "")
+        monitor = Monitor(replace(parse(Source("spec.stl", text)), library=trace.meta.spec_library or None))
         verdict = monitor.check(trace)
         margins = monitor.requirement_robustness(trace)
     except StlcError as error:
