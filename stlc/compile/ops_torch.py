@@ -17,13 +17,16 @@ from torch.autograd.function import once_differentiable
 from stlc.compile.extremum import Pick, Sliding
 from stlc.compile.ops import Mask, Ops
 from stlc.compile.ops_torch_choice import choice, reduction
-from stlc.compile.ops_torch_small import is_small, small_extrema, small_until
+from stlc.compile.ops_torch_small import block_extrema, is_small, small_extrema, small_until
 from stlc.compile.ops_torch_windows import SlidingExtremum, SlidingUntil
 from stlc.compile.sliding import Asked
 
-_LARGE, _LARGE_BLOCK, _LARGE_UNTIL = 1 << 13, 1 << 16, 1 << 12
+_LARGE, _LARGE_FEW, _LARGE_BLOCK, _LARGE_UNTIL = 1 << 13, 1 << 17, 1 << 16, 1 << 12
 """From so many numbers on, on a processor, scans in place beat what torch's own operations can do: for
-windows, for windows that all reach the last row, and for `until`."""
+windows, for windows of a few traces, for windows that all reach the last row, and for `until`."""
+
+_FEW = 16
+"""So many traces are a few."""
 
 
 class _SafeSqrt(torch.autograd.Function):
@@ -215,8 +218,10 @@ class TorchOps:
             return None
         if is_small(x, window):
             return small_extrema(x, pick, window)
-        if x.is_cuda or x.numel() < (_LARGE_BLOCK if window.to_end else _LARGE):
+        if x.is_cuda or (window.to_end and x.numel() < _LARGE_BLOCK):
             return None
+        if not window.to_end and x.numel() < (_LARGE_FEW if x.shape[1] <= _FEW else _LARGE):
+            return block_extrema(x, pick, window)
         out: Tensor = SlidingExtremum.apply(x, Asked(pick, window, TORCH))  # type: ignore[no-untyped-call]
         return out
 

@@ -1,6 +1,7 @@
-"""Windows over a handful of numbers, where the number of operations is all that counts.
+"""Windows over few numbers or few traces, by operations that torch has: how many there are is what counts.
 
-Windows are laid side by side, which takes `rows * width` numbers: a few thousand at most.
+Of a handful of numbers windows are laid side by side, which takes `rows * width` numbers: a few thousand at
+most. Of a few traces blocks are scanned by running extrema, which are quick along time alone.
 """
 
 from __future__ import annotations
@@ -18,6 +19,18 @@ _SMALL = 1 << 12
 def is_small(x: Tensor, window: Sliding) -> bool:
     """Whether the windows may be laid side by side."""
     return x.numel() * window.width <= _SMALL
+
+
+def block_extrema(x: Tensor, pick: Pick, window: Sliding) -> Tensor:
+    """Exact extrema of sliding windows: the end of one block and the beginning of the next."""
+    blocks, length = window.shape
+    filled = pad(x, (0, 0, 0, window.covered - window.rows), value=neutral(pick))[: window.covered]
+    cut = filled.reshape(blocks, length, x.shape[1])
+    run, choose = (torch.cummin, torch.minimum) if pick == "min" else (torch.cummax, torch.maximum)
+    heads = run(cut, 1).values.reshape(-1, x.shape[1])
+    tails = run(cut.flip(1), 1).values.flip(1).reshape(-1, x.shape[1])
+    stop = window.width - 1
+    return choose(tails[: window.count], heads[stop : stop + window.count])
 
 
 def small_extrema(x: Tensor, pick: Pick, window: Sliding) -> Tensor:

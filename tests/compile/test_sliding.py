@@ -15,7 +15,7 @@ from stlc.compile import extremum, scans
 from stlc.compile.extremum import Pick, Sliding
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.ops_torch import TORCH
-from stlc.compile.ops_torch_small import small_extrema, small_until
+from stlc.compile.ops_torch_small import block_extrema, small_extrema, small_until
 from stlc.compile.ops_torch_windows import SlidingExtremum, SlidingUntil
 from stlc.compile.semantics import Exact
 from stlc.compile.sliding import Asked, extrema, until
@@ -109,6 +109,11 @@ def test_windows_side_by_side_are_those_of_loops(pick: Pick, window: Sliding, se
     x, y = random(window, seed).requires_grad_(), random(window, seed + 1).requires_grad_()
     assert torch.equal(small_extrema(x, pick, window), extrema_by_loops(x, pick, window))
     assert torch.equal(small_until(x, y, pick, window), until_by_loops(x, y, pick, window))
+    if not window.to_end:
+        assert torch.equal(block_extrema(x, pick, window), extrema_by_loops(x, pick, window))
+        mine = gradients(lambda x: block_extrema(x, pick, window), [x], seed)
+        theirs = gradients(lambda x: extrema_by_loops(x, pick, window), [x], seed)
+        torch.testing.assert_close(mine, theirs, atol=1e-12, rtol=1e-12)
     mine = gradients(lambda x, y: small_until(x, y, pick, window), [x, y], seed)
     theirs = gradients(lambda x, y: until_by_loops(x, y, pick, window), [x, y], seed)
     torch.testing.assert_close(mine, theirs, atol=1e-12, rtol=1e-12)
