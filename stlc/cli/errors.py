@@ -8,6 +8,7 @@ import tempfile
 import traceback
 from collections.abc import Sequence
 from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 
 import typer
@@ -58,9 +59,10 @@ def report(error: BaseException, argv: Sequence[str]) -> int:
 
 
 def wants_json(argv: Sequence[str]) -> bool:
-    """Whether `--json` is among the options."""
-    options = argv[: argv.index("--")] if "--" in argv else argv
-    return "--json" in options
+    """Whether the options ask for a JSON document: `--json`, `--format json`, `--ast json`."""
+    options = list(argv[: argv.index("--")] if "--" in argv else argv)
+    joined = {f"{option}={value}" for option, value in pairwise([*options, ""])}
+    return bool({"--json", "--format=json", "--ast=json"} & ({*options} | joined))
 
 
 def _command(argv: Sequence[str]) -> str:

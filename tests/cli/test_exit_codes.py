@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import sys
 from pathlib import Path
 
@@ -142,3 +143,11 @@ def test_the_standard_input(command, result, monkeypatch, capsys):
 def test_the_standard_input_cannot_be_written(option, capsys):
     assert main(["lint", "-", option]) == 2
     assert "standard input" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words", [["lint", "none.stl", "--format", "json"], ["parse", "none.stl", "--ast=json"]]
+)
+def test_json_by_another_option_holds_for_failures_too(words, capsys):
+    assert main(words) == 2
+    assert json.loads(capsys.readouterr().out)["diagnostics"][0]["code"] == "U102"
