@@ -14,9 +14,11 @@ from typing import Literal, TypeAlias
 
 from stlc.compile.functions import callable_names
 from stlc.editor.document import Document
-from stlc.editor.hover import about, summary
+from stlc.editor.hover import about, about_shared, summary
+from stlc.editor.modules import shared
 from stlc.editor.symbols import inside
 from stlc.editor.vocabulary import BUILT_IN, FUNCTIONS, KEYWORDS, TAGS, TEMPORAL, TYPES
+from stlc.grammar import ast
 from stlc.grammar.parser_accepts import acceptable
 from stlc.grammar.printer_expr import own_name
 from stlc.grammar.scan import declaration_starts, lexemes
@@ -28,6 +30,7 @@ Kind: TypeAlias = Literal[
 ]
 
 _PREFIX = re.compile(r"@?`?\w*\Z")
+_OF_MODULE = re.compile(r"(?<![\w.])`?([^\W\d]\w*)`?\s*\.\s*\Z")
 _UNIT_PREFIX = re.compile(r"(?:[A-Za-zµ°Ω%][\w/^*·.°]*)?\Z")
 _SILENT = re.compile(r"""[^"\n]*(?:"[^"\n]*"[^"\n]*)*(?:(?:\#|//).*|"[^"\n]*)""")
 _PLAIN_WORDS = RESERVED | {*PRAGMAS, "as", "fn", "from"}
@@ -73,6 +76,10 @@ def complete(document: Document, offset: int) -> Completion:
     start = match.start()
     if match[0].startswith("@"):
         return Completion(start, tuple(_tags()))
+    behind_dot = _OF_MODULE.search(text[:start])
+    if behind_dot is not None:
+        names = sorted(_shared(document, behind_dot[1]), key=lambda offer: offer.text)
+        return Completion(start, tuple(names))
     piece = text[_piece_start(text) : start]
     units = _units_at(piece, text)
     if units is not None:
@@ -181,6 +188,15 @@ def _new_names(document: Document, piece: str) -> Iterator[Offer]:
                 unit = f" [{column.unit}]" if column.unit.text else ""
                 text = f"{own_name(column.name)}{unit}"
                 yield Offer(text, "signal", f"a state of {document.system.path.name}")
+
+
+def _shared(document: Document, alias: str) -> Iterator[Offer]:
+    """What a module offers."""
+    for module in document.modules:
+        if module.alias == alias:
+            for item in shared(module):
+                kind: Kind = "function" if isinstance(item, ast.Def) else "name"
+                yield Offer(own_name(item.name), kind, "", about_shared(item, module.key))
 
 
 def _units() -> Iterator[Offer]:

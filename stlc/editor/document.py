@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 
 from stlc.compile.interface import Grid
+from stlc.compile.modules import Module, load_modules
 from stlc.diagnostics import Diagnostic, Label, StlcError
 from stlc.dynamics.decl import SystemDecl
 from stlc.dynamics.schema import load_system_decl
@@ -66,10 +67,18 @@ class Document:
         return Grid() if self.system is None else Grid(self.system.dt, self.system.horizon)
 
     @cached_property
+    def modules(self) -> tuple[Module, ...]:
+        """What it imports; nothing where a file cannot be read."""
+        try:
+            return load_modules(self.spec)
+        except StlcError:
+            return ()
+
+    @cached_property
     def meaning(self) -> Meaning:
         """What its names and intervals come to."""
         interface = None if self.system is None else self.system.interface()
-        return understand(self.spec, interface=interface, grid=self.grid)
+        return understand(self.spec, self.modules, interface=interface, grid=self.grid)
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:

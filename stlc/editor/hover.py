@@ -10,8 +10,10 @@ from stlc.compile import typed
 from stlc.compile.bounds import in_words
 from stlc.compile.interface import Grid
 from stlc.compile.ir import Window
+from stlc.compile.modules import STD
 from stlc.compile.values import Number, Value, Vector, describe
 from stlc.editor.document import Document
+from stlc.editor.modules import borrowed_at
 from stlc.editor.symbols import Symbol
 from stlc.editor.vocabulary import BUILT_IN, FUNCTIONS, KEYWORDS, TAGS, TEMPORAL, TYPES
 from stlc.grammar import ast
@@ -30,6 +32,9 @@ def hover(document: Document, offset: int) -> tuple[Span, str] | None:
     found = document.names.at(offset)
     if found is not None:
         return found.span, about(document, found.symbol)
+    borrowed = borrowed_at(document.spec, document.modules, offset)
+    if borrowed is not None and borrowed.item is not None:
+        return borrowed.span, about_shared(borrowed.item, borrowed.module.key)
     lexeme, before = _lexeme(document.source.text, offset)
     node = _temporal_at(document.spec, offset)
     if node is not None and (lexeme is None or lexeme.kind != "word" or _is_temporal(lexeme)):
@@ -101,6 +106,13 @@ def about(document: Document, symbol: Symbol) -> str:
     if item is not None and item.doc and symbol.kind not in ("argument", "member"):
         parts.append(item.doc)
     return "\n\n".join(parts)
+
+
+def about_shared(item: ast.Item, key: str) -> str:
+    """A declaration of an imported file."""
+    origin = "library std" if key == STD else key
+    parts = [f"```stlc\n{show(replace(item, doc='', tags=()))}\n```", f"from {origin}", item.doc]
+    return "\n\n".join(filter(None, parts))
 
 
 def summary(document: Document, symbol: Symbol) -> str:

@@ -7,13 +7,14 @@ from dataclasses import dataclass, field, fields, replace
 
 from stlc.compile import typed
 from stlc.compile.bounds import to_window
-from stlc.compile.declare import declare
 from stlc.compile.expressions import evaluate
 from stlc.compile.formulas import resolve_formula
 from stlc.compile.horizon import reach
+from stlc.compile.imported import declared
 from stlc.compile.interface import Grid, Interface
 from stlc.compile.ir import Window
 from stlc.compile.lower import lower
+from stlc.compile.modules import Module
 from stlc.compile.scope import Definition, Failed, Known, Scope
 from stlc.compile.signals import ranged
 from stlc.compile.simplify import simplify
@@ -83,13 +84,14 @@ class Meaning:
         return None if any(finding.severity == "error" for finding in sink) else window
 
 
-def understand(spec: ast.Spec, *, interface: Interface | None, grid: Grid) -> Meaning:
+def understand(
+    spec: ast.Spec, modules: tuple[Module, ...], *, interface: Interface | None, grid: Grid
+) -> Meaning:
     """What can be understood of a specification; findings are dropped, the compiler reports them."""
     scope = Scope(temporal=True, time_unit=spec.time_unit)
-    found = declare(spec, interface, {}, scope)
-    scope = replace(scope, entries=found.entries, cache=dict.fromkeys(found.broken))
-    columns = {decl.name: _ranged(decl, plain, unit, scope) for decl, plain, unit in found.columns}
-    meaning = Meaning(scope, columns, {}, grid, interface)
+    file = declared(spec, modules, interface, {}, scope)
+    columns = {decl.name: _ranged(decl, plain, unit, file.scope) for decl, plain, unit in file.found.columns}
+    meaning = Meaning(file.scope, columns, {}, grid, interface)
     return replace(meaning, formulas=_formulas(spec, meaning))
 
 

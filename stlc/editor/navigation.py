@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from stlc.editor.document import Document
+from stlc.editor.modules import borrowed_at
 from stlc.editor.symbols import Symbol
 from stlc.grammar import ast
 from stlc.source import Span
@@ -12,11 +13,14 @@ def definition(document: Document, offset: int) -> tuple[Span, ...]:
     """Where to go from a cursor.
 
     From a use to the declaration; from the declaration of a signal, a parameter or a constant to the system
-    file that has it too; from `system "file"` into that file.
+    file that has it too; from `system "file"` into that file; from `module.name` into the module.
     """
     place = document.spec.system_span
     if place is not None and place.start <= offset <= place.end:
         return () if document.system is None else (document.system.source.span(0, 0),)
+    borrowed = borrowed_at(document.spec, document.modules, offset)
+    if borrowed is not None:
+        return () if borrowed.item is None else (borrowed.item.name_span,)
     found = document.names.at(offset)
     if found is None:
         return ()
