@@ -1,4 +1,4 @@
-"""`stlc check --out`: the robustness of every requirement at every sample, as a trace of its own."""
+"""`--out` of `stlc check`: the robustness of every requirement at every sample, as a trace of its own."""
 
 from __future__ import annotations
 
