@@ -61,7 +61,7 @@ def test_completion_behind_a_dot(typed):
 def test_a_name_that_the_file_does_not_have(typed):
     document, offset = typed("require r: x > m.botto│m")
     assert definition(document, offset) == ()
-    assert {one.diagnostic.code for one in document.findings} == {"E101"}
+    assert "E101" in {one.diagnostic.code for one in document.findings}
 
 
 def test_a_file_that_is_not_there(tmp_path):
