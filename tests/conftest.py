@@ -11,9 +11,11 @@ from hypothesis import HealthCheck, settings
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 
-settings.register_profile("stlc", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("ci", parent=settings.get_profile("stlc"), derandomize=True, print_blob=True)
-settings.load_profile("ci" if os.environ.get("CI") else "stlc")
+settings.register_profile(
+    "stlc", deadline=None, derandomize=True, print_blob=True, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.register_profile("explore", parent=settings.get_profile("stlc"), derandomize=False)
+settings.load_profile("explore" if os.environ.get("STLC_EXPLORE") else "stlc")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
