@@ -11,6 +11,7 @@ import os
 import shutil
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,8 @@ import numpy as np
 from stlc.files import atomic_path
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC", "-std=c11")
@@ -40,13 +43,38 @@ def compiler() -> str | None:
     return next((found for name in names if name and (found := shutil.which(name))), None)
 
 
+@dataclass(frozen=True, slots=True)
+class Climb:
+    """How plans are to be improved; all arrays contiguous float64.
+
+    Attributes:
+        bounds: lowest and highest value of each control, and 1 where it is an angle that turns round, (3, m).
+        factors: of each requirement's robustness in the whole, (R,).
+        bank: plans that solved other states, (k, T, m).
+        generations: of `LANES` changed plans each.
+        enough: a row is left alone once its robustness reaches this.
+        seed: of the random changes.
+    """
+
+    bounds: NDArray[np.float64]
+    factors: NDArray[np.float64]
+    bank: NDArray[np.float64]
+    generations: int
+    enough: float
+    seed: int
+
+
 class Kernel:
-    """A built `judge`; see `stlc.compile.emit_c`."""
+    """A built `judge` and `climb`; see `stlc.compile.emit_c`."""
 
     def __init__(self, path: Path, *, states: int, rules: int, steps: int) -> None:
-        self._judge = ctypes.CDLL(str(path)).judge
-        self._judge.restype = ctypes.c_int
+        library = ctypes.CDLL(str(path))
+        self._judge, self._climb = library.judge, library.climb
         self._judge.argtypes = [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 4
+        self._climb.argtypes = [
+            *([ctypes.c_int64] * 2 + [ctypes.c_void_p] * 6),
+            *(ctypes.c_int64, ctypes.c_int, ctypes.c_double, ctypes.c_uint64),
+        ]
         self._states, self._rules, self._steps = states, rules, steps
 
     def judge(
@@ -76,15 +104,96 @@ class Kernel:
             done: int = self._judge(batch, first, last, x0.ctypes.data, u.ctypes.data, rho.ctypes.data, where)
             return done
 
-        if threads < 2 or batch < SMALL:
-            failed = rows(0, batch)
-        else:
-            edges = [round(i * batch / threads) for i in range(threads + 1)]
-            with ThreadPoolExecutor(threads) as pool:
-                failed = any(pool.map(rows, edges[:-1], edges[1:]))
-        if failed:
-            raise MemoryError
+        _share(rows, batch, 1 if batch < SMALL else threads)
         return rho, seen
+
+    def climb(
+        self, x0: NDArray[np.float64], plans: NDArray[np.float64], how: Climb, *, threads: int = 1
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Improve plans by batched hill climbing on the exact robustness.
+
+        Args:
+            x0: (B, n), contiguous float64.
+            plans: where to start, (B, T, m).
+            how: the climb.
+            threads: to share the rows among; the result does not depend on it.
+
+        Returns:
+            Plans (B, T, m) and their robustness (B,); -inf where the dynamics give NaN.
+
+        Raises:
+            MemoryError: there is no room.
+        """
+        x0, plans = np.ascontiguousarray(x0, dtype=np.float64), np.array(plans, dtype=np.float64, order="C")
+        rho = np.empty(len(x0))
+        arrays = [a.ctypes.data for a in (x0, plans, rho, how.bounds, how.factors, how.bank)]
+        last_ones = (len(how.bank), how.generations, how.enough, how.seed)
+
+        def rows(first: int, last: int) -> int:
+            done: int = self._climb(first, last, *arrays, *last_ones)
+            return done
+
+        _share(rows, len(x0), threads)
+        return plans, rho
+
+
+class Adjoint:
+    """A built `pull`; see `stlc.compile.c_adjoint`."""
+
+    def __init__(self, path: Path) -> None:
+        self._pull = ctypes.CDLL(str(path)).pull
+        self._pull.argtypes = [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 5 + [ctypes.c_double]
+
+    def pull(
+        self,
+        x0: NDArray[np.float64],
+        u: NDArray[np.float64],
+        by_rho: NDArray[np.float64],
+        by_columns: NDArray[np.float64] | None,
+        *,
+        slope: float,
+        threads: int = 1,
+    ) -> NDArray[np.float64]:
+        """The gradient by plans of what depends on robustness and states.
+
+        Args:
+            x0: (B, n).
+            u: (B, T, m).
+            by_rho: derivative by the robustness of each requirement, (B, R).
+            by_columns: derivative by the states, (n, T+1, B).
+            slope: of conditions, per unit.
+            threads: to share the rows among.
+
+        Returns:
+            (B, T, m).
+
+        Raises:
+            MemoryError: there is no room.
+        """
+        arrays = [np.ascontiguousarray(a, dtype=np.float64) for a in (x0, u, by_rho)]
+        columns = None if by_columns is None else np.ascontiguousarray(by_columns, dtype=np.float64)
+        where = None if columns is None else columns.ctypes.data
+        batch, out = len(x0), np.empty_like(arrays[1])
+
+        def rows(first: int, last: int) -> int:
+            pointers = [a.ctypes.data for a in arrays]
+            done: int = self._pull(batch, first, last, *pointers, where, out.ctypes.data, slope)
+            return done
+
+        _share(rows, batch, 1 if batch < SMALL else threads)
+        return out
+
+
+def _share(rows: Callable[[int, int], int], batch: int, threads: int) -> None:
+    """Call `rows(first, last)` on parts of a batch, side by side. Raises MemoryError where one gives not 0."""
+    if threads < 2:
+        failed = rows(0, batch) != 0
+    else:
+        edges = [round(i * batch / threads) for i in range(threads + 1)]
+        with ThreadPoolExecutor(threads) as pool:
+            failed = any(pool.map(rows, edges[:-1], edges[1:]))
+    if failed:
+        raise MemoryError
 
 
 def build(text: str) -> Path | None:

@@ -112,6 +112,8 @@ class Program:
                 return partial(switch.indicator, ops=ops)
             case "blend":
                 return partial(switch.blend, ops=ops)
+            case "settle":
+                return partial(switch.settle, ops=ops)
             case "extern":
                 (given,) = instr.params
                 function: Any = self._externs[given] if isinstance(given, str) else given
@@ -271,16 +273,14 @@ class _Writer:
         return reduce(lambda a, b: a if a == b else self.tape.emit(kernel, a, b), registers)
 
     def _weight(self, cond: ir.Formula, sharpness: float | None) -> Operand:
-        """The soft indicator of a state formula: of its margin where all atoms agree on strictness."""
+        """The soft indicator of a state formula, of its margin; exact where its atoms differ in strictness."""
         kinds = _strictness(cond)
-        if not isinstance(cond, ir.Join) or len(kinds) == 1:
-            margin = self.margin(cond)
-            strict = True in kinds
-            if isinstance(margin, float):
-                return float(margin > 0 if strict else margin >= 0)
-            return self.tape.emit("indicator", margin, params=(strict, sharpness))
-        pick = self.tape.least if cond.op == "and" else self.tape.greatest
-        return reduce(pick, [self._weight(item, sharpness) for item in cond.items])
+        margin = self.margin(cond)
+        if isinstance(margin, float):
+            return float(margin > 0 if True in kinds else margin >= 0)
+        weight = self.tape.emit("indicator", margin, params=(True in kinds, sharpness))
+        truth = True if len(kinds) == 1 else self._truth(cond)
+        return weight if isinstance(truth, bool) else self.tape.emit("settle", weight, truth)
 
     def margin(self, cond: ir.Formula) -> Operand:
         """The exact robustness of a state formula."""

@@ -23,12 +23,14 @@ class FormulaWriter:
         column: C expression of an environment entry at sample `k`, lane `j`.
         lines: statements written so far.
         size: doubles that the buffers take per lane.
+        buffers: their names, and where they begin.
     """
 
     samples: int
     column: Callable[[str], str]
     lines: list[str] = field(default_factory=list)
     size: int = 0
+    buffers: list[tuple[str, int]] = field(default_factory=list)
     _known: dict[tuple[ir.Formula, int, int], str] = field(default_factory=dict)
 
     def value(self, formula: ir.Formula, start: int = 0, count: int = 1) -> str:
@@ -125,7 +127,8 @@ class FormulaWriter:
         return name
 
     def _buffer(self, count: int) -> str:
-        name = f"b{len(self._known)}_{self.size}"
+        name = f"b{len(self.buffers)}"
+        self.buffers.append((name, self.size))
         self.lines.append(
             f"double (*restrict {name})[LANES] = (double (*)[LANES])(room + {self.size} * LANES);"
         )

@@ -43,6 +43,7 @@ BINARY = {
     "min": "MIN({0}, {1})",
     "max": "MAX({0}, {1})",
 }
+CLIP = "MIN(MAX({0}, {1}), {2})"
 
 
 class Untranslatable(Exception):  # noqa: N818 - not an error: another back end takes over
@@ -95,34 +96,39 @@ class NumberWriter:
             case ir.Op(name, args):
                 return self._op(name, [self.number(arg) for arg in args])
             case ir.Ind(cond):
-                return self._register(f"(double){self.truth(cond)}")
+                return self._indicator(cond)
             case ir.Where(cond, yes, no):
-                return self._register(f"{self.truth(cond)} ? {self.number(yes)} : {self.number(no)}")
+                return self._choice(cond, self.number(yes), self.number(no))
             case ir.Extern(name) | ir.At(name) | ir.Held(name):
                 raise Untranslatable(name)
             case _:
                 assert_never(num)
 
+    def _indicator(self, cond: ir.Formula) -> str:
+        return self._register(f"(double){self.truth(cond)}")
+
+    def _choice(self, cond: ir.Formula, yes: str, no: str) -> str:
+        return self._register(f"{self.truth(cond)} ? {yes} : {no}")
+
     def _op(self, name: str, args: list[str]) -> str:
-        if name in UNARY and len(args) == 1:
-            return self._register(UNARY[name].format(*args))
         if name in ("min", "max") and len(args) == 1:
             return args[0]
         if name in BINARY:
-            return reduce(lambda a, b: self._register(BINARY[name].format(a, b)), args)
-        match name:
-            case "clip":
-                return self._register(f"MIN(MAX({args[0]}, {args[1]}), {args[2]})")
-            case "norm":
-                squares = " + ".join(f"{arg} * {arg}" for arg in args)
-                return self._register(f"sqrt({squares})")
-            case "norm1":
-                return self._register("(" + " + ".join(f"fabs({arg})" for arg in args) + ")")
-            case "norminf":
-                sizes = [self._register(f"fabs({arg})") for arg in args]
-                return reduce(lambda a, b: self._register(f"MAX({a}, {b})"), sizes)
-            case _:
-                raise Untranslatable(name)
+            return reduce(lambda a, b: self._apply(name, [a, b]), args)
+        if name in ("norm1", "norminf"):
+            sizes = [self._apply("abs", [arg]) for arg in args]
+            pick = "add" if name == "norm1" else "max"
+            return reduce(lambda a, b: self._apply(pick, [a, b]), sizes)
+        return self._apply(name, args)
+
+    def _apply(self, name: str, args: list[str]) -> str:
+        """One function of the tables, or `clip` or `norm`, in a register."""
+        if name == "norm":
+            return self._register("sqrt(" + " + ".join(f"{arg} * {arg}" for arg in args) + ")")
+        form = CLIP if name == "clip" else UNARY.get(name) or BINARY.get(name)
+        if form is None:
+            raise Untranslatable(name)
+        return self._register(form.format(*args))
 
     def _register(self, text: str) -> str:
         known = self._texts.get(text)

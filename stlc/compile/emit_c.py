@@ -9,15 +9,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from stlc.compile import ir
+from stlc.compile.c_climb import CLIMB
 from stlc.compile.c_formulas import FormulaWriter
 from stlc.compile.c_numbers import NumberWriter
 
 LANES = 16
 
-_HEAD = f"""
+HEAD = f"""
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
+#include <string.h>
 
 #define LANES {LANES}
 #define LANE for (int j = 0; j < LANES; ++j)
@@ -54,7 +56,7 @@ class Motion:
 
 
 def emit(motion: Motion, formulas: Sequence[ir.Formula]) -> str:
-    """The C text of `judge`; see `stlc.native` for its signature.
+    """The C text of `judge` and `climb`; see `stlc.native` for their signatures.
 
     Raises:
         Untranslatable: the IR holds something that has no C form.
@@ -64,20 +66,9 @@ def emit(motion: Motion, formulas: Sequence[ir.Formula]) -> str:
     states, rules, steps = len(motion.states), len(formulas), motion.steps
     return "\n".join(
         [
-            _HEAD,
-            f"typedef double lanes[{steps + 1}][LANES];",
-            f"static void roll(lanes *restrict x, const double (*restrict u)[{steps}][LANES],",
-            "                 double *restrict bad) {",
-            f"  for (int k = 0; k < {steps}; ++k) LANE {{",
-            *(f"    {line}" for line in _step(motion)),
-            "  }",
-            "}",
-            "static void check(const lanes *restrict x, double *restrict room, double *restrict bad,",
-            "                  double (*restrict out)[LANES]) {",
-            *(f"  {line}" for line in checks.lines),
-            *(f"  LANE out[{i}][j] = {value}[0][j];" for i, value in enumerate(values)),
-            "}",
-            _DRIVER.format(
+            HEAD,
+            *passes(motion, checks, values),
+            (_DRIVER + CLIMB).format(
                 states=states,
                 controls=len(motion.controls),
                 steps=steps,
@@ -86,6 +77,24 @@ def emit(motion: Motion, formulas: Sequence[ir.Formula]) -> str:
             ),
         ]
     )
+
+
+def passes(motion: Motion, checks: FormulaWriter, values: Sequence[str]) -> list[str]:
+    """The two passes forward: `roll` fills the states, `check` gives the robustness of each requirement."""
+    return [
+        f"typedef double lanes[{motion.steps + 1}][LANES];",
+        f"static void roll(lanes *restrict x, const double (*restrict u)[{motion.steps}][LANES],",
+        "                 double *restrict bad) {",
+        f"  for (int k = 0; k < {motion.steps}; ++k) LANE {{",
+        *(f"    {line}" for line in _step(motion)),
+        "  }",
+        "}",
+        "static void check(const lanes *restrict x, double *restrict room, double *restrict bad,",
+        "                  double (*restrict out)[LANES]) {",
+        *(f"  {line}" for line in checks.lines),
+        *(f"  LANE out[{i}][j] = {value}[0][j];" for i, value in enumerate(values)),
+        "}",
+    ]
 
 
 def _step(motion: Motion) -> list[str]:

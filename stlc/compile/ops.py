@@ -91,6 +91,9 @@ class Ops(Protocol):
     def either(self, a: Mask, b: Mask) -> Mask:
         """Disjunction."""
 
+    def settled(self, weight: Array, mask: Mask) -> Array:
+        """1 where `mask`, else 0, with the gradient of `weight`."""
+
     def number(self, mask: Mask, like: Array) -> Array:
         """1 where `mask`, else 0, in the dtype of `like`."""
 

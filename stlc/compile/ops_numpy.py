@@ -79,6 +79,10 @@ class NumpyOps:
         """Euclidean length."""
         return np.sqrt(reduce(operator.add, (np.square(part) for part in components)))
 
+    def settled(self, weight: Array, mask: Mask) -> Array:
+        """1 where `mask`, else 0."""
+        return self.number(mask, weight)
+
     def number(self, mask: Mask, like: Array) -> Array:
         """1 where `mask`, else 0."""
         return mask.astype(like.dtype)

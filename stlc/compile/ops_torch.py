@@ -167,6 +167,10 @@ class TorchOps:
         positive = total > 0.0
         return torch.where(positive, torch.where(positive, total, 1.0).sqrt(), total)
 
+    def settled(self, weight: Tensor, mask: Mask) -> Tensor:
+        """1 where `mask`, else 0, with the gradient of `weight`."""
+        return weight + (self.number(mask, weight) - weight.detach())
+
     def number(self, mask: Mask, like: Tensor) -> Tensor:
         """1 where `mask`, else 0."""
         out: Tensor = mask.to(like.dtype)

@@ -33,6 +33,9 @@ class Switch(Protocol):
             ops: the array library.
         """
 
+    def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
+        """The indicator `weight` of a condition whose atoms differ in strictness; `truth` is the exact mask."""
+
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
         """`yes` where the indicator `weight` is 1, `no` where it is 0."""
 
@@ -50,6 +53,10 @@ class Hard:
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
         """1 where the condition holds, else 0."""
         return ops.number(ops.gt(rho, 0.0) if strict else ops.ge(rho, 0.0), rho)
+
+    def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
+        """The mask as a number."""
+        return ops.number(truth, weight)
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
         """The value of the branch that is taken, bit for bit."""
@@ -72,6 +79,10 @@ class Tanh:
         """`(1 + tanh(w rho)) / 2` with the indicator's own sharpness where it has one."""
         width = self.sharpness if sharpness is None else sharpness
         return ops.sigmoid(rho * ops.constant(2.0 * width, rho))
+
+    def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:  # noqa: ARG002
+        """The smooth number: at the edge it is a half whichever atom is strict."""
+        return weight
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
         """`no + weight (yes - no)`."""
@@ -96,6 +107,10 @@ class StraightThrough:
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
         """0 or 1, with a gradient."""
         return ops.straight_through(rho, strict, self.slope)
+
+    def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
+        """0 or 1 as the mask says, with the gradient of `weight`."""
+        return ops.settled(weight, truth)
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
         """`no + weight (yes - no)`."""

@@ -13,7 +13,7 @@ import torch
 
 from stlc.controller.config import HELD_OUT, HELD_OUT_SEED
 from stlc.controller.missions import visited
-from stlc.controller.search import DEEP, QUICK, Searcher
+from stlc.controller.search import Searcher
 from stlc.controller.task import satisfied
 from stlc.files import write_atomic
 
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
     from stlc.controller.policy import Mlp
     from stlc.controller.task import Task
+
+CEILING_TRIES = 16_000
+"""Plans that are tried for a held-out state before it counts as infeasible."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +92,7 @@ def _solvable(task: Task, states: Tensor, plans: Tensor, bank: Tensor) -> int:
         return 0
     generator = torch.Generator().manual_seed(HELD_OUT_SEED + 1)
     searcher = Searcher(task, generator, enough=1e-4)
-    found = searcher.repair(states.float(), plans.float(), bank.float(), (QUICK, DEEP))
+    found = searcher.repair(states.float(), plans.float(), bank.float(), tries=CEILING_TRIES)
     return int(found.solved.sum())
 
 

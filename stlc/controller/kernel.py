@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from stlc.compile.c_numbers import Untranslatable
 from stlc.compile.emit_c import Motion, emit
-from stlc.native import Kernel, build
+from stlc.native import Climb, Kernel, build
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -20,6 +21,12 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from stlc.controller.task import Task
+
+
+def motion_of(task: Task) -> Motion:
+    """One exact step of a task's system, as the C emitters read it."""
+    step = task.system.exact_step
+    return Motion(task.names, task.system.control_names, step.lets, step.next, task.horizon, task.dt)
 
 
 class NativeJudge:
@@ -30,24 +37,26 @@ class NativeJudge:
         names: of the state columns.
     """
 
-    def __init__(self, kernel: Kernel, names: tuple[str, ...]) -> None:
+    def __init__(self, kernel: Kernel, task: Task) -> None:
         self.kernel = kernel
-        self.names = names
+        self.names = task.names
+        self.rules = len(task.rules)
+        controls = task.system.controls
+        turns = torch.tensor([control.squash == "angle" for control in controls])
+        low, high = task.system.control_low, task.system.control_high
+        self._bounds = torch.stack((low, high, turns.to(low.dtype))).double().numpy()
+        self._factors = np.array([rule.weight / rule.scale for rule in task.rules])
 
     @classmethod
     def of(cls, task: Task) -> NativeJudge | None:
         """The kernel of a task, built if need be; None where torch has to do its work."""
-        step = task.system.exact_step
-        motion = Motion(task.names, task.system.control_names, step.lets, step.next, task.horizon, task.dt)
         try:
-            path = build(emit(motion, [rule.formula for rule in task.rules]))
+            path = build(emit(motion_of(task), [rule.formula for rule in task.rules]))
         except Untranslatable:
             return None
         if path is None:
             return None
-        return cls(
-            Kernel(path, states=len(task.names), rules=len(task.rules), steps=task.horizon), task.names
-        )
+        return cls(Kernel(path, states=len(task.names), rules=len(task.rules), steps=task.horizon), task)
 
     def judge(self, x0: Tensor, u: Tensor, *, columns: bool) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Robustness per requirement (B, R), and the states (T+1, B) by name where they are wanted.
@@ -67,3 +76,33 @@ class NativeJudge:
         if seen is None:
             return each, {}
         return each, dict(zip(self.names, torch.from_numpy(seen).to(x0.dtype).unbind(0), strict=True))
+
+    def climb(
+        self,
+        x0: Tensor,
+        plans: Tensor,
+        bank: Tensor,
+        *,
+        generations: int,
+        enough: float,
+        seed: int,
+        threads: int = 1,
+    ) -> tuple[Tensor, Tensor]:
+        """Improve plans by hill climbing on the exact robustness.
+
+        Args:
+            x0: (B, n).
+            plans: where to start, (B, T, m).
+            bank: plans that solved other states, (k, T, m); may be empty.
+            generations: of changed plans per row.
+            enough: a row is left alone once its robustness reaches this.
+            seed: of the changes.
+            threads: to share the rows among; the result does not depend on it.
+
+        Returns:
+            Plans (B, T, m) and their robustness (B,), in the dtype of `x0`.
+        """
+        arrays = [tensor.detach().double().contiguous().numpy() for tensor in (x0, plans, bank)]
+        how = Climb(self._bounds, self._factors, arrays[2], generations, enough, seed)
+        best, rho = self.kernel.climb(arrays[0], arrays[1], how, threads=threads)
+        return torch.from_numpy(best).to(x0.dtype), torch.from_numpy(rho).to(x0.dtype)

@@ -13,6 +13,8 @@ from stlc.compile.switch import StraightThrough, Switch, Tanh
 from stlc.controller.task import satisfied
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from stlc.controller.task import Task
 
 
@@ -89,8 +91,7 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Loss:
     Returns:
         Losses per plan.
     """
-    columns = task.system.rollout_columns(x0, u, objective.switch)
-    rho = task.graph.columns(columns, ops=TORCH, smoothing=objective.smoothing)
+    rho, columns = _rolled(task, objective, x0, u)
     exact = rho if objective.smoothing is None else task.graph.columns(columns, ops=TORCH)
     good = satisfied(exact.detach())
     hinge = (objective.margin - rho).clamp(min=0.0)
@@ -101,3 +102,15 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Loss:
         good, cost, torch.zeros_like(cost)
     )
     return Loss(total=total, stl=hinge, cost=cost.detach(), satisfied=good)
+
+
+def _rolled(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
+    """Robustness (B,) and states (T+1, B) by name, differentiable: natively where that has the same meaning."""
+    switch = objective.switch
+    if objective.smoothing is None and isinstance(switch, StraightThrough) and x0.device.type == "cpu":
+        native = task.gradient
+        if native is not None:
+            each, columns = native(x0, u, slope=switch.slope)
+            return task.graph.overall(each), columns
+    columns = task.system.rollout_columns(x0, u, switch)
+    return task.graph.columns(columns, ops=TORCH, smoothing=objective.smoothing), columns

@@ -1,34 +1,31 @@
 """Repairing plans: batched hill climbing on the exact robustness, from the policy's own plan.
 
-Gradients see nothing from outside a stop zone or across an obstacle; a search does. Each round tries a batch
-of changed plans per state and keeps the best. Proposals mix noise over a random stretch of time, a constant
-shift of a stretch, a stretch held at one random level, and plans that solved other states.
+Gradients see nothing from outside a stop zone or across an obstacle; a search does. Each generation tries a
+batch of changed plans per state and keeps the best. Changes are noise over a random stretch of time, a constant
+shift of a stretch, a stretch held at one random level, and plans that solved other states. The native kernel
+does it where there is one, torch elsewhere.
 """
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from stlc.compile.emit_c import LANES
 from stlc.controller.task import FLOAT32_SLACK
 
 if TYPE_CHECKING:
     from stlc.controller.task import Task
 
-
-@dataclass(frozen=True, slots=True)
-class Effort:
-    """How much is tried: `rounds` rounds of `tries` plans per state."""
-
-    rounds: int
-    tries: int
-
-
-QUICK = Effort(rounds=30, tries=64)
-DEEP = Effort(rounds=15, tries=256)
+THOROUGH = 4000
+"""Plans that are tried per state at most, unless told otherwise."""
+TRIES = 64
+"""Plans of a generation where torch does the work."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,10 +33,12 @@ class Repaired:
     """What a search found.
 
     Attributes:
+        states: where plans start, (B, n).
         plans: the best plan per state, (B, T, m).
         rho: its exact robustness, (B,).
     """
 
+    states: Tensor
     plans: Tensor
     rho: Tensor
 
@@ -59,32 +58,56 @@ class Searcher:
         self.enough = enough
         self.low = task.system.control_low
         self.high = task.system.control_high
+        self._aside = ThreadPoolExecutor(1, thread_name_prefix="search")
 
-    def repair(
-        self, x0: Tensor, plans: Tensor, bank: Tensor, efforts: tuple[Effort, ...] = (QUICK, DEEP)
-    ) -> Repaired:
+    def repair(self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH) -> Repaired:
         """Improve plans until they satisfy the specification or the effort is spent.
 
         Args:
             x0: states, (B, n).
             plans: where to start, (B, T, m).
             bank: plans that solved other states, (k, T, m); may be empty.
-            efforts: one after the other; each works on what is still unsolved.
+            tries: plans per state at most.
         """
-        found = Repaired(plans.clone(), self.task.judge(x0, plans, states=False).rho.clone())
-        for effort in efforts:
-            for _ in range(effort.rounds):
-                still = (found.rho < self.enough).nonzero()[:, 0]
-                if still.numel() == 0:
-                    break
-                tried = self._proposals(found.plans[still], effort.tries, bank)
-                self._keep_better(x0, found, still, tried)
+        return self.begin(x0, plans, bank, tries=tries).result()
+
+    @torch.no_grad()
+    def begin(
+        self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH
+    ) -> Future[Repaired]:
+        """`repair` beside whatever else goes on; the result depends on the arguments and the generator alone."""
+        native = self.task.native
+        if native is not None and x0.device.type == "cpu":
+            seed = int(torch.randint(2**62, (), generator=self.generator))
+            x0, plans, bank = x0.clone(), plans.clone(), bank.clone()
+            generations = -(-tries // LANES)
+
+            def climb() -> Repaired:
+                best, _ = native.climb(
+                    x0, plans, bank, generations=generations, enough=self.enough, seed=seed, threads=idle_cores()
+                )
+                return Repaired(x0, best, self.task.judge(x0, best, states=False).rho)
+
+            return self._aside.submit(climb)
+        done: Future[Repaired] = Future()
+        done.set_result(self._climb(x0, plans, bank, tries))
+        return done
+
+    def _climb(self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int) -> Repaired:
+        """The same in torch."""
+        found = Repaired(x0, plans.clone(), self.task.judge(x0, plans, states=False).rho.clone())
+        for _ in range(-(-tries // TRIES)):
+            still = (found.rho < self.enough).nonzero()[:, 0]
+            if still.numel() == 0:
+                break
+            self._keep_better(found, still, self._proposals(found.plans[still], TRIES, bank))
         return found
 
-    def _keep_better(self, x0: Tensor, found: Repaired, still: Tensor, tried: Tensor) -> None:
+    def _keep_better(self, found: Repaired, still: Tensor, tried: Tensor) -> None:
         """Judge plans (k, tries, T, m) for the states `still`, (k,), and update `found` in place."""
         tries = tried.shape[1]
-        judged = self.task.judge(x0[still].repeat_interleave(tries, 0), tried.flatten(0, 1), states=False)
+        x0 = found.states[still].repeat_interleave(tries, 0)
+        judged = self.task.judge(x0, tried.flatten(0, 1), states=False)
         value, which = judged.rho.view(-1, tries).max(1)
         better = (value > found.rho[still]).nonzero()[:, 0]
         rows = still[better]
@@ -130,3 +153,8 @@ class Searcher:
 
     def _randint(self, low: int, high: int, *shape: int) -> Tensor:
         return torch.randint(low, high, shape, generator=self.generator, device=self.low.device)
+
+
+def idle_cores() -> int:
+    """Cores that torch leaves to a search beside it, at least one."""
+    return max(1, len(os.sched_getaffinity(0)) - torch.get_num_threads())

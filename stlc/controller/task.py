@@ -16,6 +16,7 @@ from stlc.compile.ops_torch import TORCH
 from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics import TOLERANCE
 from stlc.compile.switch import Hard, Switch
+from stlc.controller.gradient import NativeGradient
 from stlc.controller.kernel import NativeJudge
 
 if TYPE_CHECKING:
@@ -154,8 +155,14 @@ class Task:
         return each
 
     @cached_property
-    def _native(self) -> NativeJudge | None:
+    def native(self) -> NativeJudge | None:
+        """The kernel that does what needs no gradient; None where torch has to."""
         return NativeJudge.of(self)
+
+    @cached_property
+    def gradient(self) -> NativeGradient | None:
+        """Robustness and states differentiable by plans, natively; None where torch has to differentiate."""
+        return NativeGradient.of(self)
 
     def judge(self, x0: Tensor, u: Tensor, *, states: bool = True) -> Judged:
         """Roll plans out exactly and judge them, without gradient.
@@ -182,8 +189,8 @@ class Task:
 
     def _judged(self, x0: Tensor, u: Tensor, *, states: bool) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Robustness per requirement and states, by the native kernel where it can."""
-        if x0.device.type == "cpu" and self._native is not None:
-            return self._native.judge(x0, u, columns=states)
+        if x0.device.type == "cpu" and self.native is not None:
+            return self.native.judge(x0, u, columns=states)
         columns = self.system.rollout_columns(x0, u, HARD)
         return self.graph.per_requirement_columns(columns, ops=TORCH), columns
 

@@ -9,6 +9,7 @@ gradient step mixes fresh states with such hard ones. Of the network's plans the
 from __future__ import annotations
 
 import math
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,9 +20,9 @@ from stlc.controller.buffer import Buffer
 from stlc.controller.missions import Missions
 from stlc.controller.objective import Objective, guided_objective, loss, paper_objective
 from stlc.controller.policy import Mlp, PlanNetwork
-from stlc.controller.search import QUICK, Searcher
+from stlc.controller.search import Repaired, Searcher
 from stlc.controller.supply import Draws, Supply
-from stlc.controller.task import satisfied
+from stlc.controller.task import rank, satisfied
 
 if TYPE_CHECKING:
     from stlc.controller.config import Engine
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 MARGIN_STATES = 128
 MARGIN_SHARE = 0.2
 MARGIN_RANGE = (0.01, 0.5)
-BUSY = 0.15
-"""Share of failing states whose repair makes another search round worth while soon."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +74,9 @@ class Trainer:
         if engine.method == "guided":
             self.margin = self._feasible_margin()
         self.objective = self._objective()
+        self.searcher = Searcher(task, self.generator, enough=MARGIN_SHARE * self.margin)
+        self.repairing: Future[Repaired] | None = None
+        self.accuracy = 0.0
 
     def advance(self) -> float:
         """One gradient step; returns its loss (not finite: training has diverged)."""
@@ -109,7 +111,7 @@ class Trainer:
     def look(self) -> Look:
         """Judge fresh states; with the guided method also repair what fails.
 
-        The next look is due sooner where this one repaired much.
+        The repair goes on beside the training steps; the next look takes what it has found.
         """
         x0 = self.supply.take(self.engine.pool)
         plans, judged = Mlp(self.task, self.network).plan_judged(x0)
@@ -119,16 +121,27 @@ class Trainer:
         self.next_look = self.step + self.engine.every
         if self.engine.method != "guided":
             return Look(accuracy, shares, None, 0, 0)
-        failing = (~good).nonzero()[:, 0][: self.engine.most]
-        found = self._searcher().repair(x0[failing], plans[failing], self.buffer.bank)
+        failing, repaired, feasible = self._take_repaired()
+        bad = (~good).nonzero()[:, 0][: self.engine.most]
+        self.repairing = self.searcher.begin(x0[bad], plans[bad], self.buffer.bank)
+        self.accuracy = accuracy
+        return Look(accuracy, shares, feasible, failing, repaired)
+
+    def _take_repaired(self) -> tuple[int, int, float | None]:
+        """Put what the search round before this one has found where it is learnt from.
+
+        Returns:
+            How many states it worked on, how many it solved, and the share of states known to be feasible.
+        """
+        if self.repairing is None:
+            return 0, 0, None
+        found = self.repairing.result()
         solved = found.solved
-        self.buffer.add(x0[failing][solved], found.plans[solved])
-        self.supply.follow(x0[failing][solved], found.plans[solved])
-        repaired = int(solved.sum())
-        rate = repaired / max(1, len(failing))
-        if rate < BUSY:
-            self.next_look += self.engine.every
-        return Look(accuracy, shares, accuracy + (1.0 - accuracy) * rate, len(failing), repaired)
+        self.buffer.add(found.states[solved], found.plans[solved])
+        self.supply.follow(found.states[solved], found.plans[solved])
+        failing, repaired = len(solved), int(solved.sum())
+        rate = repaired / max(1, failing)
+        return failing, repaired, self.accuracy + (1.0 - self.accuracy) * rate
 
     # ------------------------------------------------------------------ pieces
 
@@ -141,15 +154,27 @@ class Trainer:
             states, targets = self.buffer.draw(hard, self.generator)
             x0 = torch.cat((fresh, states))
         plans: Tensor = self.network(x0)
-        count = engine.plans
-        outcome = loss(self.task, self.objective, x0.repeat_interleave(count, 0), plans.flatten(0, 1))
-        total = outcome.total.view(-1, count)
-        winner = (10.0 * outcome.stl.detach() + engine.performance * outcome.cost).view(-1, count).argmin(1)
-        value = (total.gather(1, winner[:, None])[:, 0] + engine.share * total.mean(1)).mean()
+        winner, good = self._winner(x0, plans)
+        rows = torch.arange(len(x0), device=self.device)
+        chosen = plans[rows, winner]
+        value = loss(self.task, self.objective, x0, chosen).total.mean()
+        if engine.share:
+            some = rows[:: engine.plans]
+            other = torch.randint(engine.plans, (len(some),), generator=self.generator, device=self.device)
+            value = value + engine.share * loss(self.task, self.objective, x0[some], plans[some, other]).total.mean()
         if hard:
-            solved = outcome.satisfied.view(-1, count)[-hard:].any(1)
-            value = value + self._imitation(plans[-hard:], targets, solved)
+            value = value + self._imitation(plans[-hard:], targets, good[-hard:])
         return value
+
+    @torch.no_grad()
+    def _winner(self, x0: Tensor, plans: Tensor) -> tuple[Tensor, Tensor]:
+        """Which plan is trained, the one that does best, (B,), and whether it satisfies the specification."""
+        batch, count = plans.shape[:2]
+        if count == 1 and self.engine.hard == 0:
+            return torch.zeros(batch, dtype=torch.int64, device=self.device), torch.zeros(batch, dtype=torch.bool)
+        judged = self.task.judge(x0.repeat_interleave(count, 0), plans.flatten(0, 1))
+        score = rank(judged.rho, self.task.cost(judged)).view(batch, count)
+        return score.argmax(1), satisfied(judged.rho).view(batch, count).any(1)
 
     def _imitation(self, plans: Tensor, targets: Tensor, solved: Tensor) -> Tensor:
         """Distance of the nearest plan to the repaired one, where the state still fails."""
@@ -163,7 +188,7 @@ class Trainer:
         middle = 0.5 * (self.task.system.control_low + self.task.system.control_high)
         start = middle.expand(MARGIN_STATES, self.task.horizon, -1)
         searcher = Searcher(self.task, self.generator, enough=math.inf)
-        rho = searcher.repair(x0, start, self.buffer.bank, (QUICK,)).rho
+        rho = searcher.repair(x0, start, self.buffer.bank).rho
         reached = rho[satisfied(rho)]
         if reached.numel() == 0:
             return MARGIN_RANGE[0]
@@ -175,9 +200,6 @@ class Trainer:
             return Draws(self.task, self.generator, self.device)
         policy = Mlp(self.task, self.network)
         return Missions(self.task, self.generator, self.device, lambda x0: policy.plan_judged(x0)[1])
-
-    def _searcher(self) -> Searcher:
-        return Searcher(self.task, self.generator, enough=MARGIN_SHARE * self.margin)
 
     def _objective(self) -> Objective:
         if self.engine.method == "gradient":
@@ -197,6 +219,9 @@ class Trainer:
             found.update({f"adam.{index}.{name}": value for name, value in state.items()})
         kept = len(self.buffer)
         found.update({f"supply.{name}": value for name, value in self.supply.tensors().items()})
+        if self.repairing is not None:
+            known = self.repairing.result()
+            found.update({f"repairing.{name}": getattr(known, name) for name in ("states", "plans", "rho")})
         found["buffer.states"], found["buffer.plans"] = self.buffer.states[:kept], self.buffer.plans[:kept]
         return found
 
@@ -208,13 +233,19 @@ class Trainer:
             "margin": self.margin,
             "solved": self.buffer.count,
             "next_look": self.next_look,
+            "accuracy": self.accuracy,
         }
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
         """Go on where `tensors` and `facts` were taken."""
         self.step, self.steps = int(facts["step"]), int(facts["steps"])
         self.margin, self.next_look = float(facts["margin"]), int(facts["next_look"])
+        self.accuracy = float(facts["accuracy"])
         self.objective = self._objective()
+        self.searcher = Searcher(self.task, self.generator, enough=MARGIN_SHARE * self.margin)
+        if known := _below(tensors, "repairing"):
+            self.repairing = Future()
+            self.repairing.set_result(Repaired(**known))
         for prefix, module in (("network", self.network), ("average", self.average)):
             module.load_state_dict(_below(tensors, prefix))
         layout = self.optimizer.state_dict()

@@ -1,0 +1,100 @@
+"""Hill climbing over plans as C: a batch of changed plans a generation, the best is kept, no thread waits.
+
+Appended to what `emit_c` writes; `roll` and `check` are those of the task. Each row has its own random numbers,
+so the result does not depend on how rows are shared among threads.
+"""
+
+from __future__ import annotations
+
+CLIMB = """
+/* Random numbers: splitmix64 (Steele, Lea & Flood, 2014); a normal one is the sum of four uniform ones. */
+static inline uint64_t draw(uint64_t *s) {{
+  uint64_t z = (*s += 0x9E3779B97F4A7C15ull);
+  z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9ull;
+  z = (z ^ (z >> 27)) * 0x94D049BB133111EBull;
+  return z ^ (z >> 31);
+}}
+static inline double uniform(uint64_t *s) {{ return (double)(draw(s) >> 11) * 0x1p-53; }}
+static inline int below(uint64_t *s, int n) {{ return (int)(((draw(s) >> 32) * (uint64_t)n) >> 32); }}
+static inline double normal(uint64_t *s) {{
+  const uint64_t z = draw(s);
+  const double sum = (double)(z & 65535) + (double)(z >> 16 & 65535) + (double)(z >> 32 & 65535) + (double)(z >> 48);
+  return (sum - 131070.0) * (1.7320508075688772 / 65535.0);
+}}
+static inline double bounded(double u, double low, double high, int turns) {{
+  if (turns) return u - (high - low) * floor((u - low) / (high - low));
+  return u < low ? low : u > high ? high : u;
+}}
+
+/* One changed plan for one control of lane j: a stretch of time gets noise, a shift or one level. */
+static void change(double (*restrict v)[LANES], int j, int kind, double low, double high, int turns, uint64_t *s) {{
+  const double span = high - low, size = span * ldexp(0.5, -below(s, 7));
+  const int from = below(s, {steps}), length = 1 + below(s, {steps}), to = from + length < {steps} ? from + length : {steps};
+  const double shift = kind == 1 ? size * normal(s) : 0.0, level = low + span * uniform(s);
+  for (int k = from; k < to; ++k) {{
+    const double u = kind == 0 ? v[k][j] + size * normal(s) : kind == 1 ? v[k][j] + shift : level;
+    v[k][j] = bounded(u, low, high, turns);
+  }}
+}}
+
+/* A plan that solved another state, whole or from some step on; levels over quarters while there are none. */
+static void borrow(double (*restrict v)[{steps}][LANES], int j, const double *restrict bank, int64_t plans,
+                   const double *restrict low, const double *restrict high, uint64_t *s) {{
+  if (plans > 0) {{
+    const double *from = bank + (int64_t)(uniform(s) * (double)plans) * {steps} * {controls};
+    const int first = draw(s) & 1 ? 0 : below(s, {steps});
+    for (int i = 0; i < {controls}; ++i) for (int k = first; k < {steps}; ++k) v[i][k][j] = from[k * {controls} + i];
+    return;
+  }}
+  const int piece = ({steps} + 3) / 4;
+  for (int i = 0; i < {controls}; ++i) {{
+    double level = 0.0;
+    for (int k = 0; k < {steps}; ++k) {{
+      if (k % piece == 0) level = low[i] + (high[i] - low[i]) * uniform(s);
+      v[i][k][j] = level;
+    }}
+  }}
+}}
+
+/* Improves plans (batch, {steps}, {controls}) in place; rho (batch). Rows from `first` up to `last`. 1: no memory.
+   bounds: low ({controls}), high ({controls}), turns ({controls}); factors ({rules}). */
+int climb(int64_t first, int64_t last, const double *x0, double *plans, double *rho, const double *bounds,
+          const double *factors, const double *bank, int64_t banked, int generations, double enough, uint64_t seed) {{
+  enum {{ N = {states}, M = {controls}, T = {steps}, R = {rules} }};
+  const double *low = bounds, *high = bounds + M, *turns = bounds + 2 * M;
+  lanes *x = malloc(sizeof(lanes) * N);
+  double (*v)[T][LANES] = malloc(sizeof(double) * M * T * LANES);
+  double *room = malloc(sizeof(double) * {room} * LANES);
+  double (*out)[LANES] = malloc(sizeof(double) * (R + 1) * LANES);
+  if (!x || !v || !room || !out) {{ free(x); free(v); free(room); free(out); return 1; }}
+  for (int64_t row = first; row < last; ++row) {{
+    uint64_t s = seed ^ (uint64_t)row * 0xD1B54A32D192ED03ull;
+    double *plan = plans + row * T * M, best = -INFINITY;
+    for (int i = 0; i < N; ++i) LANE x[i][0][j] = x0[row * N + i];
+    for (int g = 0; g < generations && best < enough; ++g) {{
+      for (int i = 0; i < M; ++i) for (int k = 0; k < T; ++k) LANE v[i][k][j] = plan[k * M + i];
+      for (int j = g == 0; j < LANES; ++j) {{
+        const int kind = j % 4;
+        if (kind == 3) {{ borrow(v, j, bank, banked, low, high, &s); continue; }}
+        const int only = M > 1 && (draw(&s) & 1) ? below(&s, M) : -1;
+        for (int i = 0; i < M; ++i)
+          if (only < 0 || only == i) change(v[i], j, kind, low[i], high[i], turns[i] > 0.0, &s);
+      }}
+      double bad[LANES] = {{0}};
+      roll(x, (const double (*)[T][LANES])v, bad);
+      check(x, room, bad, out);
+      int which = -1;
+      for (int j = 0; j < LANES; ++j) {{
+        double value = INFINITY;
+        for (int i = 0; i < R; ++i) value = MIN(value, out[i][j] * factors[i]);
+        if (!(bad[j] > 0.0) && value > best) {{ best = value; which = j; }}
+      }}
+      if (which >= 0)
+        for (int i = 0; i < M; ++i) for (int k = 0; k < T; ++k) plan[k * M + i] = v[i][k][which];
+    }}
+    rho[row] = best;
+  }}
+  free(x); free(v); free(room); free(out);
+  return 0;
+}}
+"""

@@ -1,0 +1,123 @@
+"""Derivatives of numbers as C statements: reverse mode over the registers that a `NumberWriter` has filled.
+
+Conditions step hard and have the slope of `(1 + tanh(slope margin)) / 2`, as `switch.StraightThrough` has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import reduce
+
+from stlc.compile import ir
+from stlc.compile.c_numbers import NumberWriter
+
+Slope = tuple[str, str]
+"""A register, and the derivative by it."""
+
+UNARY_SLOPES = {
+    "neg": "(-1.0)",
+    "abs": "(double)(({0} > 0.0) - ({0} < 0.0))",
+    "square": "(2.0 * {0})",
+    "relu": "(double)({0} > 0.0)",
+    "sqrt": "({r} > 0.0 ? 0.5 / {r} : 0.0)",
+    "exp": "{r}",
+    "log": "(1.0 / {0})",
+    "sin": "cos({0})",
+    "cos": "(-sin({0}))",
+    "tan": "(1.0 + {r} * {r})",
+    "asin": "(1.0 / sqrt(1.0 - {0} * {0}))",
+    "acos": "(-1.0 / sqrt(1.0 - {0} * {0}))",
+    "atan": "(1.0 / (1.0 + {0} * {0}))",
+}
+"""What is not here is flat: `sign floor ceil round`."""
+BINARY_SLOPES = {
+    "add": ("1.0", "1.0"),
+    "sub": ("1.0", "(-1.0)"),
+    "mul": ("{1}", "{0}"),
+    "div": ("(1.0 / {1})", "(-{r} / {1})"),
+    "mod": ("1.0", "(-floor({0} / {1}))"),
+    "pow": ("({1} * pow({0}, {1} - 1.0))", "({0} > 0.0 ? {r} * log({0}) : 0.0)"),
+    "atan2": ("({1} / ({0} * {0} + {1} * {1}))", "(-{0} / ({0} * {0} + {1} * {1}))"),
+    "min": ("(double)!({1} < {0})", "(double)({1} < {0})"),
+    "max": ("(double)!({1} > {0})", "(double)({1} > {0})"),
+}
+CLIP_SLOPE = "(double)(({0} >= {1}) & ({0} <= {2}))"
+
+
+class SlopeWriter(NumberWriter):
+    """Writes numbers, and remembers how each register changes with those before it.
+
+    Args:
+        column: C expression of an environment entry.
+    """
+
+    def __init__(self, column: Callable[[str], str]) -> None:
+        super().__init__(column)
+        self._slopes: dict[str, tuple[Slope, ...]] = {}
+        self._inputs: dict[str, str] = {}
+
+    def backward(self, seeds: Mapping[str, str], target: Callable[[str], str | None]) -> list[str]:
+        """Statements that add the gradient of registers to columns.
+
+        Args:
+            seeds: register -> C expression of the derivative of the outcome by it.
+            target: C place where the derivative by a column is gathered; None where nobody wants it.
+        """
+        registers = list(self._texts.values())
+        lines = [f"double d{name} = {seeds.get(name, '0.0')};" for name in registers]
+        for name in reversed(registers):
+            for of, slope in self._slopes.get(name, ()):
+                lines.append(f"d{of} += d{name} * {slope};")
+            place = target(self._inputs[name]) if name in self._inputs else None
+            if place is not None:
+                lines.append(f"{place} += d{name};")
+        return lines
+
+    def margin(self, cond: ir.Formula) -> str:
+        """The exact robustness of a state formula."""
+        match cond:
+            case ir.Atom(num, sign):
+                value = self.number(num)
+                return value if sign > 0 else self._apply("neg", [value])
+            case ir.Join(op, items):
+                pick = "min" if op == "and" else "max"
+                return reduce(lambda a, b: self._apply(pick, [a, b]), map(self.margin, items))
+            case _:
+                return "0.0"
+
+    def _number(self, num: ir.Num) -> str:
+        register = super()._number(num)
+        if isinstance(num, ir.Col):
+            self._inputs[register] = num.name
+        return register
+
+    def _indicator(self, cond: ir.Formula) -> str:
+        margin = self.margin(cond)
+        register = super()._indicator(cond)
+        self._remember(register, [(margin, f"bump({margin}, slope)")])
+        return register
+
+    def _choice(self, cond: ir.Formula, yes: str, no: str) -> str:
+        margin, taken = self.margin(cond), f"(double){self.truth(cond)}"
+        register = super()._choice(cond, yes, no)
+        by_margin = f"(({yes} - {no}) * bump({margin}, slope))"
+        self._remember(register, [(yes, taken), (no, f"(1.0 - {taken})"), (margin, by_margin)])
+        return register
+
+    def _apply(self, name: str, args: list[str]) -> str:
+        register = super()._apply(name, args)
+        if name == "norm":
+            slopes = [(arg, f"({register} > 0.0 ? {arg} / {register} : 0.0)") for arg in args]
+        elif name == "clip":
+            slopes = [(args[0], CLIP_SLOPE.format(*args))]
+        elif name in BINARY_SLOPES:
+            forms = BINARY_SLOPES[name]
+            slopes = [(arg, form.format(*args, r=register)) for arg, form in zip(args, forms, strict=True)]
+        else:
+            slopes = [(args[0], UNARY_SLOPES[name].format(*args, r=register))] if name in UNARY_SLOPES else []
+        self._remember(register, slopes)
+        return register
+
+    def _remember(self, register: str, slopes: list[Slope]) -> None:
+        registers = set(self._texts.values())
+        self._slopes.setdefault(register, tuple(slope for slope in slopes if slope[0] in registers))
