@@ -8,6 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from stlc.dynamics.decl import ScenarioDecl, SystemDecl
+from stlc.dynamics.schema_columns import read_controls, read_states
 from stlc.dynamics.schema_deploy import read_test
 from stlc.dynamics.schema_flow import read_flow, read_jumps, read_timers
 from stlc.dynamics.schema_functions import read_functions
@@ -18,9 +19,7 @@ from stlc.dynamics.schema_names import (
     empty,
     later,
     read_constants,
-    read_controls,
     read_definitions,
-    read_states,
     read_time,
 )
 from stlc.dynamics.schema_overrides import overridden
