@@ -23,6 +23,7 @@ from stlc.dynamics.schema_names import (
     read_time,
 )
 from stlc.dynamics.schema_overrides import overridden
+from stlc.dynamics.schema_params import read_params
 from stlc.dynamics.schema_reader import Reader
 from stlc.dynamics.schema_settings import read_backup, read_objective, read_policy, read_train
 from stlc.dynamics.yaml_nodes import Mapping, Node, load_yaml
@@ -57,7 +58,6 @@ TOP_KEYS = [
 ]
 LATER = {
     "extends": "one system file extending another",
-    "param": "parameters that are drawn for every trajectory",
     "plugin": "dynamics from a plugin",
 }
 
@@ -112,6 +112,7 @@ def _declaration(
     read_constants(found.get("const"), reader, names)
     clock = read_time(found.get("time"), reader, names) if "time" in found else Clockwork()
     states = read_states(found.get("state"), reader, names)
+    params = read_params(found.get("param"), reader, names)
     read_controls(found.get("control"), reader, names)
     read_definitions(found.get("def"), reader, names)
     timer_flow, timer_jumps = read_timers(states, reader, names, clock)
@@ -140,7 +141,7 @@ def _declaration(
                 if c.kind == "real" and c.fact and c.low is not None and c.high is not None
             }
         ),
-        init=read_init(found.get("init"), reader, names),
+        init=read_init(found.get("init"), reader, names, params),
         objective=read_objective(found.get("objective"), reader, names),
         policy=read_policy(found.get("policy"), reader, names),
         train=read_train(found.get("train"), reader, names),

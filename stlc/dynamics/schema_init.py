@@ -9,15 +9,16 @@ from stlc.compile import ir
 from stlc.compile.scope import Entry as Name
 from stlc.compile.scope import Known
 from stlc.compile.values import Number, Vector
-from stlc.dynamics.decl import Assign, InitDecl, Situation
+from stlc.dynamics.decl import Assign, FileDecl, GridDecl, InitDecl, Situation
 from stlc.dynamics.schema_expressions import Expressions, in_stored_unit, written
 from stlc.dynamics.schema_flow import state_assigns, states_of
-from stlc.dynamics.schema_names import Names, base_name, component_names, later
+from stlc.dynamics.schema_names import Names, base_name, component_names
+from stlc.dynamics.schema_points import read_file, read_grid
 from stlc.dynamics.schema_reader import Reader, first_line
 from stlc.dynamics.shared_draws import shared_draws
 from stlc.dynamics.yaml_nodes import Entry, Mapping, Node, Sequence
 
-INIT_KEYS = ("mixture", "where", "grid", "from")
+INIT_KEYS = ("mixture", "where", "grid", "from", "draw", "let")
 SITUATION_KEYS = ("name", "weight", "draw", "choose", "let", "also")
 
 
@@ -39,29 +40,69 @@ def _columns_of(name: str, value: Number | Vector) -> tuple[str, ...]:
     return component_names(name, len(value.items) if isinstance(value, Vector) else None)
 
 
-def read_init(node: Node | None, reader: Reader, names: Names) -> InitDecl:
-    """The section `init`."""
+def read_init(node: Node | None, reader: Reader, names: Names, params: tuple[Assign, ...] = ()) -> InitDecl:
+    """The section `init`; `params` are drawn before everything else."""
     if node is None:
         reader.report(
             "S102", "the file lacks `init`", reader.source.span(0, 1), "init: {mixture: [{draw: {x: 0}}]}"
         )
         return InitDecl(())
     found = reader.fields(node, "`init`", INIT_KEYS)
-    for key in ("grid", "from"):
-        if key in found:
-            later(reader, found[key], f"`{key}` under `init`")
+    given = [key for key in ("mixture", "grid", "from") if key in found]
+    if len(given) > 1:
+        reader.report(
+            "S102",
+            f"`init` takes one of `mixture`, `grid` and `from`, not {len(given)}",
+            first_line(node.span),
+        )
+    drawn = _Drawn(frozenset(assign.name for assign in params))
+    if "mixture" in given or not given:
+        mixture = _situations(found, node, drawn, reader, names)
+    else:
+        mixture = (_known(found, node, drawn, names.expressions(reader), names),)
+    where, texts = _conditions(found.get("where"), names.expressions(reader))
+    span = found["where"].span if "where" in found else node.span
+    return InitDecl(mixture, where, texts, params, first_line(span))
+
+
+def _situations(
+    found: dict[str, Node], node: Node, drawn: _Drawn, reader: Reader, names: Names
+) -> tuple[Situation, ...]:
+    """The situations under `mixture`."""
     items = reader.items(found.get("mixture"), "`mixture`")
-    if not items and not {"grid", "from"} & found.keys():
+    for key in ("draw", "let"):
+        if key in found:
+            reader.report("S102", f"`{key}` under `init` goes with `grid` or `from`", found[key].span)
+    if not items:
         reader.report(
             "S102",
             "`init` lacks a `mixture` of situations",
             first_line(node.span),
             "mixture: [{draw: {x: 0}}]",
         )
-    mixture = _mixture(items, _Drawn(), reader, names)
-    where, texts = _conditions(found.get("where"), names.expressions(reader))
-    span = found["where"].span if "where" in found else node.span
-    return InitDecl(mixture, where, texts, first_line(span))
+    return _mixture(items, drawn, reader, names)
+
+
+def _known(found: dict[str, Node], node: Node, drawn: _Drawn, here: Expressions, names: Names) -> Situation:
+    """One situation whose states, as far as it does not draw them, are those of a grid or a file."""
+    reader = here.reader
+    rest = {entry.key.text for entry in reader.entries(found.get("draw"), "`draw`")}
+    missing = [
+        column.name
+        for column in names.columns
+        if column.name not in drawn.states and not {column.name, base_name(column.name)} & rest
+    ]
+    points: GridDecl | FileDecl | None
+    if "grid" in found:
+        points = read_grid(found["grid"], here, names)
+        taken = {name for name, _ in points.axes}
+    else:
+        points = read_file(found["from"], tuple(missing), reader)
+        taken = set(missing)
+    draws = _Draws(reader, names, replace(drawn, states=drawn.states | taken))
+    draws.read(found)
+    _all_drawn("the grid", draws, node, reader, names)
+    return Situation("grid" if "grid" in found else "from", 1.0, tuple(draws.found), (), points)
 
 
 def _conditions(node: Node | None, here: Expressions) -> tuple[tuple[ir.Formula, ...], tuple[str, ...]]:
@@ -88,18 +129,23 @@ def _situation(node: Node, drawn: _Drawn, reader: Reader, names: Names) -> Situa
     draws.read(found)
     choices = reader.items(found.get("choose"), "`choose`")
     branches = _mixture(choices, draws.drawn, reader, names)
+    if not choices and isinstance(node, Mapping):
+        _all_drawn(f"the situation `{name}`" if name else "this situation", draws, node, reader, names)
+    return Situation(name, 1.0 if weight is None else weight, tuple(draws.found), branches)
+
+
+def _all_drawn(called: str, draws: _Draws, node: Node, reader: Reader, names: Names) -> None:
+    """Report states that have no first value."""
     undrawn = [column.name for column in names.columns if column.name not in draws.drawn.states]
     missing = list(dict.fromkeys(map(base_name, undrawn)))
-    if missing and not choices and not draws.failed and isinstance(node, Mapping):
+    if missing and not draws.failed:
         listed = ", ".join(f"`{column}`" for column in missing)
-        called = f"the situation `{name}`" if name else "this situation"
         reader.report(
             "S102",
             f"{called} draws no value for {listed}",
             first_line(node.span),
             "every state needs a first value",
         )
-    return Situation(name, 1.0 if weight is None else weight, tuple(draws.found), branches)
 
 
 class _Draws:
