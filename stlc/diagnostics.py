@@ -189,3 +189,4 @@ CODES: dict[str, str] = {
     # the tool itself
     "B001": "a bug in stlc",
 }
+    "S303": "initial states in a file that cannot be used",

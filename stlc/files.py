@@ -220,3 +220,12 @@ def _no_such(kind: str, name: str, folders: Sequence[Path]) -> Diagnostic:
 
 def _shown(path: Path) -> str:
     return f"installed: {path.name}" if LIBRARY in path.parents else str(path)
+
+
+def beside(home: Path, name: str) -> Path:
+    """A file that a text in the folder `home` names: where it says, else under its last name in that folder.
+
+    A run's folder keeps such files in one place, whatever folder they came from.
+    """
+    there, here = home / name, home / Path(name).name
+    return here if here.is_file() and not there.is_file() else there

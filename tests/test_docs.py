@@ -298,7 +298,7 @@ def test_the_readme_shows_a_real_diagnostic(monkeypatch, tmp_path, capsys):
     text = (ROOT / "specs/traffic.stl").read_text(encoding="utf-8")
     for folder in ("specs", "examples"):
         shutil.copytree(ROOT / folder, tmp_path / folder)
-    (tmp_path / "specs/traffic.stl").write_text(text.replace("dx > gap  ", "dx > 1 s  "), encoding="utf-8")
+    (tmp_path / "specs/traffic.stl").write_text(text.replace("dx > gap", "dx > 1 s"), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     assert main(["compile", "specs/traffic.stl"]) == 3
     assert capsys.readouterr().err == shown

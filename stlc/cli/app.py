@@ -37,7 +37,7 @@ from stlc.cli import (
     train,
 )
 from stlc.cli.coercion import HELP_NAMES, spare_adapters
-from stlc.cli.errors import TERMINATED
+from stlc.cli.errors import INTERRUPTED, TERMINATED
 from stlc.cli.errors import report as report_error
 from stlc.cli.options import describe
 from stlc.cli.output import COLOR, ColorMode, emit, silence
@@ -91,13 +91,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: the arguments without the program's name; by default those of the process.
     """
     front, rest = _split(sys.argv[1:] if argv is None else argv)
+    stopped: list[int] = []
     try:
-        with _terminable():
+        with _stoppable() as stopped:
             command = typer.main.get_command(app)
             spare_adapters(command)
             code = command.main(args=[*front, *rest], prog_name="stlc", standalone_mode=False)
     except BaseException as error:  # the boundary
-        code = report_error(error, rest)
+        code = report_error(SystemExit(stopped[0]) if stopped else error, rest)
     _flush()
     return code if isinstance(code, int) else 0
 
@@ -130,17 +131,29 @@ def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 @contextmanager
-def _terminable() -> Iterator[None]:
-    """While a command runs, SIGTERM unwinds it (so that its `finally` blocks run) and exits 143."""
+def _stoppable() -> Iterator[list[int]]:
+    """While a command runs, Ctrl-C and SIGTERM unwind it, so that its `finally` blocks run.
+
+    Gives the exit codes of what came: code in C that is interrupted may raise something else instead.
+    """
+    stopped: list[int] = []
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield stopped
         return
-    before = signal.signal(signal.SIGTERM, _terminate)
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        stopped.append(INTERRUPTED)
+        raise KeyboardInterrupt
+
+    def terminate(_number: int, _frame: FrameType | None) -> None:
+        stopped.append(TERMINATED)
+        raise SystemExit(TERMINATED)
+
+    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, terminate)}
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        before[signal.SIGINT] = signal.signal(signal.SIGINT, interrupt)
     try:
-        yield
+        yield stopped
     finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-def _terminate(_number: int, _frame: FrameType | None) -> None:
-    raise SystemExit(TERMINATED)
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
 from stlc.cli import check_options as given
-from stlc.cli.judge import Question, judge, time_step, usage
+from stlc.cli.judge import Question, judge, names_of, time_step, usage
 from stlc.cli.options import JsonOption, SetOption, SystemOption, describe, parse_overrides
 from stlc.cli.output import COLOR, emit, emit_json, say, show_diagnostics, wants_color
 
@@ -50,6 +50,7 @@ def check(
     require: given.Require = None,
     at: given.When = None,
     end: given.Ending = "open",
+    semantics: given.Robustness = "exact",
     tolerance: given.Tolerance = 1e-6,
     map_: given.Names = None,
     resample: given.Resample = None,
@@ -70,13 +71,14 @@ def check(
     question = Question(
         spec,
         system,
-        _names(map_),
+        names_of(map_),
         tuple(require or ()),
         at,
         end,
         _tolerance(tolerance),
         time_step("--resample", resample),
         parse_overrides(set_),
+        semantics,
     )
     talk = not (quiet or json)
     if _STREAM in traces:
@@ -161,18 +163,6 @@ def _split_files(files: Sequence[str], spec: Path | None) -> tuple[Path | None, 
     if not traces:
         raise usage("which trace?", "stlc check SPEC TRACE")
     return (Path(specs[0]) if specs else spec), traces
-
-
-def _names(pairs: Iterable[str] | None) -> dict[str, str]:
-    names: dict[str, str] = {}
-    for pair in pairs or ():
-        signal, sign, name = (part.strip() for part in pair.partition("="))
-        if not (signal and sign and name):
-            raise usage(f"`--map {pair}` is not of the form SIGNAL=NAME", "write it as --map v_lead=vlead")
-        if signal in names:
-            raise usage(f"`--map {signal}=…` is given twice")
-        names[signal] = name
-    return names
 
 
 def _tolerance(value: float) -> float:

@@ -29,7 +29,12 @@ def outcome_in_chunks(path: Path, work: Work) -> Outcome:
     from stlc.trace_recording import Recording
 
     question = work.question
-    for option, given in (("--resample", question.resample is not None), ("--out", work.out is not None)):
+    whole = {
+        "--resample": question.resample is not None,
+        "--out": work.out is not None,
+        "--semantics": question.semantics != "exact",
+    }
+    for option, given in whole.items():
         if given:
             raise usage(f"`{option}` needs the whole trace, and `{path}` is read in pieces")
     if question.at not in (None, "all"):

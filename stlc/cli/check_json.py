@@ -44,7 +44,7 @@ def entry_of(result: Checked, end: str) -> dict[str, Any]:
 
 
 def _requirement(judged: Judgement, result: Checked) -> dict[str, Any]:
-    low, high, least = (judged.counted(end) for end in (judged.low, judged.high, judged.least))
+    low, high, least = (judged.counted(end) for end in (*judged.margins, judged.least))
     trace, sample = judged.worst
     cause = result.causes.get(judged.name)
     time = result.verdict.subject.time(sample)

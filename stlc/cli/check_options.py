@@ -26,6 +26,12 @@ When = Annotated[
     str | None, typer.Option(metavar="0|all|K|TIME", help="Judge at this sample or time, or at all starts.")
 ]
 Ending = Annotated[End, typer.Option(help="Too short a trace: bounds, an error, cut windows.")]
+Robustness = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME", help="Robustness that is told: exact, smooth, agm, dgmsr. Verdicts are exact."
+    ),
+]
 Tolerance = Annotated[
     float, typer.Option(help="Robustness from minus this on is satisfied; 0: `>` is not `>=`.")
 ]

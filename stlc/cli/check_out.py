@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -26,7 +26,8 @@ def write_robustness(path: Path, result: Checked, question: Question) -> None:
 
     trace = result.trace
     monitor = monitor_of(result.source, question, result.trace.meta.spec_library)
-    values = monitor.requirement_robustness(trace, end="truncate" if question.end == "truncate" else "strict")
+    end: Literal["strict", "truncate"] = "truncate" if question.end == "truncate" else "strict"
+    values = monitor.requirement_robustness(trace, end=end, semantics=question.semantics)
     chosen = {judgement.name for judgement in result.verdict}
     data = {
         name: np.asarray(rows, dtype=np.float64).reshape(trace.traces, trace.samples)

@@ -39,7 +39,12 @@ def outcome_of_stream(question: Question, *, talk: bool) -> Outcome:
     """
     if question.spec is None:
         raise usage("which specification?", "stlc check SPEC -")
-    for option, given in (("--resample", question.resample), ("--at", question.at not in (None, "all"))):
+    whole = {
+        "--resample": question.resample is not None,
+        "--at": question.at not in (None, "all"),
+        "--semantics": question.semantics != "exact",
+    }
+    for option, given in whole.items():
         if given:
             raise usage(f"`{option}` needs the whole trace, and the standard input is judged line by line")
     begun = time.perf_counter()

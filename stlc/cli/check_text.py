@@ -65,7 +65,7 @@ def _row(judged: Judgement, result: Checked) -> tuple[str, ...]:
 
 
 def _robustness(judged: Judgement) -> str:
-    low, high = (float(judged.counted(end).min(initial=np.inf)) for end in (judged.low, judged.high))
+    low, high = (float(judged.counted(end).min(initial=np.inf)) for end in judged.margins)
     if not judged.counted(judged.holds).size:
         return ""
     if judged.overall == "inconclusive":

@@ -42,13 +42,13 @@ def report(error: BaseException, argv: Sequence[str]) -> int:
         case SystemExit() if isinstance(error.__context__, BrokenPipeError):
             return 0  # the reader has seen enough of a help text
         case SystemExit(code=int() as code):
-            return code
+            return _stopped(code, argv)
         case SystemExit(code=code):
             return 0 if code is None else 1
         case KeyboardInterrupt():
-            return INTERRUPTED
+            return _stopped(INTERRUPTED, argv)
         case typer.Abort() if not isinstance(error.__cause__, EOFError):
-            return INTERRUPTED
+            return _stopped(INTERRUPTED, argv)
     known = _known(error) or _crash(error, argv)
     if wants_json(argv):
         schema = f"{_command(argv)}/1"
@@ -56,6 +56,13 @@ def report(error: BaseException, argv: Sequence[str]) -> int:
     else:
         show_diagnostics(known.diagnostics)
     return known.exit_code
+
+
+def _stopped(code: int, argv: Sequence[str]) -> int:
+    """Nothing is said about a command that was stopped, but a reader of JSON gets its document."""
+    if code in (INTERRUPTED, TERMINATED) and wants_json(argv):
+        emit_json(f"{_command(argv)}/1", ok=False, exit_code=code)
+    return code
 
 
 def wants_json(argv: Sequence[str]) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -42,6 +42,7 @@ class Question:
         tolerance: a robustness of at least minus this is satisfied.
         resample: put the signals on a grid of so many seconds.
         overrides: constant -> its value, as text.
+        semantics: of the robustness that is told.
     """
 
     spec: Path | None = None
@@ -53,11 +54,25 @@ class Question:
     tolerance: float = 1e-6
     resample: float | None = None
     overrides: Mapping[str, str] = field(default_factory=dict)
+    semantics: str = "exact"
 
 
 def usage(message: str, *advice: str) -> UsageError:
     """U101."""
     return UsageError(Diagnostic("U101", message, help=advice))
+
+
+def names_of(pairs: Iterable[str] | None) -> dict[str, str]:
+    """`["x=px"]` as `{"x": "px"}`. Raises UsageError (U101) for what is of another form."""
+    names: dict[str, str] = {}
+    for pair in pairs or ():
+        signal, sign, name = (part.strip() for part in pair.partition("="))
+        if not (signal and sign and name):
+            raise usage(f"`--map {pair}` is not of the form SIGNAL=NAME", "write it as --map v_lead=vlead")
+        if signal in names:
+            raise usage(f"`--map {signal}=…` is given twice")
+        names[signal] = name
+    return names
 
 
 def judge(name: str, question: Question, runs: Path, *, talk: bool) -> Checked:
@@ -104,6 +119,7 @@ def judged(path: Path, question: Question) -> tuple[Checked, list[str]]:
         end=question.end,
         tolerance=question.tolerance,
         require=question.require,
+        semantics=question.semantics,
     )
     causes = {judgement.name: explain(verdict, judgement.name) for judgement in verdict}
     known = {name: cause for name, cause in causes.items() if cause}
@@ -121,7 +137,9 @@ def laid_reading(monitor: Monitor | None, question: Question) -> Reading:
     """How files are read: names, and the grid, where a monitor says which signals are discrete."""
     from stlc.trace import Reading
 
-    return Reading(question.names, question.resample, {} if monitor is None else _kinds(monitor))
+    if monitor is None:
+        return Reading(question.names, question.resample)
+    return Reading(question.names, question.resample, _kinds(monitor), _words(monitor))
 
 
 def _kinds(monitor: Monitor) -> dict[str, Kind]:
@@ -131,6 +149,21 @@ def _kinds(monitor: Monitor) -> dict[str, Kind]:
     signals = [item for item in monitor.spec.items if isinstance(item, ast.Signal) and item.type is not None]
     words: dict[str, Kind] = {"real": "real", "int": "int", "bool": "bool"}
     return {s.column or s.name: words.get(s.type.name, "enum") for s in signals if s.type is not None}
+
+
+def _words(monitor: Monitor) -> dict[str, Mapping[str, float]]:
+    """What the words of every signal are worth, as far as the specification says so."""
+    from stlc.grammar import ast
+    from stlc.trace_words import TRUTH
+
+    items = monitor.spec.items
+    members = {item.name: dict(item.members) for item in items if isinstance(item, ast.Enum)}
+    worth: dict[str, Mapping[str, float]] = {"bool": TRUTH, **members}
+    return {
+        item.column or item.name: {} if item.type is None else worth.get(item.type.name, {})
+        for item in items
+        if isinstance(item, ast.Signal)
+    }
 
 
 def _below(path: Path) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -18,6 +19,8 @@ from stlc.source import Span
 from stlc.units import DIMENSIONLESS, Unit, same_dims
 
 _MAX_BITS = 512
+_QUANTITY = re.compile(r"([\d.]+(?:[eE][+-]?\d+)?) *[^\W\d]\S*")
+"""A number with its unit, as written."""
 _MISSING = {
     (1, 0, 0, 0, 0): ("length", "m"),
     (0, 1, 0, 0, 0): ("mass", "kg"),
@@ -242,6 +245,12 @@ def _repair(left: Number, right: Number, span: Span) -> tuple[str, ...]:
     if left.span is None or right.span is None:
         return (drop,)
     sign = span.text.strip()
+    for number, other in ((left, right), (right, left)):
+        written = _QUANTITY.fullmatch(number.span.text if number.span else "")
+        if written and number.constant is not None:
+            sides = [side.span.text for side in (left, right) if side.span is not None]
+            bare = f" {sign} ".join(written[1] if side == written[0] else side for side in sides)
+            return (f"a number without a unit takes the one that is needed, [{other.unit}]: `{bare}`",)
     for numerator, denominator, factor_right in ((left, right, True), (right, left, False)):
         quotient = (numerator.unit.si / denominator.unit.si).dims
         if quotient in _MISSING and sign in ("<", "<=", ">", ">=", "==", "!=", "+", "-"):

@@ -60,7 +60,7 @@ class FormulaWriter:
                 return self._window("MIN" if op == "always" else "MAX", window, body, start, count)
             case ir.Until(op, window, left, right):
                 return self._until(op == "until", window, (left, right), (start, count))
-            case ir.Past() | ir.Since() | ir.Shift() | ir.Freeze():
+            case ir.Past() | ir.Since() | ir.Shift() | ir.Freeze() | ir.AtStart():
                 raise Untranslatable(type(formula).__name__)
             case _:
                 assert_never(formula)

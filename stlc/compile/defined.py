@@ -31,10 +31,9 @@ def defined(formula: ir.Formula, samples: int) -> Defined:
             return reduce(np.logical_and, bound, defined(body, samples))
         case ir.Join(_, items):
             return reduce(np.logical_and, [defined(item, samples) for item in items])
-        case ir.Over(_, window, body):
-            return _throughout(defined(body, samples), *_future(window, samples))
-        case ir.Past(_, window, body):
-            return _throughout(defined(body, samples), *_past(window, samples))
+        case ir.Over(_, window, body) | ir.Past(_, window, body):
+            seen = _future if isinstance(formula, ir.Over) else _past
+            return _throughout(defined(body, samples), *seen(window, samples))
         case ir.Until(_, window, left, right):
             first, last = _future(window, samples)
             now = np.arange(samples)
@@ -47,6 +46,8 @@ def defined(formula: ir.Formula, samples: int) -> Defined:
             return held & _throughout(defined(right, samples), first, last)
         case ir.Shift(steps, body, outside):
             return _shifted(defined(body, samples), steps, outside is not None)
+        case ir.AtStart(body):
+            return np.full(samples, defined(body, samples)[0])
         case _:
             assert_never(formula)
 

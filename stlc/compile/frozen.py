@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
 from typing import TypeAlias, assert_never, final
 
 import numpy as np
@@ -18,8 +20,8 @@ from stlc.compile.arith import Program
 from stlc.compile.horizon import columns, nodes, numbers, reach, uses_end
 from stlc.compile.inputs import inputs
 from stlc.compile.ops import Array, Ops
-from stlc.compile.samples import Reach, held_by, looks_on, reach_of
-from stlc.compile.schedule import Extent, Run, upto, within
+from stlc.compile.samples import Reach, held_by, looks_on
+from stlc.compile.schedule import Extent, Run, reads, upto, within
 
 Env: TypeAlias = Mapping[str, Array]
 Judge: TypeAlias = Callable[[ir.Formula, Env, Run, Extent], Array]
@@ -48,7 +50,7 @@ class Freezer:
 
     def values(self, node: ir.Freeze, run: Run) -> Array:
         """The node at the instants `run`, `(count, batch)`."""
-        bound = within(_together(node), run, self.extent)
+        bound = within(_together(node, self.extent), run, self.extent)
         if bound.count <= 0:
             parts = list(self._unbound(node, run))
         else:
@@ -61,14 +63,21 @@ class Freezer:
 
     def _unbound(self, node: ir.Freeze, run: Run) -> Iterator[Array]:
         """Where a value to freeze does not exist, what reads it is unknown, or false on a cut trace."""
-        for instant in (Run(t, 1) for t in range(run.start, run.start + run.count)):
-            missing = [n for n, num in node.bindings if not within(reach_of(num), instant, self.extent).count]
+        for missing, instants in groupby(range(run.start, run.start + run.count), partial(self._lost, node)):
+            first, *more = instants
             kept = tuple((name, num) for name, num in node.bindings if name not in missing)
-            body = without(node.body, frozenset(missing), self.extent)
+            body = without(node.body, missing, self.extent)
             if kept:
-                yield from self._bound(replace(node, bindings=kept, body=body), instant)
+                yield from self._bound(replace(node, bindings=kept, body=body), Run(first, 1 + len(more)))
             else:
-                yield self.judge(body, self.env, instant, self.extent)
+                yield self.judge(body, self.env, Run(first, 1 + len(more)), self.extent)
+
+    def _lost(self, node: ir.Freeze, instant: int) -> frozenset[str]:
+        """Names of the values that do not exist at an instant."""
+        extent, run = self.extent, Run(instant, 1)
+        return frozenset(
+            name for name, num in node.bindings if within(reads(num, extent), run, extent).count <= 0
+        )
 
     def _bound(self, node: ir.Freeze, run: Run) -> Iterator[Array]:
         back, ahead = _neighbourhood(node.body)
@@ -86,7 +95,7 @@ class Freezer:
     def _near(self, node: ir.Freeze, run: Run, back: int, ahead: int) -> Iterator[Array]:
         """Instants whose neighbourhood lies within the trace: it is all that is laid out."""
         length = back + ahead + 1
-        extent = replace(self.extent, samples=length)
+        extent = replace(self.extent, samples=length, stop=None)
         for chunk in _chunks(run, max(_MOST // (length * self._batch), 1)):
             chosen = np.arange(chunk.start, chunk.last + 1)
             rows = np.arange(-back, ahead + 1)[:, None] + chosen
@@ -107,7 +116,8 @@ class Freezer:
                 for name, x in self._read(node).items()
             }
             env |= self._held(node, chunk, length)
-            extent = replace(self.extent, samples=length)
+            ends = self.extent.stop
+            extent = replace(self.extent, samples=length, stop=None if ends is None else ends - begin)
             there = self.judge(node.body, env, Run(chunk.start - begin, chunk.count), extent)
             each = np.arange(chunk.count)
             yield there.reshape(chunk.count, chunk.count, batch)[each, each]
@@ -135,15 +145,16 @@ class Freezer:
         return int(self._like.shape[1])
 
 
-def _together(node: ir.Freeze) -> Reach:
-    reaches = [reach_of(num) for _, num in node.bindings]
+def _together(node: ir.Freeze, extent: Extent) -> Reach:
+    reaches = [reads(num, extent) for _, num in node.bindings]
     return Reach(max(r.past for r in reaches), max(r.future for r in reaches))
 
 
 def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
     """How many samples before and after its instant a formula reads where they exist; inf: all."""
     past, future = reach(body)
-    if any(map(looks_on, numbers(body))):
+    on_clock = any(isinstance(node, ir.AtStart) for node in nodes(body))
+    if on_clock or any(map(looks_on, numbers(body))):
         return math.inf, math.inf
     back = any(isinstance(node, (ir.Past, ir.Since)) and node.window.hi is None for node in nodes(body))
     return math.inf if back else past, math.inf if uses_end(body) else future
@@ -172,7 +183,7 @@ def without(body: ir.Formula, names: frozenset[str], extent: Extent) -> ir.Formu
             return ir.Truth(extent.end == "upper" if extent.open else sign < 0, body.span)
         case ir.Join(_, items):
             return replace(body, items=tuple(without(item, names, extent) for item in items))
-        case ir.Over() | ir.Past() | ir.Shift():
+        case ir.Over() | ir.Past() | ir.Shift() | ir.AtStart():
             return replace(body, body=without(body.body, names, extent))
         case ir.Until() | ir.Since():
             left, right = without(body.left, names, extent), without(body.right, names, extent)

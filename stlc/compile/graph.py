@@ -22,7 +22,7 @@ from stlc.compile.machine import Machine
 from stlc.compile.ops import Array, Ops
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.schedule import End, Extent, Run, Runner, Schedule, schedule
-from stlc.compile.semantics import Exact, LogSumExp, Semantics
+from stlc.compile.semantics import Exact, Semantics, semantics_of
 from stlc.compile.windows import Windows
 from stlc.signature import Signature
 
@@ -36,6 +36,7 @@ def evaluate(  # noqa: PLR0913 - the instants and the end of the trace belong to
     start: int = 0,
     count: int = 1,
     end: End = "strict",
+    stop: int | None = None,
 ) -> list[Array]:
     """Robustness of several formulas; common parts are computed once.
 
@@ -47,6 +48,8 @@ def evaluate(  # noqa: PLR0913 - the instants and the end of the trace belong to
         start: the first instant that is asked for.
         count: how many instants from there on.
         end: what stands beyond the last sample.
+        stop: how many samples there will be where `end` is "lower" or "upper"; None: windows to the end of
+            the trace end with the last one that is known.
 
     Returns:
         For each formula an array `(count, batch)`.
@@ -55,12 +58,14 @@ def evaluate(  # noqa: PLR0913 - the instants and the end of the trace belong to
         ValueError: a window leaves the trace, and `end` is "strict".
     """
     samples = len(next(iter(env.values())))
-    plan = planned(tuple(formulas), samples, Run(start, count), end)
+    plan = planned(tuple(formulas), samples, Run(start, count), end, stop)
     return execute(plan, env, Windows(semantics or Exact(), ops))
 
 
 @lru_cache(maxsize=512)
-def planned(formulas: tuple[ir.Formula, ...], samples: int, run: Run, end: End) -> Schedule:
+def planned(
+    formulas: tuple[ir.Formula, ...], samples: int, run: Run, end: End, stop: int | None = None
+) -> Schedule:
     """The schedule for a trace of `samples`, remembered. Raises ValueError as `evaluate` does."""
     if run.start < 0 or run.last >= samples:
         raise ValueError(f"instants {run.start}..{run.last} of a trace with {samples} samples")
@@ -68,7 +73,7 @@ def planned(formulas: tuple[ir.Formula, ...], samples: int, run: Run, end: End) 
         for formula in formulas:
             if not defined(formula, samples)[run.start : run.last + 1].all():
                 raise ValueError(f"the formula looks beyond the end of a trace of {samples} samples")
-    return schedule(formulas, run, Extent(samples, end))
+    return schedule(formulas, run, Extent(samples, end, stop))
 
 
 def robustness_signal(
@@ -178,14 +183,21 @@ class RobustnessGraph:
     Args:
         rules: the requirements.
         signature: the columns of a state, in order.
+        semantics: of min and max, or its name in `stlc.compile.semantics.SEMANTICS`.
 
     Trajectories are `(batch, time, dim)`, torch or NumPy, float32 or float64; results keep dtype and device.
-    `smoothing` is the scale k of log-sum-exp; None is exact.
+    `smoothing` is the scale k of log-sum-exp, for one call; None is the semantics of the graph.
+
+    Raises:
+        UsageError: U101, an unknown semantics, or `smoothing` for one that has no such scale.
     """
 
-    def __init__(self, rules: Sequence[Weighed], signature: Signature) -> None:
+    def __init__(
+        self, rules: Sequence[Weighed], signature: Signature, semantics: str | Semantics = "exact"
+    ) -> None:
         self.rules = tuple(rules)
         self.signature = signature
+        self.semantics = semantics_of(semantics)
         self._formulas = tuple(rule.formula for rule in self.rules)
 
     def robustness(self, x: Array, smoothing: float | None = None) -> Array:
@@ -211,13 +223,13 @@ class RobustnessGraph:
             rows[i : i + 1] if rule.weight == rule.scale else rows[i : i + 1] * (rule.weight / rule.scale)
             for i, rule in enumerate(self.rules)
         ]
-        return _semantics(smoothing).join(weighed, "min", ops)[0]
+        return semantics_of(self.semantics, smoothing).join(weighed, "min", ops)[0]
 
     def per_requirement_columns(
         self, env: Mapping[str, Array], *, ops: Ops, smoothing: float | None = None
     ) -> Array:
         """`per_requirement` on columns `(time, batch)`."""
-        rows = self._rows(env, ops, _semantics(smoothing))
+        rows = self._rows(env, ops, semantics_of(self.semantics, smoothing))
         if not rows:
             like = next(iter(env.values()))
             return ops.full((*like.shape[1:], 0), math.inf, like)
@@ -231,10 +243,6 @@ class RobustnessGraph:
             raise ValueError(f"{x.shape[-1]} columns where {len(self.signature)} are expected")
         ops = ops_of(x)
         return dict(zip(self.signature.names, ops.columns(x), strict=True)), ops
-
-
-def _semantics(smoothing: float | None) -> Semantics:
-    return Exact() if smoothing is None else LogSumExp(smoothing)
 
 
 def ops_of(x: Array) -> Ops:

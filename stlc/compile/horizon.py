@@ -16,26 +16,35 @@ def reach(formula: ir.Formula) -> Reach:
 
     A window to the end of the trace counts with its start alone: it takes what there is from there on.
     Windows of the past are cut at the start of the trace: the past is what they use, never what they need.
+    What is on the mission clock counts from the first sample on, whatever stands around it.
     """
+    clocked = [reach(node.body) for node in nodes(formula) if isinstance(node, ir.AtStart)]
+    return _furthest(_from_now(formula), *(Reach(0, part.future) for part in clocked))
+
+
+def _from_now(formula: ir.Formula) -> Reach:
     match formula:
-        case ir.Truth():
+        case ir.Truth() | ir.AtStart():
             return Reach(0, 0)
         case ir.Atom(num):
             return reach_of(num)
         case ir.Freeze(bindings, body):
-            return _furthest(reach(body), *(reach_of(num) for _, num in bindings))
+            return _furthest(_from_now(body), *(reach_of(num) for _, num in bindings))
         case ir.Join(_, items):
-            return _furthest(*map(reach, items))
+            return _furthest(*map(_from_now, items))
         case ir.Over(_, window, body):
-            return _ahead(reach(body), window)
+            return _ahead(_from_now(body), window)
         case ir.Past(_, window, body):
-            return _back(reach(body), window)
+            return _back(_from_now(body), window)
         case ir.Until(_, window, left, right):
-            return _furthest(_ahead(reach(right), window), _ahead(reach(left), ir.Window(0, window.hi)))
+            return _furthest(
+                _ahead(_from_now(right), window), _ahead(_from_now(left), ir.Window(0, window.hi))
+            )
         case ir.Since(_, window, left, right):
-            return _furthest(_back(reach(right), window), _back(reach(left), ir.Window(0, window.hi)))
+            held = ir.Window(0, window.hi)
+            return _furthest(_back(_from_now(right), window), _back(_from_now(left), held))
         case ir.Shift(steps, body):
-            inner = reach(body)
+            inner = _from_now(body)
             return Reach(max(inner.past - steps, 0), max(inner.future + steps, 0))
         case _:
             assert_never(formula)
@@ -87,6 +96,8 @@ def parts(formula: ir.Formula) -> tuple[ir.Formula, ...]:
         case ir.Join(_, items):
             return items
         case ir.Over(_, _, body) | ir.Past(_, _, body) | ir.Shift(_, body) | ir.Freeze(_, body):
+            return (body,)
+        case ir.AtStart(body):
             return (body,)
         case ir.Until(_, _, left, right) | ir.Since(_, _, left, right):
             return (left, right)

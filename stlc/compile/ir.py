@@ -81,13 +81,29 @@ class Where:
 class Extern:
     """Component `output` of a function that the system provides.
 
-    `function` takes the arguments as arrays and gives all components; None where nobody loaded it.
+    `function` takes the arguments as arrays and gives all components, or says in the IR what they are; None
+    where nobody loaded it.
     """
 
     name: str
     args: tuple[Num, ...]
     output: int = 0
-    function: Callable[..., Sequence[Any]] | None = field(default=None, repr=False)
+    function: Callable[..., Sequence[Any]] | Body | None = field(default=None, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """What a function computes: straight-line code.
+
+    Attributes:
+        formals: columns that stand for its arguments, component by component.
+        lets: (name, number), in order; each reads arguments and earlier ones.
+        outputs: the components of the result.
+    """
+
+    formals: tuple[str, ...]
+    lets: tuple[tuple[str, Num], ...]
+    outputs: tuple[Num, ...]
 
 
 Num: TypeAlias = Lit | Col | At | Held | Op | Ind | Where | Extern
@@ -208,4 +224,12 @@ class Freeze:
     span: Span | None = field(default=None, compare=False, repr=False)
 
 
-Formula: TypeAlias = Truth | Atom | Join | Over | Past | Until | Since | Shift | Freeze
+@dataclass(frozen=True, slots=True)
+class AtStart:
+    """The value at the first sample, whenever it is asked for: what is on the mission clock."""
+
+    body: Formula
+    span: Span | None = field(default=None, compare=False, repr=False)
+
+
+Formula: TypeAlias = Truth | Atom | Join | Over | Past | Until | Since | Shift | Freeze | AtStart

@@ -33,10 +33,9 @@ def show_formula(formula: ir.Formula) -> str:
             return _atom(formula)
         case ir.Join(op, items):
             return f" {op} ".join(map(_operand, items))
-        case ir.Over(op, window, body):
-            return f"{op}{show_window(window)} {_operand(body)}"
-        case ir.Past(op, window, body):
-            return f"{op}{show_window(window, 'start')} {_operand(body)}"
+        case ir.Over(op, window, body) | ir.Past(op, window, body):
+            end = "end" if isinstance(formula, ir.Over) else "start"
+            return f"{op}{show_window(window, end)} {_operand(body)}"
         case ir.Until(op, window, left, right):
             return f"{_operand(left)} {op}{show_window(window)} {_operand(right)}"
         case ir.Since(op, window, left, right):
@@ -47,6 +46,8 @@ def show_formula(formula: ir.Formula) -> str:
         case ir.Freeze(bindings, body):
             bound = ", ".join(f"{shown(name)} = {show_number(num, 1)}" for name, num in bindings)
             return f"freeze {bound} in {_operand(body)}"
+        case ir.AtStart(body):
+            return f"at the start ({show_formula(body)})"
         case _:
             assert_never(formula)
 

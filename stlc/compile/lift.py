@@ -1,6 +1,7 @@
 """Absolute intervals are moved out of the operators around them: their truth does not depend on now.
 
-`always[0, T] (q -> always@[a, b] p)` is `eventually[0, T] q -> always@[a, b] p`. What cannot is E307.
+`always[0, T] (q -> always@[a, b] p)` is `eventually[0, T] q -> always@[a, b] p`. What cannot is E307 in
+training; on recorded traces every one is judged where it stands.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from typing import Literal, assert_never
 
 from stlc.compile import typed
 from stlc.compile.bounds import report
-from stlc.compile.walk import absolute, nodes, normal, on_clock, operands
+from stlc.compile.walk import absolute, from_now, nodes, on_clock
 from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
@@ -86,37 +87,20 @@ def _nested(span: Span, outer: Span) -> Diagnostic:
     ).with_note(f"the operator around it starts at line {outer.line}, column {outer.column}")
 
 
-def recorded(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
+def recorded(formula: typed.Formula) -> typed.Formula:
     """The formula of a requirement for a recorded trace that is judged at its first sample alone.
 
     There the mission clock and the time from now agree, so absolute intervals become relative ones. Those
-    under another temporal operator are moved out, or are E307; without them the formula stays as written.
+    under another temporal operator stay: they are judged at the first sample, whenever they are asked for.
     """
-    if any(map(_holds_absolute, nodes(formula))):
-        formula = lifted(normal(formula), sink)
-    return _from_now(formula)
-
-
-def _holds_absolute(node: typed.Formula) -> bool:
-    """Whether this is a temporal operator with an absolute interval below it."""
-    temporal = (typed.Temporal, typed.Until, typed.Shift, typed.Edge)
-    return isinstance(node, temporal) and any(map(absolute, operands(node)))
-
-
-def _from_now(formula: typed.Formula) -> typed.Formula:
     match formula:
-        case typed.Truth() | typed.Pred():
+        case typed.Truth() | typed.Pred() | typed.Shift() | typed.Edge():
             return formula
-        case typed.Not() | typed.Shift() | typed.Edge() | typed.Freeze():
-            return replace(formula, body=_from_now(formula.body))
+        case typed.Not() | typed.Freeze():
+            return replace(formula, body=recorded(formula.body))
         case typed.Logic():
-            return replace(formula, items=tuple(map(_from_now, formula.items)))
-        case typed.Temporal():
-            interval = replace(formula.interval, clock="now")
-            return replace(formula, interval=interval, body=_from_now(formula.body))
-        case typed.Until():
-            interval = replace(formula.interval, clock="now")
-            left, right = _from_now(formula.left), _from_now(formula.right)
-            return replace(formula, interval=interval, left=left, right=right)
+            return replace(formula, items=tuple(map(recorded, formula.items)))
+        case typed.Temporal() | typed.Until():
+            return from_now(formula)
         case _:
             assert_never(formula)

@@ -12,6 +12,7 @@ from typing import Literal, TypeAlias, assert_never, final
 from stlc.compile import ir, typed
 from stlc.compile.bounds import to_window
 from stlc.compile.interface import Grid
+from stlc.compile.walk import from_now, on_clock
 from stlc.diagnostics import Diagnostic
 
 Sign: TypeAlias = Literal[1, -1]
@@ -23,7 +24,8 @@ _CAUTIOUS = frozenset({"always", "historically", "release", "trigger"})
 def lower(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> ir.Formula:
     """`formula` in negation normal form and steps.
 
-    Absolute intervals are gone by now (`stlc.compile.timers`). Findings (E301, E302, E305, E311, W304) go to
+    Absolute intervals are judged from the first sample on; what trains has none any more
+    (`stlc.compile.timers`). Findings (E301, E302, E305, E311, W304) go to
     `sink`; where it holds an error afterwards, the formula is not meant to be used.
     """
     return _Lowering(grid, sink).formula(formula, 1)
@@ -50,10 +52,8 @@ class _Lowering:
                 return self.formula(body, _flip(sign))
             case typed.Logic():
                 return self._logic(node, sign)
-            case typed.Temporal():
-                return self._temporal(node, sign)
-            case typed.Until():
-                return self._until(node, sign)
+            case typed.Temporal() | typed.Until():
+                return self._timed(node, sign)
             case typed.Shift(span, steps, body):
                 return ir.Shift(steps, self.formula(body, sign), None, span, weak=sign < 0)
             case typed.Edge():
@@ -86,6 +86,11 @@ class _Lowering:
         one = ir.Join(inner, (self.formula(left, _flip(sign)), self.formula(right, sign)), node.span)
         other = ir.Join(inner, (self.formula(left, sign), self.formula(right, _flip(sign))), node.span)
         return ir.Join("and" if sign > 0 else "or", (one, other), node.span)
+
+    def _timed(self, node: typed.Temporal | typed.Until, sign: Sign) -> ir.Formula:
+        if on_clock(node):
+            return ir.AtStart(self._timed(from_now(node), sign), node.span)
+        return self._temporal(node, sign) if isinstance(node, typed.Temporal) else self._until(node, sign)
 
     def _temporal(self, node: typed.Temporal, sign: Sign) -> ir.Formula:
         body = self.formula(node.body, sign)
@@ -133,8 +138,6 @@ class _Lowering:
         return ir.Join("and" if sign > 0 else "or", parts, node.span)
 
     def _window(self, interval: typed.Interval, op: str) -> ir.Window:
-        if interval.clock != "now":
-            raise ValueError("an absolute interval must be rewritten before it is lowered")
         return to_window(interval, self.grid, self.sink, outward=op in _CAUTIOUS)
 
 

@@ -92,6 +92,8 @@ class Machine:
                 return self._past(window, run, operands, _PICK[op])
             case ir.Shift():
                 return self._shift(node, run, operands)
+            case ir.AtStart():
+                return self._repeated(run.count)
             case ir.Atom() | ir.Freeze():
                 raise TypeError("predicates and frozen values come from programs")
             case _:
@@ -101,12 +103,16 @@ class Machine:
         full = self.windows.ops.full
         return lambda _, like: full((rows, *like.shape[1:]), value, like)
 
+    def _repeated(self, rows: int) -> Kernel:
+        full = self.windows.ops.full
+        return lambda parts, like: parts[0] + full((rows, *like.shape[1:]), 0.0, like)
+
     def _future(self, window: ir.Window, run: Run, operands: int, pick: Pick) -> Kernel:
         """Windows of the future; those "to the end" that start beyond it are unknown on an open trace."""
         rows = run.count
         beyond = neutral(pick)
         if self.extent.open and window.hi is None:
-            rows = min(rows, self.extent.samples - window.lo - run.start)
+            rows = min(rows, self.extent.length - window.lo - run.start)
             beyond = self.unknown
         if rows <= 0 or not operands:
             return self._constant(run.count, beyond)

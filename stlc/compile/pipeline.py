@@ -212,7 +212,7 @@ class _Stage:
         if self.purpose == "train":
             return augment(requirement, self.grid, self.ledger, self.sink)
         written = requirement.formula
-        formula = recorded(written, self.sink) if absolute(written) else written
+        formula = recorded(written) if absolute(written) else written
         return Augmented(formula, typed.Truth(written.span, True), None)
 
     def _lowered(self, formula: typed.Formula) -> ir.Formula:

@@ -8,6 +8,7 @@ Formulas keep their negations, implications and places; times stay in seconds, s
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import PurePath
@@ -101,9 +102,12 @@ def _elsewhere(interface: Interface | None) -> dict[str, str]:
     if interface is None:
         return {}
     found = {}
+    sizes = Counter(column.name.partition("[")[0] for column in interface.signature.columns)
     for column in interface.signature.columns:
         unit = f" [{column.unit}]" if column.unit.text else ""
-        found[column.name] = f"{interface.where} has it; declare it here too: `signal {column.name}{unit}`"
+        name = column.name.partition("[")[0]
+        sort = "" if name == column.name else f": real[{sizes[name]}]"
+        found[name] = f"{interface.where} has it; declare it here too: `signal {name}{sort}{unit}`"
     for name, (value, unit_) in interface.constants.items():
         amount = _amount(value / unit_.scale, unit_.text)
         found[name] = f"{interface.where} has it; declare it here too: `const {name} = {amount}`"

@@ -14,7 +14,7 @@ from typing import Literal, TypeAlias, assert_never
 from stlc.compile import ir
 from stlc.compile.arith import Program
 from stlc.compile.ops import Array
-from stlc.compile.samples import Reach, reach_of
+from stlc.compile.samples import Reach, farthest, reach_of
 
 End: TypeAlias = Literal["strict", "truncate", "lower", "upper"]
 """What stands beyond the last sample.
@@ -27,20 +27,33 @@ last known sample all the same.
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """How long a trace is, and whether it may go on."""
+    """How long a trace is, and whether it may go on.
+
+    Attributes:
+        samples: how many are known.
+        end: what stands beyond them.
+        stop: how many the trace will have where it goes on: windows to its end end there, and not with the
+            last known sample.
+    """
 
     samples: int
     end: End = "strict"
+    stop: int | None = None
 
     @property
     def open(self) -> bool:
         """Whether instants beyond the last sample exist, with unknown predicates."""
         return self.end in ("lower", "upper")
 
+    @property
+    def length(self) -> int:
+        """Where windows to the end of the trace end."""
+        return self.samples if self.stop is None else self.stop
+
     def last(self, window: ir.Window, latest: int) -> int:
         """The last instant that a window of the future reads when asked at `latest` at the latest."""
         if window.hi is None:
-            return self.samples - 1
+            return self.length - 1
         return latest + window.hi if self.open else min(latest + window.hi, self.samples - 1)
 
 
@@ -73,21 +86,30 @@ def operands(node: ir.Formula, run: Run, extent: Extent) -> tuple[tuple[ir.Formu
             return ((body, upto(run.start + window.lo, extent.last(window, run.last))),)
         case ir.Past(_, window, body):
             return ((body, upto(_first(window, run), run.last - window.lo)),)
-        case ir.Until(_, window, left, right):
-            last = extent.last(window, run.last)
-            if last < run.start + window.lo:
-                return ((left, Run(0, 0)), (right, Run(0, 0)))
-            return ((left, upto(run.start, last)), (right, upto(run.start + window.lo, last)))
-        case ir.Since(_, window, left, right):
-            if run.last < window.lo:
-                return ((left, Run(0, 0)), (right, Run(0, 0)))
-            first = _first(window, run)
-            return ((left, upto(first, run.last)), (right, upto(first, run.last - window.lo)))
+        case ir.Until() | ir.Since():
+            return _both(node, run, extent)
         case ir.Shift(steps, body):
             last = run.last + steps if extent.open else min(run.last + steps, extent.samples - 1)
             return ((body, upto(max(run.start + steps, 0), last)),)
+        case ir.AtStart(body):
+            return ((body, Run(0, 1)),)
         case _:
             assert_never(node)
+
+
+def _both(
+    node: ir.Until | ir.Since, run: Run, extent: Extent
+) -> tuple[tuple[ir.Formula, Run], tuple[ir.Formula, Run]]:
+    """What `until` and `since` need: the right side in the window, the left one from now up to there."""
+    window, left, right = node.window, node.left, node.right
+    if isinstance(node, ir.Until):
+        last = extent.last(window, run.last)
+        if last >= run.start + window.lo:
+            return (left, upto(run.start, last)), (right, upto(run.start + window.lo, last))
+    elif run.last >= window.lo:
+        first = _first(window, run)
+        return (left, upto(first, run.last)), (right, upto(first, run.last - window.lo))
+    return (left, Run(0, 0)), (right, Run(0, 0))
 
 
 def _first(window: ir.Window, run: Run) -> int:
@@ -172,7 +194,7 @@ def _batches(
     atoms: dict[int, tuple[int | None, str, Run]] = {}
     for index, step in enumerate(steps):
         if isinstance(step.node, ir.Atom):
-            inside = within(reach_of(step.node.num), step.run, extent)
+            inside = within(reads(step.node.num, extent), step.run, extent)
             if inside.count > 0 and isinstance(step.node.num, ir.Col) and step.node.sign > 0:
                 atoms[index] = (None, step.node.num.name, inside)
             elif inside.count > 0:
@@ -192,6 +214,15 @@ def _batches(
 
 def _signed(atom: ir.Atom) -> ir.Num:
     return atom.num if atom.sign > 0 else ir.Op("neg", (atom.num,))
+
+
+def reads(num: ir.Num, extent: Extent) -> Reach:
+    """Samples that have to exist for a number to have a value.
+
+    What reads the last sample instead of one beyond the trace has to wait for it while the trace goes on.
+    """
+    past, future = reach_of(num)
+    return Reach(past, future if extent.stop is None else max(future, farthest(num).future))
 
 
 def within(reach: Reach, run: Run, extent: Extent) -> Run:

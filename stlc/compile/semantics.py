@@ -18,6 +18,7 @@ from stlc.compile.extremum import Pick
 from stlc.compile.semantics_extrema import Exact, LogSumExp
 from stlc.compile.semantics_means import ArithmeticGeometricMean, GeneralizedMean
 from stlc.compile.semantics_protocol import Parts, Semantics
+from stlc.diagnostics import Diagnostic, UsageError
 from stlc.registry import Registry
 
 __all__ = [
@@ -43,21 +44,20 @@ SEMANTICS.register("agm")(ArithmeticGeometricMean)
 SEMANTICS.register("dgmsr")(GeneralizedMean)
 
 
-def semantics_of(smoothing: float | str | Semantics | None) -> Semantics:
+def semantics_of(asked: str | Semantics = "exact", smoothing: float | None = None) -> Semantics:
     """The semantics that somebody asks for.
 
     Args:
-        smoothing: None is exact; a number is the scale k of log-sum-exp; a name is one of `SEMANTICS`.
+        asked: a semantics, or the name of one in `SEMANTICS`.
+        smoothing: the scale k of log-sum-exp, which it asks for by itself.
 
     Raises:
-        UsageError: U101, there is no semantics of this name.
+        UsageError: U101, there is no semantics of this name, or it has no such scale.
     """
-    match smoothing:
-        case None:
-            return Exact()
-        case str():
-            return SEMANTICS.get(smoothing)()
-        case int() | float():
-            return LogSumExp(float(smoothing))
-        case _:
-            return smoothing
+    chosen = SEMANTICS.get(asked)() if isinstance(asked, str) else asked
+    if smoothing is None:
+        return chosen
+    if not isinstance(chosen, Exact | LogSumExp):
+        message = f"`{type(chosen).__name__}` has no `smoothing`"
+        raise UsageError(Diagnostic("U101", message, help=("`smoothing` is the scale of log-sum-exp",)))
+    return LogSumExp(float(smoothing))

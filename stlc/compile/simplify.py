@@ -34,6 +34,9 @@ def simplify(formula: ir.Formula) -> ir.Formula:
             return body if formula.steps == 0 else replace(formula, body=body)
         case ir.Freeze():
             return _freeze(replace(formula, body=simplify(formula.body)))
+        case ir.AtStart():
+            body = simplify(formula.body)
+            return body if isinstance(body, ir.Truth) else replace(formula, body=body)
         case _:
             assert_never(formula)
 

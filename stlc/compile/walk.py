@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Literal, TypeAlias, assert_never
+from typing import Literal, TypeAlias, TypeGuard, assert_never
 
 from stlc.compile import typed
 from stlc.compile.samples import of_now
@@ -34,9 +34,14 @@ def nodes(formula: typed.Formula) -> Iterator[typed.Formula]:
         yield from nodes(part)
 
 
-def on_clock(node: typed.Formula) -> bool:
+def on_clock(node: typed.Formula) -> TypeGuard[typed.Temporal | typed.Until]:
     """Whether the interval of this operator is on the mission clock."""
     return isinstance(node, (typed.Temporal, typed.Until)) and node.interval.clock == "start"
+
+
+def from_now(node: typed.Temporal | typed.Until) -> typed.Temporal | typed.Until:
+    """The operator with its interval measured from now: what it means at the first sample."""
+    return replace(node, interval=replace(node.interval, clock="now"))
 
 
 def absolute(formula: typed.Formula) -> bool:

@@ -67,7 +67,7 @@ def _driven(rule: Rule, task: Task) -> Rule:
     """A requirement on the mission clock is judged as it was written, once, on all that was driven."""
     if not rule.absolute:
         return rule
-    written = simplify(lower(recorded(rule.typed.formula, []), task.compiled.grid, []))
+    written = simplify(lower(recorded(rule.typed.formula), task.compiled.grid, []))
     return replace(rule, formula=written, reach=reach(written).future, windowed=False)
 
 

@@ -29,7 +29,7 @@ def open_ended(formula: ir.Formula) -> ir.Formula:
             return ir.Join("or", (formula, ir.Atom(ir.Col(BEYOND), strict=True, guard=True)))
         case ir.Join():
             return replace(formula, items=tuple(map(open_ended, formula.items)))
-        case ir.Over() | ir.Past() | ir.Shift() | ir.Freeze():
+        case ir.Over() | ir.Past() | ir.Shift() | ir.Freeze() | ir.AtStart():
             return replace(formula, body=open_ended(formula.body))
         case ir.Until() | ir.Since():
             return replace(formula, left=open_ended(formula.left), right=open_ended(formula.right))

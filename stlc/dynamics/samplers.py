@@ -12,6 +12,7 @@ from stlc.compile.switch import Hard
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.decl import InitDecl, Situation
 from stlc.dynamics.draws import Drawing, Rows
+from stlc.dynamics.points import points_of
 
 MAX_ROUNDS = 500
 MAX_BATCH = 1 << 20
@@ -29,9 +30,12 @@ class _Draws:
         self.weight = situation.weight
         self.draws = tuple(Drawing(assign) for assign in situation.draws)
         self.mixture = _Mixture(situation.branches) if situation.branches else None
+        self.points = points_of(situation.points) if situation.points is not None else None
 
     def __call__(self, table: Table, rows: Rows) -> Table:
         """`table` with this situation's names added, all (count,)."""
+        if self.points is not None:
+            table = {**table, **self.points(rows)}
         for drawing in self.draws:
             table = {**table, drawing.name: drawing(table, rows)}
         return self.mixture(table, rows) if self.mixture else table
@@ -71,6 +75,7 @@ class InitialStates:
         self.names = names
         self.drawn = 0
         self.kept = 0
+        self._params = tuple(Drawing(assign) for assign in decl.params)
         self._mixture = _Mixture(decl.mixture)
         self._where = (
             Program({f"{i}": ir.Ind(cond) for i, cond in enumerate(decl.where)}) if decl.where else None
@@ -109,7 +114,10 @@ class InitialStates:
     def _propose(self, n: int, generator: torch.Generator) -> Tensor:
         """States before rejection, (n, dim)."""
         rows = Rows(n, generator)
-        table = self._mixture({"": rows.blank()}, rows)
+        table = {"": rows.blank()}
+        for drawing in self._params:
+            table[drawing.name] = drawing(table, rows)
+        table = self._mixture(table, rows)
         return torch.stack([table[name] for name in self.names], 1)
 
     def _holds(self, states: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from stlc.dynamics.decl import ScenarioDecl, SystemDecl
+from stlc.dynamics.schema_columns import read_controls, read_states
 from stlc.dynamics.schema_deploy import read_test
 from stlc.dynamics.schema_flow import read_flow, read_jumps, read_timers
 from stlc.dynamics.schema_functions import read_functions
@@ -18,12 +19,11 @@ from stlc.dynamics.schema_names import (
     empty,
     later,
     read_constants,
-    read_controls,
     read_definitions,
-    read_states,
     read_time,
 )
 from stlc.dynamics.schema_overrides import overridden
+from stlc.dynamics.schema_params import read_params
 from stlc.dynamics.schema_reader import Reader
 from stlc.dynamics.schema_settings import read_backup, read_objective, read_policy, read_train
 from stlc.dynamics.yaml_nodes import Mapping, Node, load_yaml
@@ -58,7 +58,6 @@ TOP_KEYS = [
 ]
 LATER = {
     "extends": "one system file extending another",
-    "param": "parameters that are drawn for every trajectory",
     "plugin": "dynamics from a plugin",
 }
 
@@ -113,6 +112,7 @@ def _declaration(
     read_constants(found.get("const"), reader, names)
     clock = read_time(found.get("time"), reader, names) if "time" in found else Clockwork()
     states = read_states(found.get("state"), reader, names)
+    params = read_params(found.get("param"), reader, names)
     read_controls(found.get("control"), reader, names)
     read_definitions(found.get("def"), reader, names)
     timer_flow, timer_jumps = read_timers(states, reader, names, clock)
@@ -141,7 +141,7 @@ def _declaration(
                 if c.kind == "real" and c.fact and c.low is not None and c.high is not None
             }
         ),
-        init=read_init(found.get("init"), reader, names),
+        init=read_init(found.get("init"), reader, names, params),
         objective=read_objective(found.get("objective"), reader, names),
         policy=read_policy(found.get("policy"), reader, names),
         train=read_train(found.get("train"), reader, names),

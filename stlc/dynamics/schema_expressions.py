@@ -10,13 +10,14 @@ from typing import TypeVar
 
 from stlc.compile import ir
 from stlc.compile.formulas import resolve_state_formula
-from stlc.compile.numbers import resolve_number
+from stlc.compile.numbers import resolve_number, resolve_numbers
 from stlc.compile.scope import Entry, Scope
 from stlc.compile.values import Number
 from stlc.diagnostics import Diagnostic, StlcError
 from stlc.dynamics.algebra import names_in, names_in_formula
-from stlc.dynamics.schema_reader import Reader
+from stlc.dynamics.schema_reader import Reader, first_line
 from stlc.dynamics.yaml_nodes import Node, Scalar
+from stlc.dynamics.yaml_nodes import Sequence as ListNode
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
 from stlc.source import Span
@@ -101,6 +102,19 @@ class Expressions:
             return None
         return number
 
+    def numbers(self, node: Node | None, where: str) -> tuple[Number, ...] | None:
+        """The components that a field holds, in SI units: one expression, or a list of them."""
+        if isinstance(node, ListNode):
+            each = [self.number(item, f"a component of {where}") for item in self.reader.items(node, where)]
+            found = tuple(number for number in each if number is not None)
+            return found if found and len(found) == len(each) else None
+        expr = self.parse(node, where)
+        if expr is None:
+            return None
+        numbers = self._typed(resolve_numbers, expr)
+        read = frozenset().union(*(names_in(number.num) for number in numbers or ()))
+        return numbers if self._known(read, expr.span) else None
+
     def formula(self, node: Node | None, where: str) -> ir.Formula | None:
         """The state formula that a field holds."""
         expr = self.parse(node, where)
@@ -116,7 +130,7 @@ class Expressions:
     def check(self, expr: ast.Expr) -> None:
         """Report what is wrong with an expression of any sort."""
         rejected: list[list[Diagnostic]] = []
-        resolvers: tuple[Callable[[ast.Expr, Scope], object], ...] = (resolve_number, resolve_state_formula)
+        resolvers: tuple[Callable[[ast.Expr, Scope], object], ...] = (resolve_numbers, resolve_state_formula)
         for resolve in resolvers:
             sink: list[Diagnostic] = []
             try:
@@ -160,15 +174,34 @@ class Expressions:
         number = self.number(node, where)
         if number is None or node is None:
             return None
-        if not self._fits(number, unit):
-            self.reader.report(
-                "E203",
-                f"{where} is in [{unit}], this is in [{number.unit}]",
-                node.span,
-                label=f"[{number.unit}]",
-            )
+        return self._in_unit(number, node, where, unit)
+
+    def stored_each(self, node: Node, where: str, unit: Unit, size: int) -> tuple[ir.Num, ...] | None:
+        """The components of a vector of `size` as they are stored in columns of `unit`.
+
+        One number stands for all components; a random one is drawn for each.
+        """
+        numbers = self.numbers(node, where)
+        if numbers is None:
             return None
-        return in_stored_unit(number, unit)
+        if len(numbers) == 1 and size > 1 and isinstance(node, Scalar):
+            again = [self.number(node, where) for _ in range(size)]
+            numbers = tuple(number for number in again if number is not None)
+        if len(numbers) != size:
+            message = f"{where} has {size} components, this has {len(numbers)}"
+            self.reader.report("S203", message, first_line(node.span))
+            return None
+        found = [self._in_unit(number, node, where, unit) for number in numbers]
+        kept = tuple(value for value in found if value is not None)
+        return kept if len(kept) == size else None
+
+    def _in_unit(self, number: Number, node: Node, where: str, unit: Unit) -> ir.Num | None:
+        """A number as it is stored in a column of `unit`, or None with E203 reported."""
+        if self._fits(number, unit):
+            return in_stored_unit(number, unit)
+        message = f"{where} is in [{unit}], this is in [{number.unit}]"
+        self.reader.report("E203", message, first_line(node.span), label=f"[{number.unit}]")
+        return None
 
     def truth(self, node: Node | None, where: str) -> ir.Num | None:
         """A number or a formula as the 0 or 1 of a bool column."""
@@ -193,6 +226,17 @@ class Expressions:
             self.reader.wrong(node, where, "a constant", "use numbers and the names under `const`")
             return None
         return value.value
+
+    def constants(self, node: Node, where: str, unit: Unit, size: int) -> tuple[float, ...] | None:
+        """Components that are known now, as they are stored in columns of `unit`."""
+        values = self.stored_each(node, where, unit, size)
+        if values is None:
+            return None
+        found = tuple(value.value for value in values if isinstance(value, ir.Lit))
+        if len(found) < size:
+            self.reader.wrong(node, where, "a constant", "use numbers and the names under `const`")
+            return None
+        return found
 
     def duration(self, node: Node | None, where: str) -> Fraction | None:
         """Seconds, exactly; a bare number counts as seconds."""

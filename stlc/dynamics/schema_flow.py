@@ -7,9 +7,10 @@ from dataclasses import replace
 from stlc.compile import ir
 from stlc.dynamics.decl import Assign, JumpDecl
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
-from stlc.dynamics.schema_names import Clockwork, Names, later
-from stlc.dynamics.schema_reader import Reader
-from stlc.dynamics.yaml_nodes import Entry, Node
+from stlc.dynamics.schema_names import Clockwork, Names, base_name, later
+from stlc.dynamics.schema_reader import Reader, first_line
+from stlc.dynamics.shared_draws import shared_draws
+from stlc.dynamics.yaml_nodes import Entry, Node, Sequence
 from stlc.signature import Column
 from stlc.units import Unit
 
@@ -21,21 +22,25 @@ def read_flow(node: Node | None, reader: Reader, names: Names, clock: Clockwork)
     here = names.expressions(reader)
     found: list[Assign] = []
     for entry in reader.entries(node, "`flow`"):
-        column = state_of(entry, "`flow`", reader, names)
-        if column is None:
+        columns = states_of(entry, "`flow`", reader, names)
+        if not columns:
             continue
-        if column.kind != "real" and not clock.discrete:
-            kind = "true or false" if column.kind == "bool" else "an enum"
-            message = f"`flow` sets `{column.name}`, which is {kind}"
+        first = columns[0]
+        if first.kind != "real" and not clock.discrete:
+            kind = "true or false" if first.kind == "bool" else "an enum"
+            message = f"`flow` sets `{entry.key.text}`, which is {kind}"
             reader.report("S203", message, entry.key.span, "change it with a jump or an event")
             continue
         if clock.discrete:
-            where, unit = f"the next `{column.name}`", column.unit
+            where, unit = f"the next `{entry.key.text}`", first.unit
         else:
-            where, unit = f"the derivative of `{column.name}`", rate_unit(column.unit)
+            where, unit = f"the derivative of `{entry.key.text}`", rate_unit(first.unit)
+        if names.vector(entry.key.text):
+            found.extend(_components(columns, entry.value, where, unit, here))
+            continue
         value = here.stored(entry.value, where, unit)
         if value is not None:
-            found.append(Assign(column.name, value, written(entry.value)))
+            found.append(Assign(first.name, value, written(entry.value)))
     return tuple(found)
 
 
@@ -63,11 +68,14 @@ def read_timers(
     flows: list[Assign] = []
     jumps: list[JumpDecl] = []
     here = names.expressions(reader)
-    for column in names.columns:
-        found = states[column.name]
-        where = f"the timer `{column.name}`"
+    for name, found in states.items():
+        column = names.group(name)[0]
+        where = f"the timer `{name}`"
         _misplaced(found, where, reader)
         if "timer" not in found:
+            continue
+        if "size" in found:
+            reader.report("S103", f"{where} is a single number", found["size"].span, "declare one a timer")
             continue
         if clock.discrete:
             later(reader, found["timer"], "a timer in a discrete system")
@@ -104,13 +112,52 @@ def _running(run: ir.Formula, direction: str, unit: Unit) -> ir.Num:
 
 def read_sets(node: Node | None, where: str, here: Expressions, names: Names) -> tuple[Assign, ...]:
     """New values of states, in order."""
-    found = []
+    found: list[Assign] = []
     for entry in here.reader.entries(node, where):
-        column = state_of(entry, where, here.reader, names)
-        value = None if column is None else column_assign(column, entry.value, here)
-        if value is not None:
-            found.append(value)
+        found.extend(shared_draws(state_assigns(entry, where, here, names)))
     return tuple(found)
+
+
+def state_assigns(entry: Entry, where: str, here: Expressions, names: Names) -> tuple[Assign, ...]:
+    """A value for a state: one for each component of a vector."""
+    columns = states_of(entry, where, here.reader, names)
+    if not columns:
+        return ()
+    if not names.vector(entry.key.text):
+        found = column_assign(columns[0], entry.value, here)
+        return () if found is None else (found,)
+    if columns[0].kind == "real":
+        return _components(columns, entry.value, f"`{entry.key.text}`", columns[0].unit, here)
+    items = (entry.value,) * len(columns)
+    if isinstance(entry.value, Sequence):
+        items = here.reader.items(entry.value, where)
+    if len(items) != len(columns):
+        message = f"`{entry.key.text}` has {len(columns)} components, this has {len(items)}"
+        here.reader.report("S203", message, first_line(entry.value.span))
+        return ()
+    each = [column_assign(column, item, here) for column, item in zip(columns, items, strict=True)]
+    return tuple(found for found in each if found is not None)
+
+
+def _components(
+    columns: tuple[Column, ...], node: Node, where: str, unit: Unit, here: Expressions
+) -> tuple[Assign, ...]:
+    """Values for the components of a vector."""
+    values = here.stored_each(node, where, unit, len(columns))
+    if values is None:
+        return ()
+    texts = component_texts(node, len(columns))
+    return tuple(
+        Assign(column.name, value, text) for column, value, text in zip(columns, values, texts, strict=True)
+    )
+
+
+def component_texts(node: Node, size: int) -> tuple[str, ...]:
+    """What each component of a vector is written as."""
+    if isinstance(node, Sequence):
+        return tuple(written(item) for item in node.items)
+    text = written(node)
+    return tuple(f"{text if text.isidentifier() else f'({text})'}[{index}]" for index in range(size))
 
 
 def column_assign(column: Column, node: Node, here: Expressions) -> Assign | None:
@@ -125,17 +172,17 @@ def column_assign(column: Column, node: Node, here: Expressions) -> Assign | Non
     return None if value is None else Assign(column.name, value, written(node))
 
 
-def state_of(entry: Entry, where: str, reader: Reader, names: Names) -> Column | None:
-    """The state that a key names (S202 where it names none)."""
+def states_of(entry: Entry, where: str, reader: Reader, names: Names) -> tuple[Column, ...]:
+    """The columns of the state that a key names (S202 where it names none)."""
     name = entry.key.text
-    for column in names.columns:
-        if column.name == name:
-            return column
-    states = [column.name for column in names.columns]
+    columns = names.group(name)
+    if columns:
+        return columns
+    states = list(dict.fromkeys(base_name(column.name) for column in names.columns))
     near = reader.near(name, states)
     guess = f"did you mean `{near}`?" if near else f"states: {', '.join(states)}"
     reader.report("S202", f"{where} sets `{name}`, which is not a state", entry.key.span, guess)
-    return None
+    return ()
 
 
 def rate_unit(unit: Unit) -> Unit:

@@ -8,15 +8,17 @@ from dataclasses import dataclass, replace
 from stlc.compile import ir
 from stlc.compile.scope import Entry as Name
 from stlc.compile.scope import Known
-from stlc.compile.values import Number
-from stlc.dynamics.decl import Assign, InitDecl, Situation
+from stlc.compile.values import Number, Vector
+from stlc.dynamics.decl import Assign, FileDecl, GridDecl, InitDecl, Situation
 from stlc.dynamics.schema_expressions import Expressions, in_stored_unit, written
-from stlc.dynamics.schema_flow import column_assign, state_of
-from stlc.dynamics.schema_names import Names, later
+from stlc.dynamics.schema_flow import state_assigns, states_of
+from stlc.dynamics.schema_names import Names, base_name, component_names
+from stlc.dynamics.schema_points import read_file, read_grid
 from stlc.dynamics.schema_reader import Reader, first_line
-from stlc.dynamics.yaml_nodes import Entry, Mapping, Node
+from stlc.dynamics.shared_draws import shared_draws
+from stlc.dynamics.yaml_nodes import Entry, Mapping, Node, Sequence
 
-INIT_KEYS = ("mixture", "where", "grid", "from")
+INIT_KEYS = ("mixture", "where", "grid", "from", "draw", "let")
 SITUATION_KEYS = ("name", "weight", "draw", "choose", "let", "also")
 
 
@@ -25,38 +27,82 @@ class _Drawn:
     """What has a value at some point of a situation: states, and local names with their numbers."""
 
     states: frozenset[str] = frozenset()
-    locals: tuple[tuple[str, Number], ...] = ()
+    locals: tuple[tuple[str, Number | Vector], ...] = ()
 
     def expressions(self, names: Names, reader: Reader) -> Expressions:
         """Expressions that may draw, and read what has a value."""
         entries: dict[str, Name] = {name: Known(number, "local name") for name, number in self.locals}
-        ready = self.states | {name for name, _ in self.locals}
+        ready = self.states | {name for local, value in self.locals for name in _columns_of(local, value)}
         return names.expressions(reader).extended(entries, samplers=True, ready=ready)
 
 
-def read_init(node: Node | None, reader: Reader, names: Names) -> InitDecl:
-    """The section `init`."""
+def _columns_of(name: str, value: Number | Vector) -> tuple[str, ...]:
+    return component_names(name, len(value.items) if isinstance(value, Vector) else None)
+
+
+def read_init(node: Node | None, reader: Reader, names: Names, params: tuple[Assign, ...] = ()) -> InitDecl:
+    """The section `init`; `params` are drawn before everything else."""
     if node is None:
         reader.report(
             "S102", "the file lacks `init`", reader.source.span(0, 1), "init: {mixture: [{draw: {x: 0}}]}"
         )
         return InitDecl(())
     found = reader.fields(node, "`init`", INIT_KEYS)
-    for key in ("grid", "from"):
-        if key in found:
-            later(reader, found[key], f"`{key}` under `init`")
+    given = [key for key in ("mixture", "grid", "from") if key in found]
+    if len(given) > 1:
+        reader.report(
+            "S102",
+            f"`init` takes one of `mixture`, `grid` and `from`, not {len(given)}",
+            first_line(node.span),
+        )
+    drawn = _Drawn(frozenset(assign.name for assign in params))
+    if "mixture" in given or not given:
+        mixture = _situations(found, node, drawn, reader, names)
+    else:
+        mixture = (_known(found, node, drawn, names.expressions(reader), names),)
+    where, texts = _conditions(found.get("where"), names.expressions(reader))
+    span = found["where"].span if "where" in found else node.span
+    return InitDecl(mixture, where, texts, params, first_line(span))
+
+
+def _situations(
+    found: dict[str, Node], node: Node, drawn: _Drawn, reader: Reader, names: Names
+) -> tuple[Situation, ...]:
+    """The situations under `mixture`."""
     items = reader.items(found.get("mixture"), "`mixture`")
-    if not items and not {"grid", "from"} & found.keys():
+    for key in ("draw", "let"):
+        if key in found:
+            reader.report("S102", f"`{key}` under `init` goes with `grid` or `from`", found[key].span)
+    if not items:
         reader.report(
             "S102",
             "`init` lacks a `mixture` of situations",
             first_line(node.span),
             "mixture: [{draw: {x: 0}}]",
         )
-    mixture = _mixture(items, _Drawn(), reader, names)
-    where, texts = _conditions(found.get("where"), names.expressions(reader))
-    span = found["where"].span if "where" in found else node.span
-    return InitDecl(mixture, where, texts, first_line(span))
+    return _mixture(items, drawn, reader, names)
+
+
+def _known(found: dict[str, Node], node: Node, drawn: _Drawn, here: Expressions, names: Names) -> Situation:
+    """One situation whose states, as far as it does not draw them, are those of a grid or a file."""
+    reader = here.reader
+    rest = {entry.key.text for entry in reader.entries(found.get("draw"), "`draw`")}
+    missing = [
+        column.name
+        for column in names.columns
+        if column.name not in drawn.states and not {column.name, base_name(column.name)} & rest
+    ]
+    points: GridDecl | FileDecl | None
+    if "grid" in found:
+        points = read_grid(found["grid"], here, names)
+        taken = {name for name, _ in points.axes}
+    else:
+        points = read_file(found["from"], tuple(missing), reader)
+        taken = set(missing)
+    draws = _Draws(reader, names, replace(drawn, states=drawn.states | taken))
+    draws.read(found)
+    _all_drawn("the grid", draws, node, reader, names)
+    return Situation("grid" if "grid" in found else "from", 1.0, tuple(draws.found), (), points)
 
 
 def _conditions(node: Node | None, here: Expressions) -> tuple[tuple[ir.Formula, ...], tuple[str, ...]]:
@@ -83,17 +129,23 @@ def _situation(node: Node, drawn: _Drawn, reader: Reader, names: Names) -> Situa
     draws.read(found)
     choices = reader.items(found.get("choose"), "`choose`")
     branches = _mixture(choices, draws.drawn, reader, names)
-    missing = [column.name for column in names.columns if column.name not in draws.drawn.states]
-    if missing and not choices and not draws.failed and isinstance(node, Mapping):
+    if not choices and isinstance(node, Mapping):
+        _all_drawn(f"the situation `{name}`" if name else "this situation", draws, node, reader, names)
+    return Situation(name, 1.0 if weight is None else weight, tuple(draws.found), branches)
+
+
+def _all_drawn(called: str, draws: _Draws, node: Node, reader: Reader, names: Names) -> None:
+    """Report states that have no first value."""
+    undrawn = [column.name for column in names.columns if column.name not in draws.drawn.states]
+    missing = list(dict.fromkeys(map(base_name, undrawn)))
+    if missing and not draws.failed:
         listed = ", ".join(f"`{column}`" for column in missing)
-        called = f"the situation `{name}`" if name else "this situation"
         reader.report(
             "S102",
             f"{called} draws no value for {listed}",
             first_line(node.span),
             "every state needs a first value",
         )
-    return Situation(name, 1.0 if weight is None else weight, tuple(draws.found), branches)
 
 
 class _Draws:
@@ -131,20 +183,19 @@ class _Draws:
 
     def _draw(self, entry: Entry, where: str) -> None:
         """One state."""
-        column = state_of(entry, where, self.reader, self.names)
-        if column is None:
+        columns = states_of(entry, where, self.reader, self.names)
+        if not columns:
             return
         self._needed(entry.value)
-        assign = column_assign(column, entry.value, self.drawn.expressions(self.names, self.reader))
-        if assign is not None:
-            self.found.append(assign)
-        self.drawn = replace(self.drawn, states=self.drawn.states | {column.name})
+        here = self.drawn.expressions(self.names, self.reader)
+        self.found.extend(shared_draws(state_assigns(entry, where, here, self.names)))
+        self.drawn = replace(self.drawn, states=self.drawn.states | {column.name for column in columns})
 
     def _needed(self, node: Node) -> None:
         """The local names that an expression mentions."""
-        text = written(node)
+        texts = [written(item) for item in (node.items if isinstance(node, Sequence) else (node,))]
         for name in list(self.lets):
-            if re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text):
+            if any(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) for text in texts):
                 self._let(name)
 
     def _let(self, name: str) -> None:
@@ -153,10 +204,19 @@ class _Draws:
             return
         node = self.lets.pop(name)
         self._needed(node)
-        number = self.drawn.expressions(self.names, self.reader).number(node, f"`{name}`")
-        if number is None:
-            number = Number(ir.Lit(0.0), flexible=True)
-        else:
-            self.found.append(Assign(name, in_stored_unit(number, number.unit.si), written(node)))
-        known = replace(number, num=ir.Col(name), exact=None, span=None, origin=None)
+        numbers = self.drawn.expressions(self.names, self.reader).numbers(node, f"`{name}`")
+        known: Number | Vector = Number(ir.Lit(0.0), flexible=True)
+        if numbers is not None:
+            vector = len(numbers) > 1 or isinstance(node, Sequence)
+            called = component_names(name, len(numbers) if vector else None)
+            assigns = [
+                Assign(each, in_stored_unit(number, number.unit.si), written(node))
+                for each, number in zip(called, numbers, strict=True)
+            ]
+            self.found.extend(shared_draws(assigns))
+            items = tuple(
+                replace(number, num=ir.Col(each), exact=None, span=None, origin=None)
+                for each, number in zip(called, numbers, strict=True)
+            )
+            known = Vector(items) if vector else items[0]
         self.drawn = replace(self.drawn, locals=(*self.drawn.locals, (name, known)))

@@ -2,36 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import get_args
 
 from stlc.compile.scope import (
     Definition,
     Entry,
     Known,
     Scope,
-    column_entries,
-    constant_entries,
     constant_value,
     enforced,
-    member_entries,
 )
+from stlc.compile.values import Vector
 from stlc.diagnostics import Label, SystemFileError
-from stlc.dynamics.decl import ControlDecl, Squash
+from stlc.dynamics.decl import ControlDecl
 from stlc.dynamics.schema_expressions import SECOND, Expressions
 from stlc.dynamics.schema_reader import Reader, first_line
 from stlc.dynamics.yaml_nodes import Mapping, Node, Scalar, Sequence
 from stlc.grammar import ast
-from stlc.signature import Column, Role, Signature
+from stlc.signature import Column, Signature
 from stlc.source import Span
 from stlc.units import Unit, parse_unit
 
 TIME_KEYS = ("dt", "horizon", "integrator", "substeps", "discrete")
 INTEGRATORS = ("euler", "heun", "rk4")
-STATE_KEYS = ("unit", "range", "clamp", "role", "enum", "bool", "size", "timer", "run", "reset_when", "to")
-CONTROL_KEYS = ("unit", "range", "squash", "levels", "size")
-BOOL_LABELS = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +38,16 @@ class Clockwork:
     substeps: int = 1
     integrator: str = "euler"
     discrete: bool = False
+
+
+def base_name(column: str) -> str:
+    """The name of the vector whose component a column is; its own name where it is none."""
+    return column.partition("[")[0]
+
+
+def component_names(name: str, size: int | None) -> tuple[str, ...]:
+    """The columns of a state or control: its name, or one for each component of a vector."""
+    return (name,) if size is None else tuple(f"{name}[{index}]" for index in range(size))
 
 
 @dataclass
@@ -73,6 +78,20 @@ class Names:
         return Expressions(
             reader, Scope(dict(self.entries), error=SystemFileError, facts=enforced(self.columns))
         )
+
+    def group(self, name: str) -> tuple[Column, ...]:
+        """The state of that name: one column, or the components of a vector; none where there is none."""
+        exact = tuple(column for column in self.columns if column.name == name)
+        return exact or tuple(column for column in self.columns if base_name(column.name) == name)
+
+    def vector(self, name: str) -> bool:
+        """Whether a state of that name is a vector."""
+        return all(column.name != name for column in self.columns)
+
+    def place_components(self, name: str, columns: Iterable[str]) -> None:
+        """The components of a vector are declared where it is."""
+        if name in self.places:
+            self.places |= dict.fromkeys(columns, self.places[name])
 
     def declare(self, key: Scalar, what: str, reader: Reader) -> bool:
         """Whether `key` may become a name; says why not."""
@@ -113,78 +132,26 @@ def read_time(node: Node | None, reader: Reader, names: Names) -> Clockwork:
 
 
 def read_constants(node: Node | None, reader: Reader, names: Names) -> None:
-    """The section `const`: numbers with units; later ones may use earlier ones."""
+    """The section `const`: numbers and vectors with units; later ones may use earlier ones."""
     for entry in reader.entries(node, "`const`"):
         name = entry.key.text
         if not names.declare(entry.key, "constant", reader):
             continue
-        number = names.expressions(reader).number(entry.value, f"the constant `{name}`")
-        if number is None:
+        where = f"the constant `{name}`"
+        numbers = names.expressions(reader).numbers(entry.value, where)
+        if numbers is None:
             names.entries[name] = Known(constant_value(1.0), "constant")
-        elif number.constant is None:
-            reader.wrong(entry.value, f"the constant `{name}`", "a number that is known now")
-        else:
-            unit = number.unit if not number.bare else Unit()
-            names.constants[name] = (number.constant, unit)
-            known = constant_entries({name: names.constants[name]}, about="constant")[name]
-            names.entries[name] = Known(number, known.about, entry.key.span)
-
-
-def read_states(node: Node | None, reader: Reader, names: Names) -> dict[str, dict[str, Node]]:
-    """The section `state`; gives back the fields of every state."""
-    if node is None:
-        reader.report("S102", "the file lacks `state`", reader.source.span(0, 1), "state: {x: {unit: m}}")
-    described: dict[str, dict[str, Node]] = {}
-    for entry in reader.entries(node, "`state`"):
-        names.declare(entry.key, "state", reader)
-        where = f"the state `{entry.key.text}`"
-        found = reader.fields(entry.value, where, STATE_KEYS)
-        described[entry.key.text] = found
-        if "size" in found:
-            later(reader, found["size"], "a state of several components")
-        names.columns.append(_column(entry.key.text, found, where, reader, names))
-    names.entries |= column_entries(names.columns, about="state")
-    names.entries |= member_entries(column.labels for column in names.columns if column.kind == "enum")
-    return described
-
-
-def _column(name: str, found: dict[str, Node], where: str, reader: Reader, names: Names) -> Column:
-    """One state."""
-    unit = read_unit(found.get("unit"), reader)
-    role = reader.option(found.get("role"), f"`role` of {where}", ("state", "env")) or "state"
-    clamp = bool(reader.flag(found.get("clamp"), f"`clamp` of {where}"))
-    shown: Role = "env" if role == "env" else "state"
-    if "enum" in found:
-        labels = _members(found["enum"], where, reader)
-        values = [value for _, value in labels] or [0.0]
-        return Column(name, unit, "enum", shown, min(values), max(values), labels, fact=True)
-    if reader.flag(found.get("bool"), f"`bool` of {where}"):
-        return Column(name, unit, "bool", shown, 0.0, 1.0, BOOL_LABELS, fact=True)
-    low, high = read_range(found.get("range"), where, unit, names.expressions(reader)) or (None, None)
-    if clamp and "range" not in found:
-        reader.report(
-            "S204", f"{where} is clamped but has no range", found["clamp"].span, "add `range: [low, high]`"
-        )
-    return Column(name, unit, "real", shown, low, high, (), fact=clamp)
-
-
-def _members(node: Node, where: str, reader: Reader) -> tuple[tuple[str, float], ...]:
-    """`{stop: 0, light: 1}` or `[stop, light]`."""
-    members: list[tuple[str, float]] = []
-    if isinstance(node, Sequence):
-        words = [reader.text(item, f"a member of {where}") for item in reader.items(node, where)]
-        members = [(word, float(value)) for value, word in enumerate(words) if word]
-    else:
-        for entry in reader.entries(node, f"`enum` of {where}"):
-            value = reader.integer(entry.value, f"the member `{entry.key.text}`", low=-1_000_000)
-            if value is not None:
-                members.append((entry.key.text, float(value)))
-    if len(dict(members)) < max(len(members), 1) or len({value for _, value in members}) < len(members):
-        help_ = "{enum: {stop: 0, go: 1}}"
-        reader.report(
-            "S103", f"{where} needs members, each with a name and a value of its own", node.span, help_
-        )
-    return tuple(members)
+            continue
+        vector = len(numbers) > 1 or isinstance(entry.value, Sequence)
+        called = component_names(name, len(numbers) if vector else None)
+        for component, number in zip(called, numbers, strict=True):
+            if number.constant is None:
+                reader.wrong(entry.value, where, "a number that is known now")
+                break
+            names.constants[component] = (number.constant, Unit() if number.bare else number.unit)
+        names.place_components(name, called)
+        value = Vector(numbers) if vector else numbers[0]
+        names.entries[name] = Known(value, "constant", entry.key.span)
 
 
 def read_unit(node: Node | None, reader: Reader) -> Unit:
@@ -197,74 +164,6 @@ def read_unit(node: Node | None, reader: Reader) -> Unit:
     except ValueError as error:
         reader.report("S103", str(error), node.span, "a unit is a product of powers, for example `m/s^2`")
         return Unit()
-
-
-def read_range(node: Node | None, where: str, unit: Unit, here: Expressions) -> tuple[float, float] | None:
-    """`[low, high]`, in `unit`."""
-    if node is None:
-        return None
-    items = here.reader.items(node, f"`range` of {where}")
-    if len(items) != 2:
-        if items or (isinstance(node, Sequence) and not node.items):
-            here.reader.wrong(node, f"`range` of {where}", "two numbers `[low, high]`")
-        return None
-    low = here.constant(items[0], f"the lower bound of {where}", unit)
-    high = here.constant(items[1], f"the upper bound of {where}", unit)
-    if low is None or high is None:
-        return None
-    if not low < high:
-        here.reader.report(
-            "S204", f"the range of {where} ends before it starts", node.span, f"[{high:g}, {low:g}]"
-        )
-        return None
-    return low, high
-
-
-def read_controls(node: Node | None, reader: Reader, names: Names) -> None:
-    """The section `control`."""
-    if node is None:
-        reader.report(
-            "S102", "the file lacks `control`", reader.source.span(0, 1), "control: {u: {range: [-1, 1]}}"
-        )
-    for entry in reader.entries(node, "`control`"):
-        names.declare(entry.key, "control", reader)
-        name = entry.key.text
-        where = f"the control `{name}`"
-        found = reader.fields(entry.value, where, CONTROL_KEYS)
-        if "size" in found:
-            later(reader, found["size"], "a control of several components")
-        if "range" not in found:
-            reader.report(
-                "S204",
-                f"{where} has no range",
-                entry.key.span,
-                f"{name}: {{range: [-1, 1]}}",
-                label="needs bounds",
-            )
-        names.controls.append(_control(name, found, where, names.expressions(reader)))
-    columns = [Column(c.name, c.unit, "real", "input", c.low, c.high, (), fact=True) for c in names.controls]
-    names.entries |= column_entries(columns, about="control")
-
-
-def _control(name: str, found: dict[str, Node], where: str, here: Expressions) -> ControlDecl:
-    """One control."""
-    reader = here.reader
-    unit = read_unit(found.get("unit"), reader)
-    low, high = read_range(found.get("range"), where, unit, here) or (-1.0, 1.0)
-    word = reader.option(found.get("squash"), f"`squash` of {where}", get_args(Squash)) or "tanh"
-    squash: Squash = "clip" if word == "clip" else "angle" if word == "angle" else "tanh"
-    items = reader.items(found.get("levels"), f"`levels` of {where}")
-    levels = [here.constant(item, f"a level of {where}", unit) for item in items]
-    kept = tuple(level for level in levels if level is not None)
-    for item, level in zip(items, levels, strict=True):
-        if level is not None and not low <= level <= high:
-            reader.report(
-                "S204",
-                f"a level of {where} is outside its range",
-                item.span,
-                f"the range is [{low:g}, {high:g}]",
-            )
-    return ControlDecl(name, unit, low, high, squash, kept)
 
 
 def read_definitions(node: Node | None, reader: Reader, names: Names) -> None:

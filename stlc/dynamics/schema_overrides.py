@@ -14,11 +14,10 @@ from stlc.source import Source
 def overridden(root: Mapping, overrides: MappingType[str, str], reader: Reader) -> Mapping:
     """The document with the fields that `overrides` names replaced.
 
-    A dotted key names a field (`train.lr`, `init.mixture.0.weight`); a plain one a constant, or a field at
-    the top that holds a single value. Other plain names are left to the specification.
+    A dotted key names a field (`train.lr`, `init.mixture.0.weight`); a plain one a constant, a parameter, or
+    a field at the top that holds a single value. Other plain names are left to the specification.
     """
-    constants = root.get("const")
-    known = {e.key.text for e in constants.entries} if isinstance(constants, Mapping) else set()
+    known, params = _keys(root.get("const")), _keys(root.get("param"))
     for key, text in overrides.items():
         value = _value(key, text, reader)
         path = key.split(".")
@@ -27,11 +26,18 @@ def overridden(root: Mapping, overrides: MappingType[str, str], reader: Reader) 
         if len(path) == 1:
             if key in known:
                 path = ["const", key]
+            elif key in params:
+                path = ["param", key, *(["draw"] if isinstance(params[key], Mapping) else [])]
             elif not isinstance(root.get(key), Scalar):
                 continue
         changed = _replaced(root, path, value, key, reader)
         root = changed if isinstance(changed, Mapping) else root
     return root
+
+
+def _keys(node: Node | None) -> dict[str, Node]:
+    """What a section declares."""
+    return {entry.key.text: entry.value for entry in node.entries} if isinstance(node, Mapping) else {}
 
 
 def _value(key: str, text: str, reader: Reader) -> Node | None:

@@ -7,9 +7,11 @@ from stlc.compile.scope import Known
 from stlc.compile.values import Number
 from stlc.dynamics.decl import BackupDecl, ObjectiveDecl, PolicyDecl, Term, TrainDecl
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
+from stlc.dynamics.schema_flow import component_texts
 from stlc.dynamics.schema_names import Names
 from stlc.dynamics.schema_reader import Reader
 from stlc.dynamics.yaml_nodes import Node, Scalar, Sequence, as_int
+from stlc.grammar import ast
 
 OBJECTIVE_KEYS = ("gamma", "smoothing", "lambda", "terms")
 TERM_KEYS = ("name", "weight", "expr")
@@ -58,14 +60,26 @@ def read_policy(node: Node | None, reader: Reader, names: Names) -> PolicyDecl:
     found = reader.fields(node, "`policy`", POLICY_KEYS)
     default = PolicyDecl()
     here = names.expressions(reader)
-    seen = reader.items(found.get("observe"), "`observe`")
-    numbers = [here.truth(item, "an observation") for item in seen]
+    seen = [seen for item in reader.items(found.get("observe"), "`observe`") for seen in _seen(item, here)]
     return PolicyDecl(
         reader.option(found.get("type"), "`type` of the policy", POLICIES) or default.type,
         _integers(found.get("hidden"), "`hidden`", reader) or default.hidden,
-        tuple(number for number in numbers if number is not None),
-        tuple(written(item) for item in seen),
+        tuple(number for number, _ in seen),
+        tuple(text for _, text in seen),
     )
+
+
+def _seen(node: Node, here: Expressions) -> tuple[tuple[ir.Num, str], ...]:
+    """One item of `observe`: a number, a formula, or the components of a vector."""
+    expr = here.parse(node, "an observation")
+    if isinstance(expr, ast.Bool | ast.Compare | ast.Not | ast.Logic | ast.Member):
+        value = here.truth(node, "an observation")
+        return () if value is None else ((value, written(node)),)
+    numbers = None if expr is None else here.numbers(node, "an observation")
+    if numbers is None:
+        return ()
+    texts = (written(node),) if len(numbers) == 1 else component_texts(node, len(numbers))
+    return tuple(zip((number.num for number in numbers), texts, strict=True))
 
 
 def read_train(node: Node | None, reader: Reader, names: Names) -> TrainDecl:

@@ -9,7 +9,6 @@ from typing import TypeAlias
 
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
-from stlc.lint.modulo import modulos
 from stlc.lint.parentheses import missing_parentheses, unclear_implications
 from stlc.lint.spelling import foreign_spellings
 from stlc.lint.unused import nothing_required, unused_names
@@ -36,7 +35,6 @@ RULES: Mapping[str, Rule] = MappingProxyType(
         "W106": Rule(foreign_spellings),
         "W301": Rule(missing_parentheses),
         "W302": Rule(unclear_implications, usual=False),
-        "W403": Rule(modulos, usual=False),
         "W504": Rule(nothing_required),
     }
 )

@@ -20,6 +20,7 @@ from stlc.compile.horizon import columns, parts
 from stlc.compile.interface import Grid
 from stlc.compile.lower import lower
 from stlc.compile.thaw import thaw
+from stlc.compile.walk import from_now, on_clock
 from stlc.monitor.values import Record, bounds, history
 from stlc.source import Span
 
@@ -96,10 +97,8 @@ class Blamer:
                 return self.blame(body, sample, wanted=not wanted)
             case typed.Logic():
                 return self._logic(formula, sample, wanted)
-            case typed.Temporal():
-                return self._temporal(formula, sample, wanted)
-            case typed.Until():
-                return self._until(formula, sample, wanted)
+            case typed.Temporal() | typed.Until():
+                return self._timed(formula, sample, wanted)
             case typed.Shift(_, steps, body):
                 there = sample + steps
                 inside = there >= 0
@@ -206,6 +205,13 @@ class Blamer:
                 low = 0 if window.hi is None else max(sample - window.hi, 0)
                 return range(low, sample - window.lo + 1)
         raise TypeError(f"{type(lowered).__name__} has no window")
+
+    def _timed(self, formula: typed.Temporal | typed.Until, sample: int, wanted: bool) -> Blame:
+        if on_clock(formula):
+            return self._timed(from_now(formula), 0, wanted)
+        if isinstance(formula, typed.Temporal):
+            return self._temporal(formula, sample, wanted)
+        return self._until(formula, sample, wanted)
 
     def _temporal(self, formula: typed.Temporal, sample: int, wanted: bool) -> Blame:
         node = self._node(formula, wanted, sample)

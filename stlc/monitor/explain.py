@@ -90,7 +90,7 @@ def _cause(judgement: Judgement, subject: Prepared, trace: int, start: int) -> C
     )
     window = window_of(rule, subject.horizon)
     record = record if window is None else record.cut(start + window + 1)
-    formula = recorded(rule.typed.formula, []) if rule.absolute else rule.typed.formula
+    formula = recorded(rule.typed.formula) if rule.absolute else rule.typed.formula
     tree = Blamer(record, subject.compiled.grid).blame(formula, start)
     words = _Words(subject, record, rule.typed.written, _definitions(subject.compiled.spec))
     leaf = tree.leaf

@@ -7,25 +7,26 @@ the formula on the samples seen, with each endless operator continued by that co
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from itertools import combinations
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile import ir
-from stlc.compile.horizon import nodes, reach
+from stlc.compile.horizon import reach
 from stlc.monitor.columns import NOTHING, Reader, Side
 from stlc.monitor.streams import EndlessError, Plan, column, endless
 from stlc.monitor.values import history
 
 Floats: TypeAlias = NDArray[np.float64]
-Subset: TypeAlias = frozenset[int]
 
 _MOST = 6
 """More endless operators than this are not worth their 2^n coefficients."""
+
+_FOREVER = ir.Window(0, None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,17 +46,19 @@ class Moved:
 class Skeleton:
     """The endless operators of a formula over columns `$0`, `$1`, …; each with `lo` 0.
 
+    What an operator is worth from the last row on is a column of its own, `!0`, `!1`, …: the rest.
+
     Attributes:
         root: the formula.
         parts: column -> what it stands for.
-        variables: the endless operators in it.
-        origins: for each of them, itself before its lower bound was taken off, and that bound.
+        origins: rest -> its operator, before the lower bound was taken off.
+        operators: rest -> its operator over columns, the rest among them.
     """
 
     root: ir.Formula
     parts: dict[str, Moved] = field(default_factory=dict)
-    variables: tuple[ir.Formula, ...] = ()
-    origins: dict[ir.Formula, Moved] = field(default_factory=dict)
+    origins: dict[str, Moved] = field(default_factory=dict)
+    operators: dict[str, ir.Formula] = field(default_factory=dict)
 
     @property
     def reach(self) -> int:
@@ -80,42 +83,61 @@ def skeleton(formula: ir.Formula) -> Skeleton:
         EndlessError: an endless operator stands under one with an end, or there are too many.
     """
     found = Skeleton(formula)
-    root = _taken(formula, 0, found)
-    variables = tuple(dict.fromkeys(node for node in nodes(root) if endless_node(node)))
-    if len(variables) > _MOST:
+    found.root = _taken(formula, 0, found)
+    if len(found.origins) > _MOST:
         raise EndlessError
-    found.root, found.variables = root, variables
     return found
-
-
-def endless_node(node: ir.Formula) -> bool:
-    """Whether the window of an operator has no end."""
-    return isinstance(node, (ir.Over, ir.Until)) and node.window.hi is None
 
 
 def _taken(formula: ir.Formula, steps: int, found: Skeleton) -> ir.Formula:
     """The formula `steps` samples later, over columns."""
     if not endless(formula):
         return _part(formula, steps, found)
-    forever = ir.Window(0, None)
     match formula:
         case ir.Join(op, items):
             return ir.Join(op, tuple(_taken(item, steps, found) for item in items))
         case ir.Shift(later, body, None) if later >= 0:
             return _taken(body, steps + later, found)
         case ir.Over(op, ir.Window(lo, None), body):
-            node: ir.Formula = ir.Over(op, forever, _taken(body, steps + lo, found))
-            found.origins[node] = Moved(formula, steps)
-            return node
+            seen = ir.Over(op, _FOREVER, _taken(body, steps + lo, found))
+            rest = _rest(Moved(formula, steps), found)
+            found.operators[rest] = ir.Join("and" if op == "always" else "or", (seen, column(rest)))
+            return found.operators[rest]
         case ir.Until(op, ir.Window(lo, None), left, right):
-            parts = _taken(left, steps + lo, found), _taken(right, steps + lo, found)
-            node = ir.Until(op, forever, *parts)
-            found.origins[node] = Moved(ir.Until(op, forever, left, right), steps + lo)
+            met = _met(ir.Until(op, _FOREVER, left, right), steps + lo, found)
             if not lo:
-                return node
-            return _held(op == "until", ir.Window(0, lo - 1), (left, steps, found), node)
+                return met
+            return _held(op == "until", ir.Window(0, lo - 1), (left, steps, found), met)
         case _:
             raise EndlessError
+
+
+def _rest(origin: Moved, found: Skeleton) -> str:
+    """The column of what an operator is worth from the last row on.
+
+    Operators that read the same columns may still end in different ways: `next` of an operator is not the
+    operator of `next` where the trace is over.
+    """
+    for name, known in found.origins.items():
+        if known == origin:
+            return name
+    name = f"!{len(found.origins)}"
+    found.origins[name] = origin
+    return name
+
+
+def _met(node: ir.Until, steps: int, found: Skeleton) -> ir.Formula:
+    """`until` or `release` without a lower bound: met among the rows, or held through them and met later."""
+    left, right = _taken(node.left, steps, found), _taken(node.right, steps, found)
+    name = _rest(Moved(node, steps), found)
+    seen, rest = ir.Until(node.op, _FOREVER, left, right), column(name)
+    if node.op == "until":
+        held = ir.Join("and", (ir.Over("always", _FOREVER, left), rest))
+        found.operators[name] = ir.Join("or", (seen, held))
+    else:
+        freed = ir.Join("or", (ir.Over("eventually", _FOREVER, left), rest))
+        found.operators[name] = ir.Join("and", (seen, freed))
+    return found.operators[name]
 
 
 def _held(
@@ -141,29 +163,10 @@ def _part(formula: ir.Formula, steps: int, found: Skeleton) -> ir.Formula:
     return column(name)
 
 
-def continued(formula: ir.Formula, variables: Sequence[ir.Formula], chosen: Subset) -> ir.Formula:
-    """The formula where the endless operators go on as true (the chosen ones) or false."""
-    match formula:
-        case ir.Join(op, items):
-            return ir.Join(op, tuple(continued(item, variables, chosen) for item in items))
-        case ir.Over(op, window, body):
-            rest = ir.Truth(variables.index(formula) in chosen)
-            until_now = ir.Over(op, window, continued(body, variables, chosen))
-            return ir.Join("and" if op == "always" else "or", (until_now, rest))
-        case ir.Until(op, window, left, right):
-            rest = ir.Truth(variables.index(formula) in chosen)
-            held, met = (continued(part, variables, chosen) for part in (left, right))
-            seen = ir.Until(op, window, held, met)
-            if op == "until":
-                return ir.Join("or", (seen, ir.Join("and", (ir.Over("always", window, held), rest))))
-            return ir.Join("and", (seen, ir.Join("or", (ir.Over("eventually", window, held), rest))))
-        case _:
-            return formula
-
-
-def subsets(count: int) -> list[Subset]:
-    """All subsets of the first `count` numbers."""
-    return [frozenset(some) for size in range(count + 1) for some in combinations(range(count), size)]
+def _neutral(origin: Moved) -> float:
+    """What the rest of an operator is worth where all rows are there: nothing more is met, nothing fails."""
+    assert isinstance(origin.formula, (ir.Over, ir.Until))
+    return math.inf if origin.formula.op in ("always", "release") else -math.inf
 
 
 @dataclass(slots=True)
@@ -174,26 +177,28 @@ class Frontier:
         bones: the formula.
         side: the columns.
         at: number of the first sample that is not yet in the polynomial.
-        coefficients: subset of the operators that are +inf -> value (1, traces); None at first.
+        coefficients: (subsets of the operators, traces): the value where those operators are worth +inf from
+            there on and the others -inf; None at first.
     """
 
     bones: Skeleton
     side: Side
     at: int = 0
-    coefficients: dict[Subset, Floats] | None = None
+    coefficients: Floats | None = None
     _parts: dict[int, tuple[list[str], Reader]] = field(default_factory=dict, init=False)
-    _readers: dict[tuple[bool, bool], Reader] = field(default_factory=dict, init=False)
+    _root: Reader = field(init=False)
+    _operators: Reader = field(init=False)
+    _chosen: NDArray[np.bool_] = field(init=False)
     _unsure: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
         for steps in dict.fromkeys(part.steps for part in self.bones.parts.values()):
             alike = {name: part.formula for name, part in self.bones.parts.items() if part.steps == steps}
             self._parts[steps] = (list(alike), Reader(list(alike.values()), self.side.end))
-        variables = self.bones.variables
-        for goals in ((self.bones.root,), variables):
-            asked = [continued(goal, variables, some) for some in subsets(len(variables)) for goal in goals]
-            self._readers[goals is variables, True] = Reader(asked, "truncate")
-            self._readers[goals is variables, False] = Reader(goals, "truncate")
+        self._root = Reader([self.bones.root], "truncate")
+        self._operators = Reader(list(self.bones.operators.values()), "truncate")
+        operators = len(self.bones.operators)
+        self._chosen = np.arange(1 << operators)[:, None] >> np.arange(operators) & 1 == 1
         self._unsure = self.bones.unsure(self.side.plan)
 
     def advance(self, settled: int) -> None:
@@ -201,32 +206,36 @@ class Frontier:
         count = settled - self.at
         if count <= 0:
             return
-        values = self._first(count, going_on=True)
-        every = subsets(len(self.bones.variables))
-        size = len(values) // len(every)
-        found = {chosen: values[i * size : (i + 1) * size] for i, chosen in enumerate(every)}
-        if self.coefficients is None:
-            self.coefficients = {chosen: some[0] for chosen, some in found.items()}
-        else:
-            self.coefficients = {chosen: self._at(some) for chosen, some in found.items()}
+        subsets = len(self._chosen)
+        env = {name: np.tile(values, subsets) for name, values in self._columns(count).items()}
+        like = env[NOTHING]
+        for name, chosen in zip(self.bones.operators, self._chosen.T, strict=True):
+            ends = np.repeat(np.where(chosen, math.inf, -math.inf), like.shape[1] // subsets)
+            env[name] = np.broadcast_to(ends, like.shape)
+        found = self._first(env).reshape(-1, subsets, like.shape[1] // subsets)
+        self.coefficients = found[0] if self.coefficients is None else self._at(found)
         self.at = settled
 
     def value(self, samples: int) -> Floats:
         """The value while the trace goes on: as many unknown samples follow as the formula can tell apart."""
-        found = self._first(samples - self.at + self._unsure, going_on=False)
-        return found[0] if self.coefficients is None else self._at(found)
+        env = self._columns(samples - self.at + self._unsure)
+        for name, origin in self.bones.origins.items():
+            env[name] = np.full(env[NOTHING].shape, _neutral(origin))
+        found = self._first(env)
+        return found if self.coefficients is None else self._at(found[:, None])
 
     def ended(self, formula: ir.Formula, samples: int) -> Floats:
         """The value where the last sample is the end of the trace."""
         if self.coefficients is None:
             return self._plain(formula, 0, samples)
-        origins = [self.bones.origins[variable] for variable in self.bones.variables]
-        return self._at([self._plain(o.formula, self.at + o.steps, samples) for o in origins])
+        origins = self.bones.origins.values()
+        rests = [self._plain(origin.formula, self.at + origin.steps, samples) for origin in origins]
+        return self._at(np.stack(rests))
 
-    def _first(self, count: int, *, going_on: bool) -> list[Floats]:
-        """The formula, or once there is a polynomial the operators, at the frontier."""
-        reader = self._readers[self.coefficients is not None, going_on]
-        return reader(self._columns(count), 0, 1)
+    def _first(self, env: Mapping[str, Floats]) -> Floats:
+        """The formula, or once there is a polynomial the operators, at the frontier: one row each."""
+        reader = self._root if self.coefficients is None else self._operators
+        return np.concatenate(reader(env, 0, 1))
 
     def _plain(self, formula: ir.Formula, at: int, samples: int) -> Floats:
         """A formula over columns at one sample, endless windows up to the last sample."""
@@ -246,14 +255,11 @@ class Frontier:
             env |= zip(names, self.side.values(reader, self.at + steps, count), strict=True)
         return env
 
-    def _at(self, values: Sequence[Floats]) -> Floats:
-        """The polynomial where the operators have these values."""
+    def _at(self, rests: Floats) -> Floats:
+        """The polynomial where the operators are worth `rests` (operators, points, traces): a row a point."""
         assert self.coefficients is not None
-        terms = [
-            np.minimum.reduce([coefficient, *(values[i] for i in chosen)])
-            for chosen, coefficient in self.coefficients.items()
-        ]
-        return np.asarray(np.maximum.reduce(terms))
+        worth = np.where(self._chosen[:, :, None, None], rests, math.inf).min(axis=1, initial=math.inf)
+        return np.asarray(np.minimum(worth, self.coefficients[:, None]).max(axis=0))
 
 
 def _outlined(formula: ir.Formula, parts: dict[str, Moved]) -> ir.Formula:
@@ -263,8 +269,8 @@ def _outlined(formula: ir.Formula, parts: dict[str, Moved]) -> ir.Formula:
     match formula:
         case ir.Join(op, items):
             return ir.Join(op, tuple(_outlined(item, parts) for item in items))
-        case ir.Shift(steps, body, outside):
-            return ir.Shift(steps, _outlined(body, parts), outside)
+        case ir.Shift(body=body):
+            return replace(formula, body=_outlined(body, parts))
         case ir.Over(op, window, body):
             return ir.Over(op, window, _outlined(body, parts))
         case ir.Until(op, window, left, right):

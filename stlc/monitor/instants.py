@@ -45,7 +45,7 @@ def starts_of(rule: Rule, samples: int, horizon: int | None, at: At) -> range:
 
 def window_of(rule: Rule, horizon: int | None) -> int | None:
     """How many samples after its instant `end` is, where that depends on the instant."""
-    return horizon if rule.windowed and rule.uses_end else None
+    return horizon if rule.windowed and rule.uses_end and not rule.absolute else None
 
 
 def rule_bounds(
@@ -96,7 +96,8 @@ def rules_at(rules: Sequence[Rule], record: Record, at: int, horizon: int | None
         for rule, starts in zip(rules, starts_of_all, strict=True)
         if starts.start == at and window_of(rule, horizon) is None and _has_value(rule, record, at, end)
     ]
-    values = dict(zip(together, record.values(together, at, 1, end), strict=True)) if together else {}
+    here = range(at, at + 1)
+    values = dict(zip(together, record.values(together, here, end), strict=True)) if together else {}
     return [
         values[rule.formula] if rule.formula in values else _alone(rule, record, starts.start, horizon, end)
         for rule, starts in zip(rules, starts_of_all, strict=True)
@@ -109,12 +110,14 @@ def _has_value(rule: Rule, record: Record, at: int, end: End) -> bool:
 
 def _alone(rule: Rule, record: Record, at: int, horizon: int | None, end: End) -> Array:
     window = window_of(rule, horizon)
-    inner = record if window is None else record.cut(at + window + 1)
-    whole = window is None or at + window < record.samples
+    stop = None if window is None else at + window + 1
+    inner = record if stop is None else record.cut(stop)
+    whole = stop is None or stop <= record.samples
     if end == "strict" and not (whole and _has_value(rule, inner, at, end)):
         like = next(iter(record.env.values()))
         return record.ops.full((1, like.shape[1]), math.nan, like)
-    return inner.values([rule.formula], at, 1, end)[0]
+    going_on = not whole and end in ("lower", "upper")
+    return inner.values([rule.formula], range(at, at + 1), end, stop if going_on else None)[0]
 
 
 def check_length(rule: Rule, samples: int, starts: range, dt: float | None) -> Diagnostic | None:

@@ -9,6 +9,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.pipeline import Rule
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.prepared import Prepared
@@ -32,6 +33,7 @@ class Judgement:
         fails: certainly violated, (instants, traces).
         shape: of the signals before their time axis; () for a single trace.
         scope: which traces the assumptions allow, (traces,); None means all. Others count for nothing.
+        told: `low` and `high` in the semantics that was asked for; None: the exact ones.
     """
 
     rule: Rule
@@ -42,6 +44,12 @@ class Judgement:
     fails: Bools = field(repr=False)
     shape: tuple[int, ...]
     scope: Bools | None = field(default=None, repr=False)
+    told: tuple[Floats, Floats] | None = field(default=None, repr=False)
+
+    @property
+    def margins(self) -> tuple[Floats, Floats]:
+        """Least and greatest robustness in the semantics that was asked for, each (instants, traces)."""
+        return (self.low, self.high) if self.told is None else self.told
 
     @property
     def name(self) -> str:
@@ -80,7 +88,8 @@ class Judgement:
     @property
     def bounds(self) -> tuple[Any, Any]:
         """Both ends of the robustness over all continuations, the least over the judged instants."""
-        return _shaped(self.low.min(axis=0), self.shape), _shaped(self.high.min(axis=0), self.shape)
+        low, high = self.margins
+        return _shaped(low.min(axis=0), self.shape), _shaped(high.min(axis=0), self.shape)
 
     @property
     def robustness(self) -> Any:
@@ -93,7 +102,7 @@ class Judgement:
     @property
     def least(self) -> Floats:
         """`robustness` as an array (traces,)."""
-        low, high = self.low.min(axis=0), self.high.min(axis=0)
+        low, high = (end.min(axis=0) for end in self.margins)
         known = np.where(self.holds.all(axis=0), low, np.nan)
         known = np.where(self.fails.any(axis=0), high, known)
         return np.where(low == high, low, known)
@@ -193,8 +202,8 @@ class Verdict:
     @property
     def robustness(self) -> Any:
         """The least `weight * robustness / scale` over the requirements; a float, or an array for a batch."""
-        rows = [j.least * (j.rule.weight / j.rule.scale) for j in self.requirements]
-        return _shaped(np.min(rows, axis=0), self.shape)
+        rows = [j.least[None] * (j.rule.weight / j.rule.scale) for j in self.requirements]
+        return _shaped(self.subject.record.semantics.join(rows, "min", NUMPY)[0], self.shape)
 
     @property
     def share(self) -> float:

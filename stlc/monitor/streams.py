@@ -142,6 +142,8 @@ class _Planner:
                 return self._since(op, window, self.over_columns(left), self.over_columns(right))
             case ir.Atom():
                 return self._leaf(formula)
+            case ir.AtStart():
+                raise EndlessError
             case _:
                 return self._frozen(formula)
 
@@ -156,7 +158,9 @@ class _Planner:
         return column(self.streams[formula].name)
 
     def _frozen(self, formula: ir.Formula) -> ir.Formula:
-        if endless(formula) or any(unbounded_past(node) for node in nodes(formula)):
+        if endless(formula) or any(
+            unbounded_past(node) or isinstance(node, ir.AtStart) for node in nodes(formula)
+        ):
             raise EndlessError
         return self._leaf(formula)
 

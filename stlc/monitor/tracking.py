@@ -265,8 +265,8 @@ class Whole:
         rule, record = self._subject()
         window = window_of(rule, self.horizon)
         if window is None:
-            formula = lengthened(rule.formula, self.samples)
-            low, high = (record.values([formula], start, stop - start, end)[0] for end in ("lower", "upper"))
+            far, starts = going_on(rule.formula, self.samples), range(start, stop)
+            low, high = (record.values([rule.formula], starts, end, far)[0] for end in _BOTH)
             return Bounds(low[:, 0], high[:, 0])
         whole = min(stop, max(self.samples - window, start))
         known = range(start, whole)
@@ -295,14 +295,19 @@ class Whole:
 _NONE = np.zeros((0, 1))
 
 
-def lengthened(formula: ir.Formula, samples: int) -> ir.Formula:
-    """The formula where windows to the end of the trace reach beyond all of which anything is known."""
-    bounds = [abs(node.steps) if isinstance(node, ir.Shift) else _farthest(node) for node in nodes(formula)]
-    return _long(formula, samples + sum(bounds) + 1)
+_BOTH: tuple[Literal["lower"], Literal["upper"]] = ("lower", "upper")
+
+
+def going_on(formula: ir.Formula, samples: int) -> int:
+    """An end of a trace that goes on, so far away that everything on the way there is unknown."""
+    return samples + 1 + sum(map(_farthest, nodes(formula)))
 
 
 def _farthest(node: ir.Formula) -> int:
+    """Steps over which an operator reaches by itself."""
     match node:
+        case ir.Shift(steps=steps):
+            return abs(steps)
         case (
             ir.Over(window=window)
             | ir.Until(window=window)
@@ -310,25 +315,7 @@ def _farthest(node: ir.Formula) -> int:
             | ir.Since(window=window)
         ):
             return window.lo if window.hi is None else window.hi
+        case ir.Atom(num=num):
+            return sum(farthest(num))
         case _:
             return 0
-
-
-def _long(formula: ir.Formula, length: int) -> ir.Formula:
-    match formula:
-        case ir.Join(items=items):
-            return replace(formula, items=tuple(_long(item, length) for item in items))
-        case ir.Over(window=window, body=body):
-            return replace(formula, window=_longer(window, length), body=_long(body, length))
-        case ir.Until(window=window, left=left, right=right):
-            left, right = _long(left, length), _long(right, length)
-            return replace(formula, window=_longer(window, length), left=left, right=right)
-        case ir.Past(body=body) | ir.Shift(body=body):
-            return replace(formula, body=_long(body, length))
-        case ir.Since(left=left, right=right):
-            return replace(formula, left=_long(left, length), right=_long(right, length))
-    return formula
-
-
-def _longer(window: ir.Window, length: int) -> ir.Window:
-    return window if window.hi is not None else ir.Window(window.lo, window.lo + length)

@@ -11,8 +11,9 @@ import numpy as np
 from stlc.compile import ir
 from stlc.compile.defined import defined
 from stlc.compile.graph import evaluate
+from stlc.compile.horizon import parts
 from stlc.compile.ops import Array, Ops
-from stlc.compile.samples import reach_of
+from stlc.compile.samples import farthest
 from stlc.compile.schedule import End
 from stlc.compile.semantics import Exact, Semantics
 
@@ -40,23 +41,41 @@ class Record:
         """The first `stop` samples."""
         return self if stop >= self.samples else replace(self, env={n: x[:stop] for n, x in self.env.items()})
 
-    def values(self, formulas: Sequence[ir.Formula], start: int, count: int, end: End) -> list[Array]:
-        """Values `(count, batch)` of each formula at `count` instants from `start`."""
-        ops, semantics = self.ops, self.semantics
-        return evaluate(formulas, self.env, ops=ops, semantics=semantics, start=start, count=count, end=end)
+    def values(
+        self, formulas: Sequence[ir.Formula], instants: range, end: End, stop: int | None = None
+    ) -> list[Array]:
+        """Values `(instants, batch)` of each formula at consecutive instants; `stop` as in `evaluate`."""
+        return evaluate(
+            formulas,
+            self.env,
+            ops=self.ops,
+            semantics=self.semantics,
+            start=instants.start,
+            count=len(instants),
+            end=end,
+            stop=stop,
+        )
 
 
-def bounds(formula: ir.Formula, record: Record, starts: range, ends: Ends) -> tuple[Array, Array]:
+def bounds(
+    formula: ir.Formula, record: Record, starts: range, ends: Ends, stop: int | None = None
+) -> tuple[Array, Array]:
     """Both ends of the values at consecutive instants, each `(count, batch)`.
 
-    Where nothing is unknown, both are one and the same array.
+    Where nothing is unknown, both are one and the same array. `stop` says how many samples there will be,
+    where that are more than are known.
     """
 
-    def at(end: End) -> Array:
-        return record.values([formula], starts.start, len(starts), end)[0]
+    def at(end: End, stop: int | None = None) -> Array:
+        return record.values([formula], starts, end, stop)[0]
 
-    if ends == "truncate" or defined(formula, record.samples)[starts.start : starts.stop].all():
-        value = at("truncate" if ends == "truncate" else "strict")
+    if ends == "truncate":
+        value = at("truncate")
+        return value, value
+    if stop is not None and stop > record.samples:
+        return at("lower", stop), at("upper", stop)
+    if defined(formula, record.samples)[starts.start : starts.stop].all():
+        value = at("strict")
         return value, value
     return at("lower"), at("upper")
 
@@ -67,13 +86,16 @@ def window_bounds(
     """The same where `end` is `window` samples after each instant: `(count, batch)`.
 
     Every instant sees its own record, from what the past operators look back at to its own end. Many of them
-    are evaluated at once: they become columns.
+    are evaluated at once: they become columns. Of a record that ends before the window does the rest is not
+    known; where windows are cut its last sample is the end.
     """
     back = history(formula)
     early = range(starts.start, max(min(back, starts.stop), starts.start))
-    pairs = [bounds(formula, record.cut(k + window + 1), range(k, k + 1), ends) for k in early]
+    pairs = [
+        bounds(formula, record.cut(stop := k + window + 1), range(k, k + 1), ends, stop) for k in early
+    ]
     for inner, count in _unrolled(record, range(early.stop, starts.stop), back, window):
-        low, high = bounds(formula, inner, range(back, back + 1), ends)
+        low, high = bounds(formula, inner, range(back, back + 1), ends, back + window + 1)
         same = low is high
         low = low.reshape(count, -1)
         pairs.append((low, low if same else high.reshape(count, -1)))
@@ -103,20 +125,20 @@ def history(formula: ir.Formula) -> int:
     match formula:
         case ir.Truth():
             return 0
+        case ir.AtStart():
+            return _back(ir.Window(0, None))
         case ir.Atom(num=num):
-            return reach_of(num).past
+            return farthest(num).past
         case ir.Freeze(bindings=bindings, body=body):
-            return max(history(body), *(reach_of(num).past for _, num in bindings))
+            return max(history(body), *(farthest(num).past for _, num in bindings))
         case ir.Join(items=items):
             return max(map(history, items))
         case ir.Over(window=window, body=body):
             return max(history(body) - window.lo, 0)
         case ir.Until(left=left, right=right):
             return max(history(left), history(right))
-        case ir.Past(window=window, body=body):
-            return history(body) + _back(window)
-        case ir.Since(window=window, left=left, right=right):
-            return max(history(left), history(right)) + _back(window)
+        case ir.Past(window=window) | ir.Since(window=window):
+            return max(map(history, parts(formula))) + _back(window)
         case ir.Shift(steps=steps, body=body):
             return max(history(body) - steps, 0)
     assert_never(formula)
@@ -142,8 +164,8 @@ def by_truth(formula: ir.Formula) -> ir.Formula:
             return formula
         case ir.Join(items=items):
             return replace(formula, items=tuple(map(by_truth, items)))
-        case ir.Over(body=body) | ir.Past(body=body) | ir.Shift(body=body) | ir.Freeze(body=body):
-            return replace(formula, body=by_truth(body))
+        case ir.Over() | ir.Past() | ir.Shift() | ir.Freeze() | ir.AtStart():
+            return replace(formula, body=by_truth(formula.body))
         case ir.Until(left=left, right=right) | ir.Since(left=left, right=right):
             return replace(formula, left=by_truth(left), right=by_truth(right))
     assert_never(formula)

@@ -14,7 +14,7 @@ from stlc.compile.interface import Grid
 from stlc.compile.ops import Array
 from stlc.compile.pipeline import Compiled, Rule, compile_spec
 from stlc.compile.schedule import End
-from stlc.compile.semantics import TOLERANCE, Exact, LogSumExp
+from stlc.compile.semantics import TOLERANCE, Exact, Semantics, semantics_of
 from stlc.diagnostics import Diagnostic, SpecError, UsageError
 from stlc.files import read_source
 from stlc.grammar import ast
@@ -98,7 +98,7 @@ class Monitor:
 
     # -------------------------------------------------------------------- judging
 
-    def check(
+    def check(  # noqa: PLR0913 - one question, by name
         self,
         signals: Subject,
         *,
@@ -106,6 +106,7 @@ class Monitor:
         end: Literal["open", "strict", "truncate"] = "open",
         tolerance: float = TOLERANCE,
         require: Sequence[str] = (),
+        semantics: str | Semantics = "exact",
     ) -> Verdict:
         """Judge every requirement at the instants at which it speaks (`stlc.monitor.instants`).
 
@@ -116,12 +117,14 @@ class Monitor:
                 inconclusive, "strict" refuses, "truncate" cuts windows.
             tolerance: a robustness of at least minus this is satisfied; 0 makes strictness count.
             require: names of the requirements to judge; none means all.
+            semantics: of the robustness that is told, or its name; verdicts and reasons are always exact.
 
         Raises:
             TraceError: signals are missing (E601), not finite (E604), or do not fit (E605); with `end`
                 "strict" the trace is too short (E306).
-            UsageError: U101, an unknown requirement, or no such sample.
+            UsageError: U101, an unknown requirement or semantics, or no such sample.
         """
+        told = semantics_of(semantics)
         ready = self._prepare(signals, require, plain=True)
         samples = ready.signals.samples
         starts = [starts_of(rule, samples, ready.horizon, at) for rule in ready.rules]
@@ -131,6 +134,9 @@ class Monitor:
             _judge(rule, ready, its, "truncate" if end == "truncate" else "open", tolerance)
             for rule, its in zip(ready.rules, starts, strict=True)
         ]
+        if not told.exact:
+            ready = replace(ready, record=replace(ready.record, semantics=told))
+            judgements = [_told(judgement, ready, end) for judgement in judgements]
         return Verdict(tuple(judgements), ready).within(_scope(ready, tolerance))
 
     def robustness(
@@ -140,6 +146,7 @@ class Monitor:
         end: Literal["strict", "truncate"] = "strict",
         at: int | None = None,
         smoothing: float | None = None,
+        semantics: str | Semantics = "exact",
     ) -> Array:
         """Robustness of the whole: the least `weight * robustness / scale` over the requirements.
 
@@ -147,24 +154,32 @@ class Monitor:
             signals: as in `check`; (time,) or (…, time).
             end: "strict" leaves NaN where a window is not whole, "truncate" cuts windows.
             at: at this sample only.
-            smoothing: scale k of the log-sum-exp; None is exact.
+            smoothing: scale k of log-sum-exp, which it asks for by itself.
+            semantics: of min and max, or its name in `stlc.compile.semantics.SEMANTICS`.
 
         Returns:
             The shape of the signals, or with `at` that shape without the time axis.
         """
+        chosen = semantics_of(semantics, smoothing)
         ready = self._prepare(signals, ())
-        semantics = Exact() if smoothing is None else LogSumExp(smoothing)
-        ready = replace(ready, record=replace(ready.record, semantics=semantics))
+        ready = replace(ready, record=replace(ready.record, semantics=chosen))
         rows = _rows(ready, end, at)
         weighed = [row * (rule.weight / rule.scale) for rule, row in zip(ready.rules, rows, strict=True)]
-        whole = semantics.join(weighed, "min", ready.signals.ops)
+        whole = chosen.join(weighed, "min", ready.signals.ops)
         return ready.signals.like_given(whole) if at is None else ready.signals.at_one(whole)
 
     def requirement_robustness(
-        self, signals: Subject, *, end: Literal["strict", "truncate"] = "strict", at: int | None = None
+        self,
+        signals: Subject,
+        *,
+        end: Literal["strict", "truncate"] = "strict",
+        at: int | None = None,
+        semantics: str | Semantics = "exact",
     ) -> dict[str, Array]:
-        """Robustness of each requirement, before weight and scale; shapes as in `robustness`."""
+        """Robustness of each requirement, before weight and scale; arguments as in `robustness`."""
+        chosen = semantics_of(semantics)
         ready = self._prepare(signals, ())
+        ready = replace(ready, record=replace(ready.record, semantics=chosen))
         laid = ready.signals.like_given if at is None else ready.signals.at_one
         rows = _rows(ready, end, at)
         return {rule.name: laid(row) for rule, row in zip(ready.rules, rows, strict=True)}
@@ -178,8 +193,7 @@ class Monitor:
         ends = []
         for end in ("lower", "upper"):
             rows = _rows(ready, end, at)
-            weighed = [row * (rule.weight / rule.scale) for rule, row in zip(ready.rules, rows, strict=True)]
-            whole = Exact().join(weighed, "min", ready.signals.ops)
+            whole = Exact().join(_weighed(ready.rules, rows), "min", ready.signals.ops)
             ends.append(ready.signals.like_given(whole) if at is None else ready.signals.at_one(whole))
         return ends[0], ends[1]
 
@@ -226,9 +240,9 @@ class Monitor:
 
     def _ready(self, recorded: Times) -> Compiled:
         """Compiled for what the arguments, the trace and the given system say; at last the named system."""
-        step = Times(recorded.dt).or_else(Times(self._asked.dt)).or_else(Times(self._system.dt))
+        step = recorded.or_else(Times(self._asked.dt)).or_else(Times(self._system.dt))
         whole = Times(None, self._asked.horizon).or_else(self._system).or_else(recorded)
-        known = Times(step.dt, whole.horizon)
+        known = Times(step.dt, whole.horizon, step.trace)
         try:
             return self._compile(known)
         except SpecError as error:
@@ -280,6 +294,13 @@ def _rows(ready: Prepared, end: End, at: int | None) -> list[Array]:
     return rules_at(ready.rules, ready.record, at, ready.horizon, end)
 
 
+def _weighed(rules: Sequence[Rule], rows: Sequence[Array]) -> list[Array]:
+    return [
+        row if rule.weight == rule.scale else row * (rule.weight / rule.scale)
+        for rule, row in zip(rules, rows, strict=True)
+    ]
+
+
 def _scope(ready: Prepared, tolerance: float) -> Bools:
     """Which traces the assumptions do not exclude: (traces,)."""
     scope = np.ones(ready.signals.batch, dtype=bool)
@@ -298,3 +319,10 @@ def _judge(rule: Rule, ready: Prepared, starts: range, ends: Ends, tolerance: fl
         least, most = rule_bounds(plain, ready.record, starts, ready.horizon, ends)
         holds, fails = least > 0, most < 0
     return Judgement(rule, starts.start, low, high, holds, fails, ready.signals.shape)
+
+
+def _told(judgement: Judgement, ready: Prepared, end: Literal["open", "strict", "truncate"]) -> Judgement:
+    """The same judgement with the robustness of another semantics."""
+    starts = range(judgement.start, judgement.start + judgement.instants)
+    ends: Ends = "truncate" if end == "truncate" else "open"
+    return replace(judgement, told=rule_bounds(judgement.rule, ready.record, starts, ready.horizon, ends))

@@ -170,7 +170,49 @@ def test_sigterm_unwinds_and_exits_143(boundary):
     assert signal.getsignal(signal.SIGTERM) is before
 
 
+def test_ctrl_c_that_surfaces_as_another_error_is_one(boundary, capsys):
+    def action():
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(5)
+        except KeyboardInterrupt:
+            raise ImportError("numpy.core.multiarray failed to import") from None
+
+    before = signal.getsignal(signal.SIGINT)
+    assert boundary(action, "--json") == 130
+    out, err = capsys.readouterr()
+    assert (json.loads(out)["exit_code"], json.loads(out)["schema"], err) == (130, "act/1", "")
+    assert signal.getsignal(signal.SIGINT) is before
+
+
 # ---------------------------------------------------------------------- the real program
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_ctrl_c_at_any_time_of_the_imports(share, tmp_path):
+    words = [sys.executable, "-c", "print(flush=True)\nfrom stlc.__main__ import main\nexit(main())"]
+    words += ["simulate", "none", "--runs", str(tmp_path)]
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    begun = time.monotonic()
+    with _started(words, environment) as whole:
+        assert whole.wait(timeout=60) == 2
+    with _started(words, environment) as process:
+        time.sleep(share * (time.monotonic() - begun) * 0.5)
+        process.send_signal(signal.SIGINT)
+        code = process.wait(timeout=60)
+        said = process.stderr.read()
+    assert "Traceback" not in said
+    assert "B001" not in said
+    assert code in (130, 2)
+    assert list(tmp_path.iterdir()) == []
+
+
+def _started(words, environment):
+    """A process that has begun to run its first line."""
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, env=environment)
+    process.stdout.readline()
+    return process
 
 
 def stlc(*arguments, **options):

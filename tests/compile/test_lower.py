@@ -1,15 +1,21 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from fractions import Fraction
 
+import numpy as np
 import pytest
 from formula_strategies import GRID, SPAN
 
 from stlc.compile import ir, typed
+from stlc.compile.defined import defined
+from stlc.compile.graph import robustness_signal
+from stlc.compile.horizon import reach
 from stlc.compile.interface import Grid
 from stlc.compile.ir_text import show_formula
 from stlc.compile.lower import lower
+from stlc.compile.ops_numpy import NUMPY
 from stlc.diagnostics import Diagnostic
 
 X = typed.Pred(SPAN, ir.Col("x"), strict=True)
@@ -164,6 +170,13 @@ def test_unless_in_unless_is_lowered_twice_not_three_times() -> None:
     assert time.process_time() - began < 2
 
 
-def test_an_absolute_interval_is_a_bug_here() -> None:
-    with pytest.raises(ValueError, match="absolute"):
-        lower(always(typed.Interval(typed.Time(), None, clock="start")), GRID, [])
+def test_an_absolute_interval_is_judged_at_the_first_sample_wherever_it_stands() -> None:
+    early = typed.Temporal(SPAN, "eventually", replace(between("0", "0.2"), clock="start"), X)
+    formula = typed.Until(SPAN, "until", between("0", "0.1"), Y, typed.Not(SPAN, early))
+    assert lowered(formula)[0] == "y >= 0 until[0..1] at the start (always[0..2] x <= 0)"
+    node = lower(formula, GRID, [])
+    assert reach(node).future == 2
+    x, y = np.array([-1.0, -2.0, -3.0, 4.0])[:, None], np.ones((4, 1))
+    np.testing.assert_array_equal(defined(node, 4), [True, True, True, False])
+    value = robustness_signal(node, {"x": x, "y": y}, ops=NUMPY, end="truncate")
+    np.testing.assert_array_equal(value[:, 0], 1.0)

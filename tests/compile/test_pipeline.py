@@ -127,24 +127,21 @@ def test_a_clock_decides_truth_and_never_limits_the_margin() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "train", "check"),
+    ("text", "train"),
     [
-        ("always@[0, 1 s] eventually[0, 1 s] x > 1 m", ["E310"], None),
-        ("eventually@[0, end] x > 1 m", ["E312"], None),
-        ("not always@[1 s, end] x > 1 m", ["E312"], None),
-        ("once[1 s, 2 s] always@[0, 1 s] x > 1 m", ["E307"], ["E307"]),
-        ("rise(always@[0, 1 s] x > 1 m)", ["E307"], ["E307"]),
-        ("always[0, 1 s] (x > 1 m or (y > 1 m and always@[0, 1 s] x > 1 m))", ["E307"], ["E307"]),
-        ("always@[0, 1 s] once[1 s, 2 s] x > 1 m", ["E309"], None),
-        ("always[0, 1 s] once[0, 1 s] eventually[0, 1 s] x > 1 m", ["E309"], None),
+        ("always@[0, 1 s] eventually[0, 1 s] x > 1 m", ["E310"]),
+        ("eventually@[0, end] x > 1 m", ["E312"]),
+        ("not always@[1 s, end] x > 1 m", ["E312"]),
+        ("once[1 s, 2 s] always@[0, 1 s] x > 1 m", ["E307"]),
+        ("rise(always@[0, 1 s] x > 1 m)", ["E307"]),
+        ("always[0, 1 s] (x > 1 m or (y > 1 m and always@[0, 1 s] x > 1 m))", ["E307"]),
+        ("always@[0, 1 s] once[1 s, 2 s] x > 1 m", ["E309"]),
+        ("always[0, 1 s] once[0, 1 s] eventually[0, 1 s] x > 1 m", ["E309"]),
     ],
 )
-def test_what_cannot_be_trained_for(text: str, train: list[str], check: list[str] | None) -> None:
+def test_what_cannot_be_trained_for_can_be_checked(text: str, train: list[str]) -> None:
     assert errors(f"require a: {text}") == train
-    if check is None:
-        assert compiled(f"require a: {text}", purpose="check").requirements
-    else:
-        assert errors(f"require a: {text}", purpose="check") == check
+    assert compiled(f"require a: {text}", purpose="check").requirements
 
 
 def test_the_clock_gives_way_to_a_signal_of_its_name() -> None:

@@ -173,10 +173,12 @@ def test_gradients_of_means_are_finite_at_zero(semantics: Semantics) -> None:
 
 
 def test_semantics_by_what_somebody_asks_for() -> None:
-    assert semantics_of(None) == Exact()
-    assert semantics_of(20) == LogSumExp(20.0)
+    assert semantics_of() == Exact()
+    assert semantics_of(smoothing=20) == semantics_of("smooth", 20) == LogSumExp(20.0)
     assert semantics_of("agm") == ArithmeticGeometricMean()
     assert semantics_of(GeneralizedMean(0.1)) == GeneralizedMean(0.1)
     with pytest.raises(UsageError, match="exakt"):
         semantics_of("exakt")
+    with pytest.raises(UsageError, match="no `smoothing`"):
+        semantics_of("agm", 20)
     assert TOLERANCE == 1e-6

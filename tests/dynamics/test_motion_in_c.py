@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from dynamics.test_motion import RICH
+from dynamics.test_vectors import ARM
 
 from stlc.compile.emit_c import Motion, emit
 from stlc.dynamics.step import build_step
@@ -21,7 +22,15 @@ pytestmark = pytest.mark.skipif(compiler() is None, reason="there is no C compil
 @pytest.mark.parametrize("integrator", ["euler", "heun", "rk4"])
 @pytest.mark.parametrize("substeps", [1, 3])
 def test_rollouts_of_a_rich_system_equal_torch(make: Make, integrator: str, substeps: int) -> None:
-    system = make(RICH.format(integrator=integrator, substeps=substeps))
+    agree(make(RICH.format(integrator=integrator, substeps=substeps)))
+
+
+def test_rollouts_of_vectors_equal_torch(make: Make) -> None:
+    agree(make(ARM))
+
+
+def agree(system: System) -> None:
+    """The rollouts of random plans by the kernel are those of torch."""
     step = build_step(system.decl, soft=False)
     motion = Motion(system.names, system.control_names, step.lets, step.next, system.horizon, system.dt)
     x0 = system.sample(300, seed=2, dtype=torch.float64)

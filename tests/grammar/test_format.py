@@ -101,6 +101,14 @@ def test_the_benchmarks_keep_what_they_say(path):
 
 
 @pytest.mark.parametrize(
+    "path", [*ROOT.glob("specs/*.stl"), *ROOT.glob("stlc/templates/cart*.stl")], ids=lambda path: path.stem
+)
+def test_what_is_shipped_has_the_layout(path):
+    text = path.read_text(encoding="utf-8")
+    assert formatted(text) == text
+
+
+@pytest.mark.parametrize(
     ("written", "laid_out"),
     [
         ("", ""),

@@ -180,6 +180,27 @@ def test_the_end_of_a_stream_is_the_verdict_of_the_monitor(
                 assert decided[i] == ("satisfied" if wanted.holds[i, 0] else "violated")
 
 
+@pytest.mark.parametrize(
+    "written",
+    [
+        "eventually not next(always b > -3)",  # true where there is no next sample
+        "always (b > 4 or not next(eventually b > 3))",
+        # alike until the trace ends
+        "(always (b > 4 or next(always b > 3))) or (always (b > 4 or not next(eventually not (b > 3))))",
+        "(always (b > 4 or not next(eventually not (b > 3)))) or (always (b > 4 or next(always b > 3)))",
+    ],
+)
+def test_what_is_next_of_the_last_sample(written: str) -> None:
+    monitor = Monitor(f"{HEAD}require r: {written}\n", dt=0.1)
+    whole = {"b": np.arange(1.0, 13.0) / 8}
+    for end in ("open", "truncate"):
+        online = monitor.online(How(end=end))
+        for value in whole["b"]:
+            online.push({"b": value})
+        tally, wanted = online.finish()["r"], monitor.check(whole, end=end)["r"]
+        assert (tally.low, tally.high) == wanted.bounds, end
+
+
 @pytest.mark.parametrize("name", ["bounded", "always", "windowed", "until"])
 def test_verdicts_come_as_soon_as_they_are_decided(name: str) -> None:
     monitor, whole = monitor_of(name), signals(40, 3)
