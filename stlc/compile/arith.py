@@ -273,7 +273,7 @@ class _Writer:
         return reduce(lambda a, b: a if a == b else self.tape.emit(kernel, a, b), registers)
 
     def _weight(self, cond: ir.Formula, sharpness: float | None) -> Operand:
-        """The soft indicator of a state formula, of its margin; exact where its atoms differ in strictness."""
+        """The soft indicator of a state formula: of its margin, settled where atoms differ in strictness."""
         kinds = _strictness(cond)
         margin = self.margin(cond)
         if isinstance(margin, float):

@@ -1,4 +1,4 @@
-"""Dynamics and requirements -> C that differentiates: what plans have to do with robustness and with the states.
+"""Dynamics and requirements -> C that differentiates robustness and states by plans.
 
 Reverse mode through the exact minima and maxima (the first of equal ones gets the gradient) and through the
 steps of the system, sixteen trajectories at a time. The forward pass is that of `emit_c`.
@@ -20,7 +20,8 @@ _BUMP = """
 /* e^x for x <= 0, to the last digits, in a form that vectorises. */
 static inline double decay(double x) {
   const double at = x < -700.0 ? -700.0 : x;
-  const double n = rint(at * 1.4426950408889634), r = (at - n * 6.93147180369123816490e-01) - n * 1.90821492927058770002e-10;
+  const double n = rint(at * 1.4426950408889634);
+  const double r = (at - n * 6.93147180369123816490e-01) - n * 1.90821492927058770002e-10;
   double p = 1.0 / 6227020800.0;
   const double c[] = {1.0 / 479001600.0, 1.0 / 39916800.0, 1.0 / 3628800.0, 1.0 / 362880.0, 1.0 / 40320.0,
                       1.0 / 5040.0, 1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0, 1.0};
@@ -91,7 +92,7 @@ def _step_back(motion: Motion, fixed: Collection[str]) -> list[str]:
             return f"gx[{index[name]}][k][j]"
         return f"gu[{motion.controls.index(name)}][k][j]"
 
-    writer = SlopeWriter(column)
+    writer = SlopeWriter(column, soft=True)
     for name, num in motion.lets:
         writer.assign(name, writer.number(num))
     seeds: dict[str, str] = {}
@@ -106,7 +107,7 @@ def _step_back(motion: Motion, fixed: Collection[str]) -> list[str]:
 
 @dataclass(slots=True)
 class FormulaAdjoint(FormulaWriter):
-    """Writes formulas, and for each buffer how its gradient reaches the buffers and columns that it came from.
+    """Writes formulas, and for each buffer how its gradient reaches the buffers and columns behind it.
 
     Attributes:
         back: statements per buffer, in the order of the forward pass.
@@ -118,14 +119,15 @@ class FormulaAdjoint(FormulaWriter):
 
     def declarations(self) -> list[str]:
         """The buffers and their gradients as C names."""
-        return [
-            line
-            for name, offset in self.buffers
-            for line in (
-                f"const double (*restrict {name})[LANES] = (const double (*)[LANES])(room + {offset} * LANES);",
-                f"double (*restrict a{name})[LANES] = (double (*)[LANES])(adjoint + {offset} * LANES);",
-            )
+        values = [
+            f"const double (*restrict {name})[LANES] = (const double (*)[LANES])(room + {at} * LANES);"
+            for name, at in self.buffers
         ]
+        gradients = [
+            f"double (*restrict a{name})[LANES] = (double (*)[LANES])(adjoint + {at} * LANES);"
+            for name, at in self.buffers
+        ]
+        return values + gradients
 
     def _value(self, formula: ir.Formula, start: int, count: int) -> str:
         name = FormulaWriter._value(self, formula, start, count)
@@ -150,13 +152,13 @@ class FormulaAdjoint(FormulaWriter):
                 sides = self.value(left, start, span), self.value(right, start, span)
                 end = f"{span}" if window.hi is None else f"k + {window.hi + 1}"
                 return _until_back(name, sides, (count, window.lo, end), "<" if op == "until" else ">")
-            case ir.Past() | ir.Since() | ir.Shift() | ir.Freeze():
+            case ir.Past() | ir.Since() | ir.Shift() | ir.Freeze() | ir.AtStart():
                 raise Untranslatable(type(formula).__name__)
             case _:
                 assert_never(formula)
 
     def _atom_back(self, name: str, atom: ir.Atom, start: int, count: int) -> list[str]:
-        writer = SlopeWriter(self.column)
+        writer = SlopeWriter(self.column, soft=False)
         margin = writer.number(atom.num)
         own = f"a{name}[s][j]" if atom.sign > 0 else f"-a{name}[s][j]"
         places = {column: i for i, column in enumerate(self.states)}
@@ -186,7 +188,7 @@ def _window_back(name: str, inner: str, count: int, end: str) -> list[str]:
 
 
 def _until_back(name: str, sides: tuple[str, str], at: tuple[int, int, str], less: str) -> list[str]:
-    """The first instant that gives the value, and there the goal or the earliest worst of what has to hold."""
+    """The first instant that gives the value, and there the goal or the earliest worst of what is held."""
     (hold, goal), (count, low, end) = sides, at
     return [
         f"for (int k = 0; k < {count}; ++k) LANE {{",
@@ -211,7 +213,8 @@ int pull(int64_t batch, int64_t first, int64_t last, const double *x0, const dou
          const double *g_columns, double *g_u, double slope) {{
   enum {{ N = {states}, M = {controls}, T = {steps}, R = {rules}, ROOM = {room} }};
   lanes *x = malloc(sizeof(lanes) * N), *gx = malloc(sizeof(lanes) * N);
-  double (*v)[T][LANES] = malloc(sizeof(double) * M * T * LANES), (*gv)[T][LANES] = malloc(sizeof(double) * M * T * LANES);
+  double (*v)[T][LANES] = malloc(sizeof(double) * M * T * LANES);
+  double (*gv)[T][LANES] = malloc(sizeof(double) * M * T * LANES);
   double *room = malloc(sizeof(double) * ROOM * LANES), *adjoint = malloc(sizeof(double) * ROOM * LANES);
   double (*out)[LANES] = malloc(sizeof(double) * (R + 1) * LANES);
   const int failed = !x || !gx || !v || !gv || !room || !adjoint || !out;

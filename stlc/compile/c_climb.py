@@ -1,7 +1,7 @@
-"""Hill climbing over plans as C: a batch of changed plans a generation, the best is kept, no thread waits.
+"""Hill climbing over plans as C: a batch of changed plans a generation, the best is kept.
 
-Appended to what `emit_c` writes; `roll` and `check` are those of the task. Each row has its own random numbers,
-so the result does not depend on how rows are shared among threads.
+Appended to what `emit_c` writes; `roll` and `check` are those of the task. Each row has its own random
+numbers, so the result does not depend on how rows are shared among threads.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ static inline double uniform(uint64_t *s) {{ return (double)(draw(s) >> 11) * 0x
 static inline int below(uint64_t *s, int n) {{ return (int)(((draw(s) >> 32) * (uint64_t)n) >> 32); }}
 static inline double normal(uint64_t *s) {{
   const uint64_t z = draw(s);
-  const double sum = (double)(z & 65535) + (double)(z >> 16 & 65535) + (double)(z >> 32 & 65535) + (double)(z >> 48);
-  return (sum - 131070.0) * (1.7320508075688772 / 65535.0);
+  const uint64_t sum = (z & 65535) + (z >> 16 & 65535) + (z >> 32 & 65535) + (z >> 48);
+  return ((double)sum - 131070.0) * (1.7320508075688772 / 65535.0);
 }}
 static inline double bounded(double u, double low, double high, int turns) {{
   if (turns) return u - (high - low) * floor((u - low) / (high - low));
@@ -27,9 +27,10 @@ static inline double bounded(double u, double low, double high, int turns) {{
 }}
 
 /* One changed plan for one control of lane j: a stretch of time gets noise, a shift or one level. */
-static void change(double (*restrict v)[LANES], int j, int kind, double low, double high, int turns, uint64_t *s) {{
+static void change(double (*restrict v)[LANES], int j, int kind, double low, double high, int turns,
+                   uint64_t *s) {{
   const double span = high - low, size = span * ldexp(0.5, -below(s, 7));
-  const int from = below(s, {steps}), length = 1 + below(s, {steps}), to = from + length < {steps} ? from + length : {steps};
+  const int from = below(s, {steps}), end = from + 1 + below(s, {steps}), to = end < {steps} ? end : {steps};
   const double shift = kind == 1 ? size * normal(s) : 0.0, level = low + span * uniform(s);
   for (int k = from; k < to; ++k) {{
     const double u = kind == 0 ? v[k][j] + size * normal(s) : kind == 1 ? v[k][j] + shift : level;
@@ -43,7 +44,8 @@ static void borrow(double (*restrict v)[{steps}][LANES], int j, const double *re
   if (plans > 0) {{
     const double *from = bank + (int64_t)(uniform(s) * (double)plans) * {steps} * {controls};
     const int first = draw(s) & 1 ? 0 : below(s, {steps});
-    for (int i = 0; i < {controls}; ++i) for (int k = first; k < {steps}; ++k) v[i][k][j] = from[k * {controls} + i];
+    for (int i = 0; i < {controls}; ++i)
+      for (int k = first; k < {steps}; ++k) v[i][k][j] = from[k * {controls} + i];
     return;
   }}
   const int piece = ({steps} + 3) / 4;
@@ -56,10 +58,11 @@ static void borrow(double (*restrict v)[{steps}][LANES], int j, const double *re
   }}
 }}
 
-/* Improves plans (batch, {steps}, {controls}) in place; rho (batch). Rows from `first` up to `last`. 1: no memory.
-   bounds: low ({controls}), high ({controls}), turns ({controls}); factors ({rules}). */
+/* Improves plans (batch, {steps}, {controls}) in place; rho (batch). Rows from `first` up to `last`.
+   1: no memory. bounds: low ({controls}), high ({controls}), turns ({controls}); factors ({rules}). */
 int climb(int64_t first, int64_t last, const double *x0, double *plans, double *rho, const double *bounds,
-          const double *factors, const double *bank, int64_t banked, int generations, double enough, uint64_t seed) {{
+          const double *factors, const double *bank, int64_t banked, int generations, double enough,
+          uint64_t seed) {{
   enum {{ N = {states}, M = {controls}, T = {steps}, R = {rules} }};
   const double *low = bounds, *high = bounds + M, *turns = bounds + 2 * M;
   lanes *x = malloc(sizeof(lanes) * N);

@@ -41,7 +41,11 @@ BINARY_SLOPES = {
     "min": ("(double)!({1} < {0})", "(double)({1} < {0})"),
     "max": ("(double)!({1} > {0})", "(double)({1} > {0})"),
 }
-CLIP_SLOPE = "(double)(({0} >= {1}) & ({0} <= {2}))"
+CLIP_SLOPES = (
+    "(double)(({0} >= {1}) & ({0} <= {2}))",
+    "(double)(({0} < {1}) & ({1} <= {2}))",
+    "(double)(MAX({0}, {1}) > {2})",
+)
 
 
 class SlopeWriter(NumberWriter):
@@ -49,10 +53,12 @@ class SlopeWriter(NumberWriter):
 
     Args:
         column: C expression of an environment entry.
+        soft: whether conditions have a slope; where not, only the branch that is taken counts.
     """
 
-    def __init__(self, column: Callable[[str], str]) -> None:
+    def __init__(self, column: Callable[[str], str], *, soft: bool) -> None:
         super().__init__(column)
+        self._soft = soft
         self._slopes: dict[str, tuple[Slope, ...]] = {}
         self._inputs: dict[str, str] = {}
 
@@ -92,26 +98,26 @@ class SlopeWriter(NumberWriter):
         return register
 
     def _indicator(self, cond: ir.Formula) -> str:
-        margin = self.margin(cond)
+        margin = self.margin(cond) if self._soft else ""
         register = super()._indicator(cond)
-        self._remember(register, [(margin, f"bump({margin}, slope)")])
+        self._remember(register, [(margin, f"bump({margin}, slope)")] if self._soft else [])
         return register
 
     def _choice(self, cond: ir.Formula, yes: str, no: str) -> str:
-        margin, taken = self.margin(cond), f"(double){self.truth(cond)}"
+        margin, taken = self.margin(cond) if self._soft else "", f"(double){self.truth(cond)}"
         register = super()._choice(cond, yes, no)
-        by_margin = f"(({yes} - {no}) * bump({margin}, slope))"
-        self._remember(register, [(yes, taken), (no, f"(1.0 - {taken})"), (margin, by_margin)])
+        slopes = [(yes, taken), (no, f"(1.0 - {taken})")]
+        if self._soft:
+            slopes.append((margin, f"(({yes} - {no}) * bump({margin}, slope))"))
+        self._remember(register, slopes)
         return register
 
     def _apply(self, name: str, args: list[str]) -> str:
         register = super()._apply(name, args)
         if name == "norm":
             slopes = [(arg, f"({register} > 0.0 ? {arg} / {register} : 0.0)") for arg in args]
-        elif name == "clip":
-            slopes = [(args[0], CLIP_SLOPE.format(*args))]
-        elif name in BINARY_SLOPES:
-            forms = BINARY_SLOPES[name]
+        elif name == "clip" or name in BINARY_SLOPES:
+            forms = CLIP_SLOPES if name == "clip" else BINARY_SLOPES[name]
             slopes = [(arg, form.format(*args, r=register)) for arg, form in zip(args, forms, strict=True)]
         else:
             slopes = [(args[0], UNARY_SLOPES[name].format(*args, r=register))] if name in UNARY_SLOPES else []

@@ -21,6 +21,12 @@ HEAD = f"""
 #include <stdlib.h>
 #include <string.h>
 
+/* The vector forms of the GNU C library, where the build links them. */
+#if defined(VECTOR_MATH) && defined(__GNUC__) && !defined(__clang__)
+#define VECTOR(f) __attribute__((simd("notinbranch"), const)) double f(double);
+VECTOR(sin) VECTOR(cos) VECTOR(exp) VECTOR(log)
+#endif
+
 #define LANES {LANES}
 #define LANE for (int j = 0; j < LANES; ++j)
 #define MIN(a, b) ((b) < (a) ? (b) : (a)) /* a where it is NaN */

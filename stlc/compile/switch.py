@@ -34,7 +34,7 @@ class Switch(Protocol):
         """
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
-        """The indicator `weight` of a condition whose atoms differ in strictness; `truth` is the exact mask."""
+        """The indicator `weight` of a condition whose atoms differ in strictness; `truth` is its mask."""
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
         """`yes` where the indicator `weight` is 1, `no` where it is 0."""

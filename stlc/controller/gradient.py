@@ -14,7 +14,7 @@ from torch import Tensor
 from stlc.compile.c_adjoint import emit_adjoint
 from stlc.compile.c_numbers import Untranslatable
 from stlc.controller.kernel import NativeJudge, motion_of
-from stlc.native import Adjoint, build
+from stlc.native import Adjoint, Outcome, build
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -62,7 +62,9 @@ class _Judged(torch.autograd.Function):
     """Values from `judge`, gradients from `pull`."""
 
     @staticmethod
-    def forward(ctx: Any, native: NativeGradient, x0: Tensor, u: Tensor, slope: float) -> tuple[Tensor, Tensor]:
+    def forward(
+        ctx: Any, native: NativeGradient, x0: Tensor, u: Tensor, slope: float
+    ) -> tuple[Tensor, Tensor]:
         each, columns = native.judge.judge(x0, u, columns=True)
         ctx.native, ctx.slope = native, slope
         ctx.save_for_backward(x0, u)
@@ -70,14 +72,19 @@ class _Judged(torch.autograd.Function):
         return each, torch.stack(list(columns.values()))
 
     @staticmethod
-    def backward(ctx: Any, by_each: Tensor | None, by_columns: Tensor | None) -> tuple[None, None, Tensor, None]:
+    def backward(
+        ctx: Any, by_each: Tensor | None, by_columns: Tensor | None
+    ) -> tuple[None, None, Tensor, None]:
         x0, u = ctx.saved_tensors
         if by_each is None:
             by_each = u.new_zeros(len(u), ctx.native.judge.rules)
         gradient = ctx.native.adjoint.pull(
-            *(part.detach().double().numpy() for part in (x0, u, by_each)),
-            None if by_columns is None else by_columns.double().numpy(),
-            slope=ctx.slope,
+            *(part.detach().double().numpy() for part in (x0, u)),
+            Outcome(
+                by_each.double().numpy(),
+                None if by_columns is None else by_columns.double().numpy(),
+                ctx.slope,
+            ),
             threads=torch.get_num_threads(),
         )
         return None, None, torch.from_numpy(gradient).to(u.dtype), None

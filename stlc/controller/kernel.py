@@ -6,6 +6,7 @@ compiler, on another device, or for formulas that have no C form, torch does the
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +22,23 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from stlc.controller.task import Task
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How much a native climb tries.
+
+    Attributes:
+        generations: of changed plans per row.
+        enough: a row is left alone once its robustness reaches this.
+        seed: of the changes.
+        threads: to share the rows among; the result does not depend on it.
+    """
+
+    generations: int
+    enough: float
+    seed: int
+    threads: int = 1
 
 
 def motion_of(task: Task) -> Motion:
@@ -82,11 +100,7 @@ class NativeJudge:
         x0: Tensor,
         plans: Tensor,
         bank: Tensor,
-        *,
-        generations: int,
-        enough: float,
-        seed: int,
-        threads: int = 1,
+        effort: Effort,
     ) -> tuple[Tensor, Tensor]:
         """Improve plans by hill climbing on the exact robustness.
 
@@ -94,15 +108,12 @@ class NativeJudge:
             x0: (B, n).
             plans: where to start, (B, T, m).
             bank: plans that solved other states, (k, T, m); may be empty.
-            generations: of changed plans per row.
-            enough: a row is left alone once its robustness reaches this.
-            seed: of the changes.
-            threads: to share the rows among; the result does not depend on it.
+            effort: how much is tried.
 
         Returns:
             Plans (B, T, m) and their robustness (B,), in the dtype of `x0`.
         """
         arrays = [tensor.detach().double().contiguous().numpy() for tensor in (x0, plans, bank)]
-        how = Climb(self._bounds, self._factors, arrays[2], generations, enough, seed)
-        best, rho = self.kernel.climb(arrays[0], arrays[1], how, threads=threads)
+        how = Climb(self._bounds, self._factors, arrays[2], effort.generations, effort.enough, effort.seed)
+        best, rho = self.kernel.climb(arrays[0], arrays[1], how, threads=effort.threads)
         return torch.from_numpy(best).to(x0.dtype), torch.from_numpy(rho).to(x0.dtype)

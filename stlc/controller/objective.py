@@ -105,7 +105,7 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Loss:
 
 
 def _rolled(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-    """Robustness (B,) and states (T+1, B) by name, differentiable: natively where that has the same meaning."""
+    """Robustness (B,) and states (T+1, B) by name, differentiable: natively where that means the same."""
     switch = objective.switch
     if objective.smoothing is None and isinstance(switch, StraightThrough) and x0.device.type == "cpu":
         native = task.gradient

@@ -1,9 +1,9 @@
 """Repairing plans: batched hill climbing on the exact robustness, from the policy's own plan.
 
 Gradients see nothing from outside a stop zone or across an obstacle; a search does. Each generation tries a
-batch of changed plans per state and keeps the best. Changes are noise over a random stretch of time, a constant
-shift of a stretch, a stretch held at one random level, and plans that solved other states. The native kernel
-does it where there is one, torch elsewhere.
+batch of changed plans per state and keeps the best. Changes are noise over a random stretch of time, a
+constant shift of a stretch, a stretch held at one random level, and plans that solved other states. The
+native kernel does it where there is one, torch elsewhere.
 """
 
 from __future__ import annotations
@@ -72,20 +72,16 @@ class Searcher:
         return self.begin(x0, plans, bank, tries=tries).result()
 
     @torch.no_grad()
-    def begin(
-        self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH
-    ) -> Future[Repaired]:
-        """`repair` beside whatever else goes on; the result depends on the arguments and the generator alone."""
+    def begin(self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH) -> Future[Repaired]:
+        """`repair` beside whatever else goes on; what it gives depends on arguments and generator alone."""
         native = self.task.native
         if native is not None and x0.device.type == "cpu":
             seed = int(torch.randint(2**62, (), generator=self.generator))
             x0, plans, bank = x0.clone(), plans.clone(), bank.clone()
-            generations = -(-tries // LANES)
+            effort = Effort(-(-tries // LANES), self.enough, seed, idle_cores())
 
             def climb() -> Repaired:
-                best, _ = native.climb(
-                    x0, plans, bank, generations=generations, enough=self.enough, seed=seed, threads=idle_cores()
-                )
+                best, _ = native.climb(x0, plans, bank, effort)
                 return Repaired(x0, best, self.task.judge(x0, best, states=False).rho)
 
             return self._aside.submit(climb)

@@ -161,7 +161,10 @@ class Trainer:
         if engine.share:
             some = rows[:: engine.plans]
             other = torch.randint(engine.plans, (len(some),), generator=self.generator, device=self.device)
-            value = value + engine.share * loss(self.task, self.objective, x0[some], plans[some, other]).total.mean()
+            value = (
+                value
+                + engine.share * loss(self.task, self.objective, x0[some], plans[some, other]).total.mean()
+            )
         if hard:
             value = value + self._imitation(plans[-hard:], targets, good[-hard:])
         return value
@@ -171,7 +174,9 @@ class Trainer:
         """Which plan is trained, the one that does best, (B,), and whether it satisfies the specification."""
         batch, count = plans.shape[:2]
         if count == 1 and self.engine.hard == 0:
-            return torch.zeros(batch, dtype=torch.int64, device=self.device), torch.zeros(batch, dtype=torch.bool)
+            return torch.zeros(batch, dtype=torch.int64, device=self.device), torch.zeros(
+                batch, dtype=torch.bool
+            )
         judged = self.task.judge(x0.repeat_interleave(count, 0), plans.flatten(0, 1))
         score = rank(judged.rho, self.task.cost(judged)).view(batch, count)
         return score.argmax(1), satisfied(judged.rho).view(batch, count).any(1)

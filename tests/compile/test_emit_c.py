@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from emitted import OPERATIONS, STEPS, follower, translatable
 from formula_strategies import GRID, NAMES, formulas
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
@@ -19,8 +20,6 @@ from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.semantics import Exact
 from stlc.native import Kernel, build, compiler
 
-STEPS = 14
-
 pytestmark = pytest.mark.skipif(compiler() is None, reason="there is no C compiler here")
 
 
@@ -28,13 +27,6 @@ def _kernel(motion: Motion, rules: Sequence[ir.Formula]) -> Kernel:
     path = build(emit(motion, rules))
     assert path is not None
     return Kernel(path, states=len(motion.states), rules=len(rules), steps=motion.steps)
-
-
-def _follower(steps: int = STEPS) -> Motion:
-    """A system whose next state is its control: any trace is one of its rollouts."""
-    controls = tuple(f"to_{name}" for name in NAMES)
-    after = {name: ir.Col(control) for name, control in zip(NAMES, controls, strict=True)}
-    return Motion(NAMES, controls, (), after, steps, 0.1)
 
 
 def _judge(kernel: Kernel, trace: np.ndarray) -> np.ndarray:
@@ -47,28 +39,13 @@ def _judge(kernel: Kernel, trace: np.ndarray) -> np.ndarray:
 @given(st.lists(formulas(), min_size=30, max_size=30), st.integers(0, 2**31))
 def test_random_formulas_equal_the_evaluator(drawn: list[object], seed: int) -> None:
     lowered = [lower(formula, GRID, sink=[]) for formula in drawn]  # type: ignore[arg-type]
-    rules = [rule for rule in lowered if rule is not None and _translatable(rule)]
+    rules = [rule for rule in lowered if rule is not None and translatable(rule)]
     rng = np.random.default_rng(seed)
     trace = np.round(rng.normal(0, 2, (STEPS + 1, 50, len(NAMES))) * 8) / 8
-    found = _judge(_kernel(_follower(), rules), trace)
+    found = _judge(_kernel(follower(), rules), trace)
     env = {name: trace[:, :, i].copy() for i, name in enumerate(NAMES)}
     expected = np.concatenate(evaluate(rules, env, ops=NUMPY, semantics=Exact()))
     np.testing.assert_allclose(found.T, expected, rtol=1e-9, atol=1e-9)
-
-
-def _translatable(rule: ir.Formula) -> bool:
-    try:
-        emit(_follower(), [rule])
-    except Untranslatable:
-        return False
-    return True
-
-
-OPERATIONS = {
-    "add": 2, "sub": 2, "mul": 2, "div": 2, "mod": 2, "atan2": 2, "neg": 1, "square": 1, "abs": 1, "relu": 1,
-    "floor": 1, "ceil": 1, "round": 1, "sign": 1, "sin": 1, "cos": 1, "tan": 1, "atan": 1, "exp": 1,
-    "min": 3, "max": 3, "clip": 3, "norm": 3, "norm1": 3, "norminf": 3,
-}  # fmt: skip
 
 
 def test_every_function_equals_the_evaluator() -> None:
@@ -82,7 +59,7 @@ def test_every_function_equals_the_evaluator() -> None:
     rules = [ir.Atom(num) for num in nums] + [ir.Atom(columns[0], guard=True)]
     rng = np.random.default_rng(1)
     trace = rng.normal(0, 2, (STEPS + 1, 200, 3))
-    found = _judge(_kernel(_follower(), rules), trace)
+    found = _judge(_kernel(follower(), rules), trace)
     env = {name: trace[:, :, i].copy() for i, name in enumerate(NAMES)}
     expected = np.concatenate(evaluate(rules, env, ops=NUMPY, semantics=Exact()))
     np.testing.assert_allclose(found.T, expected, rtol=1e-12, atol=1e-12)
@@ -93,4 +70,4 @@ def test_what_has_no_c_form_is_said() -> None:
     late = [ir.Over("always", ir.Window(lo, hi), ir.Atom(ir.Col("x"))) for lo, hi in ((0, 99), (20, None))]
     for rule in (past, ir.Atom(ir.Extern("f", (ir.Col("x"),))), *late):
         with pytest.raises(Untranslatable):
-            emit(_follower(), [rule])
+            emit(follower(), [rule])
