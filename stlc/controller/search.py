@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.emit_c import LANES
+from stlc.controller.kernel import Effort
 from stlc.controller.task import FLOAT32_SLACK
 
 if TYPE_CHECKING:
