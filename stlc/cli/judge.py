@@ -177,9 +177,7 @@ def specification(recording: Recording, spec: Path | None) -> tuple[Source, str]
         return read_source(spec), ""
     meta, name = recording.meta, recording.name
     if not meta.spec_text:
-        raise usage(
-            f"`{name}` carries no specification", f"stlc check SPEC {name}", f"stlc check {name} --spec SPEC"
-        )
+        raise usage(f"`{name}` carries no specification", f"stlc check SPEC {name}", "elsewhere: --spec SPEC")
     source = Source(meta.spec_path or f"{meta.spec_name or 'specification'} in {name}", meta.spec_text)
     if meta.spec_path and Path(meta.spec_path).is_file() and read_source(meta.spec_path).text != source.text:
         return source, (

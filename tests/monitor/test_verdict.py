@@ -379,6 +379,9 @@ def test_dt_and_horizon_come_from_who_knows_them() -> None:
     assert "`lorry.yaml`, but there is no such file" in caught.value.diagnostics[0].note[-1]
     with pytest.raises(UsageError, match="not a whole number of steps"):
         Monitor(text, dt=0.1, horizon=0.25)
+    odd = Trace(Signature((Column("a"),)), 0.03, {"a": np.ones((1, 50))}, name="odd.csv")
+    with pytest.raises(TraceError, match=r"E602.*`odd.csv` has dt 0.03 s, and T = 0.25 s is no whole"):
+        Monitor(text, horizon=0.25).check(odd)
     with pytest.raises(UsageError, match="above 0"):
         Monitor(text, dt=-1)
 
