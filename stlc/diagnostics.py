@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -58,6 +59,35 @@ class Diagnostic:
     def with_note(self, text: str) -> Diagnostic:
         """The same finding with one more note."""
         return replace(self, note=(*self.note, text))
+
+
+class Findings(list[Diagnostic]):
+    """Findings that can be asked quickly whether they hold one already, however many there are."""
+
+    def __init__(self, items: Iterable[Diagnostic] = ()) -> None:
+        super().__init__(items)
+        self._known: set[tuple[str, Span | None, str]] = set()
+        self._indexed = 0
+
+    def tell(self, finding: Diagnostic) -> None:
+        """Append a finding unless its code, place and headline are there."""
+        for known in self[self._indexed :]:
+            self._known.add((known.code, known.span, known.message))
+        key = (finding.code, finding.span, finding.message)
+        if key not in self._known:
+            self._known.add(key)
+            self.append(finding)
+        self._indexed = len(self)
+
+
+def tell(sink: list[Diagnostic], finding: Diagnostic) -> None:
+    """Append a finding to a list unless it holds one of that code, place and headline."""
+    if isinstance(sink, Findings):
+        sink.tell(finding)
+        return
+    key = (finding.code, finding.span, finding.message)
+    if all((known.code, known.span, known.message) != key for known in sink):
+        sink.append(finding)
 
 
 class StlcError(Exception):

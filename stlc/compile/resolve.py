@@ -29,7 +29,7 @@ from stlc.compile.scope import Definition, Failed, Scope, enforced
 from stlc.compile.tags import Tags, read_tags
 from stlc.compile.vacuity import toothless, vacuous
 from stlc.compile.values import Number, Value, Vector
-from stlc.diagnostics import Diagnostic, Label, SpecError
+from stlc.diagnostics import Diagnostic, Findings, Label, SpecError
 from stlc.grammar import ast
 from stlc.grammar.parser import MAX_ERRORS
 from stlc.signature import Signature
@@ -58,7 +58,7 @@ def resolve(
         UsageError: an override of a constant that does not exist.
     """
     values = read_overrides(overrides or {}, spec, interface)
-    findings: list[Diagnostic] = []
+    findings = Findings()
     scope = Scope(sink=findings, temporal=True, time_unit=spec.time_unit, elsewhere=_elsewhere(interface))
     file = declared(spec, load_modules(spec), interface, values, scope)
     _adopt_units(spec, values, file.found, file.scope)

@@ -15,7 +15,7 @@ from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
 from stlc.registry import closest
 from stlc.signature import Column, Kind, Role
-from stlc.units import DIMENSIONLESS, Unit, parse_unit, same_dims
+from stlc.units import DIMENSIONLESS, Unit, nearest, parse_unit, same_dims
 
 Labels = tuple[tuple[str, float], ...]
 
@@ -179,11 +179,11 @@ def _stored(exprs: Sequence[ast.Expr], target: tuple[Column, Unit], scope: Scope
             continue
         number = as_number(value, expr, Need("the ends of a range are numbers"), scope)
         if number.bare:
-            number = in_unit(number, unit if unit.text else column.unit)
+            number = in_unit(number, unit if unit.text else column.unit, scope)
         elif not number.flexible and column.unit.text and not same_dims(number.unit, column.unit):
             message = f"`{column.name}` is in [{column.unit}], this is in [{number.unit}]"
             scope.fail(Diagnostic("E203", message, expr.span, f"[{number.unit}]"))
         if number.constant is None:
             scope.fail(Diagnostic("E205", "the ends of a range are constants", expr.span))
         exact = number.exact
-        yield float(exact / column.unit.ratio) if exact is not None else number.constant / column.unit.scale
+        yield nearest(exact / column.unit.ratio) if exact is not None else number.constant / column.unit.scale

@@ -21,7 +21,7 @@ from stlc.dynamics.yaml_nodes import Sequence as ListNode
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
 from stlc.source import Span
-from stlc.units import Unit, parse_unit, same_dims
+from stlc.units import Unit, nearest, parse_unit, same_dims
 
 _T = TypeVar("_T")
 SECOND = parse_unit("s")
@@ -288,7 +288,7 @@ def in_stored_unit(number: Number, unit: Unit) -> ir.Num:
         return number.num
     if isinstance(number.num, ir.Lit):
         exact = number.exact
-        return ir.Lit(float(exact / unit.ratio) if exact is not None else number.num.value / unit.scale)
+        return ir.Lit(nearest(exact / unit.ratio) if exact is not None else number.num.value / unit.scale)
     return ir.Op("div", (number.num, ir.Lit(unit.scale)))
 
 
