@@ -86,6 +86,12 @@ def reach_of(num: ir.Num) -> Reach:
     return Reach(max(0, *(-step for step in steps)), max(0, *steps)) if steps else Reach(0, 0)
 
 
+def farthest(num: ir.Num) -> Reach:
+    """How many samples before and after the one at hand a number reads where they exist."""
+    steps = [leaf.steps for leaf in leaves(num) if isinstance(leaf, ir.At)]
+    return Reach(max(0, *(-step for step in steps)), max(0, *steps)) if steps else Reach(0, 0)
+
+
 def mapped(num: ir.Num, change: Callable[[ir.Num], ir.Num]) -> ir.Num:
     """The number with every leaf changed."""
     match num:

@@ -52,9 +52,9 @@ def signals(samples: int, batch: int, seed: int = 0) -> dict[str, np.ndarray]:
 def by_definition(monitor: Monitor, columns: dict[str, np.ndarray], k: int, end: str) -> tuple[float, float]:
     """Value at sample `k`; a requirement with `T` and `end` sees its own window and what was before."""
     (rule,) = monitor.compiled.requirements
-    if rule.windowed and rule.uses_end:
-        columns = {name: values[: k + T + 1] for name, values in columns.items()}
-    trace = reference.Trace(columns, monitor.compiled.grid, end)
+    stop = k + T + 1 if rule.windowed and rule.uses_end else None
+    columns = {name: values[:stop] for name, values in columns.items()}
+    trace = reference.Trace(columns, monitor.compiled.grid, end, stop=stop or 0)
     value = reference.Robustness(trace).at(rule.typed.formula, k)
     return (np.nan, np.nan) if value is None else value
 

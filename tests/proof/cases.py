@@ -50,9 +50,9 @@ class Case:
         assert again == spec, self
         return Monitor(again, dt=DT, horizon=HORIZON * DT)
 
-    def record(self, end: End, until: int | None = None) -> Record:
-        """The trace up to a sample, with the signals of each sample in a row."""
-        return Record(rows(self.signals)[:until], end, ahead(self.formula))
+    def record(self, end: End, until: int | None = None, stop: int | None = None) -> Record:
+        """The trace up to a sample, with the signals of each sample in a row; `stop`: where it will end."""
+        return Record(rows(self.signals)[:until], end, ahead(self.formula), stop or until or 0)
 
     def __str__(self) -> str:
         requirement = self.text[self.text.index("region block") :].split("\n", 1)[1]

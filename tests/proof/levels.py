@@ -49,11 +49,12 @@ FUTURE = ("always", "eventually", "until", "release", "unless")
 
 @dataclass(frozen=True)
 class Record:
-    """A trace, and what is thought of the time after it."""
+    """A trace, and what is thought of the time after it: with `stop` it will have so many samples."""
 
     rows: Sequence[Row]
     end: End
     ahead: int = 0
+    stop: int = 0
 
     @property
     def samples(self) -> int:
@@ -62,7 +63,12 @@ class Record:
     @property
     def size(self) -> int:
         """Instants that exist."""
-        return self.samples + (0 if self.end == "truncate" else self.ahead)
+        return self.samples if self.end == "truncate" else self.length + self.ahead
+
+    @property
+    def length(self) -> int:
+        """Where windows to the end of the trace end."""
+        return self.samples if self.end == "truncate" else max(self.samples, self.stop)
 
     @cached_property
     def everywhere(self) -> Instants:
@@ -221,7 +227,7 @@ class _Look:
     @cached_property
     def _visible(self) -> Instants:
         """A window to the end takes the samples there are."""
-        return (1 << self.record.samples) - 1 if self._to_the_end else self.record.everywhere
+        return (1 << self.record.length) - 1 if self._to_the_end else self.record.everywhere
 
     def at(self, instants: Instants, k: int) -> Instants:
         """Who finds himself in the set k steps away; where there is nothing to see, `every` is content."""
