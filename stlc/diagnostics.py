@@ -202,6 +202,7 @@ CODES: dict[str, str] = {
     "S208": "a function from outside that cannot be loaded, or that fails",
     "S301": "initial states that are (nearly) all rejected",
     "S302": "dynamics that give NaN or infinity",
+    "S303": "initial states in a file that cannot be used",
     "W601": "an acceptance rate of initial states below 1 %",
     # runs
     "R101": "no run, or a run folder that is damaged",
@@ -219,4 +220,3 @@ CODES: dict[str, str] = {
     # the tool itself
     "B001": "a bug in stlc",
 }
-    "S303": "initial states in a file that cannot be used",
