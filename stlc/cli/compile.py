@@ -12,6 +12,7 @@ from stlc.cli.options import JsonOption, SetOption, SystemOption, describe, pars
 from stlc.cli.output import emit, emit_json, say, show_diagnostics
 
 if TYPE_CHECKING:
+    from stlc.compile import typed
     from stlc.compile.pipeline import Compiled, Rule
     from stlc.compile.timers import Timer
     from stlc.dynamics.decl import SystemDecl
@@ -81,16 +82,29 @@ def _result(compiled: Compiled, decl: SystemDecl) -> dict[str, Any]:
 
     steps = compiled.grid.horizon or 0
     source = compiled.spec.source
+    added = [*map(_parameter, compiled.parameters), *map(_added, compiled.timers)]
     return {
         "spec": source.name,
         "spec_sha256": sha256(source.text),
         "system": str(decl.path),
         "dt": float(decl.dt),
         "horizon": {"seconds": float(decl.dt * steps), "steps": steps},
-        "states": [*decl.signature.names, *(timer.name for timer in compiled.timers)],
-        "added": [_added(timer) for timer in compiled.timers],
+        "states": [*decl.signature.names, *(item["name"] for item in added)],
+        "added": added,
         "safety": [rule.name for rule in compiled.safety],
         "requirements": [_requirement(rule, float(decl.dt)) for rule in compiled.requirements],
+    }
+
+
+def _parameter(each: typed.Parameter) -> dict[str, Any]:
+    """A parameter that the system does not carry."""
+    column = each.column
+    return {
+        "name": column.name,
+        "kind": "param",
+        "initial": None,
+        "range": [column.low, column.high],
+        "about": f"{each.text}, drawn for every trajectory",
     }
 
 

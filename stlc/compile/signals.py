@@ -74,9 +74,7 @@ def _matched(column: Column, decl: ast.Signal | ast.Param, interface: Interface,
     """The column as the system stores it."""
     if column.name not in interface.signature:
         if isinstance(decl, ast.Param):
-            help_ = (f"declare it as a state of {interface.where}: `{decl.name}: {{role: env, …}}`",)
-            message = "a `param` that the system does not carry as a state is not compiled by this version"
-            scope.fail(Diagnostic("E015", message, decl.name_span, help=help_))
+            return column
         scope.fail(_absent(column, decl, interface))
     own = interface.signature[column.name]
     place = interface.places.get(column.name)
@@ -168,6 +166,13 @@ def _ends(
         return (min(values), max(values)) if values else None
     evaluate_all((domain,), scope.extended({}, samplers=True))
     return None
+
+
+def ends_of(
+    domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral, target: tuple[Column, Unit], scope: Scope
+) -> Iterator[float | None]:
+    """The ends of a range or the members of a set, in the unit of the column; None for `inf`."""
+    return _stored(domain if isinstance(domain, tuple) else domain.items, target, scope)
 
 
 def _stored(exprs: Sequence[ast.Expr], target: tuple[Column, Unit], scope: Scope) -> Iterator[float | None]:

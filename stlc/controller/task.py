@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ from stlc.compile.arith import Program
 from stlc.compile.graph import RobustnessGraph, evaluate
 from stlc.compile.interface import Grid
 from stlc.compile.ops_torch import TORCH
+from stlc.compile.parameters import fixed
 from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics import TOLERANCE
 from stlc.compile.switch import Hard, Switch
@@ -80,27 +81,38 @@ class Task:
     def __init__(self, compiled: Compiled, system: System) -> None:
         self.compiled = compiled
         self.plain = system
-        self.system = system.augmented(compiled.timers) if compiled.timers else system
+        added = compiled.timers, compiled.parameters
+        self.system = system.augmented(*added) if any(added) else system
         self.graph = RobustnessGraph(compiled.requirements, self.system.signature)
         self.safety = RobustnessGraph(compiled.safety, self.system.signature)
 
     @classmethod
-    def of(cls, spec: ast.Spec, system: System, *, overrides: Mapping[str, str] | None = None) -> Task:
+    def of(
+        cls,
+        spec: ast.Spec,
+        system: System,
+        *,
+        overrides: Mapping[str, str] | None = None,
+        values: Mapping[str, str] | None = None,
+    ) -> Task:
         """Compile a specification for a system.
 
         Args:
             spec: as parsed.
             system: that it speaks about.
-            overrides: constants to change, name -> text such as `3 s`.
+            overrides: constants to change, name -> text such as `3 s`; a parameter becomes a constant.
+            values: parameters that have one value in all trajectories, and that the policy still sees.
 
         Raises:
+            UsageError: a value does not fit.
             SpecError: the specification is invalid, or does not fit the system.
         """
         decl = system.decl
         grid = Grid(dt=decl.dt, horizon=decl.horizon)
-        return cls(
-            compile_spec(spec, grid=grid, interface=system.interface(), overrides=overrides or {}), system
-        )
+        compiled = compile_spec(spec, grid=grid, interface=system.interface(), overrides=overrides or {})
+        if values:
+            compiled = replace(compiled, parameters=fixed(compiled.parameters, values))
+        return cls(compiled, system)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -139,6 +139,10 @@ def _missing(need: Need, data: Given, name: str) -> Diagnostic:
     near = closest(wanted, data)
     shapes = ", ".join(f"{key} {tuple(np.shape(values))}" for key, values in data.items())
     help_ = () if near is None else (f"did you mean `{near}`? map it with  --map {wanted}={near}",)
+    if need.parameter:
+        value = f"{need.column.low or 0:g}{need.column.unit}"
+        advice = f"or give it one value for all traces:  --set {wanted.partition('[')[0]}={value}"
+        help_ = (*help_, advice)
     return Diagnostic(
         "E601",
         f"trace `{name}` has no signal `{wanted}`" if name != UNNAMED else f"no signal `{wanted}` is given",
