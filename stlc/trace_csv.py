@@ -30,6 +30,8 @@ MAX_BYTES = 1_000_000_000
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
 _HEAD = re.compile(r"(?P<name>[^\[\]]*[^\[\]\s](?:\[\d+\])?)\s*(?:\[(?P<unit>[^\]]*)\])?")
 _ROUND = re.compile(r"(?P<name>.*[^\s(])\s*\((?P<unit>[^()]+)\)")
+_COMMA = re.compile(r"(?<!\d),|,(?!\d)")
+"""A comma that is not within a number."""
 _WORDS = {"true": 1.0, "false": 0.0}
 _MAX_FINDINGS = 20
 
@@ -47,6 +49,8 @@ class _Sheet:
 
 def read_csv(path: Path) -> Table:
     """The columns of a `.csv` file (comma, semicolon or tab; UTF-8); those of words are texts.
+
+    Between semicolons or tabs numbers may have decimal commas.
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
@@ -94,6 +98,8 @@ def _sheet(path: Path, data: bytes) -> _Sheet:
     end = len(body) if end < 0 else end
     header = body[start:end]
     delimiter = max(",;\t", key=header.count)
+    if delimiter != "," and "," in body[end:] and not _COMMA.search(body, end):
+        body = body[:end] + body[end:].replace(",", ".")  # decimal commas, as many spreadsheets write them
     return _Sheet(Source(str(path), body), delimiter, header, start, min(end + 1, len(body)))
 
 

@@ -28,7 +28,7 @@ def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
     Args:
         recording: whose arrays may be text.
         words: name in the file -> what its words are worth; empty for a signal that has numbers. A signal
-            that is not among them is of no interest: where it holds words it is left out.
+            that is not among them is of no interest: where it holds words it is set aside.
 
     Raises:
         TraceError: E603, words where numbers are needed, or one that the signal does not have.
@@ -45,7 +45,13 @@ def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
         )
         for strand in recording.strands
     )
-    return replace(recording, strands=strands)
+    aside = {
+        name: values
+        for strand in recording.strands
+        for name, values in strand.arrays.items()
+        if name not in words and _is_text(values)
+    }
+    return replace(recording, strands=strands, extras={**recording.extras, **aside})
 
 
 def wordless(recording: Recording) -> Recording:

@@ -449,6 +449,14 @@ def test_clocks_as_others_write_them(tmp_path: Path, head: str, times: str) -> N
     assert trace.signature["Speed over Ground"].unit.text == "km/h"
 
 
+@pytest.mark.parametrize("cells", ["0,5", "-1,25e1"])
+def test_decimal_commas_between_semicolons(tmp_path: Path, cells: str) -> None:
+    trace = load_trace(csv(tmp_path / "a.csv", f"t;x\n0,0;{cells}\n0,5;1\n"))
+    assert trace.dt == 0.5
+    assert trace.data["x"].tolist() == [[float(cells.replace(",", ".")), 1.0]]
+    assert code_of(csv(tmp_path / "a.csv", f"t;x\n0,0;1\n0,5;{cells},\n")) == "E603"
+
+
 def test_another_clock_than_the_usual_one(tmp_path: Path) -> None:
     path = csv(tmp_path / "a.csv", "time,stamp,x\n0,5,1\n1,5.5,2\n")
     assert load_trace(path, Reading({"t": "time"})).dt == 1.0

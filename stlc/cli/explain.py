@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from stlc.cli import check_options as given
-from stlc.cli.options import JsonOption, SetOption, SystemOption, describe, parse_overrides
+from stlc.cli.options import JsonOption, RequireOption, SetOption, SystemOption, describe, parse_overrides
 from stlc.cli.output import emit, emit_json, table
 from stlc.diagnostics import CODES, Diagnostic, UsageError
 from stlc.registry import closest
@@ -40,9 +40,7 @@ def explain(
         str | None,
         typer.Argument(metavar="CODE|SPEC|TRACE", help="A code, precedence, a .stl file or a trace."),
     ] = None,
-    require: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="This requirement only; repeatable.")
-    ] = None,
+    require: RequireOption = None,
     at: Annotated[
         str | None, typer.Option(metavar="K|TIME", help="Of a trace: judge at this sample or time.")
     ] = None,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
-from stlc.cli.options import JsonOption, RunsOption, SetOption, describe, parse_overrides
+from stlc.cli.options import JsonOption, RunArgument, RunsOption, SetOption, describe, parse_overrides
 from stlc.diagnostics import Diagnostic, UsageError
 
 if TYPE_CHECKING:
@@ -40,9 +40,7 @@ def register(app: typer.Typer) -> None:
 
 
 def simulate(
-    run: Annotated[
-        str, typer.Argument(metavar="RUN", help="A run's folder, number, words, spec, or latest.")
-    ] = "latest",
+    run: RunArgument = "latest",
     backup: Annotated[
         bool | None, typer.Option("--backup/--no-backup", help="The paper's backup policy.")
     ] = None,

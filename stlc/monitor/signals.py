@@ -79,7 +79,8 @@ def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False)
     name = given.name if isinstance(given, Trace) else UNNAMED
     data: Given = {CLOCK: given.times, **given.data} if isinstance(given, Trace) else given
     found = {need.column.name: _find(data, need.column.name) for need in needs}
-    missing = [_missing(need, data, name) for need in needs if found[need.column.name] is None]
+    there = {**data, **given.extras} if isinstance(given, Trace) else data
+    missing = [_missing(need, there, name) for need in needs if found[need.column.name] is None]
     if missing:
         raise TraceError(*missing)
     arrays = found or _any_one(data)
