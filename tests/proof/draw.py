@@ -320,8 +320,8 @@ class Drawing:
             ("[x, y] in union(disc, block)", lambda row: _in_either(row["x"], row["y"])),
             ("[x, y] in intersect(block, complement(disc))", lambda row: _in_block_only(row["x"], row["y"])),
             ("[x, y] in dilate(block, level)", lambda row: _in_block(row["x"], row["y"]) + 0.5),
-            ("sweep([x, y]) not in disc", lambda row: _nearest(row, lambda x, y: math.hypot(x, y) - 1)),
-            ("sweep([x, y]) not in block", lambda row: _nearest(row, lambda x, y: -_in_block(x, y))),
+            ("sweep([x, y]) not in disc", lambda row: row["swept_disc"]),
+            ("sweep([x, y]) not in block", lambda row: row["swept_block"]),
             ("sweep([x, y]) in disc", lambda row: min(1 - math.hypot(*end) for end in _ends(row))),
             ("sweep([x, y]) in block", lambda row: min(_in_block(*end) for end in _ends(row))),
         ]
@@ -379,7 +379,7 @@ def _nearest(row: Row, distance: Callable[[float, float], float]) -> float:
         return distance(x + s * (a - x), y + s * (b - y))
 
     low, high = 0.0, 1.0
-    for _ in range(90):
+    for _ in range(60):
         third = (high - low) / 3
         if at(low + third) <= at(high - third):
             high -= third
@@ -415,11 +415,15 @@ def trace(rng: random.Random, *, longest: int = 18, generic: bool = False) -> di
 
 
 def rows(signals: dict[str, Any]) -> list[dict[str, Any]]:
-    """The same, sample by sample, each with those numbers of its neighbours that exist: `x+1`, `x-2`."""
+    """The same, sample by sample, each with the numbers of its neighbours that exist: `x+1`, `x-2`; and
+    how far the segment from (x, y) to the next sample stays away from two places.
+    """
     samples = len(signals["x"])
     found = [{name: values[t] for name, values in signals.items()} for t in range(samples)]
     for t, row in enumerate(found):
         for name, k in product("xyz", (-2, -1, 1, 2)):
             if 0 <= t + k < samples:
                 row[f"{name}{k:+d}"] = signals[name][t + k]
+        row["swept_disc"] = _nearest(row, lambda x, y: math.hypot(x, y) - 1)
+        row["swept_block"] = _nearest(row, lambda x, y: -_in_block(x, y))
     return found

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property, reduce
 from itertools import count
@@ -57,6 +57,8 @@ class Record:
     end: End
     ahead: int = 0
     stop: int = 0
+    margins: dict[tuple[object, ...], float | None] = field(default_factory=dict)
+    """What predicates were worth: (predicate, instant, frozen values) -> margin."""
 
     @property
     def samples(self) -> int:
@@ -156,7 +158,10 @@ class Sets:
         """What reads a sample or a frozen value that does not exist is what is thought of the unknown."""
         ask, found, end = self._asks[truth], self.record.granted, self.record.end
         for t, row in enumerate(self.record.rows):
-            margin = margin_of(atom, row, self.held)
+            key = (atom, t, *self.held.items())
+            if key not in self.record.margins:
+                self.record.margins[key] = margin_of(atom, row, self.held)
+            margin = self.record.margins[key]
             lost = end == "upper" or (end == "truncate" and not truth)
             if lost if margin is None else ask(atom, margin):
                 found |= 1 << t
