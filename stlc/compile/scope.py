@@ -81,7 +81,8 @@ class External:
         result: size of the vector that it gives; None for a number.
         unit: of the result.
         kind: of the result.
-        function: takes components and gives components; None where nobody loaded it.
+        function: takes components and gives components, or says in the IR what they are; None where nobody
+            loaded it.
         about: what it is, for messages.
         span: where its name was declared.
     """
@@ -91,7 +92,7 @@ class External:
     result: int | None
     unit: Unit
     kind: Kind
-    function: Callable[..., Sequence[Any]] | None
+    function: Callable[..., Sequence[Any]] | ir.Body | None
     about: str = ""
     span: Span | None = None
 

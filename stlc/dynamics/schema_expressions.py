@@ -9,7 +9,7 @@ from fractions import Fraction
 from typing import TypeVar
 
 from stlc.compile import ir
-from stlc.compile.formulas import resolve_state_formula
+from stlc.compile.formulas import resolve_region, resolve_state_formula
 from stlc.compile.numbers import resolve_number, resolve_numbers
 from stlc.compile.scope import Entry, Scope
 from stlc.compile.values import Number
@@ -130,7 +130,11 @@ class Expressions:
     def check(self, expr: ast.Expr) -> None:
         """Report what is wrong with an expression of any sort."""
         rejected: list[list[Diagnostic]] = []
-        resolvers: tuple[Callable[[ast.Expr, Scope], object], ...] = (resolve_numbers, resolve_state_formula)
+        resolvers: tuple[Callable[[ast.Expr, Scope], object], ...] = (
+            resolve_numbers,
+            resolve_state_formula,
+            resolve_region,
+        )
         for resolve in resolvers:
             sink: list[Diagnostic] = []
             try:
