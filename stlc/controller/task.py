@@ -18,6 +18,7 @@ from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics import TOLERANCE
 from stlc.compile.switch import Hard, Switch
 from stlc.controller.kernel import NativeJudge
+from stlc.controller.promises import Promises
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -33,6 +34,10 @@ TIE = 1e-4
 """What cost may weigh where robustness does not differ: it is flat where a deadline cannot be met."""
 PULL = 0.1
 """Weight of the pull towards the next goal among the performance terms."""
+KEPT = 3.0
+"""Weight of what open promises are kept with less than gamma to spare, among the performance terms."""
+SHORT = 10.0
+"""Weight of what a mission's plan lacks of gamma among the costs that plans are chosen by."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,12 +205,20 @@ class Task:
         return self.graph.per_requirement_columns(columns, ops=TORCH), columns
 
     def cost(self, judged: Judged) -> Tensor:
-        """Performance terms of judged plans, as if every one were satisfying, without gradient: (batch,)."""
+        """What plans are chosen by where they satisfy the specification, without gradient: (batch,).
+
+        These are the performance terms as if every plan were satisfying. On a mission the pull of the next
+        goal draws plans to the edge of what is allowed now, so there it also costs to spare less than gamma.
+        """
         with torch.no_grad():
-            return self.performance(judged.columns, judged.rho, judged.plans)
+            cost = self.performance(judged.columns, judged.rho, judged.plans)
+            if not self.compiled.timers:
+                return cost
+            gamma = self.system.decl.objective.gamma
+            return cost + SHORT * (gamma - judged.rho).clamp(0.0, gamma)
 
     def performance(self, columns: Mapping[str, Tensor], rho: Tensor, u: Tensor) -> Tensor:
-        """Performance terms as if every plan were satisfying, and the pull of the next goal: (batch,).
+        """Performance terms as if every plan were satisfying, with promises and pull of a mission: (batch,).
 
         Args:
             columns: states over time, name -> (time, batch).
@@ -213,10 +226,17 @@ class Task:
             u: controls, (batch, T, m).
         """
         cost = self.system.performance(columns, torch.ones_like(rho), rho.detach(), u)
+        if self.promises.items:
+            cost = cost + KEPT * self.promises.short(columns)
         if self._pull is None:
             return cost
         gap: Tensor = self._pull(columns, TORCH, HARD)["gap"]
         return cost + PULL * gap.mean(0)
+
+    @cached_property
+    def promises(self) -> Promises:
+        """What a mission promises, and how much it is to be kept with."""
+        return Promises(self.compiled, self.system.decl.objective.gamma)
 
     @cached_property
     def _pull(self) -> Program | None:
