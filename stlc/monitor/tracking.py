@@ -134,6 +134,17 @@ class Everywhere:
 
     def live(self, start: int, stop: int) -> Bounds:
         """Bounds over all continuations."""
+        if self.asked.ending == "truncate":
+            return _decided_first(self, start, stop)
+        return self.either(start, stop)
+
+    def certain(self, starts: range) -> Bounds:
+        """At settled instants, where windows are cut to the trace."""
+        values = self._values(2, starts.start, starts.stop)
+        return Bounds(values, values)
+
+    def either(self, start: int, stop: int) -> Bounds:
+        """At any instants, where nothing is assumed of what lies outside of the trace."""
         return Bounds(self._values(0, start, stop), self._values(1, start, stop))
 
     def ended(self, starts: range) -> Bounds:
@@ -147,9 +158,8 @@ class Everywhere:
 
     def _ended(self, starts: range) -> Bounds:
         if self.asked.ending == "open":
-            return self.live(starts.start, starts.stop)
-        values = self._values(2, starts.start, starts.stop)
-        return Bounds(values, values)
+            return self.either(starts.start, starts.stop)
+        return self.certain(starts)
 
     def drop(self, start: int) -> int:
         """Forget instants before `start`."""
@@ -165,8 +175,9 @@ class Everywhere:
             return side.values(self._readers[which], start, stop - start)[0][:, 0]
         record = Record(side.rows, NUMPY)
         starts = range(start - side.base, stop - side.base)
-        low, _ = window_bounds(self.planned.formula, record, starts, self.window, "truncate")
-        return np.asarray(low[:, 0])
+        ends: Ending = "truncate" if side.end == "truncate" else "open"
+        low, high = window_bounds(self.planned.formula, record, starts, self.window, ends)
+        return np.asarray((high if side.end == "upper" else low)[:, 0])
 
 
 def _first_needed(planned: Plan, samples: int) -> int:
@@ -252,6 +263,16 @@ class Whole:
 
     def live(self, start: int, stop: int) -> Bounds:
         """Bounds over all continuations."""
+        if self.ending == "truncate":
+            return _decided_first(self, start, stop)
+        return self.either(start, stop)
+
+    def certain(self, starts: range) -> Bounds:
+        """At settled instants, where windows are cut to the trace."""
+        return self.ended(starts)
+
+    def either(self, start: int, stop: int) -> Bounds:
+        """At any instants, where nothing is assumed of what lies outside of the trace."""
         if stop <= start:
             return Bounds(np.zeros(0), np.zeros(0))
         rule, record = self._subject()
@@ -279,6 +300,15 @@ class Whole:
     def drop(self, start: int) -> int:  # noqa: ARG002
         """Nothing can be forgotten."""
         return 0
+
+
+def _decided_first(tracker: Everywhere | Whole, start: int, stop: int) -> Bounds:
+    """Where windows are cut, what a settled instant reads before the first sample is false, not unknown."""
+    middle = min(max(tracker.settled, start), stop)
+    if middle <= start:
+        return tracker.either(start, stop)
+    known, rest = tracker.certain(range(start, middle)), tracker.either(middle, stop)
+    return Bounds(*map(np.concatenate, zip(known, rest, strict=True)))
 
 
 _BOTH: tuple[Literal["lower"], Literal["upper"]] = ("lower", "upper")
