@@ -51,8 +51,8 @@ def defined(  # noqa: C901 - one case a node
             inner = defined(body, rows, positive, held)
             return inner >> 1 if steps > 0 else (inner << 1) & everywhere
         case Edge(op, body):
-            now = defined(body, rows, (op == "rise", held) is positive)
-            before = defined(body, rows, (op == "rise", held) is not positive)
+            now = defined(body, rows, (op == "rise") is positive, held)
+            before = defined(body, rows, (op == "rise") is not positive, held)
             return now & ((before << 1) | 1)
         case Pair("->", left, right):
             return defined(left, rows, not positive, held) & defined(right, rows, positive, held)
