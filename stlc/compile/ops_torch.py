@@ -126,7 +126,11 @@ def _pair(a: Tensor | float, b: Tensor | float) -> tuple[Tensor, Tensor]:
 
 @final
 class TorchOps:
-    """`stlc.compile.ops.Ops` over torch tensors; dtype and device follow the operands."""
+    """`stlc.compile.ops.Ops` over torch tensors; dtype and device follow the operands.
+
+    Operands are `(time, batch)`, or of any shapes that broadcast; what runs over axis 0 runs over time, and a
+    reduction over it gives `(1, batch)`.
+    """
 
     name = "torch"
 

@@ -63,7 +63,7 @@ def satisfied(rho: Tensor) -> Tensor:
     """Where a robustness counts as satisfied: rho >= -1e-6, with float32 rounding allowed for.
 
     Args:
-        rho: any shape.
+        rho: (batch,), (batch, requirements), or any other shape; float64, or float32 with its own slack.
 
     Returns:
         A boolean tensor of the same shape.
