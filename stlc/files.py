@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import secrets
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -143,7 +142,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         with _reported(path):
             yield target
         return
-    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
+    temporary = target.with_name(f".{target.stem}.{os.urandom(4).hex()}{target.suffix}")
     try:
         with _reported(path):
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -12,6 +12,8 @@ T = TypeVar("T")
 U = TypeVar("U")
 
 _SIMILAR = 0.6
+_LONGEST = 100
+"""Letters of a name that somebody may have mistyped; the work grows with their square."""
 
 
 def closest(name: str, candidates: Iterable[str]) -> str | None:
@@ -20,7 +22,9 @@ def closest(name: str, candidates: Iterable[str]) -> str | None:
     One that differs in case alone comes first; then up to a third of the letters (at least one) may be
     inserted, dropped, replaced or swapped with their neighbour; then what difflib calls similar.
     """
-    pool = sorted({candidate for candidate in candidates if candidate and candidate != name})
+    pool = sorted({word for word in candidates if 0 < len(word) <= _LONGEST and word != name})
+    if len(name) > _LONGEST:
+        return None
     folded = name.casefold()
     scored = [(_distance(folded, candidate.casefold()), candidate) for candidate in pool]
     within = [item for item in scored if item[0] <= max(1, len(name) // 3) and item[0] < len(name)]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, TraceError
+from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.signature import Column, Kind, Signature
 from stlc.trace_csv import write_csv
 from stlc.trace_formats import read_recording
@@ -25,6 +25,7 @@ from stlc.trace_recording import CLOCK, EXTRA, Recording, absent, fit
 from stlc.trace_resample import resampled
 from stlc.trace_table import GROUPS
 from stlc.trace_time import RESAMPLE, read_clock
+from stlc.trace_words import Words, in_numbers, wordless
 
 __all__ = [
     "Reading",
@@ -40,6 +41,7 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 RESERVED = ("t", "meta")
+WRITTEN = (".npz", ".csv")
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,11 +107,13 @@ class Reading:
         names: signal -> its name in the file; `t` names the clock.
         resample: put the signals on a grid of so many seconds; None takes the file's own, which is uniform.
         kinds: signal -> what its numbers mean, which says how it is resampled.
+        words: signal -> what its words are worth, of all signals of interest; None refuses words.
     """
 
     names: Mapping[str, str] = field(default_factory=dict)
     resample: float | None = None
     kinds: Mapping[str, Kind] = field(default_factory=dict)
+    words: Mapping[str, Words] | None = None
 
 
 AS_IT_IS = Reading()
@@ -121,7 +125,7 @@ AS_IT_IS = Reading()
 def load_trace(path: Path | str, reading: Reading = AS_IT_IS) -> Trace:
     """Read a trace; the format follows the suffix.
 
-    It is one of `.csv`, `.parquet`, `.mat` and `.mcap`; everything else is an `.npz`.
+    It is one of `.csv`, `.tsv`, `.parquet`, `.mat` and `.mcap`; everything else is an `.npz`.
     Values may be NaN or infinite here: the monitor refuses them where a requirement needs them.
 
     Raises:
@@ -143,6 +147,10 @@ def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
     clock = names.pop(CLOCK, None)
     if clock is not None:
         recording = recording.clocked_by(clock)
+    if reading.words is None:
+        recording = wordless(recording)
+    else:
+        recording = in_numbers(recording, {names.get(n, n): worth for n, worth in reading.words.items()})
     if reading.resample is None:
         trace = _uniform(recording)
     else:
@@ -179,9 +187,11 @@ def save_trace(path: Path | str, trace: Trace) -> None:
     """Write a trace; the format follows the suffix. A `.csv` holds the signals alone.
 
     Raises:
+        UsageError: U101, the suffix is neither `.npz` nor `.csv`.
         TraceError: E605, a signal has a name that the format reserves.
         MissingError: R201, no room or no permission; an old file stays as it was.
     """
+    check_writable(path)
     taken = [name for name in trace.data if name in RESERVED or name.startswith(EXTRA)]
     if taken:
         raise TraceError(Diagnostic("E605", f"a recorded signal cannot be called `{taken[0]}`"))
@@ -193,6 +203,15 @@ def save_trace(path: Path | str, trace: Trace) -> None:
     arrays |= {f"{EXTRA}{name}": np.asarray(values) for name, values in trace.extras.items()}
     arrays["meta"] = meta_array(replace(trace.meta, dt=trace.dt), trace.signature)
     write_npz(path, arrays)
+
+
+def check_writable(path: Path | str) -> None:
+    """Raise UsageError (U101) where the suffix of a file is none that traces are written with."""
+    if Path(path).suffix.lower() not in WRITTEN and not Path(path).is_char_device():
+        message = f"`{path}`: a trace is written as {' or '.join(WRITTEN)}"
+        raise UsageError(
+            Diagnostic("U101", message, help=(f"e.g. {Path(path).stem or 'trace'}{WRITTEN[0]}",))
+        )
 
 
 def _to_csv(path: Path | str, trace: Trace) -> None:

@@ -1,7 +1,7 @@
-"""Named columns in a `.csv` file, in and out; every cell is a plain number or a diagnostic.
+"""Named columns in a `.csv` file, in and out; every cell is a number, a word or a diagnostic.
 
-The first line names the columns, units in brackets if one likes: `t, x [m], v [km/h]`. A column `trace` or
-`agent` says to which of several traces a line belongs.
+The first line names the columns, units in brackets if one likes: `t, x [m], v (km/h)`. A column `trace` or
+`agent` says to which of several traces a line belongs. A column whose first cell is a word holds words.
 """
 
 from __future__ import annotations
@@ -21,14 +21,17 @@ from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.files import write_atomic
 from stlc.source import Source, Span
 from stlc.trace_npz import unreadable
-from stlc.trace_table import Table
+from stlc.trace_table import Table, is_unit
 
-Floats = NDArray[np.float64]
+Array = NDArray[Any]
 
 MAX_BYTES = 1_000_000_000
 
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
-_HEAD = re.compile(r"(?P<name>[^\[\]\s]+(?:\[\d+\])?)\s*(?:\[(?P<unit>[^\]]*)\])?")
+_HEAD = re.compile(r"(?P<name>[^\[\]]*[^\[\]\s](?:\[\d+\])?)\s*(?:\[(?P<unit>[^\]]*)\])?")
+_ROUND = re.compile(r"(?P<name>.*[^\s(])\s*\((?P<unit>[^()]+)\)")
+_COMMA = re.compile(r"(?<!\d),|,(?!\d)")
+"""A comma that is not within a number."""
 _WORDS = {"true": 1.0, "false": 0.0}
 _MAX_FINDINGS = 20
 
@@ -45,7 +48,9 @@ class _Sheet:
 
 
 def read_csv(path: Path) -> Table:
-    """The columns of a `.csv` file (comma, semicolon or tab; UTF-8).
+    """The columns of a `.csv` file (comma, semicolon or tab; UTF-8); those of words are texts.
+
+    Between semicolons or tabs numbers may have decimal commas.
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
@@ -58,11 +63,11 @@ def table_of_text(path: Path, data: bytes) -> Table:
     """The columns of a text; `path` is for messages. Raises TraceError as `read_csv`."""
     sheet = _sheet(path, data)
     names, units = _read_header(sheet)
-    values = _read_fast(sheet, len(names))
-    if values is None:
-        values = _read_strict(sheet, len(names))
-    columns = {name: np.ascontiguousarray(values[:, i]) for i, name in enumerate(names)}
-    return Table(columns, units)
+    texts = _text_columns(sheet)
+    columns = _read_fast(sheet, len(names), texts)
+    if columns is None:
+        columns = _read_strict(sheet, len(names), texts)
+    return Table(dict(zip(names, columns, strict=True)), units)
 
 
 def _read(path: Path) -> bytes:
@@ -93,36 +98,42 @@ def _sheet(path: Path, data: bytes) -> _Sheet:
     end = len(body) if end < 0 else end
     header = body[start:end]
     delimiter = max(",;\t", key=header.count)
+    if delimiter != "," and "," in body[end:] and not _COMMA.search(body, end):
+        body = body[:end] + body[end:].replace(",", ".")  # decimal commas, as many spreadsheets write them
     return _Sheet(Source(str(path), body), delimiter, header, start, min(end + 1, len(body)))
 
 
 def _read_header(sheet: _Sheet) -> tuple[list[str], dict[str, str]]:
     findings: list[Diagnostic] = []
-    names: list[str] = []
     units: dict[str, str] = {}
+    names: list[str] = []
     for text, span in _cells(sheet.source, sheet.header_at, sheet.header, sheet.delimiter):
-        match = _HEAD.fullmatch(text)
-        name = match["name"] if match else ""
-        if match is None:
+        bare = text.removeprefix("#").strip() if not names else text  # how np.savetxt begins a header
+        name, unit = split_head(bare)
+        if not _HEAD.fullmatch(bare):
             shown = f"`{text}` is not the name of a column" if text else "a column without a name"
             findings.append(Diagnostic("E605", shown, span, label="expected a signal's name"))
         elif name in units:
             findings.append(Diagnostic("E605", f"two columns are called `{name}`", span))
         elif _NUMBER.fullmatch(name):
-            findings.append(
-                Diagnostic("E605", "the first line must name the columns", span, help=("e.g. `t,x,v`",))
-            )
+            message, advice = "the first line must name the columns", ("e.g. `t,x,v`",)
+            findings.append(Diagnostic("E605", message, span, help=advice))
         names.append(name)
-        units[name] = (match["unit"] or "").strip() if match else ""
+        units[name] = unit
     if findings:
         raise TraceError(*findings[:_MAX_FINDINGS])
     return names, units
 
 
 def split_head(text: str) -> tuple[str, str]:
-    """`v [km/h]` as name and unit; what is of another form is a name as a whole."""
+    """`v [km/h]` or `v (km/h)` as name and unit; what is of another form is a name as a whole."""
     match = _HEAD.fullmatch(text.strip())
-    return (match["name"], (match["unit"] or "").strip()) if match else (text.strip(), "")
+    if match is None:
+        return text.strip(), ""
+    round_ = _ROUND.fullmatch(match["name"])
+    if match["unit"] is None and round_ is not None and is_unit(round_["unit"].strip()):
+        return round_["name"], round_["unit"].strip()
+    return match["name"], (match["unit"] or "").strip()
 
 
 def _cells(source: Source, start: int, line: str, delimiter: str) -> Iterator[tuple[str, Span]]:
@@ -136,29 +147,54 @@ def _cells(source: Source, start: int, line: str, delimiter: str) -> Iterator[tu
         start += len(raw) + 1
 
 
-def _read_fast(sheet: _Sheet, width: int) -> Floats | None:
+def _text_columns(sheet: _Sheet) -> frozenset[int]:
+    """The columns whose first cell is a word."""
+    lines = sheet.source.text[sheet.body_at :].lstrip("\n")
+    first = lines.partition("\n")[0]
+    cells = enumerate(_cells(sheet.source, sheet.body_at, first, sheet.delimiter))
+    return frozenset(
+        i for i, (text, _) in cells if text and not _NUMBER.fullmatch(text) and text.lower() not in _WORDS
+    )
+
+
+def _read_fast(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array] | None:
     """All lines at once with NumPy's reader; None if anything about them is unusual."""
     body = sheet.source.text[sheet.body_at :]
-    if not body.strip() or '"' in body:
+    if not body.strip() or '"' in body or len(texts) == width:
         return None
+    words: list[list[str]] = []
+    if texts:
+        words = [line.split(sheet.delimiter) for line in body.split("\n") if line.strip()]
+        if any(len(cells) != width for cells in words):
+            return None
+    numbers = [i for i in range(width) if i not in texts]
     try:
         values = np.loadtxt(
-            io.StringIO(body), delimiter=sheet.delimiter, comments=None, ndmin=2, dtype=np.float64
+            io.StringIO(body),
+            delimiter=sheet.delimiter,
+            comments=None,
+            ndmin=2,
+            dtype=np.float64,
+            usecols=numbers if texts else None,
         )
     except ValueError:
         return None
-    return values if values.shape[1] == width else None
+    if values.shape[1] != len(numbers):
+        return None
+    columns: dict[int, Array] = {i: np.ascontiguousarray(values[:, k]) for k, i in enumerate(numbers)}
+    columns |= {i: np.array([cells[i].strip() for cells in words]) for i in texts}
+    return [columns[i] for i in range(width)]
 
 
-def _read_strict(sheet: _Sheet, width: int) -> Floats:
+def _read_strict(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array]:
     """Cell by cell, with the place of everything that is wrong."""
     findings: list[Diagnostic] = []
-    rows: list[list[float]] = []
+    rows: list[list[float | str]] = []
     start = sheet.body_at
     for line in sheet.source.text[sheet.body_at :].split("\n"):
         if line.strip():
             cells = list(_cells(sheet.source, start, line, sheet.delimiter))
-            rows.append(_read_row(sheet, cells, width, findings))
+            rows.append(_read_row(sheet, cells, (width, texts), findings))
         start += len(line) + 1
         if len(findings) >= _MAX_FINDINGS:
             break
@@ -166,30 +202,34 @@ def _read_strict(sheet: _Sheet, width: int) -> Floats:
         raise TraceError(*findings)
     if not rows:
         raise unreadable(sheet.source.name, "no line of numbers follows the header")
-    return np.array(rows, dtype=np.float64).reshape(-1, width)
+    kinds = [str if i in texts else np.float64 for i in range(width)]
+    return [np.array([row[i] for row in rows], dtype=kind) for i, kind in enumerate(kinds)]
 
 
 def _read_row(
-    sheet: _Sheet, cells: Sequence[tuple[str, Span]], width: int, findings: list[Diagnostic]
-) -> list[float]:
+    sheet: _Sheet,
+    cells: Sequence[tuple[str, Span]],
+    shape: tuple[int, frozenset[int]],
+    findings: list[Diagnostic],
+) -> list[float | str]:
+    width, texts = shape
     if len(cells) != width:
         span = cells[0][1].to(cells[-1][1])
         message = f"this line has {len(cells)} cells, the header names {width} columns"
         findings.append(Diagnostic("E605", message, span, help=_decimal_comma(sheet, cells, width)))
         return []
-    row = []
-    for text, span in cells:
-        if _NUMBER.fullmatch(text):
+    row: list[float | str] = []
+    for i, (text, span) in enumerate(cells):
+        if i in texts:
+            row.append(text)
+        elif _NUMBER.fullmatch(text):
             row.append(float(text))
         elif text.lower() in _WORDS:
             row.append(_WORDS[text.lower()])
         else:
             shown = f"`{text}` is not a number" if text else "an empty cell"
-            findings.append(
-                Diagnostic(
-                    "E603", shown, span, help=("write truth values as 0 and 1, enum values as numbers",)
-                )
-            )
+            advice = ("a missing value is written as nan",) if not text else ()
+            findings.append(Diagnostic("E603", shown, span, help=advice))
     return row
 
 

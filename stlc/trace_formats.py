@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
+from zipfile import is_zipfile
 
 from stlc.trace_csv import read_csv
 from stlc.trace_meta import read_meta
@@ -14,7 +15,8 @@ from stlc.trace_table import of_table
 
 Reader = Callable[[Path], Recording]
 
-SUFFIXES = (".npz", ".csv", ".parquet", ".mat", ".mcap")
+TABLES = (".csv", ".tsv")
+SUFFIXES = (".npz", *TABLES, ".parquet", ".pq", ".mat", ".mcap")
 
 _LAZY: Mapping[str, str] = {
     ".parquet": "stlc.trace_parquet:read_parquet",
@@ -33,7 +35,7 @@ def read_recording(path: Path) -> Recording:
         TraceError: the file cannot be read (E603) or does not fit together (E605).
     """
     suffix = path.suffix.lower()
-    if suffix == ".csv":
+    if suffix in TABLES:
         return of_table(path, read_csv(path))
     if suffix not in _LAZY:
         return _from_npz(path)
@@ -43,11 +45,11 @@ def read_recording(path: Path) -> Recording:
 
 
 def _from_npz(path: Path) -> Recording:
+    if path.suffix.lower() not in SUFFIXES and path.is_file() and not is_zipfile(path):
+        why = f"its suffix is none of {' '.join(SUFFIXES)}"
+        raise unreadable(path, why, advice="give it the suffix of its format")
     arrays = read_npz(path)
     meta, columns = read_meta(path, arrays.pop("meta", None))
     recording = of_arrays(path, arrays, meta)
     (strand,) = recording.strands
-    texts = [name for name, values in strand.arrays.items() if values.dtype.kind == "U"]
-    if texts:
-        raise unreadable(path, f"`{texts[0]}` holds text, not numbers")
     return Recording(str(path), (strand,), columns, meta, recording.extras)

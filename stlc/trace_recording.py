@@ -20,6 +20,10 @@ Array = NDArray[Any]
 Floats = NDArray[np.float64]
 
 CLOCK = "t"
+ROSTOPIC = "%time"
+"""How `rostopic echo -p` calls the clock, which it gives in nanoseconds."""
+CLOCKS = (CLOCK, "time", "times", "timestamp", "__time", "tout", ROSTOPIC)
+"""Names of a clock, in any case of letters."""
 EXTRA = "extra."
 
 
@@ -30,10 +34,12 @@ class Strand:
     Attributes:
         arrays: signal -> (samples,), (traces, samples) or (…, samples, components).
         clock: times in seconds, (samples,); None where the file does not say.
+        named: how the file calls the clock.
     """
 
     arrays: Mapping[str, Array]
     clock: Array | None
+    named: str = CLOCK
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +72,13 @@ class Recording:
             TraceError: E601, there is no such signal.
         """
         for index, strand in enumerate(self.strands):
+            if strand.clock is not None and strand.named == signal:
+                return self
             if signal in strand.arrays:
                 rest = {name: values for name, values in strand.arrays.items() if name != signal}
-                changed = Strand(rest, strand.arrays[signal].reshape(-1))
+                if strand.clock is not None:
+                    rest[strand.named] = strand.clock
+                changed = Strand(rest, strand.arrays[signal].reshape(-1), signal)
                 strands = (*self.strands[:index], changed, *self.strands[index + 1 :])
                 return replace(self, strands=strands)
         raise TraceError(absent(self.name, signal, self.signals))
@@ -86,11 +96,19 @@ def absent(trace: str, signal: str, known: Iterable[str]) -> Diagnostic:
     )
 
 
+def clock_among(names: Iterable[str]) -> str | None:
+    """Which of the names is that of the clock: `t`, or the only other one that is a usual one."""
+    known = list(names)
+    found = [name for name in known if name.strip().lower() in CLOCKS]
+    return CLOCK if CLOCK in known else found[0] if len(found) == 1 else None
+
+
 def of_arrays(path: Path, arrays: Mapping[str, Array], meta: TraceMeta | None = None) -> Recording:
-    """A file with one clock, `t`, among its arrays; those called `extra.…` are set aside."""
+    """A file with one clock among its arrays; those called `extra.…` are set aside."""
+    named = clock_among(arrays)
     extras = {n.removeprefix(EXTRA): values for n, values in arrays.items() if n.startswith(EXTRA)}
-    signals = {n: values for n, values in arrays.items() if n != CLOCK and not n.startswith(EXTRA)}
-    strand = Strand(signals, arrays.get(CLOCK))
+    signals = {n: values for n, values in arrays.items() if n != named and not n.startswith(EXTRA)}
+    strand = Strand(signals, None) if named is None else Strand(signals, arrays[named], named)
     return Recording(str(path), (strand,), meta=meta or TraceMeta(), extras=extras)
 
 

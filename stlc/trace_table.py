@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +12,20 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.signature import Column
 from stlc.trace_meta import TraceMeta
-from stlc.trace_recording import CLOCK, Recording, Strand, unit_of
+from stlc.trace_recording import CLOCK, ROSTOPIC, Recording, Strand, clock_among, unit_of
+from stlc.units import parse_unit
 
-Floats = NDArray[np.float64]
+Array = NDArray[Any]
 
 GROUPS = ("trace", "agent")
 """Columns of these names say to which of several traces a line belongs."""
+
+_SPELLINGS = {
+    **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
+    **dict.fromkeys(("msec", "millis", "milliseconds"), "ms"),
+    **dict.fromkeys(("usec", "micros", "microseconds"), "us"),
+    **dict.fromkeys(("nsec", "nanos", "nanoseconds"), "ns"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,11 +33,11 @@ class Table:
     """A file as read.
 
     Attributes:
-        columns: name -> values, one per line of the file.
+        columns: name -> values, one per line of the file; numbers, or texts.
         units: unit in brackets behind a name, "" where there is none.
     """
 
-    columns: dict[str, Floats]
+    columns: dict[str, Array]
     units: dict[str, str]
 
     @property
@@ -46,21 +55,45 @@ def of_table(path: Path, table: Table, meta: TraceMeta | None = None) -> Recordi
     group = next((name for name in GROUPS if name in table.columns), None)
     columns = {name: values for name, values in table.columns.items() if name != group}
     arrays = columns if group is None else _grouped(path, columns, group, table.columns[group])
-    clock = arrays.pop(CLOCK, None)
+    named = clock_among(arrays)
+    clock = None if named is None else arrays.pop(named)
     if clock is not None and clock.ndim == 2:
         clock = _common(path, clock)
+    if clock is not None and named is not None:
+        clock = _in_seconds(path, named, clock, table.units.get(named, ""))
     units = {name: Column(name, unit_of(path, name, table.units.get(name, ""))) for name in arrays}
-    return Recording(str(path), (Strand(arrays, clock),), units, meta or TraceMeta())
+    return Recording(str(path), (Strand(arrays, clock, named or CLOCK),), units, meta or TraceMeta())
 
 
-def _grouped(path: Path, columns: dict[str, Floats], group: str, keys: Floats) -> dict[str, Floats]:
+def is_unit(text: str) -> bool:
+    """Whether a text in brackets behind a name says what it is measured in."""
+    if text.lower() in _SPELLINGS:
+        return True
+    try:
+        parse_unit(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _in_seconds(path: Path, name: str, clock: Array, unit: str) -> Array:
+    """The times of a column in seconds. Raises TraceError (E605) for a unit that is no time."""
+    text = _SPELLINGS.get(unit.lower(), unit) or ("ns" if name == ROSTOPIC else "s")
+    time = unit_of(path, name, text)
+    if time.dims != parse_unit("s").dims:
+        message = f"the clock `{name}` of `{path}` is in [{unit}], which is not a time"
+        raise TraceError(Diagnostic("E605", message))
+    return clock if time.scale == 1 or clock.dtype.kind == "U" else clock * float(time.scale)
+
+
+def _grouped(path: Path, columns: dict[str, Array], group: str, keys: Array) -> dict[str, Array]:
     """Columns (lines,) -> (traces, samples)."""
     labels, sizes = np.unique(keys, return_counts=True)
     if len(set(sizes.tolist())) > 1:
         i = int(np.argmax(sizes != sizes[0]))
         message = (
-            f"traces in `{path}` differ in length: {group} {labels[0]:g} has {sizes[0]} samples, "
-            f"{labels[i]:g} has {sizes[i]}"
+            f"traces in `{path}` differ in length: {group} {_label(labels[0])} has {sizes[0]} samples, "
+            f"{_label(labels[i])} has {sizes[i]}"
         )
         help_ = ("put traces of other lengths into files of their own",)
         raise TraceError(Diagnostic("E605", message, help=help_))
@@ -68,7 +101,11 @@ def _grouped(path: Path, columns: dict[str, Floats], group: str, keys: Floats) -
     return {name: values[order] for name, values in columns.items()}
 
 
-def _common(path: Path, clock: Floats) -> Floats:
-    if not np.array_equal(clock, np.broadcast_to(clock[0], clock.shape), equal_nan=True):
+def _label(key: Any) -> str:
+    return str(key) if isinstance(key, str) else f"{key:g}"
+
+
+def _common(path: Path, clock: Array) -> Array:
+    if not np.array_equal(clock, np.broadcast_to(clock[0], clock.shape), equal_nan=clock.dtype.kind == "f"):
         raise TraceError(Diagnostic("E605", f"the traces in `{path}` were not sampled at the same times"))
     return np.asarray(clock[0])

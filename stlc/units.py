@@ -157,6 +157,14 @@ def parse_unit(text: str) -> Unit:
     return Unit(dims, ratio, cleaned)
 
 
+def nearest(value: Fraction | float) -> float:
+    """The double nearest to a number; +-inf beyond the largest."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
+
+
 def same_dims(a: Unit, b: Unit) -> bool:
     """Whether quantities of these units can be added and compared."""
     return a.dims == b.dims

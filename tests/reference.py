@@ -31,10 +31,17 @@ class Trace:
     end: Literal["strict", "truncate", "open"] = "strict"
     held: Mapping[str, float | None] = field(default_factory=dict)
     """What `freeze` binds around; None where it has no value."""
+    stop: int = 0
+    """How many samples there will be, where the end is "open" and that is more than are known."""
 
     @property
     def samples(self) -> int:
         return len(next(iter(self.columns.values())))
+
+    @property
+    def length(self) -> int:
+        """Where windows to the end end."""
+        return max(self.samples, self.stop) if self.end == "open" else self.samples
 
     def row(self, t: int) -> Row:
         return Row(self, t)
@@ -275,11 +282,11 @@ class Robustness:
 
     def _window(self, interval: typed.Interval, t: int, outward: bool) -> list[int] | None:
         """Instants of a window of the future; None: it leaves a strict trace; [-1]: nobody knows."""
-        samples = self.trace.samples
-        most = 4 * samples + 64
+        samples, length = self.trace.samples, self.trace.length
+        most = 4 * length + 64
         if interval.hi is None:
             found = [
-                t + k for k in distances(interval, self.trace.grid, most, outward=outward) if t + k < samples
+                t + k for k in distances(interval, self.trace.grid, most, outward=outward) if t + k < length
             ]
             if found or self.trace.end == "truncate":
                 return found

@@ -25,6 +25,7 @@ TRACE_FORMATS = (
         "trace_meta",
     ),
     *("trace_npz", "trace_parquet", "trace_recording", "trace_resample", "trace_table", "trace_time"),
+    "trace_words",
 )
 
 # From the bottom up; what stands in one line is one room.

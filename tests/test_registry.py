@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -101,3 +103,10 @@ def test_an_unknown_name_is_answered_with_the_nearest():
 def test_suggestions_without_a_neighbour():
     assert filled().suggest("leapfrog") == "integrators: euler, rk4"
     assert Registry[int]("world").suggest("x") == "there is no world"
+
+
+def test_a_name_of_thousands_of_letters_is_a_slip_of_nothing():
+    began = time.process_time()
+    assert closest("x" * 100_000, ["x", "x" * 99_999]) is None
+    assert closest("xy", ["x" * 100_000, "x"]) == "x"
+    assert time.process_time() - began < 0.5

@@ -19,7 +19,8 @@ from hypothesis.extra import numpy as hnp
 from stlc import trace_csv
 from stlc.diagnostics import StlcError, TraceError, UsageError
 from stlc.signature import Column, Signature
-from stlc.trace import Trace, TraceMeta, as_fraction, load_trace, save_trace
+from stlc.trace import Reading, Trace, TraceMeta, as_fraction, load_trace, save_trace
+from stlc.trace_words import TRUTH
 from stlc.units import parse_unit
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
@@ -380,6 +381,10 @@ def test_csv_lines_of_agents_may_alternate(tmp_path: Path) -> None:
     ("text", "code", "place", "words"),
     [
         ("t,x\n0,1\n0.1,oops\n", "E603", (3, 5), "`oops` is not a number"),
+        ("t,x\n0,go\n0.1,stop\n", "E603", None, "`x` in .* holds words (`go`)"),
+        ("t,x\nnow,1\nthen,2\n", "E603", None, "the clock `t` in .* holds words (`now`)"),
+        ("t [m],x\n0,1\n1,2\n", "E605", None, "the clock `t` of .* is in [m], which is not a time"),
+        ("time,Time,x\n0,1,1\n1,2,1\n", "E601", None, "no `t`"),
         ("t,x\n0,1\n0.1,\n", "E603", (3, 5), "an empty cell"),
         ("t,x\n0,1\n0.1,1_0\n", "E603", (3, 5), "`1_0` is not a number"),
         ("t,x\n0,1\n0.1,0x10\n", "E603", (3, 5), "`0x10` is not a number"),
@@ -410,14 +415,99 @@ def test_csv_that_is_wrong(
         load_trace(csv(tmp_path / "a.csv", text))
     finding = caught.value.diagnostics[0]
     assert finding.code == code
-    assert words in finding.message
+    assert all(part in finding.message for part in words.split(".*"))
     assert (finding.span and (finding.span.line, finding.span.column)) == place
 
 
 def test_csv_reports_all_bad_cells_at_once(tmp_path: Path) -> None:
     with pytest.raises(TraceError) as caught:
-        load_trace(csv(tmp_path / "a.csv", "t,x,y\n0,a,b\n1,2,c\n"))
+        load_trace(csv(tmp_path / "a.csv", "t,x,y\n0,1,2\n1,a,b\n1,2,c\n"))
     assert [d.message.split("`")[1] for d in caught.value.diagnostics] == ["a", "b", "c"]
+
+
+@pytest.mark.parametrize(
+    ("head", "times"),
+    [
+        ("time", "0 0.5 1"),
+        ("Time [s]", "0 0.5 1"),
+        ("t(s)", "0 0.5 1"),
+        ("Timestamp (ms)", "0 500 1000"),
+        ("# t [us]", "0 5e5 1e6"),
+        ("time (sec)", "0 0.5 1"),
+        ("%time", "0 500000000 1000000000"),
+        ("t", "2026-01-31T23:59:59.5Z 2026-02-01T00:00:00Z 2026-02-01T00:00:00.5Z"),
+    ],
+)
+def test_clocks_as_others_write_them(tmp_path: Path, head: str, times: str) -> None:
+    lines = [
+        f"{head},Speed over Ground (km/h),f(x)",
+        *(f"{time},{k},0" for k, time in enumerate(times.split())),
+    ]
+    trace = load_trace(csv(tmp_path / "a.csv", "\n".join(lines)))
+    assert (trace.t0, trace.dt, trace.samples) == (0.0, 0.5, 3)
+    assert list(trace.data) == ["Speed over Ground", "f(x)"]
+    assert trace.signature["Speed over Ground"].unit.text == "km/h"
+
+
+@pytest.mark.parametrize("cells", ["0,5", "-1,25e1"])
+def test_decimal_commas_between_semicolons(tmp_path: Path, cells: str) -> None:
+    trace = load_trace(csv(tmp_path / "a.csv", f"t;x\n0,0;{cells}\n0,5;1\n"))
+    assert trace.dt == 0.5
+    assert trace.data["x"].tolist() == [[float(cells.replace(",", ".")), 1.0]]
+    assert code_of(csv(tmp_path / "a.csv", f"t;x\n0,0;1\n0,5;{cells},\n")) == "E603"
+
+
+def test_another_clock_than_the_usual_one(tmp_path: Path) -> None:
+    path = csv(tmp_path / "a.csv", "time,stamp,x\n0,5,1\n1,5.5,2\n")
+    assert load_trace(path, Reading({"t": "time"})).dt == 1.0
+    trace = load_trace(path, Reading({"t": "stamp"}))
+    assert (trace.t0, trace.dt) == (5.0, 0.5)
+    assert set(trace.data) == {"x", "time"}
+
+
+WORDS = {"sign": {"stop": 0.0, "light": 1.0}, "on": TRUTH, "x": {}}
+
+
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_words_are_what_the_specification_says(tmp_path: Path, quote: str) -> None:
+    rows = [("0", "stop", "Yes", "1", "map"), ("1", "Light", "no", "2", "map")]
+    lines = ["t,Sign,on,x,frame", *(",".join(f"{quote}{cell}{quote}" for cell in row) for row in rows)]
+    path = csv(tmp_path / "a.csv", "\n".join(lines))
+    trace = load_trace(path, Reading({"sign": "Sign"}, words=WORDS))
+    assert {name: values.tolist() for name, values in trace.data.items()} == {
+        "sign": [[0, 1]],
+        "on": [[1, 0]],
+        "x": [[1, 2]],
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "message", "said"),
+    [
+        ("t,sign\n0,stop\n1,lihgt\n", "cannot be `lihgt`", "did you mean `light`?"),
+        ("t,on\n0,maybe\n1,no\n", "cannot be `maybe`", "one of true, yes"),
+        ("t,x\n0,fast\n1,slow\n", "holds words (`fast`)", "signal x : Kind"),
+    ],
+)
+def test_words_that_a_signal_does_not_have(tmp_path: Path, text: str, message: str, said: str) -> None:
+    with pytest.raises(TraceError) as caught:
+        load_trace(csv(tmp_path / "a.csv", text), Reading(words=WORDS))
+    (finding,) = caught.value.diagnostics
+    assert finding.code == "E603"
+    assert message in finding.message
+    assert said in " ".join([*finding.help, *finding.note])
+
+
+def test_other_suffixes_are_listed(tmp_path: Path) -> None:
+    with pytest.raises(TraceError, match=r"none of \.npz \.csv \.tsv \.parquet \.pq \.mat \.mcap"):
+        load_trace(csv(tmp_path / "a.txt", "t,x\n0,1\n"))
+    save_trace(tmp_path / "a.npz", a_trace())
+    (tmp_path / "a.npz").rename(tmp_path / "a.bin")
+    assert load_trace(tmp_path / "a.bin").samples == a_trace().samples
+    assert load_trace(csv(tmp_path / "a.tsv", "t\tx\n0\t1\n1\t2\n")).samples == 2
+    for path in ("a.txt", "a"):
+        with pytest.raises(UsageError, match=r"written as \.npz or \.csv"):
+            save_trace(tmp_path / path, a_trace())
 
 
 def test_csv_that_is_not_text(tmp_path: Path) -> None:

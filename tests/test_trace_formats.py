@@ -279,8 +279,10 @@ def test_clocks_that_cannot_be_resampled(tmp_path: Path, t: list[float], code: s
 
 def test_the_clock_may_have_another_name(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", time=T, x=X)
+    assert list(load_trace(tmp_path / "a.npz").data) == ["x"]
+    np.savez(tmp_path / "a.npz", now=T, x=X)
     assert code_of(tmp_path / "a.npz") == "E601"
-    trace = load_trace(tmp_path / "a.npz", Reading(names={"t": "time", "y": "x"}))
+    trace = load_trace(tmp_path / "a.npz", Reading(names={"t": "now", "y": "x"}))
     assert list(trace.data) == ["y"]
     assert code_of(tmp_path / "a.npz", Reading(names={"t": "clock"})) == "E601"
 

@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from types import FrameType
 from typing import Annotated
 
@@ -94,13 +95,32 @@ def main(argv: Sequence[str] | None = None) -> int:
     stopped: list[int] = []
     try:
         with _stoppable() as stopped:
-            command = typer.main.get_command(app)
+            command = typer.main.get_command(_asked(rest[0] if rest else ""))
             spare_adapters(command)
             code = command.main(args=[*front, *rest], prog_name="stlc", standalone_mode=False)
     except BaseException as error:  # the boundary
         code = report_error(SystemExit(stopped[0]) if stopped else error, rest)
     _flush()
     return code if isinstance(code, int) else 0
+
+
+def _asked(name: str) -> typer.Typer:
+    """The program with this command alone: to describe all of them takes as long as to lint a file.
+
+    The whole program if there is no such command.
+    """
+    alone = copy(app)
+    alone.registered_commands = [
+        each
+        for each in app.registered_commands
+        if each.callback is not None and name in (each.name, each.callback.__name__)
+    ]
+    alone.registered_groups = [
+        each
+        for each in app.registered_groups
+        if each.typer_instance and each.typer_instance.info.name == name
+    ]
+    return alone if alone.registered_commands or alone.registered_groups else app
 
 
 def _flush() -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from stlc.cli.judge import laid_reading, monitor_of, specification, usage
 from stlc.cli.outcome import Outcome
 from stlc.cli.tallies import Told, outcome_of_tallies
+from stlc.files import read_source
 
 if TYPE_CHECKING:
     from stlc.cli.many import Work
@@ -34,17 +35,18 @@ def outcome_in_chunks(path: Path, work: Work) -> Outcome:
         "--out": work.out is not None,
         "--semantics": question.semantics != "exact",
     }
-    for option, given in whole.items():
-        if given:
+    for option, asked in whole.items():
+        if asked:
             raise usage(f"`{option}` needs the whole trace, and `{path}` is read in pieces")
     if question.at not in (None, "all"):
         raise usage(f"`--at {question.at}` needs the whole trace, and `{path}` is read in pieces")
     begun = time.perf_counter()
-    read = pieces(path, work.chunk or CHUNK, laid_reading(None, question))
+    given = None if question.spec is None else monitor_of(read_source(question.spec), question)
+    read = pieces(path, work.chunk or CHUNK, laid_reading(given, question))
     first = next(read)
     head = Recording(str(path), (), meta=first.meta)
     source, note = specification(head, question.spec)
-    monitor = monitor_of(source, question, first.meta.spec_library)
+    monitor = given or monitor_of(source, question, first.meta.spec_library)
     how = How("all" if question.at else None, question.end, question.tolerance, first.t0)
     online = monitor.online(how, require=question.require, like=first)
     online.feed(first)

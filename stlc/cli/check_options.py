@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from stlc.cli.completion import requirement_names
 from stlc.cli.judge import End
 
 Files = Annotated[
@@ -20,7 +21,10 @@ Spec = Annotated[
     Path | None, typer.Option(metavar="FILE", help="The specification, instead of the trace's own.")
 ]
 Require = Annotated[
-    list[str] | None, typer.Option(metavar="NAME", help="Judge this requirement only; repeatable.")
+    list[str] | None,
+    typer.Option(
+        metavar="NAME", help="Judge this requirement only; repeatable.", autocompletion=requirement_names
+    ),
 ]
 When = Annotated[
     str | None, typer.Option(metavar="0|all|K|TIME", help="Judge at this sample or time, or at all starts.")

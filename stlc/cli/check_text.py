@@ -121,7 +121,8 @@ def _why(judged: Judgement, result: Checked) -> str:
 def _violation(judged: Judgement, cause: Cause, result: Checked, color: bool) -> str:
     verdict = result.verdict
     moment = verdict.subject.time(cause.start)
-    replay = f"stlc check {result.trace.name} --require {judged.name} --at {moment:.10g}s"
+    asked = f"{result.asked} " if result.asked else ""
+    replay = f"stlc check {asked}{result.trace.name} --require {judged.name} --at {moment:.10g}s"
     advice = [("because", cause.because), ("replay", replay)]
     return f"{_count(judged, verdict)}\n{render_place(cause.place, cause.labels, advice, color=color)}"
 

@@ -23,12 +23,14 @@ class Checked:
         source: text of the specification.
         verdict: per requirement.
         causes: violated requirement -> why.
+        asked: the words of the command line that say how it was read and judged.
     """
 
     trace: Trace
     source: Source
     verdict: Verdict
     causes: Mapping[str, Cause]
+    asked: str = ""
 
     @property
     def warnings(self) -> tuple[Diagnostic, ...]:

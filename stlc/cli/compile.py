@@ -12,6 +12,7 @@ from stlc.cli.options import JsonOption, SetOption, SystemOption, describe, pars
 from stlc.cli.output import emit, emit_json, say, show_diagnostics
 
 if TYPE_CHECKING:
+    from stlc.compile import typed
     from stlc.compile.pipeline import Compiled, Rule
     from stlc.compile.timers import Timer
     from stlc.dynamics.decl import SystemDecl
@@ -37,11 +38,42 @@ def compile_(
     system: SystemOption = None,
     set_: SetOption = None,
     show: Annotated[Part, typer.Option("--show", help="One part only.")] = "all",
+    watch: Annotated[bool, typer.Option("--watch", help="Compile again whenever a file changes.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compile `spec` for a system and print the result."""
+    if not watch:
+        _show(spec, system, (set_, show), as_json=as_json)
+        return
+    from stlc.cli.watch import watch as watch_files
+    from stlc.diagnostics import StlcError
+
+    def again() -> None:
+        try:
+            _show(spec, system, (set_, show), as_json=as_json)
+        except StlcError as error:
+            show_diagnostics(error.diagnostics)
+
+    watch_files(_files(spec, system), again)
+
+
+def _files(spec: Path, system: str | None) -> list[str]:
+    """The specification, and the system file as far as it can be found now."""
+    from stlc.diagnostics import StlcError
+    from stlc.files import find_system, read_source
+    from stlc.grammar.parser import parse
+
+    try:
+        wanted = system or parse(read_source(spec)).system
+        return [str(spec), *([str(find_system(wanted, spec))] if wanted else [])]
+    except StlcError:
+        return [str(spec)]
+
+
+def _show(spec: Path, system: str | None, how: tuple[list[str] | None, Part], *, as_json: bool) -> None:
     from stlc.compile.dump import dump
 
+    set_, show = how
     compiled, decl = _compiled(spec, system, parse_overrides(set_))
     if as_json:
         result = _result(compiled, decl)
@@ -81,16 +113,29 @@ def _result(compiled: Compiled, decl: SystemDecl) -> dict[str, Any]:
 
     steps = compiled.grid.horizon or 0
     source = compiled.spec.source
+    added = [*map(_parameter, compiled.parameters), *map(_added, compiled.timers)]
     return {
         "spec": source.name,
         "spec_sha256": sha256(source.text),
         "system": str(decl.path),
         "dt": float(decl.dt),
         "horizon": {"seconds": float(decl.dt * steps), "steps": steps},
-        "states": [*decl.signature.names, *(timer.name for timer in compiled.timers)],
-        "added": [_added(timer) for timer in compiled.timers],
+        "states": [*decl.signature.names, *(item["name"] for item in added)],
+        "added": added,
         "safety": [rule.name for rule in compiled.safety],
         "requirements": [_requirement(rule, float(decl.dt)) for rule in compiled.requirements],
+    }
+
+
+def _parameter(each: typed.Parameter) -> dict[str, Any]:
+    """A parameter that the system does not carry."""
+    column = each.column
+    return {
+        "name": column.name,
+        "kind": "param",
+        "initial": None,
+        "range": [column.low, column.high],
+        "about": f"{each.text}, drawn for every trajectory",
     }
 
 

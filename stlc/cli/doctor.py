@@ -7,7 +7,6 @@ import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, requires, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
@@ -86,6 +85,8 @@ def _packages() -> Iterator[Finding]:
 
 def _optional() -> dict[str, str]:
     """Package -> the extra that brings it, from the metadata of stlc itself."""
+    from importlib.metadata import PackageNotFoundError, requires
+
     try:
         declared = requires("stlc") or []
     except PackageNotFoundError:
@@ -101,6 +102,8 @@ def _optional() -> dict[str, str]:
 
 
 def _version(package: str) -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
     try:
         return version(package)
     except PackageNotFoundError:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import sys
-import tempfile
 import traceback
 from collections.abc import Sequence
 from datetime import datetime
@@ -134,6 +133,8 @@ def _crash(error: BaseException, argv: Sequence[str]) -> StlcError:
 
 
 def _write_report(error: BaseException, argv: Sequence[str]) -> Path | None:
+    import tempfile
+
     from stlc.provenance import hardware, versions
 
     stamp = datetime.now().astimezone()

@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-from stlc.cli.options import JsonOption, SystemOption, describe
+from stlc.cli import check_options as given
+from stlc.cli.options import JsonOption, RequireOption, SetOption, SystemOption, describe, parse_overrides
 from stlc.cli.output import emit, emit_json, table
 from stlc.diagnostics import CODES, Diagnostic, UsageError
 from stlc.registry import closest
@@ -39,9 +40,7 @@ def explain(
         str | None,
         typer.Argument(metavar="CODE|SPEC|TRACE", help="A code, precedence, a .stl file or a trace."),
     ] = None,
-    require: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="This requirement only; repeatable.")
-    ] = None,
+    require: RequireOption = None,
     at: Annotated[
         str | None, typer.Option(metavar="K|TIME", help="Of a trace: judge at this sample or time.")
     ] = None,
@@ -49,6 +48,9 @@ def explain(
         Path | None, typer.Option(metavar="FILE", help="Of a trace: instead of its own specification.")
     ] = None,
     system: SystemOption = None,
+    map_: given.Names = None,
+    resample: given.Resample = None,
+    set_: SetOption = None,
     runs: Annotated[Path, typer.Option(help="Folder of all runs.")] = Path("runs"),
     as_json: JsonOption = False,
 ) -> None:
@@ -63,9 +65,17 @@ def explain(
         _spec(what, require or [], as_json=as_json)
     else:
         from stlc.cli.explain_trace import explain_trace
-        from stlc.cli.judge import Question
+        from stlc.cli.judge import Question, names_of, time_step
 
-        question = Question(spec=spec, system=system, require=tuple(require or ()), at=at)
+        question = Question(
+            spec,
+            system,
+            names_of(map_),
+            tuple(require or ()),
+            at,
+            resample=time_step("--resample", resample),
+            overrides=parse_overrides(set_),
+        )
         explain_trace(what, question, runs, as_json=as_json)
 
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
+from stlc.cli.examples import EMPTY, FIRST, example_files, examples
 from stlc.cli.options import JsonOption, describe
 from stlc.cli.output import emit, emit_json, say
-
-Example = Literal["cart", "empty"]
 
 
 def register(app: typer.Typer) -> None:
@@ -19,7 +19,7 @@ def register(app: typer.Typer) -> None:
         help=describe(
             "Begin a project: folders, settings, and an example that trains in a minute.",
             "stlc init my-project",
-            "stlc init my-project --example empty",
+            "stlc init my-project --example car",
             note="Nothing that is there is overwritten unless --force is given.",
         )
     )(init)
@@ -27,7 +27,10 @@ def register(app: typer.Typer) -> None:
 
 def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the project.")] = Path(),
-    example: Annotated[Example, typer.Option(help="What it begins with.")] = "cart",
+    example: Annotated[
+        str,
+        typer.Option(metavar="NAME", help="cart, car, …, or empty.", autocompletion=examples),
+    ] = "cart",
     force: Annotated[bool, typer.Option("--force", help="Overwrite files that are there.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -47,20 +50,25 @@ def init(
     for path in files:
         emit(str(path))
     here = "" if folder == Path() else f"cd {folder} && "
-    say(f"next: {here}{_NEXT[example]}")
+    say(f"next: {here}{_following(files)}")
 
 
-_NEXT = {"cart": "stlc train specs/cart.stl --budget 20s", "empty": "stlc new system cart"}
+def _following(files: Iterable[Path]) -> str:
+    """What to do with the files."""
+    for path in files:
+        if path.suffix == ".stl":
+            return f"stlc train specs/{path.name} --budget 60s"
+    return "stlc new system cart"
 
 
-def _files(example: Example) -> dict[str, str]:
+def _files(example: str) -> dict[str, str]:
     """Path within the project -> text."""
     from stlc.cli.templates import ATTRIBUTES, EDITOR, IGNORED, read_template
 
     files = {".gitattributes": ATTRIBUTES, ".gitignore": IGNORED, ".vscode/settings.json": EDITOR}
-    if example == "cart":
-        files |= {
-            "specs/cart.stl": read_template("cart.stl"),
-            "systems/cart.yaml": read_template("cart.yaml"),
-        }
-    return files
+    if example == EMPTY:
+        return files
+    if example == FIRST:
+        specs = {"specs/cart.stl": read_template("cart.stl"), "systems/cart.yaml": read_template("cart.yaml")}
+        return files | specs
+    return files | example_files(example)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -123,7 +124,17 @@ def judged(path: Path, question: Question) -> tuple[Checked, list[str]]:
     )
     causes = {judgement.name: explain(verdict, judgement.name) for judgement in verdict}
     known = {name: cause for name, cause in causes.items() if cause}
-    return Checked(trace, source, verdict, known), [note] if note else []
+    return Checked(trace, source, verdict, known, spoken(question)), [note] if note else []
+
+
+def spoken(question: Question) -> str:
+    """The words of the command line that say how a trace is read and judged."""
+    words = [] if question.spec is None else [str(question.spec)]
+    words += [] if question.system is None else ["--system", question.system]
+    for option, pairs in (("--map", question.names), ("--set", question.overrides)):
+        words += [word for name, value in pairs.items() for word in (option, f"{name}={value}")]
+    words += [] if question.resample is None else ["--resample", f"{question.resample:.10g}s"]
+    return shlex.join(words)
 
 
 def laid_out(recording: Recording, monitor: Monitor, question: Question) -> Trace:
@@ -177,9 +188,7 @@ def specification(recording: Recording, spec: Path | None) -> tuple[Source, str]
         return read_source(spec), ""
     meta, name = recording.meta, recording.name
     if not meta.spec_text:
-        raise usage(
-            f"`{name}` carries no specification", f"stlc check SPEC {name}", f"stlc check {name} --spec SPEC"
-        )
+        raise usage(f"`{name}` carries no specification", f"stlc check SPEC {name}", "elsewhere: --spec SPEC")
     source = Source(meta.spec_path or f"{meta.spec_name or 'specification'} in {name}", meta.spec_text)
     if meta.spec_path and Path(meta.spec_path).is_file() and read_source(meta.spec_path).text != source.text:
         return source, (

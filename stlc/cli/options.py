@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from stlc.cli.completion import requirement_names, run_names
 from stlc.diagnostics import Diagnostic, UsageError
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on the standard output.")]
@@ -18,6 +19,23 @@ SystemOption = Annotated[
         "-s",
         metavar="FILE",
         help="The system: as given, beside the spec, in examples/, or an installed one.",
+    ),
+]
+RunArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="RUN",
+        help="A run's folder, number, words, spec, or latest.",
+        autocompletion=run_names,
+    ),
+]
+RequireOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--require",
+        metavar="NAME",
+        help="This requirement only; repeatable.",
+        autocompletion=requirement_names,
     ),
 ]
 RunsOption = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Folder of all runs.")]

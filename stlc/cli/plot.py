@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.options import JsonOption, SystemOption, describe
+from stlc.cli import check_options as given
+from stlc.cli.options import JsonOption, RequireOption, SetOption, SystemOption, describe, parse_overrides
 from stlc.cli.output import emit, emit_json, say
 from stlc.diagnostics import Diagnostic, StlcError, UsageError
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from stlc.monitor.verdict import Monitor
     from stlc.trace import Trace
     from stlc.view.signals import Choice, Margins
+    from stlc.view.style import Picture
 
 _FORMATS = (".svg", ".png", ".pdf")
 
@@ -27,8 +29,10 @@ def register(app: typer.Typer) -> None:
             "Draw the signals of a trace, and the robustness of each requirement beneath them.",
             "stlc plot trace.npz",
             "stlc plot latest --require give_way -o give_way.svg",
+            "stlc plot latest --places -o map.png",
             note="A run stands for the trace in its folder. The worst and a typical trace are shown unless "
-            "--trace names one. The suffix of -o says what is written: .svg, .png or .pdf.",
+            "--trace names one. With --places all paths are drawn over the places of the requirements: "
+            "`[x, y] in dock` names one. The suffix of -o says what is written: .svg, .png or .pdf.",
         )
     )(plot)
 
@@ -38,36 +42,51 @@ def plot(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="By default beside the trace, .svg.")
     ] = None,
-    require: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="This requirement only; repeatable.")
-    ] = None,
+    require: RequireOption = None,
     trace: Annotated[int | None, typer.Option(min=0, metavar="K", help="Trace number K of the file.")] = None,
+    places: Annotated[
+        bool, typer.Option("--places", help="Paths over the places of the specification.")
+    ] = False,
     spec: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The specification, instead of the trace's own.")
     ] = None,
     system: SystemOption = None,
+    map_: given.Names = None,
+    resample: given.Resample = None,
+    set_: SetOption = None,
     runs: Annotated[Path, typer.Option(help="Folder of all runs.")] = Path("runs"),
     as_json: JsonOption = False,
 ) -> None:
     """Draw a trace and print where the picture is."""
-    from stlc.trace import load_trace
+    from stlc.cli.judge import Question, laid_out, monitor_of, names_of, specification, time_step
+    from stlc.trace import read_recording
     from stlc.view import require_drawing
     from stlc.view.signals import draw_signals
 
     require_drawing()
     path = _find(what, runs)
     target = _target(output, path)
-    recorded = load_trace(path)
-    monitor = _monitor(recorded, spec, system)
-    margins = _margins(monitor, recorded, require or [])
-    choices = _choices(recorded, margins, trace)
-    picture = draw_signals(recorded, margins, choices)
+    grid = time_step("--resample", resample)
+    question = Question(spec, system, names_of(map_), resample=grid, overrides=parse_overrides(set_))
+    recording = read_recording(path)
+    source, note = specification(recording, question.spec)
+    monitor = monitor_of(source, question, recording.meta.spec_library)
+    recorded = laid_out(recording, monitor, question)
+    if places:
+        shown = list(range(recorded.traces)) if trace is None else [trace]
+        picture = _map(monitor, _one(recorded, trace), require or [])
+    else:
+        margins = _margins(monitor, recorded, require or [])
+        choices = _choices(recorded, margins, trace)
+        picture, shown = draw_signals(recorded, margins, choices), [choice.index for choice in choices]
     _save(picture, target)
     if as_json:
-        result = {"trace": str(path), "picture": str(target), "shown": [choice.index for choice in choices]}
+        result = {"trace": str(path), "picture": str(target), "shown": shown}
         emit_json("plot/1", ok=True, exit_code=0, result=result)
         return
     say(f"trace {path}")
+    if note:
+        say(note)
     emit(str(target))
 
 
@@ -104,24 +123,6 @@ def _target(output: Path | None, trace: Path) -> Path:
     return target
 
 
-def _monitor(trace: Trace, spec: Path | None, system: str | None) -> Monitor:
-    from stlc.files import read_source
-    from stlc.grammar.parser import parse
-    from stlc.monitor.verdict import Monitor
-    from stlc.source import Source
-
-    meta = trace.meta
-    if spec is not None:
-        return Monitor(parse(read_source(spec)), system=system)
-    if not meta.spec_text:
-        advice = (f"stlc plot {trace.name} --spec SPEC",)
-        raise UsageError(Diagnostic("U101", f"`{trace.name}` carries no specification", help=advice))
-    name = meta.spec_path or f"{meta.spec_name or 'specification'} in {trace.name}"
-    return Monitor(
-        replace(parse(Source(name, meta.spec_text)), library=meta.spec_library or None), system=system
-    )
-
-
 def _margins(monitor: Monitor, trace: Trace, wanted: list[str]) -> Margins:
     """Requirement -> robustness at every sample, (traces, samples)."""
     import numpy as np
@@ -135,6 +136,35 @@ def _margins(monitor: Monitor, trace: Trace, wanted: list[str]) -> Margins:
     return {name: np.atleast_2d(rho) for name, rho in found.items() if not wanted or name in wanted}
 
 
+def _one(trace: Trace, wanted: int | None) -> Trace:
+    """One trace of a file, or all of them."""
+    if wanted is None:
+        return trace
+    _require_trace(trace.traces, wanted)
+    return replace(
+        trace, data={name: rows[wanted : wanted + 1] for name, rows in trace.data.items()}, extras={}
+    )
+
+
+def _map(monitor: Monitor, trace: Trace, wanted: list[str]) -> Picture:
+    """Paths over the places of the requirements. Raises UsageError U101 where they name none."""
+    from stlc.view.chart import chart_of, draw_chart
+
+    chart = chart_of(monitor.spec, monitor.check(trace, require=wanted), trace)
+    if chart is None:
+        advice = ("a place is a region of two signals: `[x, y] in circle([0, 0], 1 m)`",)
+        raise UsageError(
+            Diagnostic("U101", f"no requirement of `{monitor.spec.name}` names a place", help=advice)
+        )
+    return draw_chart(chart)
+
+
+def _require_trace(traces: int, wanted: int) -> None:
+    if wanted >= traces:
+        advice = (f"they go from 0 to {traces - 1}",)
+        raise UsageError(Diagnostic("U101", f"there is no trace {wanted}", help=advice))
+
+
 def _choices(trace: Trace, margins: Margins, wanted: int | None) -> tuple[Choice, ...]:
     import numpy as np
 
@@ -143,11 +173,7 @@ def _choices(trace: Trace, margins: Margins, wanted: int | None) -> tuple[Choice
 
     names = trace_names(trace)
     if wanted is not None:
-        if wanted >= len(names):
-            last = len(names) - 1
-            raise UsageError(
-                Diagnostic("U101", f"there is no trace {wanted}", help=(f"they go from 0 to {last}",))
-            )
+        _require_trace(len(names), wanted)
         return (Choice(wanted, names[wanted]),)
     per_trace = [np.nanmin(np.where(np.isnan(rho), np.inf, rho), axis=1) for rho in margins.values()]
     least = np.min(per_trace, axis=0) if per_trace else np.zeros(len(names))

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
-from stlc.cli.options import JsonOption, RunsOption, describe
+from stlc.cli.options import JsonOption, RunArgument, RunsOption, describe
 from stlc.cli.output import emit, emit_json
 
 
@@ -24,9 +23,7 @@ def register(app: typer.Typer) -> None:
 
 
 def report(
-    run: Annotated[
-        str, typer.Argument(metavar="RUN", help="A run's folder, number, words, spec, or latest.")
-    ] = "latest",
+    run: RunArgument = "latest",
     runs: RunsOption = Path("runs"),
     as_json: JsonOption = False,
 ) -> None:

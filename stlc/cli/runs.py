@@ -8,13 +8,13 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from stlc.cli.options import JsonOption, describe
+from stlc.cli.completion import run_names
+from stlc.cli.options import JsonOption, RunArgument, describe
 from stlc.cli.output import emit, emit_json, say, table
 from stlc.diagnostics import Diagnostic, UsageError
 
 Sort = Literal["time", "acc", "name"]
 
-_Run = Annotated[str, typer.Argument(metavar="RUN", help="A run's folder, number, words, spec, or latest.")]
 _Runs = Annotated[Path, typer.Option("--runs", help="Folder of all runs.")]
 RUNS = Path("runs")
 
@@ -67,7 +67,7 @@ def list_(
         say(f"there is no run in {runs}; train one: stlc train specs/traffic.stl --system car.yaml")
 
 
-def show(run: _Run = "latest", runs: _Runs = RUNS, as_json: JsonOption = False) -> None:
+def show(run: RunArgument = "latest", runs: _Runs = RUNS, as_json: JsonOption = False) -> None:
     """Print the record of `run`."""
     from stlc.rundir import RunDir
 
@@ -86,7 +86,7 @@ def show(run: _Run = "latest", runs: _Runs = RUNS, as_json: JsonOption = False) 
 
 
 def diff(
-    first: _Run,
+    first: RunArgument,
     second: Annotated[str, typer.Argument(metavar="OTHER", help="The run to compare with.")] = "latest",
     runs: _Runs = RUNS,
     as_json: JsonOption = False,
@@ -113,7 +113,9 @@ def diff(
 
 
 def rm(
-    names: Annotated[list[str], typer.Argument(metavar="RUN…", help="Runs to remove.")],
+    names: Annotated[
+        list[str], typer.Argument(metavar="RUN…", help="Runs to remove.", autocompletion=run_names)
+    ],
     force: Annotated[bool, typer.Option("--force", help="Also those that are still going.")] = False,
     runs: _Runs = RUNS,
     as_json: JsonOption = False,

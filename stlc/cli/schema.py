@@ -60,8 +60,10 @@ def load_schema(name: str) -> dict[str, Any]:
     command = wanted.partition("/")[0]
     frame = _read("frame")
     properties = {**frame["properties"], "schema": {"const": wanted}}
-    properties["result"] = {"anyOf": [_read(command), {"type": "null"}]}
-    return {"$schema": _DIALECT, "title": wanted, **frame, "properties": properties}
+    result = _read(command)
+    shared = {"$defs": result.pop("$defs")} if "$defs" in result else {}
+    properties["result"] = {"anyOf": [result, {"type": "null"}]}
+    return {"$schema": _DIALECT, "title": wanted, **frame, "properties": properties, **shared}
 
 
 def _read(name: str) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
-from stlc.cli.options import JsonOption, RunsOption, describe
+from stlc.cli.options import JsonOption, RunArgument, RunsOption, SetOption, describe, parse_overrides
 from stlc.diagnostics import Diagnostic, UsageError
 
 if TYPE_CHECKING:
@@ -40,9 +40,7 @@ def register(app: typer.Typer) -> None:
 
 
 def simulate(
-    run: Annotated[
-        str, typer.Argument(metavar="RUN", help="A run's folder, number, words, spec, or latest.")
-    ] = "latest",
+    run: RunArgument = "latest",
     backup: Annotated[
         bool | None, typer.Option("--backup/--no-backup", help="The paper's backup policy.")
     ] = None,
@@ -57,6 +55,7 @@ def simulate(
     fail_under: Annotated[
         float | None, typer.Option(metavar="SHARE", help="Exit with 1 if the plan accuracy is less.")
     ] = None,
+    set_: SetOption = None,
     runs: RunsOption = Path("runs"),
     pictures: Annotated[bool, typer.Option(help="Draw the animation and the report.")] = True,
     json: JsonOption = False,
@@ -65,8 +64,12 @@ def simulate(
     chosen = _guard(backup, guard)
     from stlc.controller.drive import Setting
     from stlc.controller.run import Run
+    from stlc.trace import check_writable
 
-    opened = Run.open(run, root=runs)
+    if record is not None:
+        check_writable(record)
+
+    opened = Run.open(run, root=runs, overrides=parse_overrides(set_))
     test = opened.task.system.decl.test
     setting = Setting(
         tuple(range(seed, seed + seeds)), agents or test.agents, steps or test.steps, test.replan

@@ -113,6 +113,7 @@ def _entry(told: Told, online: Online, tallies: Mapping[str, Tally], status: Sta
         "end": online.how.end,
         "traces": 1,
         "samples": told.samples,
+        "in_scope": int(online.in_scope is not False),
         "verdict": status,
         "robustness": math.nan if any(map(math.isnan, known)) else min(known),
         "satisfied_traces": int(status == "satisfied"),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stlc.cli.completion import run_names
 from stlc.cli.options import JsonOption, SetOption, SystemOption, describe, parse_overrides
 from stlc.diagnostics import Diagnostic, UsageError
 
@@ -62,7 +63,10 @@ def train(
     ] = None,
     seed: SeedOption = None,
     method: MethodOption = None,
-    resume: Annotated[str | None, typer.Option(metavar="RUN", help="Go on with an interrupted run.")] = None,
+    resume: Annotated[
+        str | None,
+        typer.Option(metavar="RUN", help="Go on with an interrupted run.", autocompletion=run_names),
+    ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the run; drawn if not given.")] = None,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")] = "cpu",
     threads: Annotated[int | None, typer.Option(min=1, help="Threads of torch.")] = None,

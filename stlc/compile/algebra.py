@@ -16,7 +16,7 @@ from stlc.compile.values import Number, literal, unit_text
 from stlc.diagnostics import Diagnostic, Label
 from stlc.signature import Kind
 from stlc.source import Span
-from stlc.units import DIMENSIONLESS, Unit, same_dims
+from stlc.units import DIMENSIONLESS, Unit, nearest, same_dims
 
 _MAX_BITS = 512
 _QUANTITY = re.compile(r"([\d.]+(?:[eE][+-]?\d+)?) *[^\W\d]\S*")
@@ -74,18 +74,31 @@ def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[
         return tuple(args), Number(ir.Lit(0.0), DIMENSIONLESS, True, True, span=span)
     unit = known[0].unit
     blank = Number(ir.Lit(0.0), unit, not rigid, span=span)
-    return tuple(in_unit(arg, unit) if arg.bare else arg for arg in args), blank
+    return tuple(in_unit(arg, unit, scope) if arg.bare else arg for arg in args), blank
 
 
-def in_unit(number: Number, unit: Unit) -> Number:
-    """A bare number read in `unit`: 30 becomes 30 deg."""
+def too_large(span: Span | None) -> Diagnostic:
+    """E005: a number that no double holds."""
+    return Diagnostic(
+        "E005",
+        "this number is beyond double precision",
+        span,
+        note=("in SI units the largest is about 1.8e308",),
+    )
+
+
+def in_unit(number: Number, unit: Unit, scope: Scope) -> Number:
+    """A bare number read in `unit`: 30 becomes 30 deg. Raises Failed (E005 beyond double precision)."""
     if unit.ratio == 1:
         return replace(number, unit=unit, bare=False, flexible=False)
     exact = None if number.exact is None else number.exact * unit.ratio
     value = number.constant
     num: ir.Num = ir.Op("mul", (number.num, ir.Lit(unit.scale)))
     if value is not None:
-        num = ir.Lit(float(exact) if exact is not None else value * unit.scale)
+        stored = nearest(exact) if exact is not None else value * unit.scale
+        if not math.isfinite(stored):
+            scope.fail(too_large(number.span))
+        num = ir.Lit(stored)
     return replace(number, num=num, unit=unit, exact=exact, kind="real", bare=False, flexible=False)
 
 

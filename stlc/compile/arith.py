@@ -174,8 +174,9 @@ class _Writer:
     With `exact` conditions are masks; otherwise they are margins handed to the switch.
     """
 
-    def __init__(self, constants: Mapping[str, float], *, exact: bool) -> None:
-        self.tape = Tape()
+    def __init__(self, constants: Mapping[str, float], *, exact: bool, tape: Tape | None = None) -> None:
+        self.tape = Tape() if tape is None else tape
+        self.bound: dict[str, Operand] = {}
         self._constants = constants
         self._exact = exact
         self._seen: dict[int, Operand] = {}
@@ -192,7 +193,7 @@ class _Writer:
             case ir.Lit(value):
                 return float(value)
             case ir.Col(name):
-                known = self._constants.get(name)
+                known = self.bound.get(name, self._constants.get(name))
                 return self.tape.emit("input", params=(name,)) if known is None else known
             case ir.At() | ir.Held():
                 return self.tape.emit("input", params=(key_of(num),))
@@ -202,11 +203,21 @@ class _Writer:
                 return self._indicator(cond, sharpness)
             case ir.Where(cond, yes, no):
                 return self._where(cond, self.number(yes), self.number(no))
+            case ir.Extern(_, args, output, ir.Body() as body):
+                return self._inlined(body, [self.number(arg) for arg in args], output)
             case ir.Extern(name, args, output, function):
                 whole = self.tape.emit("extern", *map(self.number, args), params=(function or name,))
                 return self.tape.emit("pick", whole, params=(output,))
             case _:
                 assert_never(num)
+
+    def _inlined(self, body: ir.Body, args: list[Operand], output: int) -> Operand:
+        """A function of which only numbers are known: its lines on the same tape, which knows them again."""
+        inner = _Writer(self._constants, exact=self._exact, tape=self.tape)
+        inner.bound.update(zip(body.formals, args, strict=True))
+        for name, num in body.lets:
+            inner.bound[name] = inner.number(num)
+        return inner.number(body.outputs[output])
 
     def _op(self, name: str, args: list[Operand]) -> Operand:
         tape = self.tape

@@ -8,13 +8,13 @@ on the samples holds as written: `always` and `release` take the neighbour outsi
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from fractions import Fraction
 
 from stlc.compile import ir, typed
 from stlc.compile.interface import Grid
-from stlc.diagnostics import Diagnostic
+from stlc.diagnostics import Diagnostic, tell
 from stlc.source import Span
+from stlc.units import nearest
 
 MAX_STEPS = 10**12
 """Bounds beyond are longer than any trace, and sums of them would not fit into 64 bits."""
@@ -78,20 +78,19 @@ def _last(hi: Fraction, *, outward: bool, excluded: bool) -> int:
 
 def report(sink: list[Diagnostic], finding: Diagnostic) -> None:
     """Append a finding that is not there yet: a formula and its negation may both be lowered."""
-    if finding not in sink:
-        sink.append(finding)
+    tell(sink, finding)
 
 
 def _reversed(interval: typed.Interval, lo: Fraction, hi: Fraction | None, sink: list[Diagnostic]) -> bool:
     if lo < 0:
         text = "an interval starts before now"
         report(
-            sink, Diagnostic("E302", text, interval.lo.span or interval.span, label=f"{float(lo):g} steps")
+            sink, Diagnostic("E302", text, interval.lo.span or interval.span, label=f"{nearest(lo):g} steps")
         )
         return True
     if hi is not None and hi < lo:
         text = "the interval ends before it starts"
-        label = f"from {float(lo):g} to {float(hi):g} steps"
+        label = f"from {nearest(lo):g} to {nearest(hi):g} steps"
         report(sink, Diagnostic("E301", text, interval.span, label=label))
         return True
     return False
@@ -119,15 +118,14 @@ def _note_rounding(time: typed.Time, exact: Fraction, taken: int, grid: Grid, si
         ),
         note=("`always` and `release` also take the sample outside, `eventually` and `until` do not",),
     )
-    if not any(replace(other, label=finding.label) == finding for other in sink):
-        sink.append(finding)
+    tell(sink, finding)
 
 
 def in_words(steps: Fraction, grid: Grid) -> str:
     """A time as people write it: in seconds where the step is known."""
     if grid.dt is None:
-        return f"{float(steps):g} steps"
-    return f"{float(steps * grid.dt):g} s"
+        return f"{nearest(steps):g} steps"
+    return f"{nearest(steps * grid.dt):g} s"
 
 
 def _step(grid: Grid) -> str:

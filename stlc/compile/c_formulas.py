@@ -20,14 +20,14 @@ class FormulaWriter:
 
     Attributes:
         samples: T + 1.
-        column: C expression of an environment entry at sample `k`, lane `j`.
+        column: C expression of an environment entry at a sample, which is one too, and lane `j`.
         lines: statements written so far.
         size: doubles that the buffers take per lane.
         buffers: their names, and where they begin.
     """
 
     samples: int
-    column: Callable[[str], str]
+    column: Callable[[str, str], str]
     lines: list[str] = field(default_factory=list)
     size: int = 0
     buffers: list[tuple[str, int]] = field(default_factory=list)
@@ -66,12 +66,24 @@ class FormulaWriter:
                 assert_never(formula)
 
     def _atom(self, atom: ir.Atom, start: int, count: int) -> str:
-        writer = NumberWriter(self.column)
+        writer = NumberWriter(
+            lambda name: self.column(name, "k"), lambda leaf: self._elsewhere(leaf, start, count)
+        )
         margin = writer.number(atom.num)
         value = margin if atom.sign > 0 else f"(-{margin})"
         if atom.guard:
             value = f"({value} {'>' if atom.strict else '>='} 0.0 ? INFINITY : -INFINITY)"
         return self._fill(count, value, before=[*writer.lines, f"bad[j] += NAN_IN({value});"], first=start)
+
+    def _elsewhere(self, leaf: ir.At, start: int, count: int) -> str:
+        """A column so many samples from here; a clamped one stays within the plan."""
+        last = self.samples - 1
+        index = f"k + ({leaf.steps})"
+        if leaf.clamped:
+            index = f"{index} < {last} ? {index} : {last}" if leaf.steps > 0 else f"{index} > 0 ? {index} : 0"
+        elif start + leaf.steps < 0 or start + count - 1 + leaf.steps > last:
+            raise Untranslatable("a sample outside of the plan")
+        return self.column(leaf.name, index)
 
     def _last(self, window: ir.Window, start: int, count: int) -> int:
         """Last sample that the window of the last instant reaches."""

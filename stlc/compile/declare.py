@@ -132,6 +132,12 @@ def _entry(
 ) -> Entry:
     about = f"{_keyword(item)}, declared at line {item.name_span.line}"
     match item:
+        case ast.Param() if item.name in overrides:
+            check_type(item.type, found.enums, scope)
+            unit = declared_unit(item.unit, item, scope) if item.unit else None
+            return Definition(
+                item.name, overrides[item.name], (), unit, "constant", f"{about}, set", item.name_span
+            )
         case ast.Signal() | ast.Param():
             return _column_entry(item, found, interface, scope)
         case ast.Const():
@@ -157,7 +163,7 @@ def _column_entry(
     found.columns.append((item, columns, unit))
     role = f"{item.role} signal" if isinstance(item, ast.Signal) and item.role else _keyword(item)
     about = f"{role}, declared at line {item.name_span.line}"
-    if interface is not None:
+    if interface is not None and columns[0].name in interface.signature:
         about += f"; also a state of {interface.where}"
     (entry,) = column_entries(columns, about=about, span=item.name_span).values()
     return replace(entry, value=_read_in(entry.value, unit)) if unit.text else entry

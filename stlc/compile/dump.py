@@ -92,9 +92,11 @@ def _interval(op: str, window: ir.Window, grid: Grid, *, back: bool) -> str:
 
 
 def _states(compiled: Compiled) -> Iterator[str]:
-    added = [timer.name for timer in compiled.timers]
+    added = [each.column.name for each in compiled.parameters] + [timer.name for timer in compiled.timers]
     read = [name for name in compiled.signature.names if name not in added]
     yield "  columns   " + " ".join(read) + (f" | {' '.join(added)}" if added else "")
+    for each in compiled.parameters:
+        yield f"  + param   {each.column.name}  {each.text}, drawn for every trajectory"
     yield from (_added(timer, "  ") for timer in compiled.timers)
     if compiled.mission is not None:
         yield f"  mission   {_both(compiled.mission, compiled.grid)}"

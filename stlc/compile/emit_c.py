@@ -67,7 +67,7 @@ def emit(motion: Motion, formulas: Sequence[ir.Formula]) -> str:
     Raises:
         Untranslatable: the IR holds something that has no C form.
     """
-    checks = FormulaWriter(motion.steps + 1, lambda name: f"x[{motion.states.index(name)}][k][j]")
+    checks = FormulaWriter(motion.steps + 1, lambda name, k: f"x[{motion.states.index(name)}][{k}][j]")
     values = [checks.value(formula) for formula in formulas]
     states, rules, steps = len(motion.states), len(formulas), motion.steps
     return "\n".join(

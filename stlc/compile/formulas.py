@@ -7,7 +7,7 @@ from stlc.compile.conditions import condition, is_state
 from stlc.compile.expressions import evaluate
 from stlc.compile.scope import Failed, Scope
 from stlc.compile.sorts import Need, as_formula
-from stlc.compile.values import Number, Value, describe, noun
+from stlc.compile.values import REGION_TYPES, Number, Region, Value, describe, noun
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 
@@ -31,6 +31,23 @@ def resolve_state_formula(expr: ast.Expr, scope: Scope, *, what: str = "a condit
             if not is_state(formula):
                 scope.fail(Diagnostic("E202", f"{what} speaks about one instant", expr.span, "temporal"))
             return condition(formula)
+    except Failed:
+        raise scope.error(*(f for f in scope.sink[before:] if f.severity == "error")) from None
+
+
+def resolve_region(expr: ast.Expr, scope: Scope) -> Region:
+    """The expression as a region.
+
+    Raises:
+        StlcError: `scope.error`, with what was found.
+    """
+    before = len(scope.sink)
+    try:
+        with scope.meter.fresh():
+            value = evaluate(expr, scope)
+            if not isinstance(value, REGION_TYPES):
+                scope.fail(Diagnostic("E205", f"a region is needed, this is {noun(value)}", expr.span))
+            return value
     except Failed:
         raise scope.error(*(f for f in scope.sink[before:] if f.severity == "error")) from None
 

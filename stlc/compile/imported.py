@@ -6,9 +6,11 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
+from stlc.compile import typed
 from stlc.compile.declare import Declared, declare
 from stlc.compile.interface import Interface
 from stlc.compile.modules import Module
+from stlc.compile.parameters import parameters
 from stlc.compile.scope import Bounds, Failed, Scope
 from stlc.compile.signals import ranged
 from stlc.diagnostics import Diagnostic, Label
@@ -55,13 +57,21 @@ def _of_module(module: Module, interface: Interface | None, scope: Scope) -> Fil
     return declared(module.spec, module.imports, interface, {}, blank)
 
 
-def signature_of(file: File) -> Signature:
-    """The columns of a file and of what it imports, each once; E104 where two files differ about one."""
+def signature_of(file: File, interface: Interface | None) -> tuple[Signature, tuple[typed.Parameter, ...]]:
+    """The columns of a file and of what it imports, each once, and those that are parameters.
+
+    E104 where two files differ about one, or the system has other values for a parameter.
+    """
     columns: dict[str, tuple[Column, Span]] = {}
+    drawn: dict[str, typed.Parameter] = {}
     for where in _every(file):
         for decl, plain, unit in where.found.columns:
             try:
                 found = ranged(plain, unit, decl, where.scope)
+                if isinstance(decl, ast.Param):
+                    made = parameters(decl, found, unit, interface, where.scope)
+                    drawn = {part.column.name: part for part in made} | drawn
+                    found = tuple(part.column for part in made)
             except Failed:
                 found = plain
             for column in found:
@@ -69,7 +79,8 @@ def signature_of(file: File) -> Signature:
                     columns[column.name] = (column, decl.name_span)
                 elif where is not file:
                     _check_same(column, decl.name_span, columns[column.name], file.scope)
-    return Signature(tuple(column for column, _ in columns.values()))
+    order = [column for column, _ in columns.values()]
+    return Signature(tuple(order)), tuple(drawn[column.name] for column in order if column.name in drawn)
 
 
 def _every(file: File) -> Iterator[File]:

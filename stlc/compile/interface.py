@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any, Protocol
 
+from stlc.compile.ir import Body
 from stlc.signature import Signature
 from stlc.source import Span
 from stlc.units import Unit
@@ -23,7 +24,9 @@ class Grid:
 class Function(Protocol):
     """A function from outside, such as forward kinematics."""
 
-    def bound(self, arguments: tuple[int | None, ...], result: int | None) -> Callable[..., Sequence[Any]]:
+    def bound(
+        self, arguments: tuple[int | None, ...], result: int | None
+    ) -> Callable[..., Sequence[Any]] | Body:
         """The function on components.
 
         Args:
@@ -31,7 +34,8 @@ class Function(Protocol):
             result: the size of the vector that it gives; None for a number.
 
         Returns:
-            Takes all components as arrays that broadcast, and gives the components of the result.
+            Takes all components as arrays that broadcast, and gives the components of the result; or what
+            these are in the IR.
         """
 
 

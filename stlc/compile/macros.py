@@ -77,7 +77,7 @@ def _in_unit(value: Value, unit: Unit, span: Span, scope: Scope) -> Value:
 
 def _number_in(number: Number, unit: Unit, span: Span, scope: Scope) -> Number:
     if number.bare:
-        return in_unit(number, unit)
+        return in_unit(number, unit, scope)
     if not number.flexible and not same_dims(number.unit, unit):
         message = f"declared as [{unit}], but this is {unit_text(number) or '[1]'}"
         scope.fail(Diagnostic("E203", message, number.span or span))

@@ -14,7 +14,7 @@ from stlc.compile.values import Label, Number, Value, Vector, noun
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.signature import Column
-from stlc.units import Unit, same_dims
+from stlc.units import Unit, nearest, same_dims
 
 __all__ = ["Number", "resolve_number", "resolve_numbers", "stored"]
 
@@ -63,7 +63,7 @@ def stored(number: Number, unit: Unit) -> ir.Num:
     value = number.constant
     if value is None:
         return ir.Op("div", (number.num, ir.Lit(unit.scale)))
-    return ir.Lit(float(number.exact / unit.ratio) if number.exact is not None else value / unit.scale)
+    return ir.Lit(nearest(number.exact / unit.ratio) if number.exact is not None else value / unit.scale)
 
 
 def _code(scope: Scope) -> str:
@@ -113,7 +113,7 @@ def _fitted(number: Number, expr: ast.Expr, column: Column, scope: Scope) -> Num
             Diagnostic(_code(scope), f"`{column.name}` is a number, this is an enum member", expr.span)
         )
     if number.bare:
-        return in_unit(number, column.unit)
+        return in_unit(number, column.unit, scope)
     if not number.flexible and column.unit.text and not same_dims(number.unit, column.unit):
         message = f"`{column.name}` is in [{column.unit}], this is in [{number.unit}]"
         scope.fail(Diagnostic("E203", message, expr.span, f"[{number.unit}]"))

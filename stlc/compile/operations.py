@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
 from stlc.compile import comparisons, moments, typed
+from stlc.compile.algebra import too_large
 from stlc.compile.calls import unsupported
 from stlc.compile.choices import choose_formula, choose_number
 from stlc.compile.functions import OPERATORS
@@ -18,7 +20,7 @@ from stlc.compile.vectors import broadcast, negate
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.source import Span
-from stlc.units import parse_unit
+from stlc.units import nearest, parse_unit
 
 _VERBS = {"+": "adds", "-": "subtracts", "*": "multiplies", "/": "divides", "%": "divides", "^": "raises"}
 
@@ -42,7 +44,10 @@ def _quantity(expr: ast.Quantity, _values: Sequence[Value], scope: Scope) -> Val
         unit = parse_unit(expr.unit)
     except ValueError as error:
         scope.fail(Diagnostic("E203", str(error), expr.span))
-    number = literal(expr.value * unit.ratio, expr.span)
+    exact = expr.value * unit.ratio
+    if not math.isfinite(nearest(exact)):
+        scope.fail(too_large(expr.span))
+    number = literal(exact, expr.span)
     return replace(number, unit=unit, flexible=False, bare=False, kind="real")
 
 

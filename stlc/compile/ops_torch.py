@@ -6,6 +6,7 @@ import operator
 from collections.abc import Hashable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, cast, final
 
 import numpy as np
@@ -17,6 +18,7 @@ from torch.autograd.function import once_differentiable
 from stlc.compile.extremum import Pick, Sliding
 from stlc.compile.ops import Mask, Ops
 from stlc.compile.ops_torch_choice import choice, reduction
+from stlc.compile.ops_torch_kernel import by_kernel
 from stlc.compile.ops_torch_small import block_extrema, is_small, small_extrema, small_until
 from stlc.compile.ops_torch_windows import SlidingExtremum, SlidingUntil
 from stlc.compile.sliding import Asked
@@ -24,6 +26,9 @@ from stlc.compile.sliding import Asked
 _LARGE, _LARGE_FEW, _LARGE_BLOCK, _LARGE_UNTIL = 1 << 13, 1 << 17, 1 << 16, 1 << 12
 """From so many numbers on, on a processor, scans in place beat what torch's own operations can do: for
 windows, for windows of a few traces, for windows that all reach the last row, and for `until`."""
+
+_LARGE_KERNEL = 1 << 11
+"""From so many numbers on a kernel is worth building."""
 
 _FEW = 16
 """So many traces are a few."""
@@ -43,6 +48,28 @@ class _SafeSqrt(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> Tensor:
         (root,) = ctx.saved_tensors
         return torch.where(root > 0, grad / (2.0 * root), 0.0)
+
+
+class _Kept(torch.autograd.Function):
+    """Some rows as they are, in the others a constant."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, keep: NDArray[np.bool_], value: float) -> Tensor:
+        edges = (0, *(np.flatnonzero(np.diff(keep)) + 1).tolist(), len(keep))
+        ctx.runs = [(slice(a, b), bool(keep[a])) for a, b in pairwise(edges)]
+        return _kept(x, ctx.runs, value)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        return _kept(grad, ctx.runs, 0.0), None, None
+
+
+def _kept(x: Tensor, runs: list[tuple[slice, bool]], value: float) -> Tensor:
+    out = torch.empty_like(x)
+    for rows, stay in runs:
+        out[rows] = x[rows] if stay else value
+    return out
 
 
 class _SmoothMax(torch.autograd.Function):
@@ -99,7 +126,11 @@ def _pair(a: Tensor | float, b: Tensor | float) -> tuple[Tensor, Tensor]:
 
 @final
 class TorchOps:
-    """`stlc.compile.ops.Ops` over torch tensors; dtype and device follow the operands."""
+    """`stlc.compile.ops.Ops` over torch tensors; dtype and device follow the operands.
+
+    Operands are `(time, batch)`, or of any shapes that broadcast; what runs over axis 0 runs over time, and a
+    reduction over it gives `(1, batch)`.
+    """
 
     name = "torch"
 
@@ -222,6 +253,8 @@ class TorchOps:
             return None
         if is_small(x, window):
             return small_extrema(x, pick, window)
+        if x.numel() >= _LARGE_KERNEL and (found := by_kernel((x,), pick, window)) is not None:
+            return found
         if x.is_cuda or (window.to_end and x.numel() < _LARGE_BLOCK):
             return None
         if not window.to_end and x.numel() < (_LARGE_FEW if x.shape[1] <= _FEW else _LARGE):
@@ -235,6 +268,8 @@ class TorchOps:
             return None
         if is_small(left, window):
             return small_until(left, right, pick, window)
+        if left.numel() >= _LARGE_KERNEL and (found := by_kernel((left, right), pick, window)) is not None:
+            return found
         if left.numel() < _LARGE_UNTIL and not window.to_end:
             return None
         out: Tensor = SlidingUntil.apply(left, right, Asked(pick, window, TORCH))  # type: ignore[no-untyped-call]
@@ -285,8 +320,10 @@ class TorchOps:
 
     def rows(self, keep: NDArray[np.bool_], x: Tensor, value: float) -> Tensor:
         """`x` with `value` in the rows that are not kept."""
-        kept = torch.from_numpy(keep).to(x.device).reshape(-1, *(1,) * (x.ndim - 1))
-        return torch.where(kept, x, value)
+        if keep.all():
+            return x
+        out: Tensor = _Kept.apply(x, keep, value)  # type: ignore[no-untyped-call]
+        return out
 
     def columns(self, x: Tensor) -> Sequence[Tensor]:
         """One `(time, batch)` tensor for every column of `(batch, time, dim)`: a copy, and views of it."""

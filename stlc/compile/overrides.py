@@ -1,4 +1,4 @@
-"""`--set NAME=VALUE`: constants that the command line changes."""
+"""`--set NAME=VALUE`: constants that the command line changes, and parameters that it fixes."""
 
 from __future__ import annotations
 
@@ -15,15 +15,17 @@ from stlc.source import Source
 def read_overrides(
     overrides: Mapping[str, str], spec: ast.Spec, interface: Interface | None
 ) -> dict[str, ast.Expr]:
-    """Constant of the specification -> the expression that replaces its value.
+    """Constant or parameter of the specification -> the expression that is its value.
 
-    A constant that only the system has is left to it, and so is a dotted key.
+    What the system has alone is left to it: constants, states and parameters that it carries, dotted keys.
 
     Raises:
         UsageError: U101, a name that neither has, or a value that is not an expression.
     """
+    carried = set() if interface is None else {name.partition("[")[0] for name in interface.signature.names}
+    systems = set() if interface is None else {*interface.constants, *carried}
     own = {item.name for item in spec.items if isinstance(item, ast.Const)}
-    systems = set() if interface is None else set(interface.constants)
+    own |= {item.name for item in spec.items if isinstance(item, ast.Param)} - carried
     found: dict[str, ast.Expr] = {}
     faults: list[Diagnostic] = []
     for name, text in overrides.items():

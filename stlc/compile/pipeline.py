@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Literal, TypeAlias, final
 
@@ -94,6 +94,7 @@ class Compiled:
         requirements: in order.
         assumptions: the `assume`s, in order; never part of the whole.
         timers: states that the requirements need beyond those of the system.
+        parameters: what is drawn for every trajectory and the system does not carry, for training.
         pull: for training, how far the next goal of the mission is at one sample; None without such goals.
         mission: the last step of the mission that a requirement names; None where none does.
         grid: of time.
@@ -107,6 +108,7 @@ class Compiled:
     requirements: tuple[Rule, ...]
     assumptions: tuple[Rule, ...]
     timers: tuple[Timer, ...]
+    parameters: tuple[typed.Parameter, ...]
     pull: ir.Num | None = field(repr=False)
     mission: int | None
     grid: Grid
@@ -145,6 +147,9 @@ def compile_spec(
         SpecError: with all errors of a stage.
     """
     sink: list[Diagnostic] = []
+    if interface is not None and purpose == "check":
+        given = {item.name for item in spec.items if isinstance(item, ast.Param)} & (overrides or {}).keys()
+        interface = _without(interface, given)
     resolved = resolve(spec, interface=interface, overrides=overrides or {}, sink=sink)
     ranges = nominal(resolved.signature.columns)
     stage = _Stage(grid, purpose, Ledger(_taken(resolved, interface)), sink, ranges)
@@ -163,6 +168,7 @@ def compile_spec(
         requirements=requirements,
         assumptions=assumptions,
         timers=stage.ledger.timers,
+        parameters=tuple(each for each in resolved.parameters if not each.carried),
         pull=pull(goals),
         mission=max(map(mission_steps, goals), default=None),
         grid=grid,
@@ -217,6 +223,12 @@ class _Stage:
 
     def _lowered(self, formula: typed.Formula) -> ir.Formula:
         return simplify(lower(formula, self.grid, self.sink))
+
+
+def _without(interface: Interface, names: Iterable[str]) -> Interface:
+    """An interface that leaves states whose value is given to the specification: its parameters."""
+    kept = [column for column in interface.signature.columns if column.name.partition("[")[0] not in names]
+    return replace(interface, signature=Signature(tuple(kept)))
 
 
 def _signature(spec: typed.Spec, rules: Iterable[Rule], timers: Iterable[Timer]) -> Signature:

@@ -29,7 +29,7 @@ from stlc.compile.scope import Definition, Failed, Scope, enforced
 from stlc.compile.tags import Tags, read_tags
 from stlc.compile.vacuity import toothless, vacuous
 from stlc.compile.values import Number, Value, Vector
-from stlc.diagnostics import Diagnostic, Label, SpecError
+from stlc.diagnostics import Diagnostic, Findings, Label, SpecError
 from stlc.grammar import ast
 from stlc.grammar.parser import MAX_ERRORS
 from stlc.signature import Signature
@@ -58,11 +58,11 @@ def resolve(
         UsageError: an override of a constant that does not exist.
     """
     values = read_overrides(overrides or {}, spec, interface)
-    findings: list[Diagnostic] = []
+    findings = Findings()
     scope = Scope(sink=findings, temporal=True, time_unit=spec.time_unit, elsewhere=_elsewhere(interface))
     file = declared(spec, load_modules(spec), interface, values, scope)
     _adopt_units(spec, values, file.found, file.scope)
-    signature = signature_of(file)
+    signature, parameters = signature_of(file, interface)
     file = with_facts(file, enforced(signature.columns))
     scope = file.scope
     constants = _constants(spec, interface, scope)
@@ -74,7 +74,7 @@ def resolve(
     for requirement, item in zip(requirements, _items(spec, ast.Require), strict=True):
         sink.extend(_warnings(requirement, item, signature, scope))
     name = spec.name or PurePath(spec.source.name).stem
-    return typed.Spec(name, signature, constants, requirements, assumptions, spec)
+    return typed.Spec(name, signature, constants, requirements, assumptions, spec, parameters)
 
 
 def _finish(findings: Sequence[Diagnostic], spec: ast.Spec, sink: list[Diagnostic]) -> None:

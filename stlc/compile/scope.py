@@ -12,7 +12,7 @@ from stlc.compile import ir
 from stlc.compile.functions import callable_names, sampler_names
 from stlc.compile.meter import Cost, Meter
 from stlc.compile.values import Label, Number, Origin, Value, Vector
-from stlc.diagnostics import Diagnostic, SpecError, StlcError, SystemFileError
+from stlc.diagnostics import Diagnostic, Findings, SpecError, StlcError, SystemFileError, tell
 from stlc.grammar import ast
 from stlc.registry import closest
 from stlc.signature import Column, Kind
@@ -20,6 +20,8 @@ from stlc.source import Span
 from stlc.units import DIMENSIONLESS, Unit
 
 TIME_WORDS = ("T", "end", "dt")
+_MAX_PAIRS = 20_000
+"""Of names and candidates that are compared for "did you mean" before the rest goes without."""
 
 _COMPONENT = re.compile(r"(?P<name>.+)\[(?P<index>\d+)\]")
 
@@ -79,7 +81,8 @@ class External:
         result: size of the vector that it gives; None for a number.
         unit: of the result.
         kind: of the result.
-        function: takes components and gives components; None where nobody loaded it.
+        function: takes components and gives components, or says in the IR what they are; None where nobody
+            loaded it.
         about: what it is, for messages.
         span: where its name was declared.
     """
@@ -89,7 +92,7 @@ class External:
     result: int | None
     unit: Unit
     kind: Kind
-    function: Callable[..., Sequence[Any]] | None
+    function: Callable[..., Sequence[Any]] | ir.Body | None
     about: str = ""
     span: Span | None = None
 
@@ -117,7 +120,7 @@ class Scope:
     """
 
     entries: Mapping[str, Entry] = field(default_factory=dict)
-    sink: list[Diagnostic] = field(default_factory=list)
+    sink: list[Diagnostic] = field(default_factory=Findings)
     error: type[StlcError] = SpecError
     samplers: bool = False
     temporal: bool = False
@@ -153,9 +156,7 @@ class Scope:
 
     def report(self, finding: Diagnostic) -> None:
         """Add a finding, once (a macro that is used twice has its faults once)."""
-        key = (finding.code, finding.span, finding.message)
-        if all((known.code, known.span, known.message) != key for known in self.sink):
-            self.sink.append(finding)
+        tell(self.sink, finding)
 
     def fail(self, finding: Diagnostic) -> NoReturn:
         """Report and give up on the expression at hand."""
@@ -167,7 +168,8 @@ class Scope:
         candidates = [*self.locals, *self.entries]
         if called:
             candidates += [*callable_names(), *(sampler_names() if self.samplers else ())]
-        near = closest(name.name, candidates)
+        pairs = len(candidates) * (1 + len(self.sink))
+        near = closest(name.name, candidates) if pairs <= _MAX_PAIRS else None
         what = "function" if called else "name"
         help_ = () if near is None else (f"did you mean `{near}`?{self._about(near)}",)
         if name.name in self.elsewhere:

@@ -15,7 +15,7 @@ from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
 from stlc.registry import closest
 from stlc.signature import Column, Kind, Role
-from stlc.units import DIMENSIONLESS, Unit, parse_unit, same_dims
+from stlc.units import DIMENSIONLESS, Unit, nearest, parse_unit, same_dims
 
 Labels = tuple[tuple[str, float], ...]
 
@@ -74,9 +74,7 @@ def _matched(column: Column, decl: ast.Signal | ast.Param, interface: Interface,
     """The column as the system stores it."""
     if column.name not in interface.signature:
         if isinstance(decl, ast.Param):
-            help_ = (f"declare it as a state of {interface.where}: `{decl.name}: {{role: env, …}}`",)
-            message = "a `param` that the system does not carry as a state is not compiled by this version"
-            scope.fail(Diagnostic("E015", message, decl.name_span, help=help_))
+            return column
         scope.fail(_absent(column, decl, interface))
     own = interface.signature[column.name]
     place = interface.places.get(column.name)
@@ -170,6 +168,13 @@ def _ends(
     return None
 
 
+def ends_of(
+    domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral, target: tuple[Column, Unit], scope: Scope
+) -> Iterator[float | None]:
+    """The ends of a range or the members of a set, in the unit of the column; None for `inf`."""
+    return _stored(domain if isinstance(domain, tuple) else domain.items, target, scope)
+
+
 def _stored(exprs: Sequence[ast.Expr], target: tuple[Column, Unit], scope: Scope) -> Iterator[float | None]:
     """Constants in the unit of the column; bare numbers are read in the unit that was declared."""
     column, unit = target
@@ -179,11 +184,11 @@ def _stored(exprs: Sequence[ast.Expr], target: tuple[Column, Unit], scope: Scope
             continue
         number = as_number(value, expr, Need("the ends of a range are numbers"), scope)
         if number.bare:
-            number = in_unit(number, unit if unit.text else column.unit)
+            number = in_unit(number, unit if unit.text else column.unit, scope)
         elif not number.flexible and column.unit.text and not same_dims(number.unit, column.unit):
             message = f"`{column.name}` is in [{column.unit}], this is in [{number.unit}]"
             scope.fail(Diagnostic("E203", message, expr.span, f"[{number.unit}]"))
         if number.constant is None:
             scope.fail(Diagnostic("E205", "the ends of a range are constants", expr.span))
         exact = number.exact
-        yield float(exact / column.unit.ratio) if exact is not None else number.constant / column.unit.scale
+        yield nearest(exact / column.unit.ratio) if exact is not None else number.constant / column.unit.scale

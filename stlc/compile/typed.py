@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias
 
 from stlc.compile import ir
 from stlc.grammar import ast
-from stlc.signature import Signature
+from stlc.signature import Column, Signature
 from stlc.source import Span
 
 
@@ -151,6 +151,25 @@ class Requirement:
 
 
 @dataclass(frozen=True, slots=True)
+class Parameter:
+    """One component of a `param`: a constant of every trajectory.
+
+    Attributes:
+        span: of its name.
+        column: that holds it, with its range.
+        draw: how it is drawn, in the unit of the column; a number with samplers.
+        text: the same as written.
+        carried: the system has it as a state, and draws it.
+    """
+
+    span: Span = field(compare=False, repr=False)
+    column: Column
+    draw: ir.Num
+    text: str
+    carried: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Spec:
     """A resolved specification.
 
@@ -160,7 +179,8 @@ class Spec:
         constants: every `const`, in SI units.
         requirements: in order.
         assumptions: `assume`s, in order.
-        source: the text.
+        source_ast: as parsed.
+        parameters: every `param`, by component.
     """
 
     name: str
@@ -169,3 +189,4 @@ class Spec:
     requirements: tuple[Requirement, ...]
     assumptions: tuple[Requirement, ...]
     source_ast: ast.Spec = field(compare=False, repr=False)
+    parameters: tuple[Parameter, ...] = ()

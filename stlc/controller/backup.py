@@ -179,7 +179,7 @@ class Backup:
 
 
 def finite(plan: Tensor, task: Task) -> Tensor:
-    """The plan with every entry that is no number replaced by the control's value nearest to 0."""
+    """Plans (B, T, m) with every entry that is no number replaced by the control's value nearest to 0."""
     low, high = task.system.control_low.to(plan), task.system.control_high.to(plan)
     return torch.where(torch.isfinite(plan), plan, torch.zeros_like(plan).clamp(low, high))
 

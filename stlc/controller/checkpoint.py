@@ -20,12 +20,12 @@ from torch import Tensor
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.files import write_atomic
 from stlc.provenance import sha256
+from stlc.rundir import RunDir
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from stlc.rundir import RunDir
 
 FOLDER = "ckpt"
 POINTER = "last.json"
@@ -84,7 +84,7 @@ def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpo
             raise RunError(
                 Diagnostic(
                     "R102",
-                    f"the checkpoint in `{folder}` was trained for another {word}",
+                    f"the checkpoint in `{_shown(folder)}` was trained for another {word}",
                     help=(f"train again, or put the {word} back that the checkpoint was made with",),
                     note=(f"{word} now {wanted[:12]}, of the checkpoint {str(facts.get(key))[:12]}",),
                 )
@@ -104,7 +104,7 @@ def _read(folder: Path) -> tuple[dict[str, Any], bytes]:
         raise RunError(
             Diagnostic(
                 "R101",
-                f"there is no checkpoint in `{folder}`",
+                f"there is no checkpoint in `{_shown(folder)}`",
                 help=("train: stlc train SPEC", "an earlier run is named by its number: stlc simulate 7"),
                 note=("nothing has been saved yet, or the run ended before that",),
             )
@@ -117,7 +117,13 @@ def _read(folder: Path) -> tuple[dict[str, Any], bytes]:
 
 
 def _damaged(folder: Path, why: str) -> Diagnostic:
-    return Diagnostic("R101", f"the checkpoint in `{folder}` is damaged: {why}", help=("train again",))
+    message = f"the checkpoint in `{_shown(folder)}` is damaged: {why}"
+    return Diagnostic("R101", message, help=("train again",))
+
+
+def _shown(folder: Path) -> str:
+    """The folder as it is printed."""
+    return f"{RunDir(folder.parent).shown}/{folder.name}"
 
 
 def weights(checkpoint: Checkpoint, prefix: str) -> dict[str, torch.Tensor]:

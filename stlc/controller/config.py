@@ -14,6 +14,11 @@ HELD_OUT = 5000
 HELD_OUT_SEED = 981_273
 """Seed of the held-out states: used for reports only, never while training or tuning."""
 
+MISSION_HOLD = 0.7
+"""On missions the states to learn from change while a policy gets further: the rate falls late."""
+MISSION_MOST = 128
+"""Failing states of missions are alike: many stand where nothing can be done any more."""
+
 
 @dataclass(frozen=True, slots=True)
 class TrainConfig:
@@ -57,6 +62,7 @@ class Engine:
         hard: solved hard states a step, once there are any.
         lr: peak learning rate.
         warmup: share of the steps over which it rises.
+        hold: share of the steps over which it stays at its peak; it rises in a fixed number of steps then.
         clip: bound of the gradient's norm.
         average: decay of the average of the weights.
         pool: fresh states that a search round judges.
@@ -77,6 +83,7 @@ class Engine:
     hard: int
     lr: float
     warmup: float = 0.03
+    hold: float = 0.0
     clip: float = 1.0
     average: float = 0.99
     pool: int = 2048
@@ -94,6 +101,7 @@ def decide(task: Task, config: TrainConfig) -> Engine:
     declared = task.system.decl.train
     method: Method = "gradient" if (config.method or declared.method) == "gradient" else "guided"
     guided = method == "guided"
+    mission = bool(task.compiled.timers)
     batch = config.batch or declared.batch or (256 if guided else 512)
     plans = config.plans or (4 if guided else 1)
     return Engine(
@@ -104,6 +112,8 @@ def decide(task: Task, config: TrainConfig) -> Engine:
         batch=batch,
         hard=batch if guided else 0,
         lr=config.lr or declared.lr or 1e-3,
+        hold=MISSION_HOLD if mission else 0.0,
+        most=MISSION_MOST if mission else 256,
         share=0.05 if plans > 1 else 0.0,
         performance=0.3 if guided else 1.0,
         held_out=config.held_out,

@@ -75,7 +75,8 @@ class Guard:
         """Decide for (agents, n) states; verdicts are taken in float64.
 
         A plan that was begun and still satisfies the specification is gone on with where the new one is no
-        better; otherwise an agent that may do something later could put it off at every step.
+        better; otherwise an agent that may do something later could put it off at every step. So is one that
+        is about to keep a promise of a mission with more to spare (`stlc.controller.promises`).
 
         Args:
             x: (agents, n) states.
@@ -104,7 +105,7 @@ class Guard:
             return Found(fresh, zero, zero, judged.rho, safe)
         rest = self.task.judge(x, begun.plan)
         better = rank(rest.rho, self.task.cost(rest)) >= rank(judged.rho, self.task.cost(judged))
-        keep = better & (rest.rho >= -TOLERANCE)
+        keep = (better | self._deepened(rest)) & (rest.rho >= -TOLERANCE)
         return Found(
             torch.where(keep[:, None, None], begun.plan, fresh),
             torch.where(keep, begun.source, zero),
@@ -112,6 +113,12 @@ class Guard:
             torch.where(keep, rest.rho, judged.rho),
             torch.where(keep, rest.safe >= -TOLERANCE, safe),
         )
+
+    def _deepened(self, rest: Judged) -> Tensor:
+        """Whether what is left of a plan goes on with keeping a promise, (agents,)."""
+        if not self.task.promises.items:
+            return torch.zeros_like(rest.rho, dtype=torch.bool)
+        return self.task.promises.deepened(rest.columns)
 
     def _plan(self, x: Tensor) -> tuple[Tensor, Judged]:
         if isinstance(self.policy, _JudgesItself):

@@ -121,29 +121,26 @@ class _Worlds:
         self.size = (len(setting.seeds) * setting.agents, len(task.plain.names))
         self.parts = [setting.agents] * len(setting.seeds)
         with _blame("be made"):
-            self.worlds = [
-                make(task.plain, setting.agents, torch.Generator().manual_seed(seed))
-                for seed in setting.seeds
-            ]
+            self.generators = [torch.Generator().manual_seed(seed) for seed in setting.seeds]
+            self.worlds = [make(task.plain, setting.agents, generator) for generator in self.generators]
 
     def reset(self) -> Tensor:
-        """The first states, (rows, n); timers are as at the start of a mission."""
+        """The first states, (rows, n); parameters are drawn, timers as at the start of a mission."""
         with _blame("begin"):
             states = [world.reset() for world in self.worlds]
-        x = self._checked(states, 0)
-        begun = torch.tensor([timer.initial for timer in self.system.timers]).to(x)
-        return torch.cat((x, begun.expand(len(x), -1)), 1)
+        parts = zip(torch.split(self._checked(states, 0), self.parts), self.generators, strict=True)
+        return torch.cat([self.system.begun(x, generator) for x, generator in parts])
 
     def advance(self, x: Tensor, action: Tensor, step: int) -> Tensor:
         """(rows, n), (rows, m) -> the (rows, n) states after step number `step`.
 
-        Worlds know no timers: those follow from the true states.
+        Worlds know neither parameters nor timers: those stay, these follow from the true states.
         """
         known = x[:, : self.size[1]]
         each = zip(self.worlds, torch.split(known, self.parts), torch.split(action, self.parts), strict=True)
         with _blame(f"take step {step}"):
             states = [world.advance(before, act) for world, before, act in each]
-        return torch.cat((self._checked(states, step), self.system.timers_later(x)), 1)
+        return torch.cat((self._checked(states, step), self.system.added_later(x)), 1)
 
     def _checked(self, states: list[Tensor], step: int) -> Tensor:
         with _blame(f"give states at step {step}"):

@@ -1,7 +1,14 @@
-"""A time budget becomes a number of steps, once, in the first seconds; everything after counts steps."""
+"""A time budget becomes a number of steps; the weights depend on the seed and on that number alone.
+
+Where states are independent draws, the first seconds tell: they are timed on a trainer that is thrown away.
+On missions they do not, because search rounds get dearer and cheaper with what is visited. There the learning
+rate stays at its peak until most of the time is gone, so nothing that was done so far depends on how many
+steps there will be, and the number is named when the rate begins to fall.
+"""
 
 from __future__ import annotations
 
+import math
 import time
 from typing import TYPE_CHECKING
 
@@ -38,6 +45,36 @@ def steps_within(task: Task, engine: Engine, seconds: float, device: torch.devic
     step = _time(trial.advance, TIMED_STEPS)
     left = seconds * (1.0 - RESERVE) - (time.perf_counter() - begun) - built
     return max(engine.every, int(left / (step + look / (1.5 * engine.every))))
+
+
+class OpenEnd:
+    """How many steps a budget is worth, said again at every look until the schedule has to know.
+
+    Attributes:
+        settled: whether the number of steps is final.
+    """
+
+    def __init__(self, seconds: float, begun: float) -> None:
+        """`seconds` from `begun`, by `time.perf_counter`."""
+        self.settled = False
+        self._end = begun + seconds * (1.0 - RESERVE)
+        self._marks: list[tuple[int, float]] = []
+
+    def mark(self, trainer: Trainer, now: float) -> None:
+        """Take note of the time `now` and set the steps of `trainer`; to be called at every look.
+
+        A step is taken to cost what the later half of them did. The rate falls over the last steps and must
+        have been at its peak so far, so there are never fewer than that allows.
+        """
+        if self.settled:
+            return
+        self._marks.append((trainer.step, now))
+        hold, soon = trainer.engine.hold, 2 * trainer.engine.every
+        step, then = [mark for mark in self._marks if 2 * mark[0] <= trainer.step][-1]
+        cost = (now - then) / max(trainer.step - step, 1)
+        steps = trainer.step + int((self._end - now) / cost) if cost > 0 else trainer.steps
+        self.settled = trainer.step > 0 and trainer.step + soon > hold * steps
+        trainer.steps = max(steps, math.ceil((trainer.step if self.settled else trainer.step + soon) / hold))
 
 
 def _time(call: Callable[[], object], times: int) -> float:

@@ -16,6 +16,7 @@ from stlc.controller.task import Task
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.dynamics.system import System
 from stlc.files import read_source, write_atomic
+from stlc.grammar import ast
 from stlc.grammar.parser import parse
 from stlc.provenance import sha256
 from stlc.rundir import RUNS, RunDir
@@ -46,8 +47,17 @@ class Run:
     policy: Mlp
 
     @classmethod
-    def open(cls, where: Path | str = "latest", *, root: Path = RUNS, device: str = "cpu") -> Run:
+    def open(
+        cls,
+        where: Path | str = "latest",
+        *,
+        root: Path = RUNS,
+        device: str = "cpu",
+        overrides: Mapping[str, str] | None = None,
+    ) -> Run:
         """Load a run by folder, name, number, or `latest`, below the folder `root` of all runs.
+
+        `overrides` change constants and give values to parameters, as `--set` does; the policy stays.
 
         Raises:
             UsageError: there is no such run.
@@ -55,7 +65,7 @@ class Run:
             SpecError, SystemFileError: its specification or system is invalid.
         """
         folder = RunDir.open(where, root)
-        task = load_task(folder)
+        task = load_task(folder, overrides or {})
         engine = load_engine(folder)
         saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
         network = PlanNetwork(task, hidden=engine.hidden, plans=engine.plans)
@@ -70,11 +80,19 @@ class Run:
         return cls(folder, task, Mlp(task, network.to(torch.device(device)).eval()))
 
 
-def load_task(folder: RunDir) -> Task:
-    """Compile the specification and the system that lie in a run's folder."""
-    overrides = folder.record().get("overrides") or {}
+def load_task(folder: RunDir, overrides: Mapping[str, str] | None = None) -> Task:
+    """Compile the specification and the system that lie in a run's folder, changed as `overrides` say.
+
+    A parameter that the policy was trained with keeps its column: it has the value that is given.
+    """
+    trained = folder.record().get("overrides") or {}
     spec = replace(parse(read_source(folder.path / SPEC)), library=read_library(folder))
-    return Task.of(spec, System.load(folder.path / SYSTEM, overrides), overrides=overrides)
+    changed = {**trained, **(overrides or {})}
+    drawn = {item.name for item in spec.items if isinstance(item, ast.Param)} - trained.keys()
+    values = {name: text for name, text in changed.items() if name in drawn}
+    constants = {name: text for name, text in changed.items() if name not in drawn}
+    system = System.load(folder.path / SYSTEM, changed)
+    return Task.of(spec, system, overrides=constants, values=values)
 
 
 def spec_hash(folder: RunDir) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -13,11 +13,13 @@ from stlc.compile.arith import Program
 from stlc.compile.graph import RobustnessGraph, evaluate
 from stlc.compile.interface import Grid
 from stlc.compile.ops_torch import TORCH
+from stlc.compile.parameters import fixed
 from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics import TOLERANCE
 from stlc.compile.switch import Hard, Switch
 from stlc.controller.gradient import NativeGradient
 from stlc.controller.kernel import NativeJudge
+from stlc.controller.promises import Promises
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -33,6 +35,10 @@ TIE = 1e-4
 """What cost may weigh where robustness does not differ: it is flat where a deadline cannot be met."""
 PULL = 0.1
 """Weight of the pull towards the next goal among the performance terms."""
+KEPT = 3.0
+"""Weight of what open promises are kept with less than gamma to spare, among the performance terms."""
+SHORT = 10.0
+"""Weight of what a mission's plan lacks of gamma among the costs that plans are chosen by."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +64,7 @@ def satisfied(rho: Tensor) -> Tensor:
     """Where a robustness counts as satisfied: rho >= -1e-6, with float32 rounding allowed for.
 
     Args:
-        rho: any shape.
+        rho: (batch,), (batch, requirements), or any other shape; float64, or float32 with its own slack.
 
     Returns:
         A boolean tensor of the same shape.
@@ -81,27 +87,38 @@ class Task:
     def __init__(self, compiled: Compiled, system: System) -> None:
         self.compiled = compiled
         self.plain = system
-        self.system = system.augmented(compiled.timers) if compiled.timers else system
+        added = compiled.timers, compiled.parameters
+        self.system = system.augmented(*added) if any(added) else system
         self.graph = RobustnessGraph(compiled.requirements, self.system.signature)
         self.safety = RobustnessGraph(compiled.safety, self.system.signature)
 
     @classmethod
-    def of(cls, spec: ast.Spec, system: System, *, overrides: Mapping[str, str] | None = None) -> Task:
+    def of(
+        cls,
+        spec: ast.Spec,
+        system: System,
+        *,
+        overrides: Mapping[str, str] | None = None,
+        values: Mapping[str, str] | None = None,
+    ) -> Task:
         """Compile a specification for a system.
 
         Args:
             spec: as parsed.
             system: that it speaks about.
-            overrides: constants to change, name -> text such as `3 s`.
+            overrides: constants to change, name -> text such as `3 s`; a parameter becomes a constant.
+            values: parameters that have one value in all trajectories, and that the policy still sees.
 
         Raises:
+            UsageError: a value does not fit.
             SpecError: the specification is invalid, or does not fit the system.
         """
         decl = system.decl
         grid = Grid(dt=decl.dt, horizon=decl.horizon)
-        return cls(
-            compile_spec(spec, grid=grid, interface=system.interface(), overrides=overrides or {}), system
-        )
+        compiled = compile_spec(spec, grid=grid, interface=system.interface(), overrides=overrides or {})
+        if values:
+            compiled = replace(compiled, parameters=fixed(compiled.parameters, values))
+        return cls(compiled, system)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -195,12 +212,20 @@ class Task:
         return self.graph.per_requirement_columns(columns, ops=TORCH), columns
 
     def cost(self, judged: Judged) -> Tensor:
-        """Performance terms of judged plans, as if every one were satisfying, without gradient: (batch,)."""
+        """What plans are chosen by where they satisfy the specification, without gradient: (batch,).
+
+        These are the performance terms as if every plan were satisfying. On a mission the pull of the next
+        goal draws plans to the edge of what is allowed now, so there it also costs to spare less than gamma.
+        """
         with torch.no_grad():
-            return self.performance(judged.columns, judged.rho, judged.plans)
+            cost = self.performance(judged.columns, judged.rho, judged.plans)
+            if not self.compiled.timers:
+                return cost
+            gamma = self.system.decl.objective.gamma
+            return cost + SHORT * (gamma - judged.rho).clamp(0.0, gamma)
 
     def performance(self, columns: Mapping[str, Tensor], rho: Tensor, u: Tensor) -> Tensor:
-        """Performance terms as if every plan were satisfying, and the pull of the next goal: (batch,).
+        """Performance terms as if every plan were satisfying, with promises and pull of a mission: (batch,).
 
         Args:
             columns: states over time, name -> (time, batch).
@@ -208,10 +233,17 @@ class Task:
             u: controls, (batch, T, m).
         """
         cost = self.system.performance(columns, torch.ones_like(rho), rho.detach(), u)
+        if self.promises.items:
+            cost = cost + KEPT * self.promises.short(columns)
         if self._pull is None:
             return cost
         gap: Tensor = self._pull(columns, TORCH, HARD)["gap"]
         return cost + PULL * gap.mean(0)
+
+    @cached_property
+    def promises(self) -> Promises:
+        """What a mission promises, and how much it is to be kept with."""
+        return Promises(self.compiled, self.system.decl.objective.gamma)
 
     @cached_property
     def _pull(self) -> Program | None:

@@ -12,7 +12,7 @@ import torch
 from stlc.controller.checkpoint import load_checkpoint, save_checkpoint
 from stlc.controller.config import Engine, TrainConfig, decide
 from stlc.controller.held_out import Score, save_states, score
-from stlc.controller.pace import steps_within
+from stlc.controller.pace import OpenEnd, steps_within
 from stlc.controller.run import Run, load_engine, load_task, save_engine, spec_hash, system_hash
 from stlc.controller.trainer import Look, Trainer
 from stlc.diagnostics import Diagnostic, MissingError, RunError
@@ -83,11 +83,12 @@ def train(task: Task, config: TrainConfig, folder: RunDir, watch: Watch | None =
     save_engine(folder, engine)
     declared = task.system.decl.train
     steps = config.steps or (declared.steps if config.budget is None else None)
-    if steps is None:
-        steps = steps_within(task, engine, config.budget or declared.budget or DEFAULT_BUDGET, device)
-    trainer = Trainer(task, engine, steps=steps, device=device)
-    folder.update({"steps": steps, "margin": trainer.margin, "engine": asdict(engine)})
-    return _Session(folder, trainer, watch or Watch(), begun).finish()
+    budget, end = config.budget or declared.budget or DEFAULT_BUDGET, None
+    if steps is None and engine.hold:
+        steps, end = round(2 * engine.every / engine.hold), OpenEnd(budget, begun)
+    trainer = Trainer(task, engine, steps=steps or steps_within(task, engine, budget, device), device=device)
+    folder.update({"steps": trainer.steps, "margin": trainer.margin, "engine": asdict(engine)})
+    return _Session(folder, trainer, watch or Watch(), begun, end).finish()
 
 
 def resume(
@@ -147,11 +148,14 @@ def find_device(name: str) -> torch.device:
 class _Session:
     """One sitting of training: from wherever the trainer stands to the end, or to an interruption."""
 
-    def __init__(self, folder: RunDir, trainer: Trainer, watch: Watch, begun: float) -> None:
+    def __init__(
+        self, folder: RunDir, trainer: Trainer, watch: Watch, begun: float, end: OpenEnd | None = None
+    ) -> None:
         self.folder = folder
         self.trainer = trainer
         self.watch = watch
         self.begun = begun
+        self.end = end
         self.hashes = {"spec_hash": spec_hash(folder), "system_hash": system_hash(folder)}
 
     def finish(self) -> Outcome:
@@ -159,9 +163,11 @@ class _Session:
         trainer = self.trainer
         sat_down, first = time.perf_counter(), trainer.step
         saved = sat_down
+        self._revise()
         value = math.nan
         while trainer.step < trainer.steps:
             if trainer.step >= trainer.next_look:
+                self._revise()
                 pace = (time.perf_counter() - sat_down) / max(1, trainer.step - first)
                 self._row(trainer.look(), value, pace)
             value = trainer.advance()
@@ -174,6 +180,12 @@ class _Session:
                 return self._interrupted()
         self._save()
         return self._judged()
+
+    def _revise(self) -> None:
+        """Where a budget is still open, say anew how many steps it is worth."""
+        if self.end is not None:
+            self.end.mark(self.trainer, time.perf_counter())
+            self.folder.update({"steps": self.trainer.steps})
 
     def _judged(self) -> Outcome:
         policy = self.trainer.policy

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 MARGIN_STATES = 128
 MARGIN_SHARE = 0.2
 MARGIN_RANGE = (0.01, 0.5)
+RISE = 30
+"""Steps to the peak of the learning rate where it is held; independent of how many there will be."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,10 +99,11 @@ class Trainer:
 
     @property
     def rate(self) -> float:
-        """Learning rate of the next step: a short rise, then half a cosine to 0."""
-        done = self.step / self.steps
-        rise = min(1.0, (self.step + 1) / max(1.0, self.engine.warmup * self.steps))
-        return self.engine.lr * rise * 0.5 * (1.0 + math.cos(math.pi * done))
+        """Learning rate of the next step: a short rise, a while at the peak, then half a cosine to 0."""
+        engine, hold = self.engine, self.engine.hold
+        rise = min(1.0, (self.step + 1) / (RISE if hold else max(1.0, engine.warmup * self.steps)))
+        fallen = max(0.0, self.step / self.steps - hold) / (1.0 - hold)
+        return engine.lr * rise * 0.5 * (1.0 + math.cos(math.pi * fallen))
 
     @property
     def policy(self) -> Mlp:

@@ -41,14 +41,17 @@ class World(Protocol):
         """How much of the task got done since `reset`."""
 
     def snapshot(self) -> Scene:
-        """What a picture of this instant needs: arrays that keep their shape through a deployment."""
+        """What a picture of this instant needs: arrays that keep their shape through a deployment.
+
+        What belongs to an agent has the agents first: (agents, …).
+        """
 
     def units(self) -> Mapping[str, str]:
         """Units of entries of `progress` that have one."""
 
     @staticmethod
     def draw(axes: Any, scene: Scene, index: int) -> None:
-        """Draw frame `index` of snapshots stacked over time, with `decision` (frames, agents) beside them."""
+        """Draw frame `index` of snapshots stacked to (frames, …); `decision` is (frames, agents)."""
 
 
 class WorldType(Protocol):
@@ -72,13 +75,13 @@ class ModelWorld:
         self._counts = {event.name: 0.0 for event in self._system.decl.test.events if event.when is not None}
 
     def reset(self) -> Tensor:
-        """Initial states as in training."""
+        """Initial states as in training, (agents, n)."""
         self._begin()
         drawn = self._system.sample(self._agents, generator=self._generator, dtype=torch.float64)
         return self._happen(drawn)
 
     def advance(self, x: Tensor, action: Tensor) -> Tensor:
-        """One step of the model, then what happens to whom."""
+        """One step of the model, then what happens to whom: (agents, n), (agents, m) -> (agents, n)."""
         moved = self._system.step(x, action)
         self._step += 1
         return self._happen(moved)
@@ -92,12 +95,12 @@ class ModelWorld:
         return {}
 
     def snapshot(self) -> Scene:
-        """The states and the names of their columns."""
+        """The states, (agents, n), and the names of their columns, (n,)."""
         return {"state": self._x.numpy(force=True), "names": np.array(self._system.names)}
 
     @staticmethod
     def draw(axes: Any, scene: Scene, index: int) -> None:
-        """Agents in the plane of the first two columns."""
+        """Agents in the plane of the first two columns; `scene["state"]` is (frames, agents, n)."""
         names, state = scene["names"][index], scene["state"]
         decided = scene["decision"][index] if "decision" in scene else np.zeros(state.shape[1], dtype=int)
         second = min(1, state.shape[2] - 1)

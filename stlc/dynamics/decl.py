@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias
 
 from stlc.compile import ir
 from stlc.compile.interface import Grid, Interface
-from stlc.diagnostics import Diagnostic
+from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.signature import Signature
 from stlc.source import Source, Span
 from stlc.units import Unit
@@ -207,7 +207,7 @@ class WorldRef:
 
 @dataclass(frozen=True, slots=True)
 class FunctionDecl:
-    """A Python function on arrays that specifications may call.
+    """A function that specifications may call: in Python, on arrays, or known as numbers.
 
     Attributes:
         name: by which `extern fn` knows it.
@@ -215,6 +215,7 @@ class FunctionDecl:
         attribute: its name there.
         library: the arrays that it takes; None takes what the caller has.
         span: where it is named.
+        body: what it computes, from one vector to one, where the file says that; None for Python.
     """
 
     name: str
@@ -222,6 +223,19 @@ class FunctionDecl:
     attribute: str
     library: Literal["numpy", "torch"] | None = None
     span: Span | None = field(default=None, compare=False, repr=False)
+    body: ir.Body | None = field(default=None, repr=False)
+
+    def bound(self, arguments: tuple[int | None, ...], result: int | None) -> ir.Body:
+        """What it computes; see `stlc.compile.interface.Function`. Raises SystemFileError (S208)."""
+        assert self.body is not None
+        takes, gives = len(self.body.formals), len(self.body.outputs)
+        if (arguments, result) == ((takes,), gives):
+            return self.body
+        form = f"extern fn {self.name}(q: real[{takes}]) -> real[{gives}]"
+        message = (
+            f"`{self.name}` takes a vector of {takes} and gives one of {gives}, declared is another form"
+        )
+        raise SystemFileError(Diagnostic("S208", message, self.span, "named here", help=(form,)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -314,7 +328,10 @@ class SystemDecl:
         return Grid(self.dt, self.horizon)
 
     def interface(self) -> Interface:
-        """What the compiler of specifications may know of this system."""
+        """What the compiler of specifications may know of this system, nothing loaded."""
         names = frozenset(function.name for function in self.functions)
+        known = {function.name: function for function in self.functions if function.body is not None}
         path = self.source.name
-        return Interface(self.name, self.signature, self.constants, names, path=path, places=self.places)
+        return Interface(
+            self.name, self.signature, self.constants, names, known, path=path, places=self.places
+        )

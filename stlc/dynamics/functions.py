@@ -12,19 +12,23 @@ from typing import Any, final
 
 import numpy as np
 
+from stlc.compile.interface import Function
 from stlc.compile.ops import Array
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.decl import FunctionDecl, SystemDecl
 from stlc.registry import closest
 
 
-def load_functions(decl: SystemDecl) -> Mapping[str, PythonFunction]:
+def load_functions(decl: SystemDecl) -> Mapping[str, Function]:
     """The functions of a system, by name: their modules are imported, which runs them.
 
     Raises:
         SystemFileError: S208, a module or a function cannot be loaded.
     """
-    return {function.name: PythonFunction(function, _loaded(function)) for function in decl.functions}
+    return {
+        function.name: function if function.body is not None else PythonFunction(function, _loaded(function))
+        for function in decl.functions
+    }
 
 
 def function_files(decl: SystemDecl) -> dict[str, Path]:

@@ -114,6 +114,7 @@ def _declaration(
     states = read_states(found.get("state"), reader, names)
     params = read_params(found.get("param"), reader, names)
     read_controls(found.get("control"), reader, names)
+    functions = read_functions(found.get("functions"), reader, names)
     read_definitions(found.get("def"), reader, names)
     timer_flow, timer_jumps = read_timers(states, reader, names, clock)
     flow = read_flow(found.get("flow"), reader, names, clock)
@@ -148,7 +149,7 @@ def _declaration(
         backup=read_backup(found.get("backup"), reader, clock.horizon),
         test=read_test(found.get("test"), reader, names, clock.dt),
         scenarios=_scenarios(found.get("scenario"), reader),
-        functions=read_functions(found.get("functions"), reader),
+        functions=functions,
         overrides=MappingProxyType(dict(overrides)),
         places=MappingProxyType(names.places),
         warnings=tuple(finding for finding in reader.findings if finding.severity == "warning"),

@@ -9,7 +9,7 @@ from fractions import Fraction
 from typing import TypeVar
 
 from stlc.compile import ir
-from stlc.compile.formulas import resolve_state_formula
+from stlc.compile.formulas import resolve_region, resolve_state_formula
 from stlc.compile.numbers import resolve_number, resolve_numbers
 from stlc.compile.scope import Entry, Scope
 from stlc.compile.values import Number
@@ -21,7 +21,7 @@ from stlc.dynamics.yaml_nodes import Sequence as ListNode
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
 from stlc.source import Span
-from stlc.units import Unit, parse_unit, same_dims
+from stlc.units import Unit, nearest, parse_unit, same_dims
 
 _T = TypeVar("_T")
 SECOND = parse_unit("s")
@@ -130,7 +130,11 @@ class Expressions:
     def check(self, expr: ast.Expr) -> None:
         """Report what is wrong with an expression of any sort."""
         rejected: list[list[Diagnostic]] = []
-        resolvers: tuple[Callable[[ast.Expr, Scope], object], ...] = (resolve_numbers, resolve_state_formula)
+        resolvers: tuple[Callable[[ast.Expr, Scope], object], ...] = (
+            resolve_numbers,
+            resolve_state_formula,
+            resolve_region,
+        )
         for resolve in resolvers:
             sink: list[Diagnostic] = []
             try:
@@ -288,7 +292,7 @@ def in_stored_unit(number: Number, unit: Unit) -> ir.Num:
         return number.num
     if isinstance(number.num, ir.Lit):
         exact = number.exact
-        return ir.Lit(float(exact / unit.ratio) if exact is not None else number.num.value / unit.scale)
+        return ir.Lit(nearest(exact / unit.ratio) if exact is not None else number.num.value / unit.scale)
     return ir.Op("div", (number.num, ir.Lit(unit.scale)))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from stlc.compile import ir
+from stlc.dynamics.algebra import add, multiply
 from stlc.dynamics.decl import Assign, JumpDecl
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_names import Clockwork, Names, base_name, later
@@ -77,12 +78,13 @@ def read_timers(
         if "size" in found:
             reader.report("S103", f"{where} is a single number", found["size"].span, "declare one a timer")
             continue
-        if clock.discrete:
-            later(reader, found["timer"], "a timer in a discrete system")
         direction = reader.option(found["timer"], f"`timer` of {where}", ("up", "down")) or "up"
         run = here.formula(found["run"], f"`run` of {where}") if "run" in found else ir.Truth(True)
         if run is not None:
-            flows.append(Assign(column.name, _running(run, direction, column.unit), f"timer {direction}"))
+            rate = _running(run, direction, column.unit)
+            if clock.discrete:
+                rate = add(ir.Col(column.name), multiply(ir.Lit(float(clock.dt)), rate))
+            flows.append(Assign(column.name, rate, f"timer {direction}"))
         guard = here.formula(found.get("reset_when"), f"`reset_when` of {where}")
         value = here.stored(found["to"], where, column.unit) if "to" in found else ir.Lit(0.0)
         if guard is not None and value is not None:

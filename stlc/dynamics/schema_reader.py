@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
-from stlc.diagnostics import Diagnostic, Label, SystemFileError
+from stlc.diagnostics import Diagnostic, Findings, Label, SystemFileError, tell
 from stlc.dynamics.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence, as_bool, as_float, as_int
 from stlc.registry import closest
 from stlc.source import Source, Span
@@ -21,7 +21,7 @@ class Reader:
     """
 
     source: Source
-    findings: list[Diagnostic] = field(default_factory=list)
+    findings: list[Diagnostic] = field(default_factory=Findings)
 
     def report(
         self,
@@ -38,12 +38,7 @@ class Reader:
     def add(self, *findings: Diagnostic) -> None:
         """Remember findings, each place once: an anchor that is used twice is wrong once."""
         for finding in findings:
-            known = any(
-                (f.code, f.span, f.message) == (finding.code, finding.span, finding.message)
-                for f in self.findings
-            )
-            if not known:
-                self.findings.append(finding)
+            tell(self.findings, finding)
 
     def close(self) -> None:
         """Raise SystemFileError with all errors, in the order of the file, if there is any."""

@@ -16,10 +16,12 @@ from stlc.compile.interface import Interface
 from stlc.compile.ops_torch import TORCH
 from stlc.compile.switch import Hard, Switch
 from stlc.compile.timers import Timer
+from stlc.compile.typed import Parameter
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.algebra import add, multiply, names_in
-from stlc.dynamics.decl import ControlDecl, SystemDecl
+from stlc.dynamics.decl import Assign, ControlDecl, SystemDecl
 from stlc.dynamics.describe import describe
+from stlc.dynamics.draws import Drawing, Rows
 from stlc.dynamics.functions import load_functions
 from stlc.dynamics.rollout import Columns, Stepper
 from stlc.dynamics.samplers import InitialStates
@@ -39,14 +41,20 @@ class System:
     Attributes:
         decl: the declaration.
         timers: states that a specification adds, the last columns.
+        parameters: constants of a trajectory that a specification adds, the columns before the timers.
+        added: the columns of both.
         signature: the state columns, in order.
-        initial: the distribution of initial states, timers apart.
+        initial: the distribution of initial states, without what a specification adds.
     """
 
-    def __init__(self, decl: SystemDecl, timers: Sequence[Timer] = ()) -> None:
+    def __init__(
+        self, decl: SystemDecl, timers: Sequence[Timer] = (), parameters: Sequence[Parameter] = ()
+    ) -> None:
         self.decl = decl
         self.timers = tuple(timers)
-        self.signature = decl.signature.extended(*(timer.column for timer in timers))
+        self.parameters = tuple(parameters)
+        self.added = (*(each.column for each in parameters), *(timer.column for timer in timers))
+        self.signature = decl.signature.extended(*self.added)
         self.initial = InitialStates(decl.init, decl.signature.names)
         self._steppers: dict[bool, Stepper] = {}
 
@@ -58,13 +66,13 @@ class System:
         """
         return cls(load_system_decl(find_system(str(path)), overrides or {}))
 
-    def augmented(self, timers: Sequence[Timer]) -> System:
-        """The same system with timers as its last columns.
+    def augmented(self, timers: Sequence[Timer], parameters: Sequence[Parameter] = ()) -> System:
+        """The same system with parameters, and with timers as its last columns.
 
-        They follow from the states before; no gradient goes through them. Initial states are the starts of
-        missions.
+        Parameters are drawn for every trajectory, and nothing moves them. Timers follow from the states
+        before; no gradient goes through them. Initial states are the starts of missions.
         """
-        return System(self.decl, (*self.timers, *timers))
+        return System(self.decl, (*self.timers, *timers), (*self.parameters, *parameters))
 
     def interface(self) -> Interface:
         """What the compiler may know of this system, its functions loaded. Raises SystemFileError (S208)."""
@@ -121,7 +129,7 @@ class System:
     def observed_count(self) -> int:
         """Numbers that the policy sees."""
         observe = self.decl.policy.observe
-        return len(observe) + len(self.timers) if observe else len(self.names)
+        return len(observe) + len(self.added) if observe else len(self.names)
 
     def describe(self) -> str:
         """States, controls, flow, jumps and initial situations, as a table of text."""
@@ -135,10 +143,30 @@ class System:
         moved = self._stepper(switch).step(before, self._inputs(u), switch) | self._later(before)
         return torch.stack([moved[name] for name in self.names], 1)
 
-    def timers_later(self, x: Tensor) -> Tensor:
-        """The timers one step after a state, whatever moved it: (B, n) -> (B, timers)."""
-        later = self._later(self._named(x))
-        return torch.stack([later[timer.name] for timer in self.timers], 1) if later else x[:, :0]
+    def begun(self, states: Tensor, generator: torch.Generator) -> Tensor:
+        """States of the declaration with parameters drawn, and timers as at the start of a mission.
+
+        (B, n - added) -> (B, n).
+        """
+        if not self.added:
+            return states
+        table = dict(zip(self.decl.signature.names, states.double().unbind(1), strict=True))
+        rows = Rows(len(states), generator)
+        for drawing in self._drawings:
+            table[drawing.name] = drawing(table, rows)
+        drawn = [table[each.column.name].to(states) for each in self.parameters]
+        clocks = [torch.full_like(states[:, 0], timer.initial) for timer in self.timers]
+        return torch.cat((states, torch.stack([*drawn, *clocks], 1)), 1)
+
+    @cached_property
+    def _drawings(self) -> tuple[Drawing, ...]:
+        return tuple(Drawing(Assign(each.column.name, each.draw)) for each in self.parameters)
+
+    def added_later(self, x: Tensor) -> Tensor:
+        """Parameters and timers one step after a state, whatever moved it: (B, n) -> (B, added)."""
+        before = self._named(x)
+        later = before | self._later(before)
+        return torch.stack([later[column.name] for column in self.added], 1) if self.added else x[:, :0]
 
     def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
         """Many steps: (B, n), (B, T, m) -> (B, T+1, n), the initial state first."""
@@ -207,7 +235,7 @@ class System:
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> Tensor:
-        """Initial states, (n, dim), timers as at the start of a mission.
+        """Initial states, (n, dim), parameters drawn, timers as at the start of a mission.
 
         The same seed gives the same states, whatever the dtype.
 
@@ -220,13 +248,12 @@ class System:
             else:
                 generator.manual_seed(seed)
         states = self.initial.sample(n, generator)
-        begun = torch.tensor([timer.initial for timer in self.timers]).to(states)
-        return torch.cat((states, begun.expand(n, -1)), 1).to(device=device, dtype=dtype)
+        return self.begun(states, generator).to(device=device, dtype=dtype)
 
     # -------------------------------------------------------------- policy, objective
 
     def observe(self, x: Tensor) -> Tensor:
-        """What the policy sees, timers last: (…, n) -> (…, k)."""
+        """What the policy sees, parameters and timers last: (…, n) -> (…, k)."""
         if self._observation is None:
             return x
         seen = self._observation(self._named(x), TORCH, HARD)
@@ -235,7 +262,7 @@ class System:
     @cached_property
     def _observation(self) -> Program | None:
         observe = self.decl.policy.observe
-        seen = (*observe, *(ir.Col(timer.name) for timer in self.timers))
+        seen = (*observe, *(ir.Col(column.name) for column in self.added))
         return Program({str(i): num for i, num in enumerate(seen)}) if observe else None
 
     def performance(

@@ -6,7 +6,6 @@ unknown the two agree.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias, assert_never
@@ -22,12 +21,16 @@ from stlc.compile.schedule import Extent, Run, Schedule, schedule
 from stlc.compile.semantics import Exact
 from stlc.compile.windows import Windows
 from stlc.monitor.streams import Latch, Latched, Leaf, Plan, column, read_by
+from stlc.monitor.values import by_truth
 
 Floats: TypeAlias = NDArray[np.float64]
 End: TypeAlias = Literal["lower", "upper", "truncate"]
 
 NOTHING = ""
 """A column for formulas that read none."""
+
+FAR = 1 << 40
+"""More samples than any trace has."""
 
 _REMEMBERED = 256
 _EXACT = Windows(Exact(), NUMPY)
@@ -39,11 +42,13 @@ class Reader:
     Args:
         formulas: over columns.
         end: what stands beyond the last row.
+        going_on: the trace does not end with the last row.
     """
 
-    def __init__(self, formulas: Sequence[ir.Formula], end: End) -> None:
+    def __init__(self, formulas: Sequence[ir.Formula], end: End, *, going_on: bool = False) -> None:
         self.formulas = tuple(formulas)
         self.end = end
+        self._stop = FAR if going_on else None
         self.names = frozenset().union(*map(names_of_columns, self.formulas)) or frozenset({NOTHING})
         self._known: dict[tuple[int, int, int], Schedule] = {}
 
@@ -56,7 +61,9 @@ class Reader:
         if key not in self._known:
             if len(self._known) >= _REMEMBERED:
                 self._known.clear()
-            self._known[key] = schedule(self.formulas, Run(start, count), Extent(length, self.end))
+            self._known[key] = schedule(
+                self.formulas, Run(start, count), Extent(length, self.end, self._stop)
+            )
         inner = {name: env[name] if len(env[name]) == length else env[name][:length] for name in self.names}
         return execute(self._known[key], inner, _EXACT)
 
@@ -91,7 +98,9 @@ class Side:
         leaves = [stream for stream in self.plan.streams if isinstance(stream, Leaf)]
         for reads in dict.fromkeys((leaf.back, leaf.ahead) for leaf in leaves):
             alike = [leaf for leaf in leaves if (leaf.back, leaf.ahead) == reads]
-            self._leaves.append((alike, Reader([leaf.formula for leaf in alike], self.end)))
+            formulas = [by_truth(leaf.formula) if self.truth else leaf.formula for leaf in alike]
+            going_on = self.end != "truncate" and not self._over
+            self._leaves.append((alike, Reader(formulas, self.end, going_on=going_on)))
         latched = [stream for stream in self.plan.streams if isinstance(stream, Latched)]
         self._latched = [(stream, Reader(stream.parts, self.end)) for stream in latched]
         if self.end == "truncate":
@@ -146,21 +155,10 @@ class Side:
     ) -> None:
         env, first = signals
         start, ahead = self._settled.get(leaves[0].name, 0), leaves[0].ahead
-        known = samples if self._over or self.end == "truncate" else max(samples - ahead, start)
-        traces = self.rows[NOTHING].shape[1]
-        found: list[Floats] = [np.zeros((0, traces))] * len(leaves)
-        if known > start:
-            found = reader(env, start - first, known - start)
-        for leaf, values in zip(leaves, found, strict=True):
-            values = _true_or_false(values, leaf.formula) if self.truth else values
-            missing = samples + self._pads[leaf.name] - known
-            tail = np.full((missing, traces), self._unknown)
-            self._put(leaf.name, start, np.concatenate([values, tail]))
+        count = samples + max(self._pads[leaf.name] for leaf in leaves) - start
+        for leaf, values in zip(leaves, reader(env, start - first, count), strict=True):
+            self._put(leaf.name, start, values[: samples + self._pads[leaf.name] - start])
             self._settled[leaf.name] = max(samples - ahead, start)
-
-    @property
-    def _unknown(self) -> float:
-        return math.inf if self.end == "upper" else -math.inf
 
     def _grow_latched(self, stream: Latched, reader: Reader, samples: int) -> None:
         start = self._settled.get(stream.name, 0)
@@ -175,11 +173,6 @@ class Side:
         """Replace all rows from sample `start` on."""
         kept = self.rows.get(name)
         self.rows[name] = values if kept is None else np.concatenate([kept[: start - self.base], values])
-
-
-def _true_or_false(values: Floats, formula: ir.Formula) -> Floats:
-    strict = isinstance(formula, ir.Atom) and formula.strict
-    return np.where(values > 0 if strict else values >= 0, math.inf, -math.inf)
 
 
 def _continued(op: Latch, parts: Sequence[Floats], last: Floats | None) -> Floats:

@@ -12,21 +12,26 @@ from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.files import find_system
 from stlc.grammar import ast
 from stlc.trace import Trace, as_fraction
+from stlc.trace_time import RESAMPLE
 
 _SLACK = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """A time step and a horizon, both in seconds and exact; None where nobody said."""
+    """A time step and a horizon, both in seconds and exact; None where nobody said.
+
+    `trace` names the file that the step was measured in, "" where it was said.
+    """
 
     dt: Fraction | None = None
     horizon: Fraction | None = None
+    trace: str = ""
 
     def or_else(self, other: Times) -> Times:
         """What is unknown here is taken from `other`."""
-        dt = self.dt if self.dt is not None else other.dt
-        return Times(dt, self.horizon if self.horizon is not None else other.horizon)
+        step = self if self.dt is not None else other
+        return Times(step.dt, self.horizon if self.horizon is not None else other.horizon, step.trace)
 
     @property
     def complete(self) -> bool:
@@ -34,13 +39,21 @@ class Times:
         return self.dt is not None and self.horizon is not None
 
     def grid(self) -> Grid:
-        """The same in steps. Raises UsageError (U101) where the horizon is not a whole number of steps."""
+        """The same in steps.
+
+        Raises:
+            TraceError: E602, the horizon is not a whole number of steps of a trace.
+            UsageError: U101, it is not one of the steps that were asked for.
+        """
         if self.dt is None or self.horizon is None:
             return Grid(self.dt, None)
         steps = self.horizon / self.dt
         whole = round(steps)
         if abs(steps - whole) > _SLACK * max(whole, 1):
             horizon, dt = float(self.horizon), float(self.dt)
+            if self.trace:
+                message = f"`{self.trace}` has dt {dt:g} s, and T = {horizon:g} s is no whole number of steps"
+                raise TraceError(Diagnostic("E602", message, help=(RESAMPLE,)))
             message = f"the horizon {horizon:g} s is not a whole number of steps of {dt:g} s"
             raise UsageError(Diagnostic("U101", message))
         return Grid(self.dt, whole)
@@ -85,4 +98,4 @@ def recorded_times(trace: Trace, asked: Times) -> Times:
         message = f"`{trace.name}` has dt {float(dt):g} s, the monitor was told {float(asked.dt):g} s"
         raise TraceError(Diagnostic("E602", message))
     horizon = trace.meta.horizon
-    return Times(dt, None if horizon is None else horizon * dt)
+    return Times(dt, None if horizon is None else horizon * dt, trace.name)

@@ -13,6 +13,7 @@ from typing import Literal, TypeAlias
 
 from stlc.compile.defined import defined
 from stlc.compile.graph import robustness_signal
+from stlc.compile.interface import Grid
 from stlc.compile.ops import Array
 from stlc.compile.pipeline import Rule
 from stlc.compile.schedule import End
@@ -120,12 +121,14 @@ def _alone(rule: Rule, record: Record, at: int, horizon: int | None, end: End) -
     return inner.values([rule.formula], range(at, at + 1), end, stop if going_on else None)[0]
 
 
-def check_length(rule: Rule, samples: int, starts: range, dt: float | None) -> Diagnostic | None:
+def check_length(rule: Rule, samples: int, starts: range, grid: Grid) -> Diagnostic | None:
     """E306 where a value at `starts` needs more samples than there are."""
-    if defined(rule.formula, samples)[starts.start : starts.stop].all():
+    window = window_of(rule, grid.horizon) or 0
+    fits = starts.stop - 1 + window < samples
+    if fits and defined(rule.formula, samples)[starts.start : starts.stop].all():
         return None
-    unit, step = ("samples", 1.0) if dt is None else ("s", dt)
-    needed, length = (starts.stop - 1 + rule.reach) * step, (samples - 1) * step
+    unit, step = ("samples", 1.0) if grid.dt is None else ("s", float(grid.dt))
+    needed, length = (starts.stop - 1 + max(rule.reach, window)) * step, (samples - 1) * step
     return Diagnostic(
         "E306",
         f"this needs {needed:.6g} {unit} of signal; the trace has {length:.6g} {unit}",
@@ -137,9 +140,9 @@ def check_length(rule: Rule, samples: int, starts: range, dt: float | None) -> D
     )
 
 
-def require_length(rules_and_starts: list[tuple[Rule, range]], samples: int, dt: float | None) -> None:
+def require_length(rules_and_starts: list[tuple[Rule, range]], samples: int, grid: Grid) -> None:
     """Raise TraceError (E306) where a requirement needs more samples than there are."""
-    findings = [check_length(rule, samples, starts, dt) for rule, starts in rules_and_starts]
+    findings = [check_length(rule, samples, starts, grid) for rule, starts in rules_and_starts]
     found = [finding for finding in findings if finding is not None]
     if found:
         raise TraceError(*found)

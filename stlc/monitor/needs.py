@@ -26,11 +26,13 @@ class Need:
         column: as the specification declares it.
         by: names of the requirements.
         span: of its declaration.
+        parameter: it is a `param`, which may be given a value instead.
     """
 
     column: Column
     by: tuple[str, ...]
     span: Span | None = None
+    parameter: bool = False
 
 
 def needs_of(compiled: Compiled, rules: Sequence[Rule]) -> tuple[Need, ...]:
@@ -41,13 +43,20 @@ def needs_of(compiled: Compiled, rules: Sequence[Rule]) -> tuple[Need, ...]:
     """
     _require_functions(compiled, rules)
     read = {rule.name: columns(rule.formula) for rule in rules}
-    spans = {item.name: item.name_span for item in compiled.spec.items if isinstance(item, ast.Signal)}
+    declared = [item for item in compiled.spec.items if isinstance(item, ast.Signal | ast.Param)]
+    spans = {item.name: item.name_span for item in declared}
+    parameters = {each.column.name for each in compiled.typed.parameters}
     wanted: dict[str, tuple[str, ...]] = {}
     for rule in rules:
         for column in read[rule.name]:
             wanted[column] = (*wanted.get(column, ()), rule.name)
     return tuple(
-        Need(column, wanted[column.name], spans.get(_INDEX.sub("", column.name)))
+        Need(
+            column,
+            wanted[column.name],
+            spans.get(_INDEX.sub("", column.name)),
+            column.name in parameters,
+        )
         for column in compiled.signature.columns
         if column.name in wanted
     )

@@ -317,12 +317,10 @@ class Online:
         horizon = self.compiled.grid.horizon
         found: dict[str, Tally] = {}
         refused: list[Diagnostic] = []
-        dt = None if self.compiled.grid.dt is None else float(self.compiled.grid.dt)
         for watched in self._watched:
             starts = starts_of(watched.rule, self.samples, horizon, self.how.at)
             if self.how.end == "strict":
-                last = range(starts.stop - 1, starts.stop)
-                finding = check_length(watched.rule, self.samples, last, dt)
+                finding = check_length(watched.rule, self.samples, starts, self.compiled.grid)
                 refused += [] if finding is None else [finding]
             rest = range(min(watched.tally.instants, starts.stop), starts.stop)
             found[watched.rule.name] = (

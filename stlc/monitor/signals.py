@@ -79,7 +79,8 @@ def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False)
     name = given.name if isinstance(given, Trace) else UNNAMED
     data: Given = {CLOCK: given.times, **given.data} if isinstance(given, Trace) else given
     found = {need.column.name: _find(data, need.column.name) for need in needs}
-    missing = [_missing(need, data, name) for need in needs if found[need.column.name] is None]
+    there = {**data, **given.extras} if isinstance(given, Trace) else data
+    missing = [_missing(need, there, name) for need in needs if found[need.column.name] is None]
     if missing:
         raise TraceError(*missing)
     arrays = found or _any_one(data)
@@ -139,6 +140,10 @@ def _missing(need: Need, data: Given, name: str) -> Diagnostic:
     near = closest(wanted, data)
     shapes = ", ".join(f"{key} {tuple(np.shape(values))}" for key, values in data.items())
     help_ = () if near is None else (f"did you mean `{near}`? map it with  --map {wanted}={near}",)
+    if need.parameter:
+        value = f"{need.column.low or 0:g}{need.column.unit}"
+        advice = f"or give it one value for all traces:  --set {wanted.partition('[')[0]}={value}"
+        help_ = (*help_, advice)
     return Diagnostic(
         "E601",
         f"trace `{name}` has no signal `{wanted}`" if name != UNNAMED else f"no signal `{wanted}` is given",

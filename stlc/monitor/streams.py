@@ -149,12 +149,11 @@ class _Planner:
 
     def _leaf(self, formula: ir.Formula) -> ir.Formula:
         if formula not in self.streams:
-            back = max(reach(formula).past, history(formula)) + looks_back(formula)
             ahead = reach(formula).future
             ahead = (
                 max(ahead, looks_on(formula)) if isinstance(formula, ir.Atom) else ahead + looks_on(formula)
             )
-            self.streams[formula] = Leaf(f"#{len(self.streams)}", formula, back, ahead)
+            self.streams[formula] = Leaf(f"#{len(self.streams)}", formula, history(formula), ahead)
         return column(self.streams[formula].name)
 
     def _frozen(self, formula: ir.Formula) -> ir.Formula:
@@ -204,11 +203,6 @@ def unbounded_past(node: ir.Formula) -> bool:
 def looks_on(formula: ir.Formula) -> int:
     """How far the predicates look ahead, at samples that some do without at the end of the trace."""
     return max(0, *_offsets(formula))
-
-
-def looks_back(formula: ir.Formula) -> int:
-    """How far the predicates look back, at samples that some do without at the start of the trace."""
-    return max(0, *(-steps for steps in _offsets(formula)))
 
 
 def _offsets(formula: ir.Formula) -> list[int]:

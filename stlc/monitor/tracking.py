@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple, Protocol, TypeAlias
@@ -14,7 +13,8 @@ from stlc.compile import ir
 from stlc.compile.horizon import nodes, reach
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.pipeline import Rule
-from stlc.monitor.columns import End, Reader, Side
+from stlc.compile.samples import farthest
+from stlc.monitor.columns import FAR, End, Reader, Side
 from stlc.monitor.frontier import Frontier, Skeleton, skeleton
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.streams import EndlessError, Plan, endless, looks_on, plan
@@ -134,6 +134,17 @@ class Everywhere:
 
     def live(self, start: int, stop: int) -> Bounds:
         """Bounds over all continuations."""
+        if self.asked.ending == "truncate":
+            return _decided_first(self, start, stop)
+        return self.either(start, stop)
+
+    def certain(self, starts: range) -> Bounds:
+        """At settled instants, where windows are cut to the trace."""
+        values = self._values(2, starts.start, starts.stop)
+        return Bounds(values, values)
+
+    def either(self, start: int, stop: int) -> Bounds:
+        """At any instants, where nothing is assumed of what lies outside of the trace."""
         return Bounds(self._values(0, start, stop), self._values(1, start, stop))
 
     def ended(self, starts: range) -> Bounds:
@@ -147,23 +158,14 @@ class Everywhere:
 
     def _ended(self, starts: range) -> Bounds:
         if self.asked.ending == "open":
-            if self.window is not None and starts.stop + self.window > self.samples:
-                return Bounds(self._cut_short(0, starts), self._cut_short(1, starts))
-            return self.live(starts.start, starts.stop)
-        values = self._values(2, starts.start, starts.stop)
-        return Bounds(values, values)
+            return self.either(starts.start, starts.stop)
+        return self.certain(starts)
 
     def drop(self, start: int) -> int:
         """Forget instants before `start`."""
         for side in self._sides:
             side.drop(start - self._back)
         return _first_needed(self.planned, self.samples)
-
-    def _cut_short(self, which: int, starts: range) -> Floats:
-        """Of a trace shorter than the window: its last sample is the end."""
-        side, stop = self._sides[which], self.samples - self._sides[which].base
-        known = {name: rows[:stop] for name, rows in side.rows.items()}
-        return self._readers[which](known, starts.start - side.base, len(starts))[0][:, 0]
 
     def _values(self, which: int, start: int, stop: int) -> Floats:
         side = self._sides[which]
@@ -173,8 +175,9 @@ class Everywhere:
             return side.values(self._readers[which], start, stop - start)[0][:, 0]
         record = Record(side.rows, NUMPY)
         starts = range(start - side.base, stop - side.base)
-        low, _ = window_bounds(self.planned.formula, record, starts, self.window, "truncate")
-        return np.asarray(low[:, 0])
+        ends: Ending = "truncate" if side.end == "truncate" else "open"
+        low, high = window_bounds(self.planned.formula, record, starts, self.window, ends)
+        return np.asarray((high if side.end == "upper" else low)[:, 0])
 
 
 def _first_needed(planned: Plan, samples: int) -> int:
@@ -260,19 +263,26 @@ class Whole:
 
     def live(self, start: int, stop: int) -> Bounds:
         """Bounds over all continuations."""
+        if self.ending == "truncate":
+            return _decided_first(self, start, stop)
+        return self.either(start, stop)
+
+    def certain(self, starts: range) -> Bounds:
+        """At settled instants, where windows are cut to the trace."""
+        return self.ended(starts)
+
+    def either(self, start: int, stop: int) -> Bounds:
+        """At any instants, where nothing is assumed of what lies outside of the trace."""
         if stop <= start:
             return Bounds(np.zeros(0), np.zeros(0))
         rule, record = self._subject()
         window = window_of(rule, self.horizon)
         if window is None:
-            far, starts = going_on(rule.formula, self.samples), range(start, stop)
-            low, high = (record.values([rule.formula], starts, end, far)[0] for end in _BOTH)
+            longer, starts = lengthened(rule.formula, self.samples), range(start, stop)
+            low, high = (record.values([longer], starts, end, FAR)[0] for end in _BOTH)
             return Bounds(low[:, 0], high[:, 0])
-        whole = min(stop, max(self.samples - window, start))
-        known = range(start, whole)
-        low, high = rule_bounds(rule, record, known, self.horizon, "open") if known else (_NONE, _NONE)
-        unknown = np.full(stop - whole, math.inf)
-        return Bounds(np.concatenate([low[:, 0], -unknown]), np.concatenate([high[:, 0], unknown]))
+        low, high = rule_bounds(rule, record, range(start, stop), self.horizon, "open")
+        return Bounds(low[:, 0], high[:, 0])
 
     def ended(self, starts: range) -> Bounds:
         """Where the trace is over."""
@@ -292,22 +302,26 @@ class Whole:
         return 0
 
 
-_NONE = np.zeros((0, 1))
+def _decided_first(tracker: Everywhere | Whole, start: int, stop: int) -> Bounds:
+    """Where windows are cut, what a settled instant reads before the first sample is false, not unknown."""
+    middle = min(max(tracker.settled, start), stop)
+    if middle <= start:
+        return tracker.either(start, stop)
+    known, rest = tracker.certain(range(start, middle)), tracker.either(middle, stop)
+    return Bounds(*map(np.concatenate, zip(known, rest, strict=True)))
 
 
 _BOTH: tuple[Literal["lower"], Literal["upper"]] = ("lower", "upper")
 
 
-def going_on(formula: ir.Formula, samples: int) -> int:
-    """An end of a trace that goes on, so far away that everything on the way there is unknown."""
-    return samples + 1 + sum(map(_farthest, nodes(formula)))
+def lengthened(formula: ir.Formula, samples: int) -> ir.Formula:
+    """The formula where windows to the end of the trace reach beyond all of which anything is known."""
+    bounds = [abs(node.steps) if isinstance(node, ir.Shift) else _farthest(node) for node in nodes(formula)]
+    return _long(formula, samples + sum(bounds) + 1)
 
 
 def _farthest(node: ir.Formula) -> int:
-    """Steps over which an operator reaches by itself."""
     match node:
-        case ir.Shift(steps=steps):
-            return abs(steps)
         case (
             ir.Over(window=window)
             | ir.Until(window=window)
@@ -319,3 +333,23 @@ def _farthest(node: ir.Formula) -> int:
             return sum(farthest(num))
         case _:
             return 0
+
+
+def _long(formula: ir.Formula, length: int) -> ir.Formula:
+    match formula:
+        case ir.Join(items=items):
+            return replace(formula, items=tuple(_long(item, length) for item in items))
+        case ir.Over(window=window, body=body):
+            return replace(formula, window=_longer(window, length), body=_long(body, length))
+        case ir.Until(window=window, left=left, right=right):
+            left, right = _long(left, length), _long(right, length)
+            return replace(formula, window=_longer(window, length), left=left, right=right)
+        case ir.Past(body=body) | ir.Shift(body=body) | ir.Freeze(body=body) | ir.AtStart(body=body):
+            return replace(formula, body=_long(body, length))
+        case ir.Since(left=left, right=right):
+            return replace(formula, left=_long(left, length), right=_long(right, length))
+    return formula
+
+
+def _longer(window: ir.Window, length: int) -> ir.Window:
+    return window if window.hi is not None else ir.Window(window.lo, window.lo + length)

@@ -91,9 +91,7 @@ def window_bounds(
     """
     back = history(formula)
     early = range(starts.start, max(min(back, starts.stop), starts.start))
-    pairs = [
-        bounds(formula, record.cut(stop := k + window + 1), range(k, k + 1), ends, stop) for k in early
-    ]
+    pairs = [bounds(formula, record.cut(stop := k + window + 1), range(k, k + 1), ends, stop) for k in early]
     for inner, count in _unrolled(record, range(early.stop, starts.stop), back, window):
         low, high = bounds(formula, inner, range(back, back + 1), ends, back + window + 1)
         same = low is high

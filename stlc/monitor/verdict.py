@@ -129,7 +129,7 @@ class Monitor:
         samples = ready.signals.samples
         starts = [starts_of(rule, samples, ready.horizon, at) for rule in ready.rules]
         if end == "strict":
-            require_length(list(zip(ready.rules, starts, strict=True)), samples, ready.dt)
+            require_length(list(zip(ready.rules, starts, strict=True)), samples, ready.compiled.grid)
         judgements = [
             _judge(rule, ready, its, "truncate" if end == "truncate" else "open", tolerance)
             for rule, its in zip(ready.rules, starts, strict=True)
@@ -164,7 +164,7 @@ class Monitor:
         ready = self._prepare(signals, ())
         ready = replace(ready, record=replace(ready.record, semantics=chosen))
         rows = _rows(ready, end, at)
-        weighed = [row * (rule.weight / rule.scale) for rule, row in zip(ready.rules, rows, strict=True)]
+        weighed = _weighed(ready.rules, rows)
         whole = chosen.join(weighed, "min", ready.signals.ops)
         return ready.signals.like_given(whole) if at is None else ready.signals.at_one(whole)
 

@@ -1,4 +1,4 @@
-"""A deployment in motion: drawn by its world where it has one, else its signals as they grow."""
+"""A deployment in motion: drawn by its world, over the places of the specification, else its signals."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import numpy as np
 
 from stlc.diagnostics import StlcError
 from stlc.rundir import RunDir
-from stlc.trace import load_trace
+from stlc.trace import Trace, load_trace
+from stlc.view.chart import Chart, chart_film, chart_of
+from stlc.view.driven import monitor_of
 from stlc.view.film import MAX_BYTES, MAX_FRAMES, Film, Scene, save_gif, save_still, scene_film, signal_film
 
 SCENE = "scene.npz"
@@ -22,7 +24,7 @@ def film_of(run: RunDir) -> Film | None:
     """What there is to see of the run's deployment; None where nothing was recorded.
 
     A world draws its own scene and is loaded from the folder. Without one, or where it cannot be loaded,
-    the signals of the trace are shown.
+    the paths of the trace are shown over the places that its specification names, else its signals.
     """
     return _scene_film(run) or _signal_film(run)
 
@@ -84,7 +86,17 @@ def _signal_film(run: RunDir) -> Film | None:
         trace = load_trace(run.path / TRACE)
     except StlcError:
         return None
-    return signal_film(trace, title=_title(run))
+    chart = _chart(trace)
+    return signal_film(trace, title=_title(run)) if chart is None else chart_film(chart, title=_title(run))
+
+
+def _chart(trace: Trace) -> Chart | None:
+    """The map of a trace; None where it carries no specification that names places."""
+    try:
+        monitor = monitor_of(trace)
+        return chart_of(monitor.spec, monitor.check(trace), trace)
+    except StlcError:
+        return None
 
 
 def _load_scene(path: Path) -> Scene | None:

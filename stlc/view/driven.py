@@ -14,6 +14,7 @@ from stlc.monitor.explain import Cause, explain
 from stlc.monitor.verdict import Judgement, Monitor, Verdict
 from stlc.source import Source
 from stlc.trace import Trace
+from stlc.view.chart import chart_of, draw_chart
 from stlc.view.html import Child, Html, classed, el, figure, join, table
 from stlc.view.material import Material, untagged
 from stlc.view.page import Section
@@ -22,6 +23,11 @@ from stlc.view.style import ORANGE, RED
 from stlc.view.words import count, share
 
 TITLE = "What was driven"
+MAP_CAPTION = (
+    "Paths over the places that the specification names, from the hollow points to the full ones. "
+    "Beside it the share of traces that are in a place (shaded: when it matters; dashed: who has been there "
+    "in that time)."
+)
 
 
 def driven_section(material: Material) -> Section | None:
@@ -30,8 +36,7 @@ def driven_section(material: Material) -> Section | None:
     if trace is None:
         return None
     try:
-        text = trace.meta.spec_text or material.texts.get("spec.stl", "")
-        monitor = Monitor(replace(parse(Source("spec.stl", text)), library=trace.meta.spec_library or None))
+        monitor = monitor_of(trace, material.texts.get("spec.stl", ""))
         verdict = monitor.check(trace)
         margins = monitor.requirement_robustness(trace)
     except StlcError as error:
@@ -49,6 +54,32 @@ def driven_section(material: Material) -> Section | None:
         causes_of(verdict, names, monitor.spec),
     )
     return Section("driven", TITLE, body, picture)
+
+
+def monitor_of(trace: Trace, text: str = "") -> Monitor:
+    """What judges a trace: by the specification that it carries, or else by `text`.
+
+    Raises:
+        SpecError: the specification is invalid.
+    """
+    source = Source("spec.stl", trace.meta.spec_text or text)
+    return Monitor(replace(parse(source), library=trace.meta.spec_library or None))
+
+
+def map_section(material: Material) -> Section | None:
+    """The paths over the places of the specification; None where it names none in a plane."""
+    trace = material.trace
+    if trace is None:
+        return None
+    try:
+        monitor = monitor_of(trace, material.texts.get("spec.stl", ""))
+        chart = chart_of(monitor.spec, monitor.check(trace), trace)
+    except StlcError:
+        return None
+    if chart is None:
+        return None
+    picture = draw_chart(chart)
+    return Section("map", "Where it drives", figure(picture.data_uri(), picture.alt, MAP_CAPTION), picture)
 
 
 def trace_names(trace: Trace) -> list[str]:

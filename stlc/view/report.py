@@ -14,7 +14,7 @@ from stlc.version import __version__
 from stlc.view import require_drawing
 from stlc.view.closing import failures_section, repeat_section, texts_section
 from stlc.view.deployment import deployment_section, deployment_tiles, film_section
-from stlc.view.driven import driven_section
+from stlc.view.driven import driven_section, map_section
 from stlc.view.material import Material, gather
 from stlc.view.opening import headline, requirements_section, training_section
 from stlc.view.page import Section, page
@@ -46,6 +46,7 @@ def sections_of(material: Material) -> list[Section]:
         requirements_section(material),
         deployment_section(material),
         film_section(material),
+        map_section(material),
         driven_section(material),
         failures_section(material),
         training_section(material),

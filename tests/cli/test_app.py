@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import functools
 import json
 import os
 import resource
@@ -178,11 +179,14 @@ def test_ctrl_c_that_surfaces_as_another_error_is_one(boundary, capsys):
         except KeyboardInterrupt:
             raise ImportError("numpy.core.multiarray failed to import") from None
 
-    before = signal.getsignal(signal.SIGINT)
-    assert boundary(action, "--json") == 130
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert boundary(action, "--json") == 130
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
     out, err = capsys.readouterr()
     assert (json.loads(out)["exit_code"], json.loads(out)["schema"], err) == (130, "act/1", "")
-    assert signal.getsignal(signal.SIGINT) is before
 
 
 # ---------------------------------------------------------------------- the real program
@@ -210,7 +214,10 @@ def test_ctrl_c_at_any_time_of_the_imports(share, tmp_path):
 def _started(words, environment):
     """A process that has begun to run its first line."""
     pipe = subprocess.PIPE
-    process = subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, env=environment)
+    heard = functools.partial(
+        signal.signal, signal.SIGINT, signal.SIG_DFL
+    )  # a shell's `&` lets it be ignored
+    process = subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, env=environment, preexec_fn=heard)
     process.stdout.readline()
     return process
 

@@ -88,6 +88,26 @@ def test_the_golden_text_of_a_violation(
     assert out == golden.read_text(encoding="utf-8")
 
 
+def test_the_replay_says_how_the_trace_was_read(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("low.stl").write_text(
+        "const top = 1\nsignal x\nsignal mode : Mode\nenum Mode { up, down }\n"
+        "require low: always[0 s, 0.2 s] (mode == up -> x < top)\n"
+    )
+    Path("drive.csv").write_text("clock,height,mode,note\n0,1,up,a\n0.1,4,up,b\n0.2,9,down,c\n")
+    words = ["check", "low.stl", "drive.csv", "--map", "t=clock", "--map", "x=height", "--set", "top=3"]
+    assert main(words) == 1
+    out = capsys.readouterr().out
+    (replay,) = [line.split("replay: ")[1] for line in out.splitlines() if "replay: " in line]
+    assert main(replay.split()[1:]) == 1
+    assert "x = 4" in capsys.readouterr().out
+    assert main([*words, "--chunk", "2"]) == 1
+    capsys.readouterr()
+    assert main([*words[:5], "--map", "mode=note"]) == 3
+    assert "`note` in `drive.csv` cannot be `a`" in capsys.readouterr().err
+    assert main(words[:5]) == 3
+    assert "trace `drive.csv` has no signal `x`" in capsys.readouterr().err
+
+
 def test_the_replay_shows_the_same_violation(capsys: pytest.CaptureFixture[str]) -> None:
     check(saved(bad_drive()))
     out = capsys.readouterr().out

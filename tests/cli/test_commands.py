@@ -29,6 +29,20 @@ def _here(tmp_path, monkeypatch):
 # ---------------------------------------------------------------------- fmt, lint, parse
 
 
+@pytest.mark.parametrize(("name", "spec"), [("car", "traffic"), ("patrol", "patrol")])
+def test_a_project_may_begin_with_an_installed_example(name, spec, capsys):
+    assert main(["init", "mine", "--example", name]) == 0
+    out, err = capsys.readouterr()
+    assert f"mine/specs/{spec}.stl" in out.splitlines()
+    assert f"next: cd mine && stlc train specs/{spec}.stl" in err
+    assert main(["compile", f"mine/specs/{spec}.stl"]) == 0
+    assert "system mine/systems/" in capsys.readouterr().err
+    for path in Path("mine").rglob("*.yaml"):
+        assert main(["system", "check", str(path), "--steps", "0"]) == 0
+    assert main(["init", "other", "--example", "cra"]) == 2
+    assert "did you mean `car`?" in capsys.readouterr().err
+
+
 def test_fmt_writes_in_place(capsys):
     assert main(["fmt", "a.stl"]) == 0
     assert Path("a.stl").read_text() == FORMATTED

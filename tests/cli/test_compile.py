@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -23,6 +24,38 @@ def _in_the_root(monkeypatch):
 def document(capsys, *arguments):
     code = main(["compile", *arguments, "--json"])
     return code, json.loads(capsys.readouterr().out)
+
+
+def test_watching_compiles_again_when_a_file_changes(tmp_path, monkeypatch, capsys):
+    for folder in ("specs", "examples"):
+        shutil.copytree(ROOT / folder, tmp_path / folder)
+    monkeypatch.chdir(tmp_path)
+    edits = iter(
+        [
+            lambda: _replace("examples/car.yaml", "T_red:   4 s", "T_red:   3 s"),
+            lambda: _replace("specs/traffic.stl", "T_red   = 4 s", "T_red   = 3 s"),
+        ]
+    )
+
+    def change(_seconds: float) -> None:
+        edit = next(edits, None)
+        if edit is None:
+            raise KeyboardInterrupt
+        edit()
+
+    monkeypatch.setattr("stlc.cli.watch.time.sleep", change)
+    assert main(["compile", "specs/traffic.stl", "--watch"]) == 130
+    out, err = capsys.readouterr()
+    assert out.count("phi_safe") == 2
+    assert (out.count("tau % 8 > 4"), out.count("tau % 8 > 3")) == (1, 1)
+    assert err.count("E104") == 1
+    assert err.count("watching specs/traffic.stl, examples/car.yaml") == 3
+
+
+def _replace(path: str, old: str, new: str) -> None:
+    text = Path(path).read_text()
+    assert old in text
+    Path(path).write_text(text.replace(old, new))
 
 
 def test_what_the_solver_sees(capsys):

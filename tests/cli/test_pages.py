@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 import shlex
@@ -12,6 +13,7 @@ import pytest
 
 from stlc.cli.app import main
 from stlc.cli.pages import FOLDER, Example, read_page
+from stlc.controller.config import TrainConfig
 from stlc.diagnostics import CODES
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -102,13 +104,20 @@ def test_a_trace(code, example, tmp_path, monkeypatch, capsys):
 WORLD = "from stlc.controller.world import ModelWorld\n\n\nclass Yard(ModelWorld):\n    pass\n"
 
 
+def quicken(patch: pytest.MonkeyPatch) -> None:
+    """Judge fewer states and decisions than a run is worth: only what is said matters here."""
+    patch.setattr("stlc.controller.config.TrainConfig", functools.partial(TrainConfig, held_out=64))
+    patch.setattr("stlc.controller.evaluate.LATENCY_SECONDS", 0.01)
+    patch.setattr("stlc.controller.trainer.MARGIN_STATES", 16)
+
+
 @pytest.fixture(scope="module")
 def project(tmp_path_factory):
     """A project with a run that has been trained for a moment and driven once."""
     folder = tmp_path_factory.mktemp("project")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr("stlc.controller.evaluate.LATENCY_SECONDS", 0.1)
+        quicken(patch)
         assert main(["init"]) == 0
         system = Path("systems/cart.yaml")
         world = 'test: {world: "yard.py:Yard", agents: 2, steps: 5}\ntrain: {steps: 20, batch: 32}\n'
@@ -133,7 +142,7 @@ def there(project, tmp_path, monkeypatch, capsys):
     home = tmp_path / "project"
     shutil.copytree(project, home, symlinks=True)
     monkeypatch.chdir(home)
-    monkeypatch.setattr("stlc.controller.evaluate.LATENCY_SECONDS", 0.1)
+    quicken(monkeypatch)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     capsys.readouterr()
     return home

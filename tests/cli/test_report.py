@@ -3,9 +3,11 @@
 import json
 
 import pytest
+from documents import misfits
 
 import stlc.view
 from stlc.cli.app import main
+from stlc.cli.schema import load_schema
 from stlc.rundir import RunDir
 
 
@@ -27,6 +29,7 @@ def test_a_run_can_be_named_and_the_answer_be_json(run, capsys):
     assert main(["report", "quiet-heron", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["schema"] == "report/1"
+    assert misfits(document, load_schema("report/1")) == []
     assert document["result"]["report"] == f"{run.shown}/report.html"
 
 

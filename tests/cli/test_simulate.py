@@ -4,8 +4,10 @@ import json
 from pathlib import Path
 
 import pytest
+from documents import misfits
 
 from stlc.cli.app import main
+from stlc.cli.schema import load_schema
 from stlc.rundir import RunDir
 from stlc.trace import load_trace
 
@@ -60,6 +62,7 @@ def test_without_backup_nothing_is_guarded(there: RunDir, capsys: pytest.Capture
     assert main(["simulate", there.name, *SMALL, "--seed", "5", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["schema"] == "simulate/1"
+    assert misfits(document, load_schema("simulate/1")) == []
     assert document["ok"] is True
     result = document["result"]
     assert set(result["guards"]) == {"none"}

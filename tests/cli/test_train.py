@@ -8,8 +8,10 @@ import signal
 from pathlib import Path
 
 import pytest
+from documents import misfits
 
 from stlc.cli.app import main
+from stlc.cli.schema import load_schema
 from stlc.controller.trainer import Trainer
 from stlc.rundir import RunDir
 
@@ -80,6 +82,7 @@ def test_an_interrupted_run_is_saved_and_told(
     told = capsys.readouterr()
     document = json.loads(told.out)
     assert (document["ok"], document["exit_code"]) == (False, code)
+    assert misfits(document, load_schema("train/1")) == []
     folder = RunDir.newest(Path("elsewhere"))
     assert document["result"]["run"] == folder.shown
     assert f"stlc train --resume {folder.shown}" in told.err

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from resolving import HEAD
 
 from stlc.compile.resolve import resolve
-from stlc.diagnostics import CODES, SpecError
+from stlc.diagnostics import CODES, Diagnostic, SpecError
 from stlc.grammar.parser import parse
 from stlc.source import Source
 
@@ -135,3 +135,41 @@ def test_what_doubles_on_every_level_is_refused(grown: str) -> None:
         resolve(parse(Source("specs/spec.stl", f"{HEAD}\nrequire r: {text}\n")), sink=[])
     assert [finding.code for finding in caught.value.diagnostics] == ["E005"]
     assert time.process_time() - began < 1
+
+
+@pytest.mark.parametrize(
+    "items",
+    [
+        "require r: x > 1e308 h * 1 m/s",
+        "require r: x > 0 m until[1e308 h, inf] y > 0 m",
+        "const k [km] = 1e308",
+        "const k [km] = [1, -1e308]",
+        "signal w [km] in [0, 1e308]",
+        "const k [km] = 2\nrequire r: 1e308 > k",
+    ],
+)
+def test_what_only_the_unit_makes_too_large(items: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        resolve(parse(Source("specs/spec.stl", f"{HEAD}\n{items}\n")), sink=[])
+    assert [finding.code for finding in caught.value.diagnostics] == ["E005"]
+
+
+@pytest.mark.parametrize("line", ["require r{0}: u{0} > 0", "signal w{0}\nrequire r{0}: v{0} > 0"])
+def test_thousands_of_errors_take_no_time(line: str) -> None:
+    text = HEAD + "\n".join(line.format(number) for number in range(3000))
+    syntax = parse(Source("specs/spec.stl", text))
+    began = time.process_time()
+    with pytest.raises(SpecError) as caught:
+        resolve(syntax, sink=[])
+    assert "2980 more errors" in caught.value.diagnostics[-1].note[-1]
+    assert time.process_time() - began < 2
+
+
+def test_thousands_of_warnings_take_no_time() -> None:
+    text = HEAD + "\n".join(f"require r{number}: always[0, {number}] x > 0 m" for number in range(2000))
+    syntax = parse(Source("specs/spec.stl", text))
+    warnings: list[Diagnostic] = []
+    began = time.process_time()
+    resolve(syntax, sink=warnings)
+    assert [finding.code for finding in warnings] == ["W101"] * 1999
+    assert time.process_time() - began < 2

@@ -203,7 +203,7 @@ def test_clocks_are_appended_and_count_whole_steps(car: System) -> None:
 
 
 def test_timers_follow_from_the_states_before(car: System) -> None:
-    """A rollout is its steps, `timers_later` is what a step does, and no gradient goes through a timer."""
+    """A rollout is its steps, `added_later` is what a step does, and no gradient goes through a timer."""
     moving = ir.Where(ir.Atom(ir.Op("sub", (ir.Col("v"), ir.Lit(2.0)))), ir.Lit(1.0), ir.Col("fast"))
     fast = Timer("fast", "latch", 0.0, moving, 0.0, 1.0)
     system = car.augmented((clock_of("clock", 40), fast))
@@ -213,7 +213,7 @@ def test_timers_follow_from_the_states_before(car: System) -> None:
     x = system.rollout(x0, u)
     state = x0
     for k in range(25):
-        assert torch.equal(system.timers_later(state), x[:, k + 1, 7:])
+        assert torch.equal(system.added_later(state), x[:, k + 1, 7:])
         state = system.step(state, u[:, k])
         torch.testing.assert_close(state, x[:, k + 1])
     ever = (x[:, :-1, 1] >= 2.0).cumsum(1) > 0
@@ -223,7 +223,7 @@ def test_timers_follow_from_the_states_before(car: System) -> None:
     (grad,) = torch.autograd.grad(x.sum(), u)
     (bare,) = torch.autograd.grad(car.rollout(x0[:, :7], u).sum(), u)
     torch.testing.assert_close(grad, bare)
-    assert car.timers_later(x0[:, :7]).shape == (64, 0)
+    assert car.added_later(x0[:, :7]).shape == (64, 0)
 
 
 def test_plans_of_the_wrong_shape_are_refused(car: System) -> None:

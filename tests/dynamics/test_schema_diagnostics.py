@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
@@ -189,3 +190,16 @@ def test_several_errors_come_in_the_order_of_the_file() -> None:
     places = [finding.span.start for finding in caught.value.diagnostics if finding.span]
     assert len(places) >= 4
     assert places == sorted(places)
+
+
+def test_thousands_of_findings_take_no_time() -> None:
+    text = GOOD + "\n".join(f"k{number}: {number}" for number in range(3000))
+    began = time.process_time()
+    with pytest.raises(StlcError) as caught:
+        parse_system(Source("cart.yaml", text), Path("cart.yaml"))
+    assert len(caught.value.diagnostics) == 3000
+    assert time.process_time() - began < 2
+
+
+def test_a_number_that_only_its_unit_makes_too_large() -> None:
+    assert "E005" in findings(GOOD.replace("wall: 5 m", "wall: 1e308 km"))

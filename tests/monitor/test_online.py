@@ -19,6 +19,7 @@ from stlc.compile.lower import lower
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.simplify import simplify
 from stlc.diagnostics import StlcError
+from stlc.monitor.columns import FAR
 from stlc.monitor.online import How
 from stlc.monitor.tracking import Asked, Everywhere, FromTheStart, Whole, lengthened, tracker_of
 from stlc.monitor.values import Record, bounds
@@ -45,9 +46,19 @@ def at_ends(
     """Bounds over all continuations, by the evaluator: endless windows run over many unknown samples."""
     record = Record(known, NUMPY)
     longer = lengthened(formula, record.samples + 60)
-    low, high = (
-        record.values([longer], starts.start, len(starts), end)[0][:, 0] for end in ("lower", "upper")
-    )
+    low, high = (record.values([longer], starts, end, FAR)[0][:, 0] for end in ("lower", "upper"))
+    return low, high
+
+
+def so_far(
+    formula: ir.Formula, known: dict[str, np.ndarray], starts: range, certain: range
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same, where `certain` instants need nothing more: windows that the start cuts are cut."""
+    low, high = at_ends(formula, known, starts)
+    if certain:
+        first, last = certain.start - starts.start, certain.stop - starts.start
+        (value, _) = bounds(formula, Record(known, NUMPY), certain, "truncate")
+        low[first:last] = high[first:last] = value[:, 0]
     return low, high
 
 
@@ -73,7 +84,9 @@ def test_a_stream_gives_what_the_whole_trace_gives(written, trace, ending, steps
         stop = now if everywhere else 1
         if done < stop:
             found = tracker.live(done, stop)
-            wanted = at_ends(formula, {name: x[:now] for name, x in trace.items()}, range(done, stop))
+            known = {name: x[:now] for name, x in trace.items()}
+            certain = range(done, tracker.settled) if ending == "truncate" else range(0)
+            wanted = so_far(formula, known, range(done, stop), certain)
             np.testing.assert_array_equal(found, wanted)
         done = max(done, min(tracker.settled, stop)) if everywhere else 0
         needed = tracker.drop(done)
@@ -92,7 +105,7 @@ def test_a_stream_gives_what_the_whole_trace_gives(written, trace, ending, steps
     trace=random_formulas.traces(1, 14, 1),
     ending=st.sampled_from(["open", "truncate"]),
 )
-def test_frozen_values_and_other_samples_are_sound_and_end_alike(written, trace, ending) -> None:
+def test_frozen_values_and_other_samples_give_what_the_whole_trace_gives(written, trace, ending) -> None:
     formula = simplify(lower(written, random_formulas.GRID, []))
     rule = a_rule(formula)
     everywhere = not rule.uses_end
@@ -103,9 +116,8 @@ def test_frozen_values_and_other_samples_are_sound_and_end_alike(written, trace,
         tracker.grow(known, 0, now)
         starts = range(now if everywhere else 1)
         low, high = tracker.live(starts.start, starts.stop)
-        least, most = at_ends(formula, known, starts)
-        assert (low <= least).all()
-        assert (high >= most).all()
+        certain = range(tracker.settled) if ending == "truncate" and everywhere else range(0)
+        np.testing.assert_array_equal((low, high), so_far(formula, known, starts, certain))
     wanted = [end[:, 0] for end in bounds(formula, Record(trace, NUMPY), starts, ending)]
     np.testing.assert_array_equal(tracker.ended(starts), wanted)
 
@@ -199,6 +211,25 @@ def test_what_is_next_of_the_last_sample(written: str) -> None:
             online.push({"b": value})
         tally, wanted = online.finish()["r"], monitor.check(whole, end=end)["r"]
         assert (tally.low, tally.high) == wanted.bounds, end
+
+
+def test_a_stream_that_is_shorter_than_the_horizon() -> None:
+    """`end` is `T` after the start, and not where the stream happens to stop."""
+    monitor, whole = monitor_of("window_to_end"), {"a": [-1.0] * 3, "b": [-1.0] * 3}
+    for end, known in (("open", (-np.inf, np.inf)), ("truncate", (-1.0, -1.0))):
+        online = monitor.online(How(end=end))
+        online.feed(whole)
+        tally = online.finish()["r_window_to_end"]
+        assert (tally.low, tally.high) == monitor.check(whole, end=end)["r_window_to_end"].bounds == known
+    for judge in (lambda: monitor.check(whole, end="strict"), lambda: _finished(monitor, whole)):
+        with pytest.raises(StlcError, match=r"E306.*needs 0\.6 s of signal; the trace has 0\.2 s"):
+            judge()
+
+
+def _finished(monitor: Monitor, whole: Any) -> Any:
+    online = monitor.online(How(end="strict"))
+    online.feed(whole)
+    return online.finish()
 
 
 @pytest.mark.parametrize("name", ["bounded", "always", "windowed", "until"])

@@ -52,9 +52,9 @@ def signals(samples: int, batch: int, seed: int = 0) -> dict[str, np.ndarray]:
 def by_definition(monitor: Monitor, columns: dict[str, np.ndarray], k: int, end: str) -> tuple[float, float]:
     """Value at sample `k`; a requirement with `T` and `end` sees its own window and what was before."""
     (rule,) = monitor.compiled.requirements
-    if rule.windowed and rule.uses_end:
-        columns = {name: values[: k + T + 1] for name, values in columns.items()}
-    trace = reference.Trace(columns, monitor.compiled.grid, end)
+    stop = k + T + 1 if rule.windowed and rule.uses_end else None
+    columns = {name: values[:stop] for name, values in columns.items()}
+    trace = reference.Trace(columns, monitor.compiled.grid, end, stop=stop or 0)
     value = reference.Robustness(trace).at(rule.typed.formula, k)
     return (np.nan, np.nan) if value is None else value
 
@@ -379,6 +379,9 @@ def test_dt_and_horizon_come_from_who_knows_them() -> None:
     assert "`lorry.yaml`, but there is no such file" in caught.value.diagnostics[0].note[-1]
     with pytest.raises(UsageError, match="not a whole number of steps"):
         Monitor(text, dt=0.1, horizon=0.25)
+    odd = Trace(Signature((Column("a"),)), 0.03, {"a": np.ones((1, 50))}, name="odd.csv")
+    with pytest.raises(TraceError, match=r"E602.*`odd.csv` has dt 0.03 s, and T = 0.25 s is no whole"):
+        Monitor(text, horizon=0.25).check(odd)
     with pytest.raises(UsageError, match="above 0"):
         Monitor(text, dt=-1)
 

@@ -39,6 +39,7 @@ class Case:
         self.text = specification(self.formula, rng)
         self.signals: dict[str, Any] = trace(rng, longest=longest, generic=generic)
         self.samples = len(self.signals["x"])
+        self.rows = rows(self.signals)
         self.folds = any(isinstance(node, Constant) for node in nodes(self.formula))
 
     def monitor(self) -> Monitor:
@@ -50,9 +51,10 @@ class Case:
         assert again == spec, self
         return Monitor(again, dt=DT, horizon=HORIZON * DT)
 
-    def record(self, end: End, until: int | None = None) -> Record:
-        """The trace up to a sample, with the signals of each sample in a row."""
-        return Record(rows(self.signals)[:until], end, ahead(self.formula))
+    def record(self, end: End, until: int | None = None, stop: int | None = None) -> Record:
+        """The trace up to a sample, with the signals of each sample in a row; `stop`: where it will end."""
+        seen = self.rows if until is None else rows({name: x[:until] for name, x in self.signals.items()})
+        return Record(seen, end, ahead(self.formula), stop or until or 0)
 
     def __str__(self) -> str:
         requirement = self.text[self.text.index("region block") :].split("\n", 1)[1]

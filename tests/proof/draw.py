@@ -7,6 +7,7 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from proof.language import (
     Edge,
     Formal,
     Formula,
+    Frozen,
     Many,
     Meet,
     Not,
@@ -26,9 +28,11 @@ from proof.language import (
     Step,
     Use,
     Window,
+    nodes,
     substituted,
 )
 from proof.levels import inside
+from proof.whole import names_of
 
 DT = Fraction(1, 10)
 HORIZON = 6
@@ -70,6 +74,8 @@ class Drawing:
     def __init__(self, rng: random.Random, taste: Taste) -> None:
         self.rng, self.taste = rng, taste
         self._uses: list[Use] = []
+        self._held: list[str] = []
+        self._frozen = 0
 
     def formula(self, depth: int | None = None) -> Formula:
         """A formula at most `depth` operators deep."""
@@ -84,7 +90,9 @@ class Drawing:
         if self.taste.steps:
             kinds += [self._step, self._edge]
         if not self.taste.plain:
-            kinds += [self._choice, self._use]
+            kinds += [self._choice, self._freeze if self._held else self._use]
+        if not self.taste.plain and len(self._held) < 2:
+            kinds.append(self._freeze)
         return kinds
 
     def _below(self, depth: int) -> Formula:
@@ -121,6 +129,21 @@ class Drawing:
 
     def _choice(self, depth: int) -> Formula:
         return Choice(self._below(depth), self._below(depth), self._below(depth))
+
+    def _freeze(self, depth: int) -> Formula:
+        """One or two numbers, if what is below reads them."""
+        bindings = []
+        for _ in range(self.rng.choice([1, 1, 2])):
+            text, value = self._seen()
+            bindings.append((f"kept{self._frozen}", text, value))
+            self._frozen += 1
+        names = [name for name, _, _ in bindings]
+        self._held += names
+        body = self._below(depth)
+        self._held = [name for name in self._held if name not in names]
+        read = frozenset().union(*(names_of(n.margin) for n in nodes(body) if isinstance(n, Atom)))
+        kept = tuple(binding for binding in bindings if binding[0] in read)
+        return Frozen(kept, body) if kept else body
 
     def _use(self, depth: int) -> Formula:
         """A `def`: a named part, an old one again, or one of two patterns with arguments."""
@@ -209,7 +232,7 @@ class Drawing:
             return Constant(self.rng.random() < 0.5)
         kinds = [self._linear] * 3
         if not self.taste.plain:
-            kinds += [self._linear, self._chain, self._range, self._function, self._quantified]
+            kinds += [self._looking, self._linear, self._chain, self._range, self._function, self._quantified]
             kinds += [self._place] if self.taste.smooth else [self._whole, self._jumping, self._place]
         return self.rng.choice(kinds)()
 
@@ -226,6 +249,31 @@ class Drawing:
             return Atom(f"{first} {op} {c_text}", lambda row: sign * (row[first] - c), op in "<>")
         text = f"{first} + {a_text} * {second} {op} {c_text}"
         return Atom(text, lambda row: sign * (row[first] + a * row[second] - c), op in "<>")
+
+    def _seen(self) -> tuple[str, Callable[[Row], float]]:
+        """A number of this sample or of another one, or one that is frozen."""
+        name = self.rng.choice(["x", "y", "z"])
+        if self._held and self.rng.random() < 0.5:
+            name = self.rng.choice(self._held)
+            return name, lambda row: row[name]
+        options: list[tuple[str, Callable[[Row], float]]] = [
+            (name, lambda row: row[name]),
+            (f"next({name})", lambda row: row[f"{name}+1"]),
+            (f"prev({name})", lambda row: row[f"{name}-1"]),
+            (f"delta({name})", lambda row: row[name] - row[f"{name}-1"]),
+            (f"shift({name}, 2 steps)", lambda row: row[f"{name}+2"]),
+            (f"shift({name}, -2)", lambda row: row[f"{name}-2"]),
+        ]
+        return self.rng.choice(options)
+
+    def _looking(self) -> Formula:
+        """A comparison of numbers that may be those of other samples."""
+        (left_text, left), (right_text, right) = self._seen(), self._seen()
+        c, c_text = self._number()
+        op = self.rng.choice([">", ">=", "<", "<="])
+        sign = 1 if op in (">", ">=") else -1
+        text = f"{left_text} {op} {right_text} + {c_text}"
+        return Atom(text, lambda row: sign * (left(row) - (right(row) + c)), op in "<>")
 
     def _chain(self) -> Formula:
         """`a <= x < b`; a conjunction that is written as one comparison."""
@@ -272,6 +320,10 @@ class Drawing:
             ("[x, y] in union(disc, block)", lambda row: _in_either(row["x"], row["y"])),
             ("[x, y] in intersect(block, complement(disc))", lambda row: _in_block_only(row["x"], row["y"])),
             ("[x, y] in dilate(block, level)", lambda row: _in_block(row["x"], row["y"]) + 0.5),
+            ("sweep([x, y]) not in disc", lambda row: row["swept_disc"]),
+            ("sweep([x, y]) not in block", lambda row: row["swept_block"]),
+            ("sweep([x, y]) in disc", lambda row: min(1 - math.hypot(*end) for end in _ends(row))),
+            ("sweep([x, y]) in block", lambda row: min(_in_block(*end) for end in _ends(row))),
         ]
         text, margin = self.rng.choice(options)
         return Atom(text, margin, "not in" in text)
@@ -313,6 +365,29 @@ def _in_block(x: float, y: float) -> float:
     return -outside if outside > 0 else -max(across, along)
 
 
+def _ends(row: Row) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Where a segment starts and ends; at the last sample it is a point."""
+    here = row["x"], row["y"]
+    return here, (row.get("x+1", here[0]), row.get("y+1", here[1]))
+
+
+def _nearest(row: Row, distance: Callable[[float, float], float]) -> float:
+    """The least of a convex function along the segment, by thirds."""
+    (x, y), (a, b) = _ends(row)
+
+    def at(s: float) -> float:
+        return distance(x + s * (a - x), y + s * (b - y))
+
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        third = (high - low) / 3
+        if at(low + third) <= at(high - third):
+            high -= third
+        else:
+            low += third
+    return min(at(low), at(0.0), at(1.0))
+
+
 def _in_either(x: float, y: float) -> float:
     return max(1 - math.hypot(x, y), _in_block(x, y))
 
@@ -340,5 +415,15 @@ def trace(rng: random.Random, *, longest: int = 18, generic: bool = False) -> di
 
 
 def rows(signals: dict[str, Any]) -> list[dict[str, Any]]:
-    """The same, sample by sample."""
-    return [{name: values[t] for name, values in signals.items()} for t in range(len(signals["x"]))]
+    """The same, sample by sample, each with the numbers of its neighbours that exist: `x+1`, `x-2`; and
+    how far the segment from (x, y) to the next sample stays away from two places.
+    """
+    samples = len(signals["x"])
+    found = [{name: values[t] for name, values in signals.items()} for t in range(samples)]
+    for t, row in enumerate(found):
+        for name, k in product("xyz", (-2, -1, 1, 2)):
+            if 0 <= t + k < samples:
+                row[f"{name}{k:+d}"] = signals[name][t + k]
+        row["swept_disc"] = _nearest(row, lambda x, y: math.hypot(x, y) - 1)
+        row["swept_block"] = _nearest(row, lambda x, y: -_in_block(x, y))
+    return found

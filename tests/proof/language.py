@@ -130,7 +130,17 @@ class Formal:
     name: str
 
 
-Formula: TypeAlias = Atom | Constant | Not | Many | Pair | Choice | Over | Meet | Step | Edge | Use | Formal
+@dataclass(frozen=True, eq=False)
+class Frozen:
+    """`freeze name = …, … in body`: text and value of each number that is kept; its name becomes a signal."""
+
+    bindings: tuple[tuple[str, str, Callable[[Row], float]], ...]
+    body: Formula
+
+
+Formula: TypeAlias = (
+    Atom | Constant | Not | Many | Pair | Choice | Over | Meet | Step | Edge | Use | Formal | Frozen
+)
 
 
 def parts(formula: Formula) -> tuple[Formula, ...]:
@@ -138,7 +148,7 @@ def parts(formula: Formula) -> tuple[Formula, ...]:
     match formula:
         case Atom() | Constant() | Formal():
             return ()
-        case Not() | Over() | Step() | Edge():
+        case Not() | Over() | Step() | Edge() | Frozen():
             return (formula.body,)
         case Many():
             return formula.items

@@ -13,8 +13,8 @@ for both.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property, reduce
 from itertools import count
@@ -26,6 +26,7 @@ from proof.language import (
     Constant,
     Edge,
     Formula,
+    Frozen,
     Many,
     Meet,
     Not,
@@ -36,6 +37,7 @@ from proof.language import (
     Use,
     Window,
     nodes,
+    parts,
     windows,
 )
 
@@ -49,11 +51,14 @@ FUTURE = ("always", "eventually", "until", "release", "unless")
 
 @dataclass(frozen=True)
 class Record:
-    """A trace, and what is thought of the time after it."""
+    """A trace, and what is thought of the time after it: with `stop` it will have so many samples."""
 
     rows: Sequence[Row]
     end: End
     ahead: int = 0
+    stop: int = 0
+    margins: dict[tuple[object, ...], float | None] = field(default_factory=dict)
+    """What predicates were worth: (predicate, instant, frozen values) -> margin."""
 
     @property
     def samples(self) -> int:
@@ -62,7 +67,12 @@ class Record:
     @property
     def size(self) -> int:
         """Instants that exist."""
-        return self.samples + (0 if self.end == "truncate" else self.ahead)
+        return self.samples if self.end == "truncate" else self.length + self.ahead
+
+    @property
+    def length(self) -> int:
+        """Where windows to the end of the trace end."""
+        return self.samples if self.end == "truncate" else max(self.samples, self.stop)
 
     @cached_property
     def everywhere(self) -> Instants:
@@ -99,8 +109,9 @@ def ahead(formula: Formula) -> int:
 class Sets:
     """Sets of instants at which a formula is met, or failed, for one way to ask of predicates."""
 
-    def __init__(self, record: Record, met: Met, failed: Met) -> None:
+    def __init__(self, record: Record, met: Met, failed: Met, held: Row | None = None) -> None:
         self.record = record
+        self.held = held or {}
         self._asks = {True: met, False: failed}
         self._known: dict[tuple[int, bool], Instants] = {}
 
@@ -115,10 +126,10 @@ class Sets:
         match formula:
             case Constant(value):
                 return self.record.everywhere if value is truth else 0
-            case Atom(_, margin):
-                ask = self._asks[truth]
-                found = (t for t, row in enumerate(self.record.rows) if ask(formula, margin(row)))
-                return self.record.granted | sum(1 << t for t in found)
+            case Atom():
+                return self._atom(formula, truth)
+            case Frozen():
+                return self._frozen(formula, truth)
             case Not(body):
                 return self.of(body, not truth)
             case Many(op, items):
@@ -142,6 +153,28 @@ class Sets:
             case Use():
                 return self.of(formula.meaning, truth)
         raise TypeError(formula)
+
+    def _atom(self, atom: Atom, truth: bool) -> Instants:
+        """What reads a sample or a frozen value that does not exist is what is thought of the unknown."""
+        ask, found, end = self._asks[truth], self.record.granted, self.record.end
+        for t, row in enumerate(self.record.rows):
+            key = (atom, t, *self.held.items())
+            if key not in self.record.margins:
+                self.record.margins[key] = margin_of(atom, row, self.held)
+            margin = self.record.margins[key]
+            lost = end == "upper" or (end == "truncate" and not truth)
+            if lost if margin is None else ask(atom, margin):
+                found |= 1 << t
+        return found
+
+    def _frozen(self, formula: Frozen, truth: bool) -> Instants:
+        """Every instant has sets of its own, for the values that it keeps."""
+        found = 0
+        for t in range(self.record.size):
+            held = kept(formula, self.record.rows[t] if t < self.record.samples else {}, self.held)
+            own = Sets(self.record, self._asks[True], self._asks[False], held)
+            found |= own.of(formula.body, truth) & 1 << t
+        return found
 
     def _pair(self, formula: Pair, truth: bool) -> Instants:
         left = {value: self.of(formula.left, value) for value in (True, False)}
@@ -221,7 +254,7 @@ class _Look:
     @cached_property
     def _visible(self) -> Instants:
         """A window to the end takes the samples there are."""
-        return (1 << self.record.samples) - 1 if self._to_the_end else self.record.everywhere
+        return (1 << self.record.length) - 1 if self._to_the_end else self.record.everywhere
 
     def at(self, instants: Instants, k: int) -> Instants:
         """Who finds himself in the set k steps away; where there is nothing to see, `every` is content."""
@@ -258,7 +291,7 @@ def _joined(sets: Sequence[Instants], *, every: bool, empty: Instants = 0) -> In
 
 def robustness(formula: Formula, record: Record) -> list[float]:
     """At every sample: the greatest level whose set has it."""
-    margins = {n.margin(row) for n in nodes(formula) if isinstance(n, Atom) for row in record.rows}
+    margins = set(margins_of(formula, record, {}))
     levels = sorted({*margins, *(-m for m in margins), math.inf}, reverse=True)
     found = [-math.inf] * record.samples
     missing = (1 << record.samples) - 1
@@ -274,6 +307,39 @@ def robustness(formula: Formula, record: Record) -> list[float]:
     return found
 
 
+def margins_of(formula: Formula, record: Record, held: Row) -> Iterator[float]:
+    """The margins of all predicates at all samples, whatever is frozen."""
+    match formula:
+        case Atom():
+            found = (margin_of(formula, row, held) for row in record.rows)
+            yield from (margin for margin in found if margin is not None)
+        case Frozen(_, body):
+            for row in [*record.rows, {}]:
+                yield from margins_of(body, record, kept(formula, row, held))
+        case _:
+            for part in parts(formula):
+                yield from margins_of(part, record, held)
+
+
+def margin_of(atom: Atom, row: Row, held: Row) -> float | None:
+    """None where it reads what does not exist."""
+    try:
+        return atom.margin({**row, **held})
+    except KeyError:
+        return None
+
+
+def kept(formula: Frozen, row: Row, held: Row) -> Row:
+    """What is frozen inside of the formula at an instant; names without a value are left out."""
+    found = {name: value for name, value in held.items() if name not in {n for n, _, _ in formula.bindings}}
+    for name, _, value in formula.bindings:
+        try:
+            found[name] = value({**row, **held})
+        except KeyError:
+            continue
+    return found
+
+
 def truth(formula: Formula, record: Record) -> list[bool]:
     """Boolean semantics at every sample: `>` is strict, `>=` is not, and there is no tolerance."""
 
@@ -282,62 +348,3 @@ def truth(formula: Formula, record: Record) -> list[bool]:
 
     held = Sets(record, true, lambda atom, margin: not true(atom, margin)).of(formula)
     return [bool(held >> t & 1) for t in range(record.samples)]
-
-
-def defined(formula: Formula, samples: int, positive: bool = True) -> Instants:
-    """Where no window of the future, no `next` and no `prev` leaves a trace of this length."""
-    everywhere = (1 << samples) - 1
-    match formula:
-        case Over() | Meet():
-            return _window_defined(formula, samples, positive)
-        case Not(body):
-            return defined(body, samples, not positive)
-        case Step(steps, body):
-            inner = defined(body, samples, positive)
-            return inner >> 1 if steps > 0 else (inner << 1) & everywhere
-        case Edge(op, body):
-            now = defined(body, samples, (op == "rise") is positive)
-            before = defined(body, samples, (op == "rise") is not positive)
-            return now & ((before << 1) | 1)
-        case Pair("->", left, right):
-            return defined(left, samples, not positive) & defined(right, samples, positive)
-        case Pair(_, left, right):
-            both = [defined(side, samples, sign) for side in (left, right) for sign in (True, False)]
-            return reduce(int.__and__, both)
-        case Choice(cond, yes, no):
-            sides = [defined(part, samples, positive) for part in (yes, no)]
-            return reduce(int.__and__, sides, defined(cond, samples) & defined(cond, samples, False))
-        case Many(_, items):
-            return reduce(int.__and__, [defined(item, samples, positive) for item in items])
-        case Use():
-            return defined(formula.meaning, samples, positive)
-        case _:
-            return everywhere
-
-
-def _window_defined(formula: Over | Meet, samples: int, positive: bool) -> Instants:
-    """Every instant that the window reads, and those on the way there, exist and are defined."""
-    window, forward = formula.window, formula.op in FUTURE
-    if isinstance(formula, Meet) and formula.op == "unless":
-        held, met = unfolded(formula)
-        return _window_defined(held, samples, positive) & _window_defined(met, samples, positive)
-    every = (formula.op in ("always", "historically", "release")) is positive
-    last = samples + 64 if window.hi is None else math.ceil(window.hi) + 1
-    distances = [k for k in range(last + 1) if inside(window, k, outward=every)]
-    target = defined(formula.right if isinstance(formula, Meet) else formula.body, samples, positive)
-    way = defined(formula.left, samples, positive) if isinstance(formula, Meet) else (1 << samples) - 1
-    found = 0
-    for t in range(samples):
-        reads = [t + k if forward else t - k for k in distances]
-        if not forward:
-            reads = [k for k in reads if k >= 0]
-        elif window.hi is None:
-            reads = [k for k in reads if k < samples]
-            if not reads:
-                continue
-        passed = range(min([t, *reads]), max([t, *reads]) + 1) if reads else ()
-        if all(k < samples and target >> k & 1 for k in reads) and all(way >> k & 1 for k in passed):
-            found |= 1 << t
-    if window.absolute:
-        return (1 << samples) - 1 if found & 1 else 0
-    return found

@@ -15,7 +15,8 @@ import pytest
 import reference
 from proof.cases import FULL, Case, seeds
 from proof.draw import HORIZON, Taste
-from proof.levels import defined, robustness, truth
+from proof.levels import robustness, truth
+from proof.whole import defined
 
 from stlc.monitor.verdict import Monitor
 
@@ -47,7 +48,7 @@ def test_every_value_is_the_definition(numbers: range) -> None:
 
 def check_strict(case: Case, found: Any, wanted: Any, bounds: tuple[Any, Any]) -> None:
     """NaN where a window leaves the trace, or what a constant inside of it decides all the same."""
-    here = np.array([bool(defined(case.formula, case.samples) >> t & 1) for t in range(case.samples)])
+    here = np.array([bool(defined(case.formula, case.rows) >> t & 1) for t in range(case.samples)])
     case.same(found[here], wanted[here], "strict")
     decided = ~here & ~np.isnan(found)
     assert case.folds or not decided.any(), f"strict has a value where a window leaves the trace\n{case}"
@@ -70,7 +71,7 @@ def test_the_other_evaluator_says_the_same(numbers: range) -> None:
             for side, end in enumerate(ends):
                 case.same([v[side] for v in values], robustness(case.formula, case.record(end)), policy)
         judge = reference.Robustness(reference.Trace(columns, grid, "strict"))
-        whole = defined(case.formula, case.samples)
+        whole = defined(case.formula, case.rows)
         for t in range(case.samples):
             value = judge.at(rule.typed.formula, t)
             assert (value is not None) is bool(whole >> t & 1), f"defined at {t}\n{case}"
@@ -125,7 +126,7 @@ def test_the_mission_clock(numbers: range) -> None:
         case.same(monitor.robustness(case.signals, end="truncate", at=0), cut, "truncate")
         case.same(monitor.bounds(case.signals, at=0), (least, most), "bounds")
         strict = monitor.robustness(case.signals, at=0)
-        case.same(strict, cut if defined(case.formula, case.samples) & 1 else math.nan, "strict")
+        case.same(strict, cut if defined(case.formula, case.rows) & 1 else math.nan, "strict")
 
 
 @pytest.mark.parametrize("numbers", seeds(FULL // 5, 40))

@@ -16,6 +16,7 @@ from proof.language import (
     Edge,
     Formal,
     Formula,
+    Frozen,
     Many,
     Meet,
     Not,
@@ -104,7 +105,7 @@ def _level(formula: Formula) -> Level:
             return LOGIC[op]
         case Meet():
             return Level.UNTIL
-        case Not() | Over() | Choice():
+        case Not() | Over() | Choice() | Frozen():
             return Level.PREFIX
         case Atom():
             return Level.COMPARISON
@@ -137,6 +138,9 @@ class _Writer:
             case Choice(cond, yes, no):
                 branches = f"if {self.text(cond)} then {self.text(yes)}"
                 return f"{branches} else {self.text(no, Level.PREFIX)}"
+            case Frozen(bindings, body):
+                kept = ", ".join(f"{name} = {text}" for name, text, _ in bindings)
+                return f"freeze {kept} in {self.text(body, Level.PREFIX)}"
             case Over(op, window, body):
                 return f"{self._timed(op, window)} {self._after(window, body)}"
             case Meet(op, window, left, right):

@@ -1,0 +1,54 @@
+"""What a shell may complete: names of runs, and of the requirements of what stands before the cursor."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import typer
+
+_REQUIRE = re.compile(r"\brequire\s+(`[^`\n]+`|[^\W\d]\w*)\s*:")
+_COMMENT = re.compile(r"(#|//).*")
+
+
+def run_names(context: typer.Context, incomplete: str) -> list[str]:
+    """The runs below `--runs`, newest first, their specifications, and `latest`."""
+    from stlc.rundir import LATEST, every_run
+
+    root = Path(str(context.params.get("runs") or "runs"))
+    runs = [run.path for run in every_run(root)][::-1]
+    names = [LATEST, *(path.name for path in runs), *(path.parent.name for path in runs)] if runs else []
+    return [name for name in dict.fromkeys(names) if name.startswith(incomplete)]
+
+
+def requirement_names(context: typer.Context, incomplete: str) -> list[str]:
+    """The requirements of the specification that is named, or that a named trace carries."""
+    names: dict[str, None] = {}
+    for path in _named(context):
+        with suppress(Exception):  # a shell wants no diagnostics
+            text = _COMMENT.sub("", _specification(path))
+            names |= dict.fromkeys(name.strip("`") for name in _REQUIRE.findall(text))
+        if names:
+            break
+    return [name for name in names if name.startswith(incomplete)]
+
+
+def _named(context: typer.Context) -> Iterator[Path]:
+    """Files on the command line, a specification first."""
+    given = list(context.args)  # of a line that is not complete nothing has been assigned yet
+    for key in ("spec", "files", "what"):
+        value = context.params.get(key)
+        given += [str(item) for item in (value if isinstance(value, list | tuple) else [value]) if item]
+    return iter(sorted(map(Path, given), key=lambda path: path.suffix not in (".stl", ".stlc")))
+
+
+def _specification(path: Path) -> str:
+    """The text of a specification, or the one in a trace."""
+    if path.suffix in (".stl", ".stlc"):
+        return path.read_text(encoding="utf-8")
+    from stlc.files import find_trace
+    from stlc.trace import read_recording
+
+    return read_recording(find_trace(str(path))).meta.spec_text

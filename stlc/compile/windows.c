@@ -1,0 +1,190 @@
+/* Extrema over sliding windows and `until`, with exact subgradients.
+
+   REAL, INDEX (an integer as wide) and BYTES (of a vector) are defined before this text. Traces are taken
+   LANES at a time, their samples beside each other, whatever the layout of the arrays. Windows are put
+   together from the end of one block and the beginning of the next (van Herk; Gil and Werman). Every value
+   carries the row that it came from; the gradient goes there, whole where rows tie. NaN wins.
+
+   `shape` is {rows, count, width, traces, step and trace strides of each array in turn}. */
+
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define LANES ((int64_t)(BYTES / sizeof(REAL)))
+#define AHEAD 16 /* rows that memory is asked for before they are needed */
+
+typedef REAL Values __attribute__((vector_size(BYTES)));
+typedef INDEX Rows __attribute__((vector_size(BYTES)));
+typedef struct { Values value; Rows from; } Best;
+typedef struct { int64_t rows, count, width; } Sliding;
+
+static int64_t least(int64_t a, int64_t b) { return a < b ? a : b; }
+
+static inline Best at(const Values *x, int64_t row, int64_t number)
+{
+    return (Best){x[row], (INDEX)number + (Rows){0}};
+}
+
+/* The neutral value: the extremum of nothing. */
+static inline Best none(int max) { return (Best){(REAL)(max ? -INFINITY : INFINITY) + (Values){0}, (Rows){0}}; }
+
+/* The better of two; the first one where they tie. */
+static inline Best better(Best a, Best b, int max)
+{
+    Rows take = (max ? b.value > a.value : b.value < a.value) | (b.value != b.value);
+    return (Best){(Values)(((Rows)b.value & take) | ((Rows)a.value & ~take)), (b.from & take) | (a.from & ~take)};
+}
+
+/* Either the value is written to a row of `to`, or the gradient of that row is added where it came from. */
+static inline void emit(Best found, Values *row, REAL *to, int back)
+{
+    if (!back) {
+        *row = found.value;
+        return;
+    }
+    for (int64_t lane = 0; lane < LANES; lane++)
+        to[found.from[lane] * LANES + lane] += (*row)[lane];
+}
+
+static inline __attribute__((always_inline)) void
+slide(Sliding s, const Values *x, Values *rows, Values *to, Best *tails, int max, int back)
+{
+    for (int64_t begin = 0; begin < s.count; begin += s.width) {
+        int64_t stop = least(begin + s.width, s.rows), last = least(begin + s.width, s.count);
+        Best tail = none(max), head = none(max);
+        for (int64_t t = stop - 1; t >= begin; t--)
+            tails[t - begin] = tail = better(at(x, t, t), tail, max);
+        for (int64_t j = begin; j < last; j++) {
+            int64_t t = j + s.width - 1;
+            if (j > begin && t < s.rows)
+                head = better(head, at(x, t, t), max);
+            emit(better(tails[j - begin], head, max), rows + j, (REAL *)to, back);
+        }
+    }
+}
+
+static inline __attribute__((always_inline)) void
+until(Sliding s, const Values *x, Values *rows, Values *to, Best *tails, int max, int back)
+{
+    const Values *left = x, *right = x + s.rows;
+    for (int64_t begin = 0; begin < s.count; begin += s.width) {
+        int64_t stop = least(begin + s.width, s.rows), last = least(begin + s.width, s.count);
+        Best held = none(!max), met = none(max), head = none(!max), reach = none(max);
+        for (int64_t t = stop - 1; t >= begin; t--) {
+            Best l = at(left, t, t);
+            met = better(l, better(at(right, t, s.rows + t), met, max), !max);
+            held = better(l, held, !max);
+            tails[2 * (t - begin)] = met;
+            tails[2 * (t - begin) + 1] = held;
+        }
+        for (int64_t j = begin; j < last; j++) {
+            int64_t t = j + s.width - 1;
+            if (j > begin && t < s.rows) {
+                head = better(head, at(left, t, t), !max);
+                reach = better(reach, better(at(right, t, s.rows + t), head, !max), max);
+            }
+            Best later = better(tails[2 * (j - begin) + 1], reach, !max);
+            emit(better(tails[2 * (j - begin)], later, max), rows + j, (REAL *)to, back);
+        }
+    }
+}
+
+/* A row is rarely aligned: it lies in two lines of the cache. */
+#define ask_for(row, write) (__builtin_prefetch(row, write), __builtin_prefetch((row) + LANES - 1, write))
+
+/* A square of samples turned round. */
+static void turn(const REAL *restrict x, int64_t x_stride, REAL *restrict y, int64_t y_stride)
+{
+    for (int64_t i = 0; i < LANES; i++)
+        for (int64_t j = 0; j < LANES; j++)
+            y[i * y_stride + j] = x[j * x_stride + i];
+}
+
+/* Some traces of an array, samples beside each other; what is not there is 0. */
+static void load(const REAL *x, const int64_t *stride, int64_t rows, int64_t lanes, Values *y)
+{
+    REAL *to = (REAL *)y;
+    int64_t t = 0;
+    if (lanes == LANES && stride[1] == 1) {
+        for (; t < rows; t++) {
+            ask_for(x + (t + AHEAD) * stride[0], 0);
+            memcpy(to + t * LANES, x + t * stride[0], BYTES);
+        }
+    } else if (lanes == LANES && stride[0] == 1) {
+        for (; t + LANES <= rows; t += LANES)
+            turn(x + t, stride[1], to + t * LANES, LANES);
+    }
+    for (; t < rows; t++)
+        for (int64_t lane = 0; lane < LANES; lane++)
+            to[t * LANES + lane] = lane < lanes ? x[t * stride[0] + lane * stride[1]] : 0;
+}
+
+/* The other way. */
+static void store(const Values *y, const int64_t *stride, int64_t rows, int64_t lanes, REAL *x)
+{
+    const REAL *from = (const REAL *)y;
+    int64_t t = 0;
+    if (lanes == LANES && stride[1] == 1) {
+        for (; t < rows; t++) {
+            ask_for(x + (t + AHEAD) * stride[0], 1);
+            memcpy(x + t * stride[0], from + t * LANES, BYTES);
+        }
+    } else if (lanes == LANES && stride[0] == 1) {
+        for (; t + LANES <= rows; t += LANES)
+            turn(from + t * LANES, LANES, x + t, stride[1]);
+    }
+    for (; t < rows; t++)
+        for (int64_t lane = 0; lane < lanes; lane++)
+            x[t * stride[0] + lane * stride[1]] = from[t * LANES + lane];
+}
+
+typedef void Walk(Sliding, const Values *, Values *, Values *, Best *, int, int);
+
+/* `arrays` are operands, values or their gradient, and with `back` the gradients of the operands. */
+static inline __attribute__((always_inline)) int
+judge(REAL **arrays, const int64_t *shape, int operands, Walk walk, int max, int back)
+{
+    Sliding s = {shape[0], shape[1], least(shape[2], shape[0])};
+    const int64_t *stride = shape + 4, *mine = stride + 2 * operands;
+    int64_t all = operands * s.rows, room = all * (1 + back) + s.count + 2 * operands * s.width;
+    Values *memory = aligned_alloc(BYTES, (size_t)room * BYTES);
+    if (!memory)
+        return 1;
+    Values *x = memory, *to = x + all, *rows = to + back * all;
+    for (int64_t first = 0; first < shape[3]; first += LANES) {
+        int64_t lanes = least(shape[3] - first, LANES);
+        for (int i = 0; i < operands; i++)
+            load(arrays[i] + first * stride[2 * i + 1], stride + 2 * i, s.rows, lanes, x + i * s.rows);
+        if (back) {
+            memset(to, 0, (size_t)all * BYTES);
+            load(arrays[operands] + first * mine[1], mine, s.count, lanes, rows);
+        }
+        walk(s, x, rows, to, (Best *)(rows + s.count), max, back);
+        if (!back)
+            store(rows, mine, s.count, lanes, arrays[operands] + first * mine[1]);
+        for (int i = 0; back && i < operands; i++) {
+            const int64_t *its = mine + 2 + 2 * i;
+            store(to + i * s.rows, its, s.rows, lanes, arrays[operands + 1 + i] + first * its[1]);
+        }
+    }
+    free(memory);
+    return 0;
+}
+
+/* Both return other than 0 where there is no memory. `max` asks for the maximum, and for `until`; else for the
+   minimum, and for `release`. */
+int slide_all(REAL **arrays, const int64_t *shape, int max, int back)
+{
+    if (back)
+        return max ? judge(arrays, shape, 1, slide, 1, 1) : judge(arrays, shape, 1, slide, 0, 1);
+    return max ? judge(arrays, shape, 1, slide, 1, 0) : judge(arrays, shape, 1, slide, 0, 0);
+}
+
+int until_all(REAL **arrays, const int64_t *shape, int max, int back)
+{
+    if (back)
+        return max ? judge(arrays, shape, 2, until, 1, 1) : judge(arrays, shape, 2, until, 0, 1);
+    return max ? judge(arrays, shape, 2, until, 1, 0) : judge(arrays, shape, 2, until, 0, 0);
+}

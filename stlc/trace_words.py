@@ -1,0 +1,108 @@
+"""Words in a trace -> numbers: members of an enum and truth values, as the specification declares them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.diagnostics import Diagnostic, TraceError
+from stlc.registry import closest
+from stlc.trace_recording import Recording, Strand
+
+Words = Mapping[str, float]
+
+TRUTH: Words = {
+    **dict.fromkeys(("true", "yes", "on"), 1.0),
+    **dict.fromkeys(("false", "no", "off"), 0.0),
+}
+"""What a column of a truth value may say, in any case of letters."""
+
+
+def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
+    """The recording without words.
+
+    Args:
+        recording: whose arrays may be text.
+        words: name in the file -> what its words are worth; empty for a signal that has numbers. A signal
+            that is not among them is of no interest: where it holds words it is set aside.
+
+    Raises:
+        TraceError: E603, words where numbers are needed, or one that the signal does not have.
+    """
+    strands = tuple(
+        replace(
+            strand,
+            arrays={
+                name: _numbers(recording.name, name, values, words[name]) if _is_text(values) else values
+                for name, values in strand.arrays.items()
+                if name in words or not _is_text(values)
+            },
+            clock=_seconds(recording.name, strand) if _is_text(strand.clock) else strand.clock,
+        )
+        for strand in recording.strands
+    )
+    aside = {
+        name: values
+        for strand in recording.strands
+        for name, values in strand.arrays.items()
+        if name not in words and _is_text(values)
+    }
+    return replace(recording, strands=strands, extras={**recording.extras, **aside})
+
+
+def wordless(recording: Recording) -> Recording:
+    """The recording, if all its signals are numbers. Raises TraceError (E603) otherwise."""
+    return in_numbers(recording, {name: {} for name in recording.signals})
+
+
+def _is_text(values: NDArray[Any] | None) -> bool:
+    return values is not None and values.dtype.kind == "U"
+
+
+def _seconds(trace: str, strand: Strand) -> NDArray[np.float64]:
+    """Dates and times (ISO 8601) as seconds since the first."""
+    assert strand.clock is not None
+    written = np.char.rstrip(strand.clock, "Zz")
+    try:
+        instants = written.astype("datetime64[ns]")
+    except ValueError:
+        shown = str(strand.clock.flat[0])[:40]
+        message = f"the clock `{strand.named}` in `{trace}` holds words (`{shown}`)"
+        advice = ("seconds, or dates and times such as 2026-01-31T12:00:00.5",)
+        raise TraceError(Diagnostic("E603", message, help=advice)) from None
+    return np.asarray((instants - instants.flat[0]) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)
+
+
+def _numbers(trace: str, name: str, values: NDArray[Any], words: Words) -> NDArray[np.float64]:
+    found, places = np.unique(values, return_inverse=True)
+    worth = [_worth(str(word), words) for word in found]
+    if None in worth:
+        odd = str(found[worth.index(None)])
+        raise TraceError(_unknown(trace, name, odd, words))
+    return np.asarray(worth, dtype=np.float64)[places].reshape(values.shape)
+
+
+def _worth(word: str, words: Words) -> float | None:
+    """A member as it is written, or the only one that differs in the case of letters."""
+    if word in words:
+        return words[word]
+    alike = {value for name, value in words.items() if name.lower() == word.lower()}
+    return alike.pop() if len(alike) == 1 else None
+
+
+def _unknown(trace: str, name: str, word: str, words: Words) -> Diagnostic:
+    shown = word if len(word) <= 40 else f"{word[:40]}…"
+    if not words:
+        advice: tuple[str, ...] = (
+            "truth values are written as true and false, or as 1 and 0",
+            f"words need an enum in the specification: enum Kind {{ … }}  and  signal {name} : Kind",
+        )
+        return Diagnostic("E603", f"`{name}` in `{trace}` holds words (`{shown}`), not numbers", help=advice)
+    near = closest(word, words)
+    advice = (f"did you mean `{near}`?",) if near else ()
+    note = (f"it is one of {', '.join(words)}, or a number",)
+    return Diagnostic("E603", f"`{name}` in `{trace}` cannot be `{shown}`", help=advice, note=note)

@@ -1,0 +1,284 @@
+"""The map: places of the specification, paths through them, and who is in which place when."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.grammar import ast
+from stlc.monitor.verdict import Verdict
+from stlc.trace import Trace
+from stlc.view.film import MOST_AGENTS, Film
+from stlc.view.places import Place, Plane, labelled, plane_of
+from stlc.view.style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    PINK,
+    RED,
+    SKY,
+    Picture,
+    look,
+    new_figure,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.patches import PathPatch
+
+MOST_PATHS = 200
+"""Paths that are drawn; the violating ones come first."""
+TAIL = 2.5
+"""Seconds of path behind a point of the film."""
+STRONG, FEEBLE = 0.4, 0.1
+"""How much of a place's colour is seen while it matters, and while it does not."""
+_TINTS = (GREEN, BLUE, PINK, SKY, ORANGE)
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """What a map shows.
+
+    Attributes:
+        trace: what was recorded.
+        plane: the two signals and their places.
+        violated: which traces violate a requirement, (traces,).
+    """
+
+    trace: Trace
+    plane: Plane
+    violated: Mask
+
+    @property
+    def paths(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Both coordinates, (traces, samples)."""
+        across, up = self.plane.axes
+        return self.trace.data[across], self.trace.data[up]
+
+    def color(self, place: Place) -> str:
+        """Of a place: red where it must not be entered, else its own."""
+        if place.role == "avoid":
+            return RED
+        others = [other for other in self.plane.places if other.role != "avoid"]
+        return _TINTS[others.index(place) % len(_TINTS)]
+
+    def inside(self, place: Place) -> Mask:
+        """Who is in a place when, (traces, samples)."""
+        return place.depth(self.trace) >= 0.0
+
+    def first(self, most: int) -> NDArray[np.int64]:
+        """At most so many traces, those that violate something first."""
+        return np.argsort(~self.violated, kind="stable")[:most]
+
+
+def chart_of(spec: ast.Spec, verdict: Verdict, trace: Trace) -> Chart | None:
+    """The map of a judged trace; None where its specification names no places in a plane."""
+    plane = plane_of(spec, [judgement.rule for judgement in verdict], trace)
+    if plane is None:
+        return None
+    violated: Mask = np.logical_or.reduce([judgement.fails.any(0) for judgement in verdict])
+    return Chart(trace, plane, violated)
+
+
+def draw_chart(chart: Chart) -> Picture:
+    """All paths over the places, and beside it for every place the share of traces in it over time."""
+    with look():
+        figure = new_figure(9, 4.4)
+        plot, rows = _layout(figure, chart)
+        _draw_places(plot, chart)
+        _draw_paths(plot, chart)
+        for axes, place in zip(rows, chart.plane.places, strict=True):
+            _draw_presence(axes, chart, place)
+    return Picture(figure, f"{_summary(chart)}, over the places of the specification.")
+
+
+def chart_film(chart: Chart, *, title: str = "") -> Film:
+    """The same in motion: places fill while they matter, paths fade behind the agents."""
+
+    def begin(figure: Figure) -> Callable[[int], None]:
+        plot, rows = _layout(figure, chart)
+        areas = _draw_places(plot, chart)
+        moving = _Moving(plot, chart)
+        cursors = []
+        for axes, place in zip(rows, chart.plane.places, strict=True):
+            _draw_presence(axes, chart, place)
+            cursors.append(axes.axvline(chart.trace.t0, color=INK, lw=1.1))
+        head = plot.set_title(_heading(title, chart.trace.times[-1]))
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
+
+        def turn(index: int) -> None:
+            now = float(chart.trace.times[index])
+            head.set_text(_heading(title, now))
+            moving.turn(index)
+            for place, area in zip(chart.plane.places, areas, strict=True):
+                strength = STRONG if place.active(now - chart.trace.t0) else FEEBLE
+                area.set_facecolor(_tint(chart.color(place), strength))
+            for cursor in cursors:
+                cursor.set_xdata([now, now])
+
+        return turn
+
+    alt = f"{title}: {_summary(chart)}, in motion over the places of the specification."
+    return Film(chart.trace.samples, chart.trace.dt, (8.4, 4.1), begin, alt)
+
+
+def _heading(title: str, seconds: float) -> str:
+    return f"{title}   {seconds:4.1f} s".strip()
+
+
+def _summary(chart: Chart) -> str:
+    good = int((~chart.violated).sum())
+    return f"Paths of {len(chart.violated):,} traces, {good:,} of which satisfy every requirement"
+
+
+# ---------------------------------------------------------------------- pieces
+
+
+def _layout(figure: Figure, chart: Chart) -> tuple[Axes, list[Axes]]:
+    """The map, and a row for each place beside it."""
+    (left, right), (low, high) = chart.plane.window(chart.trace)
+    ratio = min(max((right - left) / (high - low), 0.6), 2.0)
+    grid = figure.add_gridspec(len(chart.plane.places), 2, width_ratios=[1.55 * ratio**0.5, 1])
+    plot = figure.add_subplot(grid[:, 0])
+    plot.set(xlim=(left, right), ylim=(low, high), aspect="equal")
+    plot.set_xlabel(_label(chart.trace, chart.plane.axes[0]))
+    plot.set_ylabel(_label(chart.trace, chart.plane.axes[1]))
+    rows: list[Axes] = []
+    for index in range(len(chart.plane.places)):
+        rows.append(figure.add_subplot(grid[index, 1], sharex=rows[0] if rows else None))
+    for axes in rows[:-1]:
+        axes.tick_params(labelbottom=False)
+    rows[-1].set_xlabel("time [s]")
+    return plot, rows
+
+
+def _label(trace: Trace, name: str) -> str:
+    unit = trace.signature[name].unit.text
+    return f"{name} [{unit}]" if unit not in ("", "1") else name
+
+
+def _draw_places(axes: Axes, chart: Chart) -> list[PathPatch]:
+    """Draw every place; returns the filled area of each, empty where it cannot be seen."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    window = (axes.get_xlim(), axes.get_ylim())
+    areas = []
+    for place in chart.plane.places:
+        xs, ys, depth = chart.plane.sampled(place, chart.trace, window)
+        color = chart.color(place)
+        outline = Path(np.empty((0, 2)))
+        if (depth >= 0).any():
+            filled = axes.contourf(xs, ys, depth, levels=[0, 2 * max(float(depth.max()), 1e-9)])
+            outline = filled.get_paths()[0]
+            filled.remove()
+            row, column = np.unravel_index(int(np.argmax(depth)), depth.shape)
+            _write(axes, place.name, (float(xs[column]), float(ys[row])))
+        area = PathPatch(outline, fc=_tint(color, STRONG), ec=color, lw=1.2, zorder=2)
+        if place.role == "avoid":
+            area.set_hatch("///")
+        axes.add_patch(area)
+        areas.append(area)
+    return areas
+
+
+def _tint(color: str, strength: float) -> tuple[float, float, float, float]:
+    from matplotlib.colors import to_rgba
+
+    return to_rgba(color, strength)
+
+
+def _write(axes: Axes, name: str, at: tuple[float, float]) -> None:
+    paper = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.7}
+    axes.annotate(name, at, ha="center", va="center", color=INK, weight="bold", zorder=6, bbox=paper)
+
+
+def _draw_paths(axes: Axes, chart: Chart) -> None:
+    """Paths that satisfy everything in ink, others in red above them; where they begin and end."""
+    across, up = chart.paths
+    chosen = chart.first(MOST_PATHS)
+    for violated, color, order in ((False, INK, 3), (True, RED, 4)):
+        rows = chosen[chart.violated[chosen] == violated]
+        if not len(rows):
+            continue
+        strength = max(0.25, 0.9 - 0.01 * len(rows))
+        xs, ys = _joined(across[rows]), _joined(up[rows])
+        count = int((chart.violated == violated).sum())
+        word = "violated" if violated else "satisfied"
+        axes.plot(xs, ys, color=color, lw=0.7, alpha=strength, zorder=order, label=f"{word} ({count:,})")
+        axes.plot(across[rows, 0], up[rows, 0], "o", mfc="white", mec=color, ms=3, mew=0.7, zorder=5)
+        axes.plot(across[rows, -1], up[rows, -1], "o", color=color, ms=2, zorder=5)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, handlelength=1.4, borderpad=0)
+
+
+def _joined(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rows one after the other with gaps between: one line, which draws fast."""
+    return np.hstack([rows, np.full((len(rows), 1), np.nan)]).ravel()
+
+
+def _draw_presence(axes: Axes, chart: Chart, place: Place) -> None:
+    """The share of traces in a place over time, over the time in which it matters."""
+    color, times = chart.color(place), chart.trace.times
+    for low, high in place.windows:
+        axes.axvspan(chart.trace.t0 + low, chart.trace.t0 + high, color=FAINT, alpha=0.8, lw=0, zorder=0)
+    inside = chart.inside(place)
+    share = inside.mean(0)
+    axes.fill_between(times, share, 0, color=color, alpha=0.35, lw=0, zorder=1)
+    axes.plot(times, share, color=color, lw=1.2, zorder=2)
+    if place.visited:
+        so_far = np.logical_or.accumulate(inside & _matters(place, chart.trace), axis=1).mean(0)
+        axes.plot(times, so_far, color=color, lw=1, ls=(0, (3, 2)), zorder=2)
+    axes.set(ylim=(-0.04, 1.12), xlim=(times[0], times[-1]))
+    axes.set_yticks([0, 1], ["0", "all"])
+    axes.grid(visible=False)
+    word = "not in" if place.role == "avoid" else "in"
+    axes.set_title(f"{word} {place.name}", color=INK, pad=3)
+    axes.annotate(
+        labelled(place.uses),
+        (1, 1),
+        xycoords="axes fraction",
+        xytext=(0, 3.5),
+        textcoords="offset points",
+        ha="right",
+        color=MUTED,
+        fontsize=7.5,
+    )
+
+
+def _matters(place: Place, trace: Trace) -> Mask:
+    """When a place matters, (samples,)."""
+    return np.array([place.active(float(seconds) - trace.t0) for seconds in trace.times])
+
+
+class _Moving:
+    """The agents of the film: a point each, and a tail of path behind it."""
+
+    def __init__(self, axes: Axes, chart: Chart) -> None:
+        chosen = chart.first(MOST_AGENTS)
+        across, up = chart.paths
+        self._across, self._up = across[chosen], up[chosen]
+        self._tail = max(1, round(TAIL / chart.trace.dt))
+        (self._whole,) = axes.plot([], [], color=MUTED, lw=0.5, alpha=0.35, zorder=3)
+        (self._recent,) = axes.plot([], [], color=INK, lw=1.1, alpha=0.85, zorder=4)
+        colors = [RED if violated else INK for violated in chart.violated[chosen]]
+        self._points = axes.scatter(
+            self._across[:, 0], self._up[:, 0], s=16, c=colors, lw=0.5, ec="white", zorder=7
+        )
+
+    def turn(self, index: int) -> None:
+        """Show this sample."""
+        whole, recent = slice(0, index + 1), slice(max(0, index - self._tail), index + 1)
+        self._whole.set_data(_joined(self._across[:, whole]), _joined(self._up[:, whole]))
+        self._recent.set_data(_joined(self._across[:, recent]), _joined(self._up[:, recent]))
+        self._points.set_offsets(np.column_stack([self._across[:, index], self._up[:, index]]))

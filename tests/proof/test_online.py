@@ -1,0 +1,120 @@
+"""Random specifications, sample by sample: what a stream says against the monitor that sees the whole trace.
+
+Each case is pushed sample by sample. After every sample the bounds of all open starts are those of
+`Monitor.bounds` on what came so far, a verdict is given with the first sample on which those decide it, and
+at the end all is as `Monitor.check` has it, whatever becomes of windows that the end cuts. `-m slow` runs
+10,000 cases.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+from proof.cases import FULL, Case, seeds
+from proof.draw import Taste
+
+from stlc.compile.pipeline import Rule
+from stlc.diagnostics import SpecError, TraceError
+from stlc.monitor.columns import FAR
+from stlc.monitor.instants import window_of
+from stlc.monitor.online import How, Online
+from stlc.monitor.tracking import lengthened
+from stlc.monitor.values import Record
+from stlc.monitor.verdict import Monitor
+
+TASTES = (
+    Taste(),
+    Taste(windows=True, depth=3),
+    Taste(absolute=True, constants=False, depth=3),
+    Taste(plain=True, constants=False),
+)
+TOLERANCE = 1e-6
+
+
+def drawn(seed: int) -> tuple[Case, Monitor] | None:
+    """A case; None where an absolute interval cannot be moved out of the operator around it."""
+    case = Case(seed, TASTES[seed % len(TASTES)])
+    try:
+        return case, case.monitor()
+    except SpecError:
+        return None
+
+
+@pytest.mark.parametrize("numbers", seeds(FULL, 40))
+def test_samples_one_by_one(numbers: range) -> None:
+    judged = 0
+    for seed in numbers:
+        found = drawn(seed)
+        if found is not None:
+            judged += 1
+            check_stream(*found)
+    assert judged > len(numbers) / 2
+
+
+def check_stream(case: Case, monitor: Monitor) -> None:
+    (rule,) = monitor.compiled.requirements
+    at: Literal["all"] | None = "all" if case.seed % 2 and (rule.windowed or not rule.uses_end) else None
+    pushed = monitor.online(How(at=at))
+    seen: dict[int, str] = {}
+    before: dict[int, tuple[float, float]] = {}
+    for k in range(case.samples):
+        decisions = pushed.push({name: values[k] for name, values in case.signals.items()})
+        known = {name: values[: k + 1] for name, values in case.signals.items()}
+        bounds = so_far(monitor, rule, known, everywhere=pushed.repeats("r"))
+        for start, low, high in pushed.open_starts("r"):
+            case.same((low, high), bounds[start], f"bounds at {start} after {k + 1}")
+            least, most = before.get(start, (-np.inf, np.inf))
+            assert least <= low + 1e-9, f"at {start} after {k + 1}\n{case}"
+            assert high <= most + 1e-9, f"at {start} after {k + 1}\n{case}"
+            before[start] = low, high
+        for decision in decisions:
+            assert decision.start not in seen, case
+            seen[decision.start] = decision.status
+        for start, (low, high) in bounds.items():
+            status = "satisfied" if low >= -TOLERANCE else "violated" if high < -TOLERANCE else None
+            assert seen.get(start) == status, f"decided at {start} after {k + 1}\n{case}"
+    check_end(case, monitor, pushed, at)
+    for end in ("truncate", "strict"):
+        fed = monitor.online(How(at=at, end=end))
+        cut = case.seed % case.samples
+        for low, high in ((0, cut), (cut, case.samples)):
+            if high > low:
+                fed.feed({name: values[low:high] for name, values in case.signals.items()})
+        check_end(case, monitor, fed, at)
+
+
+def so_far(
+    monitor: Monitor, rule: Rule, known: dict[str, Any], *, everywhere: bool
+) -> dict[int, tuple[float, float]]:
+    """Start -> bounds by the monitor that sees all that came; windows to the end run on without one."""
+    if rule.uses_end and window_of(rule, monitor.compiled.grid.horizon) is None:
+        columns = {name: values[:, None] for name, values in known.items() if values.ndim == 1}
+        columns |= {f"q[{i}]": known["q"][:, i, None] for i in range(3)}
+        record = Record(columns, monitor._prepare(known, ()).record.ops)
+        longer = lengthened(rule.formula, record.samples + 60)
+        low, high = (record.values([longer], range(1), end, FAR)[0] for end in ("lower", "upper"))
+        return {0: (float(low[0, 0]), float(high[0, 0]))}
+    low, high = monitor.bounds(known)
+    return {k: (low[k], high[k]) for k in range(len(low) if everywhere else 1)}
+
+
+def check_end(case: Case, monitor: Monitor, online: Online, at: Any) -> None:
+    end = online.how.end
+    wanted, tally = asked(lambda: monitor.check(case.signals, at=at, end=end)), asked(online.finish)
+    if isinstance(wanted, str) or isinstance(tally, str):
+        assert wanted == tally, case
+        return
+    case.same((tally.low, tally.high), wanted.bounds, f"{end}, at the end")
+    found = (tally.status, tally.instants, tally.share)
+    assert found == (wanted.overall, wanted.instants, wanted.share), case
+
+
+def asked(question: Callable[[], Any]) -> Any:
+    """What is said of the requirement, or why nothing can be said."""
+    try:
+        return question()["r"]
+    except TraceError as error:
+        return str(error)
