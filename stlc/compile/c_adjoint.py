@@ -14,7 +14,7 @@ from stlc.compile import ir
 from stlc.compile.c_formulas import FormulaWriter
 from stlc.compile.c_numbers import Untranslatable
 from stlc.compile.c_slopes import SlopeWriter
-from stlc.compile.emit_c import HEAD, Motion, passes
+from stlc.compile.emit_c import HEAD, Motion, passes, state_column
 
 _BUMP = """
 /* e^x for x <= 0, to the last digits, in a form that vectorises. */
@@ -49,9 +49,7 @@ def emit_adjoint(motion: Motion, formulas: Sequence[ir.Formula], *, fixed: Colle
     Raises:
         Untranslatable: the IR holds something that has no C form.
     """
-    checks = FormulaAdjoint(
-        motion.steps + 1, lambda name: f"x[{motion.states.index(name)}][k][j]", states=motion.states
-    )
+    checks = FormulaAdjoint(motion.steps + 1, state_column(motion))
     values = [checks.value(formula) for formula in formulas]
     states, controls, steps = len(motion.states), len(motion.controls), motion.steps
     return "\n".join(
@@ -87,11 +85,6 @@ def _step_back(motion: Motion, fixed: Collection[str]) -> list[str]:
             return f"x[{index[name]}][k][j]"
         return f"u[{motion.controls.index(name)}][k][j]"
 
-    def target(name: str) -> str:
-        if name in index:
-            return f"gx[{index[name]}][k][j]"
-        return f"gu[{motion.controls.index(name)}][k][j]"
-
     writer = SlopeWriter(column, soft=True)
     for name, num in motion.lets:
         writer.assign(name, writer.number(num))
@@ -102,7 +95,7 @@ def _step_back(motion: Motion, fixed: Collection[str]) -> list[str]:
             own = f"gx[{index[name]}][k + 1][j]"
             seeds[register] = f"{seeds[register]} + {own}" if register in seeds else own
     still = [f"gx[{i}][k][j] += gx[{i}][k + 1][j];" for name, i in index.items() if name not in motion.next]
-    return [*writer.lines, *writer.backward(seeds, target), *still]
+    return [*writer.lines, *writer.backward(seeds), *still]
 
 
 @dataclass(slots=True)
@@ -111,10 +104,8 @@ class FormulaAdjoint(FormulaWriter):
 
     Attributes:
         back: statements per buffer, in the order of the forward pass.
-        states: names of the state columns, in order.
     """
 
-    states: tuple[str, ...] = ()
     back: list[list[str]] = field(default_factory=list)
 
     def declarations(self) -> list[str]:
@@ -158,11 +149,12 @@ class FormulaAdjoint(FormulaWriter):
                 assert_never(formula)
 
     def _atom_back(self, name: str, atom: ir.Atom, start: int, count: int) -> list[str]:
-        writer = SlopeWriter(self.column, soft=False)
+        writer = SlopeWriter(
+            lambda name: self.column(name, "k"), lambda leaf: self._elsewhere(leaf, start, count), soft=False
+        )
         margin = writer.number(atom.num)
         own = f"a{name}[s][j]" if atom.sign > 0 else f"-a{name}[s][j]"
-        places = {column: i for i, column in enumerate(self.states)}
-        lines = [*writer.lines, *writer.backward({margin: own}, lambda of: f"gx[{places[of]}][k][j]")]
+        lines = [*writer.lines, *writer.backward({margin: own})]
         return [f"for (int s = 0, k = {start}; s < {count}; ++s, ++k) LANE {{", *lines, "}"]
 
 

@@ -101,40 +101,39 @@ class NumberWriter:
             case ir.Ind(cond):
                 return self._indicator(cond)
             case ir.Where(cond, yes, no):
-<<<<<<< HEAD
                 return self._choice(cond, self.number(yes), self.number(no))
-=======
-                return self._register(f"{self.truth(cond)} ? {self.number(yes)} : {self.number(no)}")
             case ir.Extern(name, args, output, ir.Body() as body):
                 return self._inlined(name, body, [self.number(arg) for arg in args])[output]
             case ir.At() if self._at is not None:
                 return self._register(self._at(num))
->>>>>>> main
             case ir.Extern(name) | ir.At(name) | ir.Held(name):
                 raise Untranslatable(name)
             case _:
                 assert_never(num)
 
-<<<<<<< HEAD
     def _indicator(self, cond: ir.Formula) -> str:
         return self._register(f"(double){self.truth(cond)}")
 
     def _choice(self, cond: ir.Formula, yes: str, no: str) -> str:
         return self._register(f"{self.truth(cond)} ? {yes} : {no}")
-=======
+
     def _inlined(self, name: str, body: ir.Body, args: list[str]) -> list[str]:
         """The components of a function that is known as numbers, its statements written."""
         outputs = self._calls.get((name, *args))
         if outputs is None:
-            inner = NumberWriter(self._column, self._at)
-            inner.lines, inner._texts = self.lines, self._texts
+            inner = self._inside()
             for formal, arg in zip(body.formals, args, strict=True):
                 inner.assign(formal, arg)
             for let, num in body.lets:
                 inner.assign(let, inner.number(num))
             outputs = self._calls[name, *args] = [inner.number(output) for output in body.outputs]
         return outputs
->>>>>>> main
+
+    def _inside(self) -> NumberWriter:
+        """A writer with names of its own into the same registers."""
+        inner = NumberWriter(self._column, self._at)
+        inner.lines, inner._texts = self.lines, self._texts
+        return inner
 
     def _op(self, name: str, args: list[str]) -> str:
         if name in ("min", "max") and len(args) == 1:

@@ -53,30 +53,30 @@ class SlopeWriter(NumberWriter):
 
     Args:
         column: C expression of an environment entry.
+        at: C expression of an entry at another sample.
         soft: whether conditions have a slope; where not, only the branch that is taken counts.
     """
 
-    def __init__(self, column: Callable[[str], str], *, soft: bool) -> None:
-        super().__init__(column)
+    def __init__(
+        self, column: Callable[[str], str], at: Callable[[ir.At], str] | None = None, *, soft: bool
+    ) -> None:
+        super().__init__(column, at)
         self._soft = soft
         self._slopes: dict[str, tuple[Slope, ...]] = {}
         self._inputs: dict[str, str] = {}
 
-    def backward(self, seeds: Mapping[str, str], target: Callable[[str], str | None]) -> list[str]:
-        """Statements that add the gradient of registers to columns.
+    def backward(self, seeds: Mapping[str, str]) -> list[str]:
+        """Statements that add the gradient to columns: the derivative by `x[…]` is gathered in `gx[…]`.
 
         Args:
             seeds: register -> C expression of the derivative of the outcome by it.
-            target: C place where the derivative by a column is gathered; None where nobody wants it.
         """
         registers = list(self._texts.values())
         lines = [f"double d{name} = {seeds.get(name, '0.0')};" for name in registers]
         for name in reversed(registers):
-            for of, slope in self._slopes.get(name, ()):
-                lines.append(f"d{of} += d{name} * {slope};")
-            place = target(self._inputs[name]) if name in self._inputs else None
-            if place is not None:
-                lines.append(f"{place} += d{name};")
+            lines += [f"d{of} += d{name} * {slope};" for of, slope in self._slopes.get(name, ())]
+            if name in self._inputs:
+                lines.append(f"g{self._inputs[name]} += d{name};")
         return lines
 
     def margin(self, cond: ir.Formula) -> str:
@@ -94,8 +94,16 @@ class SlopeWriter(NumberWriter):
     def _number(self, num: ir.Num) -> str:
         register = super()._number(num)
         if isinstance(num, ir.Col):
-            self._inputs[register] = num.name
+            self._inputs[register] = self._column(num.name)
+        elif isinstance(num, ir.At) and self._at is not None:
+            self._inputs[register] = self._at(num)
         return register
+
+    def _inside(self) -> SlopeWriter:
+        inner = SlopeWriter(self._column, self._at, soft=self._soft)
+        inner.lines, inner._texts = self.lines, self._texts
+        inner._slopes, inner._inputs = self._slopes, self._inputs
+        return inner
 
     def _indicator(self, cond: ir.Formula) -> str:
         margin = self.margin(cond) if self._soft else ""

@@ -5,7 +5,7 @@ The same IR as the torch graph, exact switching, double precision, `LANES` traje
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from stlc.compile import ir
@@ -67,7 +67,7 @@ def emit(motion: Motion, formulas: Sequence[ir.Formula]) -> str:
     Raises:
         Untranslatable: the IR holds something that has no C form.
     """
-    checks = FormulaWriter(motion.steps + 1, lambda name, k: f"x[{motion.states.index(name)}][{k}][j]")
+    checks = FormulaWriter(motion.steps + 1, state_column(motion))
     values = [checks.value(formula) for formula in formulas]
     states, rules, steps = len(motion.states), len(formulas), motion.steps
     return "\n".join(
@@ -83,6 +83,11 @@ def emit(motion: Motion, formulas: Sequence[ir.Formula]) -> str:
             ),
         ]
     )
+
+
+def state_column(motion: Motion) -> Callable[[str, str], str]:
+    """C expression of a state at a sample, of lane `j`."""
+    return lambda name, k: f"x[{motion.states.index(name)}][{k}][j]"
 
 
 def passes(motion: Motion, checks: FormulaWriter, values: Sequence[str]) -> list[str]:
