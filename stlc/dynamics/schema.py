@@ -7,10 +7,10 @@ from collections.abc import Mapping as MappingType
 from pathlib import Path
 from types import MappingProxyType
 
-from stlc.dynamics.decl import ScenarioDecl, SystemDecl
-from stlc.dynamics.schema_columns import read_controls, read_states
+from stlc.dynamics.decl import SystemDecl
+from stlc.dynamics.schema_columns import name_columns, read_controls, read_states
 from stlc.dynamics.schema_deploy import read_test
-from stlc.dynamics.schema_flow import read_flow, read_jumps, read_timers
+from stlc.dynamics.schema_flow import read_flow, read_jumps, read_latches, read_timers
 from stlc.dynamics.schema_functions import read_functions
 from stlc.dynamics.schema_init import read_init
 from stlc.dynamics.schema_names import (
@@ -22,11 +22,12 @@ from stlc.dynamics.schema_names import (
     read_definitions,
     read_time,
 )
-from stlc.dynamics.schema_overrides import overridden
+from stlc.dynamics.schema_overrides import given_states, overridden
 from stlc.dynamics.schema_params import read_params
 from stlc.dynamics.schema_reader import Reader
+from stlc.dynamics.schema_scenario import read_scenarios
 from stlc.dynamics.schema_settings import read_backup, read_objective, read_policy, read_train
-from stlc.dynamics.yaml_nodes import Mapping, Node, load_yaml
+from stlc.dynamics.yaml_nodes import Node, load_yaml
 from stlc.files import read_source
 from stlc.source import Source
 
@@ -113,6 +114,8 @@ def _declaration(
     clock = read_time(found.get("time"), reader, names) if "time" in found else Clockwork()
     states = read_states(found.get("state"), reader, names)
     params = read_params(found.get("param"), reader, names)
+    params += read_latches(found.get("jump"), reader, names)
+    name_columns(names, "state")
     read_controls(found.get("control"), reader, names)
     functions = read_functions(found.get("functions"), reader, names)
     read_definitions(found.get("def"), reader, names)
@@ -142,34 +145,15 @@ def _declaration(
                 if c.kind == "real" and c.fact and c.low is not None and c.high is not None
             }
         ),
-        init=read_init(found.get("init"), reader, names, params),
+        init=given_states(read_init(found.get("init"), reader, names, params), overrides, reader, names),
         objective=read_objective(found.get("objective"), reader, names),
         policy=read_policy(found.get("policy"), reader, names),
         train=read_train(found.get("train"), reader, names),
         backup=read_backup(found.get("backup"), reader, clock.horizon),
         test=read_test(found.get("test"), reader, names, clock.dt),
-        scenarios=_scenarios(found.get("scenario"), reader),
+        scenarios=read_scenarios(found.get("scenario"), reader, names, clock),
         functions=functions,
         overrides=MappingProxyType(dict(overrides)),
         places=MappingProxyType(names.places),
         warnings=tuple(finding for finding in reader.findings if finding.severity == "warning"),
     )
-
-
-def _scenarios(node: Node | None, reader: Reader) -> tuple[ScenarioDecl, ...]:
-    """Names of overlays; one that changes anything is refused by this version."""
-    found = []
-    for entry in reader.entries(node, "`scenario`"):
-        where = f"the scenario `{entry.key.text}`"
-        if isinstance(entry.value, Mapping):
-            keys = ("doc", "expect", "const", "override", "events", "disturb", "noise", "model_mismatch")
-            fields = reader.fields(entry.value, where, keys)
-            for key in keys[2:]:
-                if not empty(fields.get(key)):
-                    later(reader, fields[key], f"`{key}` of {where}")
-            doc = reader.text(fields.get("doc"), f"`doc` of {where}") or ""
-        else:
-            reader.entries(entry.value, where)
-            doc = ""
-        found.append(ScenarioDecl(entry.key.text, doc))
-    return tuple(found)
