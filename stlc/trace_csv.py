@@ -170,9 +170,7 @@ def _read_fast(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array] 
         if any(len(cells) != width for cells in words):
             return None
     numbers = [i for i in range(width) if i not in texts]
-    lines = io.TextIOWrapper(
-        io.BytesIO(text[start:].encode()), "utf-8"
-    )  # a StringIO takes four times as much
+    lines = io.TextIOWrapper(io.BytesIO(text[start:].encode()), "utf-8")  # a StringIO is four times as large
     try:
         values = np.loadtxt(
             lines,
