@@ -305,6 +305,7 @@ class SystemDecl:
         scenarios: named overlays.
         scenario: the one that is laid over, if any.
         functions: from outside, for specifications.
+        bases: the texts of the files that it extends, the nearest first.
         overrides: what `--set` changed.
         places: name of a state, control, constant or definition -> where it is declared.
         warnings: findings that do not stop anything.
@@ -335,6 +336,7 @@ class SystemDecl:
     scenarios: tuple[ScenarioDecl, ...] = ()
     scenario: ScenarioDecl | None = None
     functions: tuple[FunctionDecl, ...] = ()
+    bases: tuple[Source, ...] = field(default=(), repr=False)
     overrides: Mapping[str, str] = field(default_factory=dict)
     places: Mapping[str, Span] = field(default_factory=dict, repr=False)
     warnings: tuple[Diagnostic, ...] = field(default=(), repr=False)
@@ -343,7 +345,8 @@ class SystemDecl:
     def hash(self) -> str:
         """SHA-256 of the text and of what was overridden, in hexadecimal."""
         changes = "".join(f"\0{key}={value}" for key, value in sorted(self.overrides.items()))
-        return hashlib.sha256((self.source.text + changes).encode()).hexdigest()
+        texts = "".join(base.text for base in self.bases)
+        return hashlib.sha256((self.source.text + texts + changes).encode()).hexdigest()
 
     @property
     def grid(self) -> Grid:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping as MappingType
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
 from stlc.dynamics.decl import SystemDecl
 from stlc.dynamics.schema_columns import name_columns, read_controls, read_states
 from stlc.dynamics.schema_deploy import read_test
+from stlc.dynamics.schema_extends import extended
 from stlc.dynamics.schema_flow import read_flow, read_jumps, read_latches, read_timers
 from stlc.dynamics.schema_functions import read_functions
 from stlc.dynamics.schema_init import read_init
@@ -58,7 +60,6 @@ TOP_KEYS = [
     "plot",
 ]
 LATER = {
-    "extends": "one system file extending another",
     "plugin": "dynamics from a plugin",
 }
 
@@ -83,6 +84,7 @@ def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | 
     """The declaration that a text holds; `path` says what its relative paths start from."""
     reader = Reader(source)
     root = load_yaml(source, sink=reader.findings)
+    root, bases = extended(root, reader)
     root = overridden(root, overrides or {}, reader)
     found = reader.fields(root, "a system file", TOP_KEYS, required=("stlc", "name", "time"))
     _version(found.get("stlc"), reader)
@@ -91,7 +93,7 @@ def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | 
             later(reader, found[key], what)
     decl = _declaration(found, reader, source, path, overrides or {})
     reader.close()
-    return decl
+    return replace(decl, bases=bases)
 
 
 def _version(node: Node | None, reader: Reader) -> None:
@@ -127,7 +129,7 @@ def _declaration(
         doc=" ".join((reader.text(found.get("doc"), "`doc`") or "").split()),
         path=path,
         source=source,
-        spec=Path(os.path.normpath(path.parent / spec)) if spec else None,
+        spec=Path(os.path.normpath(_folder(found["spec"], source, path) / spec)) if spec else None,
         dt=clock.dt,
         horizon=clock.horizon,
         substeps=clock.substeps,
@@ -157,3 +159,8 @@ def _declaration(
         places=MappingProxyType(names.places),
         warnings=tuple(finding for finding in reader.findings if finding.severity == "warning"),
     )
+
+
+def _folder(node: Node, source: Source, path: Path) -> Path:
+    """Where relative paths of a value start from: the folder of the file that it stands in."""
+    return path.parent if node.span.source == source else Path(node.span.source.name).parent
