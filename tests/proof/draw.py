@@ -28,11 +28,10 @@ from proof.language import (
     Step,
     Use,
     Window,
-    nodes,
     substituted,
 )
 from proof.levels import inside
-from proof.whole import names_of
+from proof.whole import read_in
 
 DT = Fraction(1, 10)
 HORIZON = 6
@@ -141,7 +140,7 @@ class Drawing:
         self._held += names
         body = self._below(depth)
         self._held = [name for name in self._held if name not in names]
-        read = frozenset().union(*(names_of(n.margin) for n in nodes(body) if isinstance(n, Atom)))
+        read = read_in(body)
         kept = tuple(binding for binding in bindings if binding[0] in read)
         return Frozen(kept, body) if kept else body
 
