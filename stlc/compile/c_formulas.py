@@ -7,7 +7,7 @@ trajectories, so every line of it becomes vector code. Only the instants that th
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import assert_never
 
 from stlc.compile import ir
@@ -30,6 +30,7 @@ class FormulaWriter:
     lines: list[str] = field(default_factory=list)
     size: int = 0
     _known: dict[tuple[ir.Formula, int, int], str] = field(default_factory=dict)
+    _calls: dict[tuple[str, tuple[ir.Num, ...]], list[str]] = field(default_factory=dict)
 
     def value(self, formula: ir.Formula, start: int = 0, count: int = 1) -> str:
         """The buffer with the robustness of a formula at `count` instants from `start` on."""
@@ -65,7 +66,9 @@ class FormulaWriter:
 
     def _atom(self, atom: ir.Atom, start: int, count: int) -> str:
         writer = NumberWriter(
-            lambda name: self.column(name, "k"), lambda leaf: self._elsewhere(leaf, start, count)
+            lambda name: self.column(name, "k"),
+            lambda leaf: self._elsewhere(leaf, start, count),
+            self._called,
         )
         margin = writer.number(atom.num)
         value = margin if atom.sign > 0 else f"(-{margin})"
@@ -82,6 +85,22 @@ class FormulaWriter:
         elif start + leaf.steps < 0 or start + count - 1 + leaf.steps > last:
             raise Untranslatable("a sample outside of the plan")
         return self.column(leaf.name, index)
+
+    def _called(self, num: ir.Extern) -> str | None:
+        """A function of columns, computed once for all samples and all predicates that call it."""
+        if not isinstance(num.function, ir.Body) or not all(isinstance(arg, ir.Col) for arg in num.args):
+            return None
+        key = (num.name, num.args)
+        if key not in self._calls:
+            writer = NumberWriter(lambda name: self.column(name, "k"))
+            parts = [replace(num, output=index) for index in range(len(num.function.outputs))]
+            values = [writer.number(part) for part in parts]
+            names = [self._buffer(self.samples) for _ in parts]
+            stores = [f"{name}[k][j] = {value};" for name, value in zip(names, values, strict=True)]
+            body = " ".join([*writer.lines, *stores])
+            self.lines.append(f"for (int k = 0; k < {self.samples}; ++k) LANE {{ {body} }}")
+            self._calls[key] = names
+        return f"{self._calls[key][num.output]}[k][j]"
 
     def _last(self, window: ir.Window, start: int, count: int) -> int:
         """Last sample that the window of the last instant reaches."""
