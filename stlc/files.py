@@ -48,6 +48,8 @@ def read_source(path: Path | str) -> Source:
         raise UsageError(_missing(path)) from None
     except OSError as error:
         raise UsageError(Diagnostic("U102", f"cannot read `{name}`: {_reason(error)}")) from None
+    except ValueError:  # a zero byte in the name
+        raise UsageError(Diagnostic("U102", f"no file can be called {name!r}")) from None
     return _decode(name, data)
 
 

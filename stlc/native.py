@@ -26,9 +26,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC", "-std=c11")
+FLAGS = ("-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC", "-std=c11")
 VECTOR_FLAGS = ("-DVECTOR_MATH", *(f"-fno-builtin-{name}" for name in ("sin", "cos", "exp", "log")))
 """For the vector functions of the GNU C library: a sine is not merged with the cosine beside it."""
+LONG = 80_000
+"""Characters of a C text from which on the third level of optimisation takes too long for what it gains."""
 SMALL = 512
 """Rows below which a second thread costs more than it saves."""
 
@@ -239,8 +241,9 @@ def build(text: str) -> Path | None:
 def _compile(using: str, source: Path, target: Path) -> None:
     """Build with vector forms of sine and the like where the C library has them, without elsewhere."""
     fast = [[*VECTOR_FLAGS, "-lmvec"]] if sys.platform == "linux" and platform.machine() == "x86_64" else []
+    level = "-O3" if source.stat().st_size < LONG else "-O2"
     for attempt in (*fast, []):
-        command = [using, *FLAGS, str(source), "-o", str(target), *attempt, "-lm"]
+        command = [using, level, *FLAGS, str(source), "-o", str(target), *attempt, "-lm"]
         done = subprocess.run(command, check=False, capture_output=True, timeout=120)
         if done.returncode == 0:
             return

@@ -30,6 +30,8 @@ MAX_BYTES = 1_000_000_000
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
 _HEAD = re.compile(r"(?P<name>[^\[\]]*[^\[\]\s](?:\[\d+\])?)\s*(?:\[(?P<unit>[^\]]*)\])?")
 _ROUND = re.compile(r"(?P<name>.*[^\s(])\s*\((?P<unit>[^()]+)\)")
+_ANY = re.compile(r"\S")
+_FILLED = re.compile(r"[^\n]+")
 _COMMA = re.compile(r"(?<!\d),|,(?!\d)")
 """A comma that is not within a number."""
 _WORDS = {"true": 1.0, "false": 0.0}
@@ -149,8 +151,8 @@ def _cells(source: Source, start: int, line: str, delimiter: str) -> Iterator[tu
 
 def _text_columns(sheet: _Sheet) -> frozenset[int]:
     """The columns whose first cell is a word."""
-    lines = sheet.source.text[sheet.body_at :].lstrip("\n")
-    first = lines.partition("\n")[0]
+    filled = _FILLED.search(sheet.source.text, sheet.body_at)
+    first = filled[0] if filled else ""
     cells = enumerate(_cells(sheet.source, sheet.body_at, first, sheet.delimiter))
     return frozenset(
         i for i, (text, _) in cells if text and not _NUMBER.fullmatch(text) and text.lower() not in _WORDS
@@ -159,18 +161,19 @@ def _text_columns(sheet: _Sheet) -> frozenset[int]:
 
 def _read_fast(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array] | None:
     """All lines at once with NumPy's reader; None if anything about them is unusual."""
-    body = sheet.source.text[sheet.body_at :]
-    if not body.strip() or '"' in body or len(texts) == width:
+    text, start = sheet.source.text, sheet.body_at
+    if not _ANY.search(text, start) or text.find('"', start) >= 0 or len(texts) == width:
         return None
     words: list[list[str]] = []
     if texts:
-        words = [line.split(sheet.delimiter) for line in body.split("\n") if line.strip()]
+        words = [line.split(sheet.delimiter) for line in text[start:].split("\n") if line.strip()]
         if any(len(cells) != width for cells in words):
             return None
     numbers = [i for i in range(width) if i not in texts]
+    lines = io.TextIOWrapper(io.BytesIO(text[start:].encode()), "utf-8")  # a StringIO is four times as large
     try:
         values = np.loadtxt(
-            io.StringIO(body),
+            lines,
             delimiter=sheet.delimiter,
             comments=None,
             ndmin=2,
@@ -181,6 +184,7 @@ def _read_fast(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array] 
         return None
     if values.shape[1] != len(numbers):
         return None
+    lines.close()
     columns: dict[int, Array] = {i: np.ascontiguousarray(values[:, k]) for k, i in enumerate(numbers)}
     columns |= {i: np.array([cells[i].strip() for cells in words]) for i in texts}
     return [columns[i] for i in range(width)]

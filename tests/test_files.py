@@ -267,3 +267,9 @@ def test_a_trace_is_found_as_given_and_then_in_the_newest_run():
         find_trace("trase.npz")
     assert finding(caught).help == ("did you mean `trace.npz`?",)
     assert finding(caught).note == ("looked at: trase.npz, runs/latest/trase.npz",)
+
+
+def test_a_name_that_no_file_can_have():
+    with pytest.raises(UsageError) as caught:
+        read_source("a\0b.stl")
+    assert finding(caught).message == r"no file can be called 'a\x00b.stl'"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import paper
 import pytest
+import torch
 from paper import Array
 
 LIMITS = ((2, 0.5), (4, 0.3), (5, 0.5))  # column and bound: heading, sway, turn rate
@@ -230,7 +231,7 @@ def test_initial_states_have_the_benchmarks_distribution(ship: paper.Benchmark) 
 @pytest.mark.parametrize(
     ("ship", "old", "new"),
     [(SAFE, "r1 + 1.5 m", "r1 + 1.7 m"), (SAFE, "0, 99)", "0, 70)"), (SAFE, "99 * step", "70 * step"),
-     (TRACK, "randint(1, 9)", "randint(1, 10)"), (TRACK, "tau < 5 * dt", "tau < 3 * dt"),
+     (TRACK, "randint(1, 9)", "randint(1, 10)"), (TRACK, "tau < 5 * dt", "tau < dt"),
      (TRACK, "r1 + 0.5 m", "r1 + 1.5 m"), (TRACK, "weight: 1", "weight: 2"),
      (TRACK, "not (y > 1.5 and psi > 0) ", "not (y > 1.9 and psi > 0) ")],
 )  # fmt: skip
@@ -243,6 +244,9 @@ def test_another_distribution_is_noticed(ship: paper.Benchmark, old: str, new: s
     assert paper.unlike(ship, ship.task(system=((old, new),)))
 
 
-def test_allowances_are_whole_steps() -> None:
-    tau = TRACK.task().sample(5000, seed=3)[:, 9].double().numpy() / 0.15
-    assert np.abs(tau - np.rint(tau)).max() < 1e-5
+def test_allowances_are_whole_steps_and_short_ones_stay_off_the_banks() -> None:
+    states = TRACK.task().sample(20_000, seed=3, dtype=torch.float64).numpy()
+    steps, wide = states[:, 9] / 0.15, np.abs(states[:, 1]) > 1.5
+    assert np.abs(steps - np.rint(steps)).max() < 1e-9
+    assert not wide[np.rint(steps) < 5].any()
+    assert wide[np.rint(steps) == 5].any()

@@ -4,9 +4,13 @@ Everything follows from one `random.Random`; nothing is read but the specificati
 """
 
 import random
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import islice
 
+from fuzz_bombs import specifications, systems
+from fuzz_grammar import specification
 from fuzz_mutation import WORDS, corpus, mutated, soup
 from fuzz_specs import SMALL, SYSTEM, TRAINED, monster
 from fuzz_systems import monstrous_yaml
@@ -15,17 +19,58 @@ from fuzz_traces import archived, foreign, small_trace, table
 
 @dataclass
 class Input:
-    """A command line, and the files that lie in the folder where it runs."""
+    """A command line, and the files that lie in the folder where it runs.
+
+    Without a command line `a.stl` is read by the library (`fuzz_laws.laws`).
+    """
 
     kind: str
-    arguments: list[str]
+    arguments: list[str] = field(default_factory=list)
     files: dict[str, bytes] = field(default_factory=dict)
 
 
 def draw(rng: random.Random) -> Input:
     """One input."""
-    maker = rng.choices([_spec, _system, _trace, _line], weights=[50, 20, 22, 8])[0]
+    maker = rng.choices([_text, _spec, _system, _trace, _line], weights=[38, 20, 22, 17, 3])[0]
     return maker(rng)
+
+
+def _text(rng: random.Random) -> Input:
+    roll = rng.random()
+    if roll < 0.65:
+        data = specification(rng).encode()
+    elif roll < 0.83:
+        data = mutated(specification(rng).encode(), rng)
+    elif roll < 0.95:
+        data = mutated(
+            _piece(rng.choice(corpus("specs/*.stl") + corpus("tests/grammar/data/*.stl")), rng), rng
+        )
+    elif roll < 0.97:
+        data = mutated(_piece(rng.choice(corpus("docs/*.md") + corpus("stlc/**/*.stl")), rng), rng)
+    else:
+        data = _bomb(rng).encode("utf-8", "replace")
+    return Input("text", files={"a.stl": data})
+
+
+def _piece(data: bytes, rng: random.Random) -> bytes:
+    """Some of it: whole files are slow, and most of them is alike."""
+    return data[: rng.choice([300, 300, 1000, 1000, len(data)])]
+
+
+def _bomb(rng: random.Random) -> str:
+    """A bomb of some size; the largest are rare."""
+    size = rng.choices([5, 30, 300, 3000, 100_000], weights=[40, 40, 15, 4, 1])[0]
+    return _pick(specifications(size), _BOMBS, rng)
+
+
+def _pick(bombs: Iterator[tuple[str, str]], many: int, rng: random.Random) -> str:
+    """One of a sequence that is told only as it goes."""
+    at = rng.randrange(many)
+    return next(islice(bombs, at, None))[1]
+
+
+_BOMBS = sum(1 for _ in specifications(5))
+_YAML_BOMBS = sum(1 for _ in systems(5, SYSTEM))
 
 
 def _spec(rng: random.Random) -> Input:
@@ -33,10 +78,13 @@ def _spec(rng: random.Random) -> Input:
     roll = rng.random()
     if roll < 0.1:
         number = rng.randrange(len(corpus("specs/*.stl")))
-        text, system = mutated(corpus("specs/*.stl")[number], rng), rng.choice(corpus("examples/*.yaml"))
+        text, system = (
+            mutated(_piece(corpus("specs/*.stl")[number], rng), rng),
+            rng.choice(corpus("examples/*.yaml")),
+        )
     elif roll < 0.55:
         text = mutated(base.encode(), rng)
-    elif roll < 0.7:
+    elif roll < 0.85:
         text = (base + rng.choice(["require r: ", "def d = ", "const k = ", ""]) + soup(rng)).encode()
     elif roll < 0.97:
         text = (base + monster(rng)).encode("utf-8", "replace")
@@ -86,16 +134,20 @@ def _system(rng: random.Random) -> Input:
     spec, text = TRAINED.encode(), SYSTEM.encode()
     if rng.random() < 0.5:
         spec, text = rng.choice(corpus("specs/*.stl")), rng.choice(corpus("examples/*.yaml"))
-    if rng.random() < 0.7:
+    roll = rng.random()
+    if roll < 0.7:
         data = mutated(text, rng)
-    elif rng.random() < 0.1:
+    elif roll < 0.8:
+        size = rng.choices([5, 30, 300, 3000, 100_000], weights=[10, 10, 6, 3, 1])[0]
+        data = _pick(systems(size, SYSTEM), _YAML_BOMBS, rng).encode("utf-8", "replace")
+    elif roll < 0.83:
         data = rng.choice([b"", b"null", b"[]", b"3", b"\0", rng.randbytes(300), b"a: b: c", b"- " * 5000])
     else:
         data = monstrous_yaml(text.decode(), rng).encode("utf-8", "replace")
     command = rng.choice([["compile", "a.stl"], ["compile", "a.stl", "--json"], ["check", "a.stl", "t.npz"]])
     arguments = [*command, "--system", "b.yaml"]
     if "system" in commands() and rng.random() < 0.2:
-        arguments = ["system", "check", "b.yaml"]
+        arguments = ["system", rng.choice(["show", "show", "show", "check"]), "b.yaml"]
     return Input("system", arguments, {"a.stl": spec, "b.yaml": data, "t.npz": small_trace()})
 
 
@@ -130,7 +182,7 @@ nonexistent/a.stl a.stl/b E203 E999 precedence -- T_red=3s k=v=w
 VALUES = (*_VALUES.split(), "", " ", "\n", "9" * 4000, "x" * 5000, "\udc80", "a\x00b")
 
 
-_BUSY = frozenset({"train", "simulate", "lsp", "doctor"})
+_BUSY = frozenset({"train", "simulate", "lsp", "doctor", "bench"})
 """Commands that may work, or wait, for longer than any input is worth."""
 
 

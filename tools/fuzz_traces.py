@@ -14,11 +14,12 @@ from fuzz_specs import SMALL
 @cache
 def small_trace() -> bytes:
     """A sound trace for `SMALL`."""
-    return archive({name: np.linspace(-1, 1, 12) for name in ("x", "y", "z", "n", "flag", "mode")} | _rest())
+    return archive({name: np.linspace(-1, 1, 12) for name in ("x", "y", "z")} | _rest())
 
 
 def _rest() -> dict[str, np.ndarray]:
-    return {f"q[{i}]": np.full(12, float(i)) for i in range(3)} | {"t": np.arange(12) / 10}
+    words = {"n": np.arange(12), "flag": np.arange(12) % 2, "mode": np.zeros(12)}
+    return words | {f"q[{i}]": np.full(12, float(i)) for i in range(3)} | {"t": np.arange(12) / 10}
 
 
 def archive(arrays: dict[str, np.ndarray]) -> bytes:
@@ -53,7 +54,8 @@ def archived(rng: random.Random) -> tuple[str, bytes]:
             rng.choice(["{", "[]", "{}", '{"dt": 0.1}', '{"signals": {"x": {"unit": "m^^2"}}}', "[" * 5000])
         ),
     ]
-    arrays = {name: numbers.normal(size=samples) for name in ("x", "y", "z", "n", "flag", "mode")}
+    arrays = {name: numbers.normal(size=samples) for name in ("x", "y", "z")}
+    arrays |= {name: numbers.integers(0, 2, size=samples) for name in ("n", "flag", "mode")}
     arrays |= {f"q[{i}]": numbers.normal(size=samples) for i in range(3)} | {"t": np.arange(samples) / 10}
     for _ in range(rng.choice([1, 1, 2, 4])):
         arrays[rng.choice(["t", "t", "x", "y", "meta", "q[0]", "extra.a", "", "..", "x" * 300])] = rng.choice(
@@ -82,7 +84,7 @@ def _claimed(rng: random.Random) -> bytes:
 def table(rng: random.Random) -> tuple[str, bytes]:
     """A `.csv`: its suffix and what is in it."""
     names = ["t", "x", "y", "z", "n", "flag", "mode", "q[0]", "q[1]", "q[2]"]
-    rows = [",".join(names), *(",".join(f"{k / 10 + (i > 0)}" for i in range(10)) for k in range(12))]
+    rows = [",".join(names), *(",".join([f"{k / 10}", *"001010010"]) for k in range(12))]
     if rng.random() < 0.5:
         at, cell = rng.randrange(13), rng.randrange(10)
         cells = rows[at].split(",")

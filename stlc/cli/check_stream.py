@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 from stlc.cli.judge import Question, monitor_of, usage
 from stlc.cli.outcome import WORDS, Outcome
@@ -50,7 +50,7 @@ def outcome_of_stream(question: Question, *, talk: bool) -> Outcome:
     begun = time.perf_counter()
     source = read_source(question.spec)
     monitor = monitor_of(source, question)
-    samples = _timed(_renamed(_samples(sys.stdin.buffer), question.names))
+    samples = _timed(_renamed(_samples(_lines(sys.stdin.buffer)), question.names))
     first, dt = next(samples)
     online = _online(monitor, question, first, dt)
     for sample in _from(first, samples):
@@ -119,6 +119,11 @@ def _samples(lines: Iterable[bytes]) -> Iterator[Sample]:
             header = _header(text, number)
         else:
             yield _row(text, header, number)
+
+
+def _lines(stream: BinaryIO) -> Iterator[bytes]:
+    """Lines, of those that are too long as much as shows it."""
+    return iter(lambda: stream.readline(MAX_LINE + 1), b"")
 
 
 def _text(raw: bytes, number: int) -> str:

@@ -55,6 +55,9 @@ def simulate(
     fail_under: Annotated[
         float | None, typer.Option(metavar="SHARE", help="Exit with 1 if the plan accuracy is less.")
     ] = None,
+    scenario: Annotated[
+        str | None, typer.Option(metavar="NAME", help="An overlay of the system file, such as an OOD case.")
+    ] = None,
     set_: SetOption = None,
     runs: RunsOption = Path("runs"),
     pictures: Annotated[bool, typer.Option(help="Draw the animation and the report.")] = True,
@@ -69,7 +72,7 @@ def simulate(
     if record is not None:
         check_writable(record)
 
-    opened = Run.open(run, root=runs, overrides=parse_overrides(set_))
+    opened = Run.open(run, root=runs, overrides=parse_overrides(set_), scenario=scenario)
     test = opened.task.system.decl.test
     setting = Setting(
         tuple(range(seed, seed + seeds)), agents or test.agents, steps or test.steps, test.replan
@@ -153,11 +156,17 @@ def _save(run: Run, setting: Setting, found: Mapping[Mode, Deployment], record: 
         "system": run.task.system.name,
         "run": run.dir.name,
         "world": world.path.name if world is not None else None,
+        "scenario": _laid_over(run),
         "trace": f"{run.dir.shown}/trace.npz",
     }
     document = as_json(found, setting, facts)
     run.dir.write_json(RESULT, document)
     return document
+
+
+def _laid_over(run: Run) -> str | None:
+    scenario = run.task.system.decl.scenario
+    return None if scenario is None else scenario.name
 
 
 def _draw(run: Run) -> dict[str, str]:
@@ -197,7 +206,8 @@ def _screen(document: Record) -> Iterator[str]:
     seeds, agents, steps = len(document["seeds"]), document["agents"], document["steps"]
     size = f"{seeds} seed{'s' * (seeds > 1)} x {agents} agents x {steps} steps"
     world = document["world"] or f"{document['system']} and its events"
-    yield " · ".join((document["spec"], f"run {document['run']}", f"world {world}", size))
+    scenario = [f"scenario {document['scenario']}"] if document["scenario"] else []
+    yield " · ".join((document["spec"], f"run {document['run']}", f"world {world}", *scenario, size))
     header = ("", *({"none": "no guard", "paper": "paper's guard"}[name] for name in guards))
     yield table([*_shares(guards), *_progress(guards), *_times(guards)], header=header)
     for name, guard in guards.items():

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import assert_never
 
 from stlc.compile import ir
-from stlc.compile.c_formulas import FormulaWriter
+from stlc.compile.c_formulas import FormulaWriter, over
 from stlc.compile.c_numbers import Untranslatable
 from stlc.compile.c_slopes import SlopeWriter
 from stlc.compile.emit_c import HEAD, Motion, passes, state_column
@@ -95,7 +95,8 @@ def _step_back(motion: Motion, fixed: Collection[str]) -> list[str]:
             own = f"gx[{index[name]}][k + 1][j]"
             seeds[register] = f"{seeds[register]} + {own}" if register in seeds else own
     still = [f"gx[{i}][k][j] += gx[{i}][k + 1][j];" for name, i in index.items() if name not in motion.next]
-    return [*writer.lines, *writer.backward(seeds), *still]
+    lines, gathered = writer.backward(seeds)
+    return [*writer.lines, *lines, *(f"{place} += {value};" for place, value in gathered.items()), *still]
 
 
 @dataclass(slots=True)
@@ -149,13 +150,28 @@ class FormulaAdjoint(FormulaWriter):
                 assert_never(formula)
 
     def _atom_back(self, name: str, atom: ir.Atom, start: int, count: int) -> list[str]:
+        heads: dict[str, str] = {}
         writer = SlopeWriter(
-            lambda name: self.column(name, "k"), lambda leaf: self._elsewhere(leaf, start, count), soft=False
+            lambda name: self.column(name, "k"),
+            lambda leaf: self._elsewhere(leaf, start, count, heads),
+            soft=False,
         )
         margin = writer.number(atom.num)
         own = f"a{name}[s][j]" if atom.sign > 0 else f"-a{name}[s][j]"
-        lines = [*writer.lines, *writer.backward({margin: own})]
-        return [f"for (int s = 0, k = {start}; s < {count}; ++s, ++k) LANE {{", *lines, "}"]
+        lines, gathered = writer.backward({margin: own})
+        # Two indices may be the same sample: gathered apart from the loop that computes, which vectorises so.
+        shares = [f"h{i}" for i in range(len(gathered))]
+        return [
+            over(start, count, heads),
+            *(f"double {share}[LANES];" for share in shares),
+            "LANE {",
+            *writer.lines,
+            *lines,
+            *(f"{share}[j] = {value};" for share, value in zip(shares, gathered.values(), strict=True)),
+            "}",
+            *(f"LANE {place} += {share}[j];" for share, place in zip(shares, gathered, strict=True)),
+            "}",
+        ]
 
 
 def _join_back(name: str, parts: Sequence[str], count: int) -> list[str]:

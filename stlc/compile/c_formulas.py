@@ -6,12 +6,14 @@ trajectories, so every line of it becomes vector code. Only the instants that th
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import assert_never
 
 from stlc.compile import ir
 from stlc.compile.c_numbers import NumberWriter, Untranslatable
+from stlc.compile.samples import everything
 
 
 @dataclass(slots=True)
@@ -32,9 +34,11 @@ class FormulaWriter:
     size: int = 0
     buffers: list[tuple[str, int]] = field(default_factory=list)
     _known: dict[tuple[ir.Formula, int, int], str] = field(default_factory=dict)
+    _calls: dict[tuple[str, tuple[ir.Num, ...]], list[str]] = field(default_factory=dict)
 
     def value(self, formula: ir.Formula, start: int = 0, count: int = 1) -> str:
         """The buffer with the robustness of a formula at `count` instants from `start` on."""
+        formula = _split(formula)
         key = (formula, start, count)
         known = self._known.get(key)
         if known is None:
@@ -66,24 +70,51 @@ class FormulaWriter:
                 assert_never(formula)
 
     def _atom(self, atom: ir.Atom, start: int, count: int) -> str:
+        heads: dict[str, str] = {}
         writer = NumberWriter(
-            lambda name: self.column(name, "k"), lambda leaf: self._elsewhere(leaf, start, count)
+            lambda name: self.column(name, "k"),
+            lambda leaf: self._elsewhere(leaf, start, count, heads),
+            self._called,
         )
         margin = writer.number(atom.num)
         value = margin if atom.sign > 0 else f"(-{margin})"
         if atom.guard:
             value = f"({value} {'>' if atom.strict else '>='} 0.0 ? INFINITY : -INFINITY)"
-        return self._fill(count, value, before=[*writer.lines, f"bad[j] += NAN_IN({value});"], first=start)
+        name = self._buffer(count)
+        body = " ".join([*writer.lines, f"bad[j] += NAN_IN({value});", f"{name}[s][j] = {value};"])
+        self.lines.append(f"{over(start, count, heads)} LANE {{ {body} }} }}")
+        return name
 
-    def _elsewhere(self, leaf: ir.At, start: int, count: int) -> str:
-        """A column so many samples from here; a clamped one stays within the plan."""
+    def _elsewhere(self, leaf: ir.At, start: int, count: int, heads: dict[str, str]) -> str:
+        """A column so many samples from here; a clamped one stays within the plan.
+
+        What its index is goes to `heads`: it does not depend on the lane.
+        """
         last = self.samples - 1
         index = f"k + ({leaf.steps})"
         if leaf.clamped:
-            index = f"{index} < {last} ? {index} : {last}" if leaf.steps > 0 else f"{index} > 0 ? {index} : 0"
+            kept = f"{index} < {last} ? {index} : {last}" if leaf.steps > 0 else f"{index} > 0 ? {index} : 0"
+            index = f"{'after' if leaf.steps > 0 else 'before'}{abs(leaf.steps)}"
+            heads[index] = kept
         elif start + leaf.steps < 0 or start + count - 1 + leaf.steps > last:
             raise Untranslatable("a sample outside of the plan")
         return self.column(leaf.name, index)
+
+    def _called(self, num: ir.Extern) -> str | None:
+        """A function of columns, computed once for all samples and all predicates that call it."""
+        if not isinstance(num.function, ir.Body) or not all(isinstance(arg, ir.Col) for arg in num.args):
+            return None
+        key = (num.name, num.args)
+        if key not in self._calls:
+            writer = NumberWriter(lambda name: self.column(name, "k"))
+            parts = [replace(num, output=index) for index in range(len(num.function.outputs))]
+            values = [writer.number(part) for part in parts]
+            names = [self._buffer(self.samples) for _ in parts]
+            stores = [f"{name}[k][j] = {value};" for name, value in zip(names, values, strict=True)]
+            body = " ".join([*writer.lines, *stores])
+            self.lines.append(f"for (int k = 0; k < {self.samples}; ++k) LANE {{ {body} }}")
+            self._calls[key] = names
+        return f"{self._calls[key][num.output]}[k][j]"
 
     def _last(self, window: ir.Window, start: int, count: int) -> int:
         """Last sample that the window of the last instant reaches."""
@@ -128,14 +159,9 @@ class FormulaWriter:
         ]
         return name
 
-    def _fill(self, count: int, value: str, *, before: list[str] | None = None, first: int = 0) -> str:
+    def _fill(self, count: int, value: str) -> str:
         name = self._buffer(count)
-        body = " ".join([*(before or []), f"{name}[s][j] = {value};"])
-        if first or before is not None:
-            loop = f"for (int s = 0, k = {first}; s < {count}; ++s, ++k) LANE {{ {body} }}"
-        else:
-            loop = f"for (int k = 0; k < {count}; ++k) LANE {name}[k][j] = {value};"
-        self.lines.append(loop)
+        self.lines.append(f"for (int k = 0; k < {count}; ++k) LANE {name}[k][j] = {value};")
         return name
 
     def _buffer(self, count: int) -> str:
@@ -146,3 +172,32 @@ class FormulaWriter:
         )
         self.size += count
         return name
+
+
+def over(start: int, count: int, heads: Mapping[str, str]) -> str:
+    """The head of a loop over `count` samples `k` from `start` on, `s` counting from 0, and its indices."""
+    indices = " ".join(f"const int {name} = {value};" for name, value in heads.items())
+    return f"for (int s = 0, k = {start}; s < {count}; ++s, ++k) {{ {indices}"
+
+
+LARGE = 64
+"""Nodes of a number from which on its minima and maxima are computed apart: compilers take long over long loops."""
+
+
+def _split(formula: ir.Formula) -> ir.Formula:
+    """A predicate over the extremum of large numbers as a formula over predicates; anything else as it is."""
+    if not isinstance(formula, ir.Atom) or formula.guard or not isinstance(formula.num, ir.Op):
+        return formula
+    name, args = formula.num.name, formula.num.args
+    if name not in ("min", "max", "neg") or not _large(formula.num):
+        return formula
+    if name == "neg":
+        return _split(replace(formula, num=args[0], sign=-formula.sign, strict=formula.strict))
+    if len(args) == 1:
+        return _split(replace(formula, num=args[0]))
+    both = (name == "min") == (formula.sign > 0)
+    return ir.Join("and" if both else "or", tuple(replace(formula, num=arg) for arg in args), formula.span)
+
+
+def _large(num: ir.Num) -> bool:
+    return next(islice(everything(num), LARGE, None), None) is not None

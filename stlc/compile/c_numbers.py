@@ -56,12 +56,19 @@ class NumberWriter:
     Args:
         column: C expression of an environment entry.
         at: the same at another sample; None where there is only one.
+        call: C expression of a component of a function's result that stands somewhere already, else None.
     """
 
-    def __init__(self, column: Callable[[str], str], at: Callable[[ir.At], str] | None = None) -> None:
+    def __init__(
+        self,
+        column: Callable[[str], str],
+        at: Callable[[ir.At], str] | None = None,
+        call: Callable[[ir.Extern], str | None] | None = None,
+    ) -> None:
         self.lines: list[str] = []
         self._column = column
         self._at = at
+        self._call = call
         self._known: dict[ir.Num, str] = {}
         self._texts: dict[str, str] = {}
         self._calls: dict[tuple[str, ...], list[str]] = {}
@@ -103,6 +110,9 @@ class NumberWriter:
             case ir.Where(cond, yes, no):
                 return self._choice(cond, self.number(yes), self.number(no))
             case ir.Extern(name, args, output, ir.Body() as body):
+                stored = None if self._call is None else self._call(num)
+                if stored is not None:
+                    return self._register(stored)
                 return self._inlined(name, body, [self.number(arg) for arg in args])[output]
             case ir.At() if self._at is not None:
                 return self._register(self._at(num))

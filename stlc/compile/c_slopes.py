@@ -65,19 +65,22 @@ class SlopeWriter(NumberWriter):
         self._slopes: dict[str, tuple[Slope, ...]] = {}
         self._inputs: dict[str, str] = {}
 
-    def backward(self, seeds: Mapping[str, str]) -> list[str]:
-        """Statements that add the gradient to columns: the derivative by `x[…]` is gathered in `gx[…]`.
+    def backward(self, seeds: Mapping[str, str]) -> tuple[list[str], dict[str, str]]:
+        """Statements that take a gradient back to columns.
 
         Args:
             seeds: register -> C expression of the derivative of the outcome by it.
+
+        Returns:
+            The statements, and what they give: place where the derivative by a column is gathered (that by
+            `x[…]` in `gx[…]`) -> register.
         """
         registers = list(self._texts.values())
         lines = [f"double d{name} = {seeds.get(name, '0.0')};" for name in registers]
         for name in reversed(registers):
             lines += [f"d{of} += d{name} * {slope};" for of, slope in self._slopes.get(name, ())]
-            if name in self._inputs:
-                lines.append(f"g{self._inputs[name]} += d{name};")
-        return lines
+        gathered = {f"g{place}": f"d{name}" for name, place in self._inputs.items()}
+        return lines, gathered
 
     def margin(self, cond: ir.Formula) -> str:
         """The exact robustness of a state formula."""

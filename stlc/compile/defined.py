@@ -76,6 +76,9 @@ def _past(window: ir.Window, samples: int) -> tuple[NDArray[np.int_], NDArray[np
 def _throughout(inside: Defined, first: NDArray[np.int_], last: NDArray[np.int_]) -> Defined:
     """Whether all instants first..last lie within the trace and are defined; true for none at all."""
     samples = len(inside)
+    known = int(np.argmin(inside)) if not inside.all() else samples
+    if not inside[known:].any():  # what looks ahead only is defined up to some sample
+        return np.asarray(((last < known) | (last < first)) & (last < samples))
     missing = np.concatenate([[0], np.cumsum(~inside)])
     low, high = np.clip(first, 0, samples), np.clip(last + 1, 0, samples)
     whole = missing[np.maximum(high, low)] == missing[low]

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-MAX_NODES = 100_000
+MAX_NODES = 50_000
 MAX_LEVELS = 120
 
 

@@ -73,6 +73,7 @@ class Engine:
         share: weight of the mean over plans beside the winner's loss.
         performance: factor of the performance terms.
         held_out: states of the last verdict.
+        samples: size of a fixed training set; 0: fresh states in every step.
     """
 
     method: Method
@@ -94,6 +95,7 @@ class Engine:
     share: float = 0.05
     performance: float = 0.3
     held_out: int = HELD_OUT
+    samples: int = 0
 
 
 def decide(task: Task, config: TrainConfig) -> Engine:
@@ -117,4 +119,5 @@ def decide(task: Task, config: TrainConfig) -> Engine:
         share=0.05 if plans > 1 else 0.0,
         performance=0.3 if guided else 1.0,
         held_out=config.held_out,
+        samples=0 if guided else declared.samples or 0,
     )

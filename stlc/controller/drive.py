@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from stlc.controller.disturbance import Disturbance
 from stlc.diagnostics import Diagnostic, RunError, StlcError, SystemFileError
 
 if TYPE_CHECKING:
@@ -71,12 +72,12 @@ class Recorder:
     units: Mapping[str, str] = field(default_factory=dict)
 
     def start(self, x: Tensor, world: World) -> None:
-        """The first sample."""
+        """The first sample: `x` (rows, n), agents of all seeds one after the other."""
         self.states.append(x)
         self.frames.append(world.snapshot())
 
     def step(self, decision: Decision, action: Tensor, x: Tensor, world: World) -> None:
-        """One more step, and the sample behind it."""
+        """One more step with `action` (rows, m), and the sample `x` (rows, n) behind it."""
         self.decisions.append(decision)
         self.actions.append(action)
         self.start(x, world)
@@ -122,7 +123,9 @@ class _Worlds:
         self.parts = [setting.agents] * len(setting.seeds)
         with _blame("be made"):
             self.generators = [torch.Generator().manual_seed(seed) for seed in setting.seeds]
-            self.worlds = [make(task.plain, setting.agents, generator) for generator in self.generators]
+            real = task.plain.truth
+            self.worlds = [make(real, setting.agents, generator) for generator in self.generators]
+        self.disturbance = Disturbance(task.plain, self.generators, setting.agents)
 
     def reset(self) -> Tensor:
         """The first states, (rows, n); parameters are drawn, timers as at the start of a mission."""
@@ -140,7 +143,8 @@ class _Worlds:
         each = zip(self.worlds, torch.split(known, self.parts), torch.split(action, self.parts), strict=True)
         with _blame(f"take step {step}"):
             states = [world.advance(before, act) for world, before, act in each]
-        return torch.cat((self._checked(states, step), self.system.added_later(x)), 1)
+        moved = self.disturbance.pushed(self._checked(states, step), known, step)
+        return torch.cat((moved, self.system.added_later(x)), 1)
 
     def _checked(self, states: list[Tensor], step: int) -> Tensor:
         with _blame(f"give states at step {step}"):
@@ -183,7 +187,8 @@ def drive(
     decision = None
     for step in range(setting.steps):
         if decision is None or step % setting.replan == 0:
-            decision = guard.decide(x, decision and decision.later(setting.replan))
+            seen = worlds.disturbance.seen(x, step)
+            decision = guard.decide(seen, decision and decision.later(setting.replan))
         action = decision.plan[:, step % setting.replan]
         if not bool(torch.isfinite(action).all()):
             raise RunError(Diagnostic("R402", f"the policy's plan at step {step} is not a number"))

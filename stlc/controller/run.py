@@ -14,6 +14,7 @@ from stlc.controller.config import Engine
 from stlc.controller.policy import Mlp, PlanNetwork
 from stlc.controller.task import Task
 from stlc.diagnostics import Diagnostic, RunError
+from stlc.dynamics.scenario import scenario_constants
 from stlc.dynamics.system import System
 from stlc.files import read_source, write_atomic
 from stlc.grammar import ast
@@ -54,10 +55,12 @@ class Run:
         root: Path = RUNS,
         device: str = "cpu",
         overrides: Mapping[str, str] | None = None,
+        scenario: str | None = None,
     ) -> Run:
         """Load a run by folder, name, number, or `latest`, below the folder `root` of all runs.
 
-        `overrides` change constants and give values to parameters, as `--set` does; the policy stays.
+        `overrides` change constants and give values to parameters, as `--set` does, and a `scenario` of
+        the system file is laid over it; the policy stays.
 
         Raises:
             UsageError: there is no such run.
@@ -65,7 +68,7 @@ class Run:
             SpecError, SystemFileError: its specification or system is invalid.
         """
         folder = RunDir.open(where, root)
-        task = load_task(folder, overrides or {})
+        task = load_task(folder, overrides, scenario)
         engine = load_engine(folder)
         saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
         network = PlanNetwork(task, hidden=engine.hidden, plans=engine.plans)
@@ -80,18 +83,21 @@ class Run:
         return cls(folder, task, Mlp(task, network.to(torch.device(device)).eval()))
 
 
-def load_task(folder: RunDir, overrides: Mapping[str, str] | None = None) -> Task:
+def load_task(
+    folder: RunDir, overrides: Mapping[str, str] | None = None, scenario: str | None = None
+) -> Task:
     """Compile the specification and the system that lie in a run's folder, changed as `overrides` say.
 
     A parameter that the policy was trained with keeps its column: it has the value that is given.
     """
     trained = folder.record().get("overrides") or {}
     spec = replace(parse(read_source(folder.path / SPEC)), library=read_library(folder))
-    changed = {**trained, **(overrides or {})}
+    overlay = {} if scenario is None else scenario_constants(folder.path / SYSTEM, scenario, trained)
+    changed = {**trained, **overlay, **(overrides or {})}
     drawn = {item.name for item in spec.items if isinstance(item, ast.Param)} - trained.keys()
     values = {name: text for name, text in changed.items() if name in drawn}
     constants = {name: text for name, text in changed.items() if name not in drawn}
-    system = System.load(folder.path / SYSTEM, changed)
+    system = System.load(folder.path / SYSTEM, changed, scenario=scenario)
     return Task.of(spec, system, overrides=constants, values=values)
 
 

@@ -1,4 +1,4 @@
-"""Fresh initial states, drawn in blocks: one draw of thousands costs little more than one of hundreds."""
+"""Training states: fresh ones, drawn in blocks of thousands, or a fixed set."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Supply(Protocol):
     """Where training states come from."""
 
     def take(self, n: int) -> Tensor:
-        """`n` states that were not handed out before, (n, dim), float32."""
+        """The next `n` states, (n, dim), float32."""
 
     def follow(self, states: Tensor, plans: Tensor) -> None:
         """Take note of plans that solve states which a policy fails on: (k, n), (k, T, m)."""
@@ -63,3 +63,37 @@ class Draws:
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Go on where `tensors` were taken."""
         self.block = tensors["block"].to(self._device)
+
+
+class Fixed:
+    """A training set: states of another supply, handed out in a new order each time it has been used up.
+
+    Attributes:
+        states: all of them, (size, n).
+        queue: indices of those that are still to come, (k,).
+    """
+
+    def __init__(self, fresh: Supply, size: int, generator: torch.Generator) -> None:
+        self._generator = generator
+        self.states = fresh.take(size)
+        self.queue = torch.empty(0, dtype=torch.int64, device=self.states.device)
+
+    def take(self, n: int) -> Tensor:
+        """The next `n` states, (n, dim), float32."""
+        size, device = self.states.shape[0], self.states.device
+        while self.queue.shape[0] < n:
+            order = torch.randperm(size, generator=self._generator, device=device)
+            self.queue = torch.cat((self.queue, order))
+        taken, self.queue = self.queue[:n], self.queue[n:]
+        return self.states[taken]
+
+    def follow(self, states: Tensor, plans: Tensor) -> None:
+        """Where a plan leads does not change the set."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The set, and what of it is still to come."""
+        return {"states": self.states, "queue": self.queue}
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Go on where `tensors` were taken."""
+        self.states, self.queue = (tensors[name].to(self.states.device) for name in ("states", "queue"))

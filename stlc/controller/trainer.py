@@ -21,7 +21,7 @@ from stlc.controller.missions import Missions
 from stlc.controller.objective import Objective, guided_objective, loss, paper_objective
 from stlc.controller.policy import Mlp, PlanNetwork
 from stlc.controller.search import Repaired, Searcher
-from stlc.controller.supply import Draws, Supply
+from stlc.controller.supply import Draws, Fixed, Supply
 from stlc.controller.task import rank, satisfied
 
 if TYPE_CHECKING:
@@ -69,6 +69,7 @@ class Trainer:
         self.supply = self._supply()
         self.average = _network(task, engine, device)
         self.network.normalise(self.supply.take(4096))
+        self.training = Fixed(self.supply, engine.samples, self.generator) if engine.samples else self.supply
         self.average.load_state_dict(self.network.state_dict())
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=engine.lr, fused=True)
         self.buffer = Buffer.empty(len(task.names), task.horizon, len(task.system.control_names), device)
@@ -150,7 +151,7 @@ class Trainer:
 
     def _loss(self) -> Tensor:
         engine = self.engine
-        fresh = self.supply.take(engine.batch)
+        fresh = self.training.take(engine.batch)
         hard = engine.hard if len(self.buffer) else 0
         x0, targets = fresh, fresh.new_zeros(0)
         if hard:
@@ -226,6 +227,8 @@ class Trainer:
         for index, state in self.optimizer.state_dict()["state"].items():
             found.update({f"adam.{index}.{name}": value for name, value in state.items()})
         kept = len(self.buffer)
+        if isinstance(self.training, Fixed):
+            found.update({f"training.{name}": value for name, value in self.training.tensors().items()})
         found.update({f"supply.{name}": value for name, value in self.supply.tensors().items()})
         if self.repairing is not None:
             known = self.repairing.result()
@@ -267,6 +270,8 @@ class Trainer:
         self.buffer.plans[:kept] = tensors["buffer.plans"]
         self.buffer.count = int(facts["solved"])
         self.supply.restore(_below(tensors, "supply"))
+        if isinstance(self.training, Fixed):
+            self.training.restore(_below(tensors, "training"))
         self.generator.set_state(tensors["generator"].cpu())
 
 

@@ -104,6 +104,7 @@ class InitDecl:
         where: what every state must meet.
         where_text: as written.
         params: what is drawn before a situation is picked; situations may draw it anew.
+        override: what is drawn last, over what situations say.
         span: for messages.
     """
 
@@ -111,6 +112,7 @@ class InitDecl:
     where: tuple[ir.Formula, ...] = ()
     where_text: tuple[str, ...] = field(default=(), compare=False)
     params: tuple[Assign, ...] = ()
+    override: tuple[Assign, ...] = ()
     span: Span | None = field(default=None, compare=False, repr=False)
 
 
@@ -254,10 +256,29 @@ class TestDecl:
 
 @dataclass(frozen=True, slots=True)
 class ScenarioDecl:
-    """A named overlay of a deployment."""
+    """A named overlay of a deployment.
+
+    Attributes:
+        name: as written.
+        doc: one line for people.
+        expect: "nominal", or "ood" where a policy meets what training never drew.
+        constants: other values, as text; they change the model too.
+        override: initial values, drawn after all others.
+        events: that happen beside those of `test`.
+        disturb: what is added to derivatives of the truth, not of the model.
+        noise: what is added to the states that agents see.
+        mismatch: constants of the truth that the model does not know, as text.
+    """
 
     name: str
     doc: str = ""
+    expect: str = "nominal"
+    constants: Mapping[str, str] = field(default_factory=dict)
+    override: tuple[Assign, ...] = ()
+    events: tuple[EventDecl, ...] = ()
+    disturb: tuple[Assign, ...] = ()
+    noise: tuple[Assign, ...] = ()
+    mismatch: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -282,7 +303,9 @@ class SystemDecl:
         jumps: in file order.
         clamps: columns that are kept within (low, high).
         scenarios: named overlays.
+        scenario: the one that is laid over, if any.
         functions: from outside, for specifications.
+        bases: the texts of the files that it extends, the nearest first.
         overrides: what `--set` changed.
         places: name of a state, control, constant or definition -> where it is declared.
         warnings: findings that do not stop anything.
@@ -311,7 +334,9 @@ class SystemDecl:
     backup: BackupDecl
     test: TestDecl
     scenarios: tuple[ScenarioDecl, ...] = ()
+    scenario: ScenarioDecl | None = None
     functions: tuple[FunctionDecl, ...] = ()
+    bases: tuple[Source, ...] = field(default=(), repr=False)
     overrides: Mapping[str, str] = field(default_factory=dict)
     places: Mapping[str, Span] = field(default_factory=dict, repr=False)
     warnings: tuple[Diagnostic, ...] = field(default=(), repr=False)
@@ -320,7 +345,8 @@ class SystemDecl:
     def hash(self) -> str:
         """SHA-256 of the text and of what was overridden, in hexadecimal."""
         changes = "".join(f"\0{key}={value}" for key, value in sorted(self.overrides.items()))
-        return hashlib.sha256((self.source.text + changes).encode()).hexdigest()
+        texts = "".join(base.text for base in self.bases)
+        return hashlib.sha256((self.source.text + texts + changes).encode()).hexdigest()
 
     @property
     def grid(self) -> Grid:

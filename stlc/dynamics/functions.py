@@ -15,7 +15,7 @@ import numpy as np
 from stlc.compile.interface import Function
 from stlc.compile.ops import Array
 from stlc.diagnostics import Diagnostic, SystemFileError
-from stlc.dynamics.decl import FunctionDecl, SystemDecl
+from stlc.dynamics.decl import FileDecl, FunctionDecl, SystemDecl
 from stlc.registry import closest
 
 
@@ -32,10 +32,19 @@ def load_functions(decl: SystemDecl) -> Mapping[str, Function]:
 
 
 def function_files(decl: SystemDecl) -> dict[str, Path]:
-    """The files below the folder of the system file that hold its functions, by their relative paths."""
+    """The files that a system file names: by their paths below its folder, else by their last names.
+
+    These are the files that it extends, those of its functions, and those of its initial states.
+    """
     home = decl.path.parent.resolve()
-    paths = [function.module.resolve() for function in decl.functions if isinstance(function.module, Path)]
-    return {path.relative_to(home).as_posix(): path for path in paths if path.is_relative_to(home)}
+    named = [Path(base.name) for base in decl.bases]
+    named += [function.module for function in decl.functions if isinstance(function.module, Path)]
+    named += [part.points.path for part in decl.init.mixture if isinstance(part.points, FileDecl)]
+    found: dict[str, Path] = {}
+    for path in (each.resolve() for each in named if each.is_file()):
+        below = path.is_relative_to(home)
+        found[path.relative_to(home).as_posix() if below else path.name] = path
+    return found
 
 
 def _loaded(decl: FunctionDecl) -> Callable[..., Array]:

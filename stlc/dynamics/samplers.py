@@ -77,6 +77,7 @@ class InitialStates:
         self.kept = 0
         self._params = tuple(Drawing(assign) for assign in decl.params)
         self._mixture = _Mixture(decl.mixture)
+        self._override = tuple(Drawing(assign) for assign in decl.override)
         self._where = (
             Program({f"{i}": ir.Ind(cond) for i, cond in enumerate(decl.where)}) if decl.where else None
         )
@@ -118,6 +119,8 @@ class InitialStates:
         for drawing in self._params:
             table[drawing.name] = drawing(table, rows)
         table = self._mixture(table, rows)
+        for drawing in self._override:
+            table[drawing.name] = drawing(table, rows)
         return torch.stack([table[name] for name in self.names], 1)
 
     def _holds(self, states: Tensor) -> Tensor:

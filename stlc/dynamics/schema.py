@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping as MappingType
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
-from stlc.dynamics.decl import ScenarioDecl, SystemDecl
-from stlc.dynamics.schema_columns import read_controls, read_states
+from stlc.dynamics.decl import SystemDecl
+from stlc.dynamics.schema_columns import name_columns, read_controls, read_states
 from stlc.dynamics.schema_deploy import read_test
-from stlc.dynamics.schema_flow import read_flow, read_jumps, read_timers
+from stlc.dynamics.schema_extends import extended
+from stlc.dynamics.schema_flow import read_flow, read_jumps, read_latches, read_timers
 from stlc.dynamics.schema_functions import read_functions
 from stlc.dynamics.schema_init import read_init
 from stlc.dynamics.schema_names import (
@@ -22,11 +24,12 @@ from stlc.dynamics.schema_names import (
     read_definitions,
     read_time,
 )
-from stlc.dynamics.schema_overrides import overridden
+from stlc.dynamics.schema_overrides import given_states, overridden
 from stlc.dynamics.schema_params import read_params
 from stlc.dynamics.schema_reader import Reader
+from stlc.dynamics.schema_scenario import read_scenarios
 from stlc.dynamics.schema_settings import read_backup, read_objective, read_policy, read_train
-from stlc.dynamics.yaml_nodes import Mapping, Node, load_yaml
+from stlc.dynamics.yaml_nodes import Node, load_yaml
 from stlc.files import read_source
 from stlc.source import Source
 
@@ -57,7 +60,6 @@ TOP_KEYS = [
     "plot",
 ]
 LATER = {
-    "extends": "one system file extending another",
     "plugin": "dynamics from a plugin",
 }
 
@@ -82,6 +84,7 @@ def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | 
     """The declaration that a text holds; `path` says what its relative paths start from."""
     reader = Reader(source)
     root = load_yaml(source, sink=reader.findings)
+    root, bases = extended(root, reader)
     root = overridden(root, overrides or {}, reader)
     found = reader.fields(root, "a system file", TOP_KEYS, required=("stlc", "name", "time"))
     _version(found.get("stlc"), reader)
@@ -90,7 +93,7 @@ def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | 
             later(reader, found[key], what)
     decl = _declaration(found, reader, source, path, overrides or {})
     reader.close()
-    return decl
+    return replace(decl, bases=bases)
 
 
 def _version(node: Node | None, reader: Reader) -> None:
@@ -113,6 +116,8 @@ def _declaration(
     clock = read_time(found.get("time"), reader, names) if "time" in found else Clockwork()
     states = read_states(found.get("state"), reader, names)
     params = read_params(found.get("param"), reader, names)
+    params += read_latches(found.get("jump"), reader, names)
+    name_columns(names, "state")
     read_controls(found.get("control"), reader, names)
     functions = read_functions(found.get("functions"), reader, names)
     read_definitions(found.get("def"), reader, names)
@@ -124,7 +129,7 @@ def _declaration(
         doc=" ".join((reader.text(found.get("doc"), "`doc`") or "").split()),
         path=path,
         source=source,
-        spec=Path(os.path.normpath(path.parent / spec)) if spec else None,
+        spec=Path(os.path.normpath(_folder(found["spec"], source, path) / spec)) if spec else None,
         dt=clock.dt,
         horizon=clock.horizon,
         substeps=clock.substeps,
@@ -142,13 +147,13 @@ def _declaration(
                 if c.kind == "real" and c.fact and c.low is not None and c.high is not None
             }
         ),
-        init=read_init(found.get("init"), reader, names, params),
+        init=given_states(read_init(found.get("init"), reader, names, params), overrides, reader, names),
         objective=read_objective(found.get("objective"), reader, names),
         policy=read_policy(found.get("policy"), reader, names),
         train=read_train(found.get("train"), reader, names),
         backup=read_backup(found.get("backup"), reader, clock.horizon),
         test=read_test(found.get("test"), reader, names, clock.dt),
-        scenarios=_scenarios(found.get("scenario"), reader),
+        scenarios=read_scenarios(found.get("scenario"), reader, names, clock),
         functions=functions,
         overrides=MappingProxyType(dict(overrides)),
         places=MappingProxyType(names.places),
@@ -156,20 +161,6 @@ def _declaration(
     )
 
 
-def _scenarios(node: Node | None, reader: Reader) -> tuple[ScenarioDecl, ...]:
-    """Names of overlays; one that changes anything is refused by this version."""
-    found = []
-    for entry in reader.entries(node, "`scenario`"):
-        where = f"the scenario `{entry.key.text}`"
-        if isinstance(entry.value, Mapping):
-            keys = ("doc", "expect", "const", "override", "events", "disturb", "noise", "model_mismatch")
-            fields = reader.fields(entry.value, where, keys)
-            for key in keys[2:]:
-                if not empty(fields.get(key)):
-                    later(reader, fields[key], f"`{key}` of {where}")
-            doc = reader.text(fields.get("doc"), f"`doc` of {where}") or ""
-        else:
-            reader.entries(entry.value, where)
-            doc = ""
-        found.append(ScenarioDecl(entry.key.text, doc))
-    return tuple(found)
+def _folder(node: Node, source: Source, path: Path) -> Path:
+    """Where relative paths of a value start from: the folder of the file that it stands in."""
+    return path.parent if node.span.source == source else Path(node.span.source.name).parent

@@ -38,13 +38,13 @@ def read_test(node: Node | None, reader: Reader, names: Names, dt: Fraction) -> 
         steps or default.steps,
         reader.integer(found.get("agents"), "`agents`", high=100_000) or default.agents,
         reader.integer(found.get("replan"), "`replan`") or default.replan,
-        tuple(_event(item, index, here, names, dt) for index, item in enumerate(items)),
+        tuple(read_event(item, index, here, names, dt) for index, item in enumerate(items)),
         tuple(metric for metric in metrics if metric),
         _world(found.get("world"), reader),
     )
 
 
-def _event(node: Node, index: int, here: Expressions, names: Names, dt: Fraction) -> EventDecl:
+def read_event(node: Node, index: int, here: Expressions, names: Names, dt: Fraction) -> EventDecl:
     """One event: exactly one of `when`, `at` and `every`."""
     reader = here.reader
     found = reader.fields(node, "an event", EVENT_KEYS, required=("set",))

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 from stlc.compile import ir
 from stlc.dynamics.algebra import add, multiply
 from stlc.dynamics.decl import Assign, JumpDecl
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
-from stlc.dynamics.schema_names import Clockwork, Names, base_name, later
+from stlc.dynamics.schema_names import Clockwork, Names, base_name
 from stlc.dynamics.schema_reader import Reader, first_line
 from stlc.dynamics.shared_draws import shared_draws
-from stlc.dynamics.yaml_nodes import Entry, Node, Sequence
+from stlc.dynamics.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence, as_bool
 from stlc.signature import Column
 from stlc.units import Unit
 
@@ -52,14 +53,41 @@ def read_jumps(node: Node | None, reader: Reader, names: Names) -> tuple[JumpDec
     for index, item in enumerate(reader.items(node, "`jump`")):
         fields = reader.fields(item, "a jump", JUMP_KEYS, required=("guard", "reset"))
         name = reader.text(fields.get("name"), "`name` of a jump") or f"jump {index + 1}"
-        if "once" in fields:
-            later(reader, fields["once"], "a jump that happens only once")
         guard = here.formula(fields.get("guard"), "a guard")
         resets = read_sets(fields.get("reset"), "`reset`", here, names)
         sharpness = reader.number(fields.get("sharpness"), "`sharpness`", low=1e-9)
-        if guard is not None:
-            found.append(JumpDecl(name, guard, resets, sharpness, written(fields.get("guard"))))
+        if guard is None:
+            continue
+        if reader.flag(fields.get("once"), "`once`"):
+            latch = latch_name(name)
+            guard = ir.Join("and", (guard, ir.Atom(ir.Op("sub", (ir.Lit(0.5), ir.Col(latch))))))
+            resets = (*resets, Assign(latch, ir.Lit(1.0), "true"))
+        found.append(JumpDecl(name, guard, resets, sharpness, written(fields.get("guard"))))
     return tuple(found)
+
+
+def read_latches(node: Node | None, reader: Reader, names: Names) -> tuple[Assign, ...]:
+    """For every jump that happens `once`, a state that remembers whether it has; false at first."""
+    found: list[Assign] = []
+    for index, item in enumerate(node.items if isinstance(node, Sequence) else ()):
+        once = item.get("once") if isinstance(item, Mapping) else None
+        if not isinstance(once, Scalar) or as_bool(once) is not True or not isinstance(item, Mapping):
+            continue
+        written_name = item.get("name")
+        name = written_name.text if isinstance(written_name, Scalar) else f"jump {index + 1}"
+        latch = latch_name(name)
+        if names.group(latch) or latch in names.places:
+            reader.report("E102", f"`{latch}` remembers the jump `{name}`, and is declared", once.span)
+            continue
+        names.places[latch] = once.span
+        names.columns.append(Column(latch, Unit(), "bool", "state", 0.0, 1.0, (), fact=True))
+        found.append(Assign(latch, ir.Lit(0.0), "false"))
+    return tuple(found)
+
+
+def latch_name(jump: str) -> str:
+    """The state that remembers whether a jump has happened."""
+    return f"{re.sub(r'[^0-9A-Za-z_]', '_', jump)}_happened"
 
 
 def read_timers(

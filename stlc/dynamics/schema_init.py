@@ -62,7 +62,7 @@ def read_init(node: Node | None, reader: Reader, names: Names, params: tuple[Ass
         mixture = (_known(found, node, drawn, names.expressions(reader), names),)
     where, texts = _conditions(found.get("where"), names.expressions(reader))
     span = found["where"].span if "where" in found else node.span
-    return InitDecl(mixture, where, texts, params, first_line(span))
+    return InitDecl(mixture, where, texts, params, span=first_line(span))
 
 
 def _situations(

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping as MappingType
+from dataclasses import replace
 
 from stlc.diagnostics import SystemFileError
+from stlc.dynamics.decl import Assign, InitDecl
+from stlc.dynamics.schema_flow import state_assigns
+from stlc.dynamics.schema_names import Names, base_name
 from stlc.dynamics.schema_reader import Reader
-from stlc.dynamics.yaml_nodes import Mapping, Node, Scalar, Sequence, load_node
+from stlc.dynamics.shared_draws import shared_draws
+from stlc.dynamics.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence, load_node
 from stlc.registry import closest
 from stlc.source import Source
 
@@ -73,3 +78,17 @@ def _missing(node: Node, head: str, value: Node, key: str, reader: Reader) -> No
     guess = f"did you mean `{near}`?" if near else f"keys here: {', '.join(keys)}" if keys else ""
     reader.report("S101", f"`--set {key}`: there is no `{head}` in the system file", value.span, guess)
     return node
+
+
+def given_states(init: InitDecl, overrides: MappingType[str, str], reader: Reader, names: Names) -> InitDecl:
+    """Initial states where `--set` names a state: `--set x=3m`, or how it is drawn instead."""
+    params = {base_name(assign.name) for assign in init.params}
+    here = names.expressions(reader).extended({}, samplers=True)
+    found: list[Assign] = []
+    for key, text in overrides.items():
+        if names.group(key) and key not in params:
+            node = _value(key, text, reader)
+            if node is not None:
+                entry = Entry(Scalar(node.span, key), node)
+                found.extend(shared_draws(state_assigns(entry, "`--set`", here, names)))
+    return replace(init, override=(*init.override, *found))

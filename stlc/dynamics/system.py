@@ -25,6 +25,7 @@ from stlc.dynamics.draws import Drawing, Rows
 from stlc.dynamics.functions import load_functions
 from stlc.dynamics.rollout import Columns, Stepper
 from stlc.dynamics.samplers import InitialStates
+from stlc.dynamics.scenario import truth, under
 from stlc.dynamics.schema import load_system_decl
 from stlc.dynamics.step import Step, build_step
 from stlc.files import find_system
@@ -59,12 +60,21 @@ class System:
         self._steppers: dict[bool, Stepper] = {}
 
     @classmethod
-    def load(cls, path: Path | str, overrides: Mapping[str, str] | None = None) -> System:
-        """The system of a file, or of the name of one that `stlc.files.find_system` finds.
+    def load(
+        cls, path: Path | str, overrides: Mapping[str, str] | None = None, *, scenario: str | None = None
+    ) -> System:
+        """The system of a file, or of the name of one that `stlc.files.find_system` finds, under a scenario.
 
         Raises UsageError where there is none, SystemFileError where it is invalid.
         """
-        return cls(load_system_decl(find_system(str(path)), overrides or {}))
+        decl = load_system_decl(find_system(str(path)), overrides or {})
+        return cls(decl if scenario is None else under(decl, scenario))
+
+    @cached_property
+    def truth(self) -> System:
+        """The system as it is, where its scenario says that the model is mistaken; parameters apart."""
+        real = truth(self.decl)
+        return self if real is self.decl else System(real)
 
     def augmented(self, timers: Sequence[Timer], parameters: Sequence[Parameter] = ()) -> System:
         """The same system with parameters, and with timers as its last columns.

@@ -159,7 +159,7 @@ class Online:
         """Take one sample in; the verdicts that it decides, in the order of the requirements.
 
         Raises:
-            TraceError: E601, a signal is missing; E604, one is not finite.
+            TraceError: E601, a signal is missing; E604, one is not finite; E605, one is not a single number.
         """
         self.grow({need.column.name: np.full((1, 1), _number(sample, need)) for need in self._needs})
         found = [self._decisions(watched) for watched in self._watched if not watched.over]
@@ -350,4 +350,7 @@ def _number(sample: Sample, need: Need) -> float:
     names = (need.column.name, need.column.name.partition("[")[0])
     given = {name: [sample[name]] for name in names if name in sample}
     laid = arrange(given or {name: [0.0] for name in sample}, [need], plain=True)
+    if laid.samples != 1 or laid.shape:
+        message = f"`{need.column.name}` is one number of a sample, and several are given"
+        raise TraceError(Diagnostic("E605", message, need.span, note=(f"needed by: {', '.join(need.by)}",)))
     return float(laid.env[need.column.name][0, 0])

@@ -142,7 +142,8 @@ def _missing(need: Need, data: Given, name: str) -> Diagnostic:
     help_ = () if near is None else (f"did you mean `{near}`? map it with  --map {wanted}={near}",)
     if need.parameter:
         value = f"{need.column.low or 0:g}{need.column.unit}"
-        advice = f"or give it one value for all traces:  --set {wanted.partition('[')[0]}={value}"
+        either = "or " if help_ else ""
+        advice = f"{either}give it one value for all traces:  --set {wanted.partition('[')[0]}={value}"
         help_ = (*help_, advice)
     return Diagnostic(
         "E601",

@@ -43,6 +43,7 @@ SHARES = {
     "foreseen_safe_starts": ("executed safely, as foreseen", "the same for what is tagged @safety"),
 }
 HOLDS = "holds."
+FORESEEN = "driven safely, where the world did as the model says"
 SOURCES = ("policy", "backup", "safest", "")
 
 
@@ -54,9 +55,10 @@ def deployment_tiles(material: Material) -> list[tuple[str, str]]:
     name, guard = list(guards.items())[-1]
     metrics = guard.get("metrics") or {}
     beside = "with backup" if name == "paper" else "no guard"
+    foreseen, all_ = _mean(metrics, "foreseen_safe_starts"), _mean(metrics, "executed_safe_starts")
     tiles = [
         (share(_mean(metrics, "plan_accuracy")), f"of deployed plans, {beside}"),
-        (share(_mean(metrics, "executed_safe_starts")), "of driven windows safe"),
+        (share(all_), "of starts driven safely") if foreseen is None else (share(foreseen), FORESEEN),
     ]
     return [tile for tile in tiles if tile[0]]
 

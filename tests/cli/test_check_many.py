@@ -274,6 +274,8 @@ def test_a_stream_gives_what_the_trace_gives(
         ('{"t": 0, "a": 1, "on": 1}\n[1]\n', 3, "line 2 of the standard input is not a JSON object"),
         ('{"t": 0, "a": "x", "on": 1}\n{"t": 1, "a": 1, "on": 1}\n', 3, "no signal `a`"),
         (b"\xff\xfe\x00", 3, "is not UTF-8"),
+        ('{"t": 0, "a": [1, 2], "on": 1}\n{"t": 1, "a": 1, "on": 1}\n', 3, "`a` is one number of a sample"),
+        ("t,a,on\n0,1," + "1" * 1_000_001, 3, "line 2 of the standard input is longer than"),
     ],
 )
 def test_streams_that_are_refused(

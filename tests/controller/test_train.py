@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from stlc.controller.launch import Launch, open_folder
 from stlc.controller.run import Run, spec_hash, system_hash
 from stlc.controller.task import Task
 from stlc.controller.train import Watch, resume, train
+from stlc.controller.trainer import Trainer
 from stlc.diagnostics import MissingError, RunError
 from stlc.dynamics.system import System
 from stlc.files import read_source
@@ -31,6 +33,28 @@ def _folder(task: Task, root: Path, config: TrainConfig) -> RunDir:
 def _saved(run: RunDir) -> dict[str, torch.Tensor]:
     hashes = {"spec_hash": spec_hash(run), "system_hash": system_hash(run)}
     return load_checkpoint(run, **hashes).tensors
+
+
+def test_a_fixed_training_set(car_task: Task) -> None:
+    engine = replace(decide(car_task, TrainConfig(method="gradient", batch=16)), samples=40)
+    trainer, again = (Trainer(car_task, engine, steps=9, device=torch.device("cpu")) for _ in range(2))
+    for _ in range(5):
+        trainer.advance()
+    again.restore({name: value.clone() for name, value in trainer.tensors().items()}, trainer.facts())
+    for _ in range(2):
+        assert trainer.advance() == again.advance()
+    assert all(torch.equal(value, again.tensors()[name]) for name, value in trainer.tensors().items())
+    trainer.training.take(8)  # 7 x 16 + 8 states: the set has been handed out three times
+    states, counts = trainer.training.take(120).unique(dim=0, return_counts=True)
+    assert (len(states), set(counts.tolist())) == (40, {3})
+    assert len(trainer.supply.take(60).unique(dim=0)) == 60
+
+
+def test_the_system_file_may_ask_for_a_training_set() -> None:
+    system = System.load(ROOT / "examples" / "car.yaml", {"train.samples": "500"})
+    task = Task.of(parse(read_source(ROOT / "specs" / "traffic.stl")), system)
+    assert decide(task, TrainConfig(method="gradient")).samples == 500
+    assert decide(task, TrainConfig(method="guided")).samples == 0
 
 
 @pytest.mark.parametrize("method", ["guided", "gradient"])

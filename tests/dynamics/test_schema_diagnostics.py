@@ -100,7 +100,7 @@ CHANGES: dict[str, tuple[str, str]] = {
     "unsupported_plugin": ("name: cart\n", 'name: cart\nplugin: "my.module:Cart"\n'),
     "vector_of_another_size": ("  x: v\n", "  x: [v, v]\n"),
     "vector_without_size": ("x: {unit: m,", "x: {size: 3, unit: m,"),
-    "unsupported_scenario": ("test:\n", "scenario:\n  windy: {disturb: {x: 1}}\ntest:\n"),
+    "scenario_of_nothing": ("test:\n", "scenario:\n  windy: {disturb: {z: 1}, const: {wal: 3}}\ntest:\n"),
     "version": ("stlc: 1\n", "stlc: 2\n"),
     "tag": ("name: cart", "name: !!python/object/apply:os.system [id]"),
     "tab": ("  x: v\n", "\tx: v\n"),

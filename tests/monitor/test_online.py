@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tracemalloc
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
@@ -277,6 +278,23 @@ def test_memory_is_bounded_by_the_horizon() -> None:
     assert most <= 5 * T
 
 
+@pytest.mark.parametrize("samples", [1_000, pytest.param(100_000, marks=pytest.mark.slow)])
+def test_memory_does_not_grow(samples: int) -> None:
+    online = monitor_of("bounded", "past").online(How(at="all"))
+    values = np.sin(np.arange(997.0)).tolist()
+    tracemalloc.start()
+    try:
+        for k in range(samples):
+            if k == 300:
+                before, _ = tracemalloc.get_traced_memory()
+            online.push({"a": values[k % 997], "b": values[(7 * k) % 997]})
+        after, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert after - before < 30_000
+    assert online.standing("r_bounded").instants == samples
+
+
 def test_which_memory_a_requirement_needs() -> None:
     kinds = {}
     for name in REQUIREMENTS:
@@ -334,6 +352,8 @@ def test_samples_that_are_refused() -> None:
         online.push({"a": float("nan"), "b": 0.0, "q": [0.0, 0.0]})
     with pytest.raises(StlcError, match="E601"):
         online.push({"q": [0.0, 0.0]})
+    with pytest.raises(StlcError, match=r"E605.*`a` is one number of a sample"):
+        online.push({"a": [1.0, 2.0], "b": 0.0, "q": [0.0, 0.0]})
     assert online.samples == 1
 
 

@@ -28,11 +28,10 @@ from proof.language import (
     Step,
     Use,
     Window,
-    nodes,
     substituted,
 )
 from proof.levels import inside
-from proof.whole import names_of
+from proof.whole import read_in
 
 DT = Fraction(1, 10)
 HORIZON = 6
@@ -141,7 +140,7 @@ class Drawing:
         self._held += names
         body = self._below(depth)
         self._held = [name for name in self._held if name not in names]
-        read = frozenset().union(*(names_of(n.margin) for n in nodes(body) if isinstance(n, Atom)))
+        read = read_in(body)
         kept = tuple(binding for binding in bindings if binding[0] in read)
         return Frozen(kept, body) if kept else body
 
@@ -320,10 +319,13 @@ class Drawing:
             ("[x, y] in union(disc, block)", lambda row: _in_either(row["x"], row["y"])),
             ("[x, y] in intersect(block, complement(disc))", lambda row: _in_block_only(row["x"], row["y"])),
             ("[x, y] in dilate(block, level)", lambda row: _in_block(row["x"], row["y"]) + 0.5),
-            ("sweep([x, y]) not in disc", lambda row: row["swept_disc"]),
-            ("sweep([x, y]) not in block", lambda row: row["swept_block"]),
-            ("sweep([x, y]) in disc", lambda row: min(1 - math.hypot(*end) for end in _ends(row))),
-            ("sweep([x, y]) in block", lambda row: min(_in_block(*end) for end in _ends(row))),
+            ("sweep([x + 0.03, y - 0.07]) not in disc", lambda row: row["swept_disc"]),
+            ("sweep([x + 0.03, y - 0.07]) not in block", lambda row: row["swept_block"]),
+            (
+                "sweep([x + 0.03, y - 0.07]) in disc",
+                lambda row: min(1 - math.hypot(*end) for end in _ends(row)),
+            ),
+            ("sweep([x + 0.03, y - 0.07]) in block", lambda row: min(_in_block(*end) for end in _ends(row))),
         ]
         text, margin = self.rng.choice(options)
         return Atom(text, margin, "not in" in text)
@@ -366,9 +368,9 @@ def _in_block(x: float, y: float) -> float:
 
 
 def _ends(row: Row) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Where a segment starts and ends; at the last sample it is a point."""
-    here = row["x"], row["y"]
-    return here, (row.get("x+1", here[0]), row.get("y+1", here[1]))
+    """Where a segment starts and ends, off the grid of ties; at the last sample it is a point."""
+    x, y = row["x"], row["y"]
+    return (x + 0.03, y - 0.07), (row.get("x+1", x) + 0.03, row.get("y+1", y) - 0.07)
 
 
 def _nearest(row: Row, distance: Callable[[float, float], float]) -> float:

@@ -129,6 +129,12 @@ def test_the_mission_clock(numbers: range) -> None:
         case.same(strict, cut if defined(case.formula, case.rows) & 1 else math.nan, "strict")
 
 
+def test_on_the_mission_clock_the_end_is_the_last_sample() -> None:
+    text = "signal x\nrequire r: always[0, T] x > 0 and always@[5 steps, end] x > 1"
+    x = np.array([1.0] * 5 + [3.0, 1.5, 3.0])
+    assert Monitor(text, dt=1, horizon=2).robustness({"x": x}, at=0) == 0.5
+
+
 @pytest.mark.parametrize("numbers", seeds(FULL // 5, 40))
 def test_planning_windows(numbers: range) -> None:
     """Where `T` and `end` are both meant, `end` is the end of each planning window."""

@@ -39,7 +39,7 @@ def defined(  # noqa: C901 - one case a node
         case Atom(_, margin):
             return _there(margin, rows, held)
         case Frozen(bindings, body):
-            read = frozenset().union(*(names_of(n.margin) for n in nodes(body) if isinstance(n, Atom)))
+            read = read_in(body)
             inner = held | {name for name, _, _ in bindings}
             bound = [_there(value, rows, held) for name, _, value in bindings if name in read]
             return reduce(int.__and__, bound, defined(body, rows, positive, inner))
@@ -104,6 +104,18 @@ def _there(value: Callable[[Row], Any], rows: Rows, held: Names) -> Instants:
     """The samples at which everything exists that a number reads."""
     read = names_of(value) - held
     return sum(1 << t for t, row in enumerate(rows) if read <= row.keys())
+
+
+def read_in(formula: Formula) -> Names:
+    """What the predicates of a formula read, and the numbers that it freezes."""
+    found: Names = frozenset()
+    for node in nodes(formula):
+        match node:
+            case Atom(_, margin):
+                found |= names_of(margin)
+            case Frozen(bindings):
+                found = found.union(*(names_of(value) for _, _, value in bindings))
+    return found
 
 
 def names_of(value: Callable[[Row], Any]) -> Names:

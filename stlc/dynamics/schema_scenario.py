@@ -1,0 +1,81 @@
+"""The section `scenario`: named overlays of a deployment, each checked whether it is chosen or not."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+from stlc.compile import ir
+from stlc.compile.scope import Known
+from stlc.compile.values import Number
+from stlc.dynamics.decl import Assign, ScenarioDecl
+from stlc.dynamics.schema_deploy import read_event
+from stlc.dynamics.schema_expressions import SECOND, Expressions, written
+from stlc.dynamics.schema_flow import rate_unit, read_sets, states_of
+from stlc.dynamics.schema_names import Clockwork, Names
+from stlc.dynamics.schema_reader import Reader
+from stlc.dynamics.yaml_nodes import Entry, Node
+
+SCENARIO_KEYS = ("doc", "expect", "const", "override", "events", "disturb", "noise", "model_mismatch")
+EXPECTED = ("nominal", "ood")
+
+
+def read_scenarios(
+    node: Node | None, reader: Reader, names: Names, clock: Clockwork
+) -> tuple[ScenarioDecl, ...]:
+    """All overlays, in the order of the file."""
+    return tuple(_scenario(entry, reader, names, clock) for entry in reader.entries(node, "`scenario`"))
+
+
+def _scenario(entry: Entry, reader: Reader, names: Names, clock: Clockwork) -> ScenarioDecl:
+    where = f"the scenario `{entry.key.text}`"
+    found = reader.fields(entry.value, where, SCENARIO_KEYS)
+    timed = _timed(names.expressions(reader), names)
+    items = reader.items(found.get("events"), f"`events` of {where}")
+    return ScenarioDecl(
+        entry.key.text,
+        " ".join((reader.text(found.get("doc"), f"`doc` of {where}") or "").split()),
+        reader.option(found.get("expect"), f"`expect` of {where}", EXPECTED) or "nominal",
+        MappingProxyType(_constants(found.get("const"), f"`const` of {where}", reader, names)),
+        read_sets(found.get("override"), f"`override` of {where}", timed, names),
+        tuple(read_event(item, index, timed, names, clock.dt) for index, item in enumerate(items)),
+        _rates(found.get("disturb"), f"`disturb` of {where}", timed, (names, clock)),
+        read_sets(found.get("noise"), f"`noise` of {where}", timed, names),
+        MappingProxyType(
+            _constants(found.get("model_mismatch"), f"`model_mismatch` of {where}", reader, names)
+        ),
+    )
+
+
+def _timed(here: Expressions, names: Names) -> Expressions:
+    """Expressions that may draw, and know the time of the deployment."""
+    clock = Known(Number(ir.Col("t"), SECOND), "seconds since the start of the deployment")
+    return here.extended({"t": clock} if "t" not in names.places else {}, samplers=True)
+
+
+def _constants(node: Node | None, where: str, reader: Reader, names: Names) -> dict[str, str]:
+    """Constants and their other values, as text."""
+    found: dict[str, str] = {}
+    for entry in reader.entries(node, where):
+        name = entry.key.text
+        if name not in names.constants and f"{name}[0]" not in names.constants:
+            reader.unknown(entry.key, where, tuple(names.constants))
+        elif names.expressions(reader).numbers(entry.value, f"`{name}`") is not None:
+            found[name] = written(entry.value) or entry.value.span.text
+    return found
+
+
+def _rates(
+    node: Node | None, where: str, here: Expressions, known: tuple[Names, Clockwork]
+) -> tuple[Assign, ...]:
+    """What is added to derivatives (or next values), in the unit of the state per second."""
+    names, clock = known
+    found: list[Assign] = []
+    for entry in here.reader.entries(node, where):
+        columns = states_of(entry, where, here.reader, names)
+        if not columns:
+            continue
+        unit = columns[0].unit if clock.discrete else rate_unit(columns[0].unit)
+        values = here.stored_each(entry.value, f"`{entry.key.text}`", unit, len(columns))
+        text = written(entry.value)
+        found.extend(Assign(c.name, value, text) for c, value in zip(columns, values or (), strict=False))
+    return tuple(found)

@@ -1,0 +1,154 @@
+"""Scenarios: overlays of a deployment that the model does, or does not, know about."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from stlc.controller.deploy import Guard
+from stlc.controller.drive import Recorder, Recording, Setting, drive
+from stlc.controller.task import Task
+from stlc.controller.world import world_type
+from stlc.diagnostics import StlcError
+from stlc.dynamics.scenario import under
+from stlc.dynamics.schema import parse_system
+from stlc.dynamics.system import System
+from stlc.grammar.parser import parse
+from stlc.source import Source
+
+SYSTEM = """\
+stlc: 1
+name: boat
+time: {dt: 0.5 s, horizon: 4 steps}
+const: {speed: 1 m/s, drift: 0 m/s}
+state:
+  x: {unit: m}
+  y: {unit: m, range: [-1, 1], clamp: true}
+  p: {size: 2, unit: m, role: env}
+  calls: {role: env}
+control: {u: {unit: m/s, range: [-1, 1]}}
+flow: {x: speed, y: u + drift}
+init: {mixture: [{draw: {x: 0, y: 0, p: 0, calls: 0}}]}
+test: {steps: 4, agents: 3}
+scenario:
+  nominal: {}
+  fast: {const: {speed: 3 m/s}}
+  far: {expect: ood, doc: "starts\n  far away", override: {x: "uniform(10, 11)", p: [1, 2]}}
+  called: {events: [{name: call, at: 1 s, set: {calls: calls + 1}}]}
+  current: {disturb: {y: "0.4 m/s * sin(t / 1 s)", p: [0, 1]}}
+  blurred: {noise: {x: "normal(0, 0.1)"}}
+  drifting: {model_mismatch: {drift: 0.5 m/s}, override: {x: 5}}
+"""
+SPEC = "signal x [m]\nsignal p: real[2] [m]\nconst speed = 1 m/s\nrequire a: always[0, T] x > -speed * 1 s\n"
+
+
+class Still:
+    """Remembers what it saw, and does nothing."""
+
+    def __init__(self, task: Task) -> None:
+        self.horizon, self.saw = task.horizon, []  # type: ignore[var-annotated]
+
+    def plan(self, x0: Tensor) -> Tensor:
+        self.saw.append(x0)
+        return torch.zeros((len(x0), self.horizon, 1), dtype=x0.dtype)
+
+
+def task_of(scenario: str) -> Task:
+    decl = under(parse_system(Source("boat.yaml", SYSTEM), Path("boat.yaml")), scenario)
+    return Task.of(parse(Source("a.stl", SPEC)), System(decl), overrides=decl.scenario.constants)  # type: ignore[union-attr]
+
+
+@pytest.fixture
+def driven() -> Callable[[str], tuple[Recording, Still]]:
+    def drive_in(scenario: str) -> tuple[Recording, Still]:
+        task = task_of(scenario)
+        policy, recorder = Still(task), Recorder(3)
+        drive(Guard(task, policy), world_type(task.system.decl), Setting((0, 1), 3, 4), recorder)
+        found = recorder.recording()
+        assert found is not None
+        return found, policy
+
+    return drive_in
+
+
+Driven = Callable[[str], tuple[Recording, Still]]
+
+
+def test_nothing_is_different_in_the_nominal_one(driven: Driven) -> None:
+    states = driven("nominal")[0].states
+    assert states[0, :, 0].tolist() == [0.0, 0.5, 1.0, 1.5, 2.0]
+    assert not states[:, :, 1:].any()
+
+
+def test_constants_change_model_and_truth(driven: Driven) -> None:
+    assert driven("fast")[0].states[0, :, 0].tolist() == [0.0, 1.5, 3.0, 4.5, 6.0]
+    model = task_of("fast").system
+    assert float(model.step(torch.zeros(1, 5), torch.zeros(1, 1))[0, 0]) == 1.5
+
+
+def test_initial_values_are_drawn_last(driven: Driven) -> None:
+    states = driven("far")[0].states
+    assert ((states[:, 0, 0] >= 10) & (states[:, 0, 0] <= 11)).all()
+    assert len(set(states[:, 0, 0].tolist())) == 6
+    assert states[:, 0, 2:4].tolist() == [[1.0, 2.0]] * 6
+    far = task_of("far").system.decl.scenario
+    assert far is not None
+    assert (far.doc, far.expect) == ("starts far away", "ood")
+
+
+def test_events_are_added(driven: Driven) -> None:
+    assert driven("called")[0].states[0, :, 4].tolist() == [0, 0, 1, 1, 1]
+
+
+def test_a_disturbance_moves_the_truth_alone(driven: Driven) -> None:
+    states = torch.from_numpy(driven("current")[0].states)
+    pushes = 0.5 * 0.4 * torch.sin(0.5 * torch.arange(4, dtype=torch.float64))
+    torch.testing.assert_close(states[0, 1:, 1], pushes.cumsum(0))
+    torch.testing.assert_close(states[0, :, 3], 0.5 * torch.arange(5, dtype=torch.float64))
+    model = task_of("current").system
+    assert not bool(model.step(torch.zeros(1, 5), torch.zeros(1, 1))[0, 1:].any())
+
+
+def test_noise_is_in_what_agents_see_alone(driven: Driven) -> None:
+    recording, policy = driven("blurred")
+    assert recording.states[0, :, 0].tolist() == [0.0, 0.5, 1.0, 1.5, 2.0]
+    seen = torch.stack([x[:, 0] for x in policy.saw], 1)
+    errors = seen - torch.from_numpy(recording.states[:, :4, 0])
+    assert 0.03 < float(errors.std()) < 0.3
+    assert len(set(errors.flatten().tolist())) == errors.numel()
+
+
+def test_the_truth_has_constants_of_its_own(driven: Driven) -> None:
+    states = driven("drifting")[0].states
+    assert states[0, :, 0].tolist() == [5.0, 5.5, 6.0, 6.5, 7.0]
+    assert states[0, :, 1].tolist() == [0.0, 0.25, 0.5, 0.75, 1.0]
+    assert not bool(task_of("drifting").system.step(torch.zeros(1, 5), torch.zeros(1, 1))[0, 1:].any())
+
+
+def test_an_unknown_scenario_is_said() -> None:
+    with pytest.raises(StlcError) as caught:
+        task_of("fats")
+    assert "did you mean `fast`?" in caught.value.diagnostics[0].help[0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "code"),
+    [
+        ("speed: 3 m/s", "sped: 3 m/s", "S101"),
+        ("speed: 3 m/s", "speed: 3 m/s +", "S201"),
+        ("p: [1, 2]", "q: [1, 2]", "S202"),
+        ("p: [0, 1]", "p: [0, 1, 2]", "S203"),
+        ("0.4 m/s * sin", "0.4 m * sin", "E203"),
+        ("expect: ood", "expect: bad", "S103"),
+        ("at: 1 s, ", "", "S102"),
+    ],
+)
+def test_scenarios_are_checked_whether_chosen_or_not(old: str, new: str, code: str) -> None:
+    assert SYSTEM.count(old) == 1
+    with pytest.raises(StlcError) as caught:
+        parse_system(Source("boat.yaml", SYSTEM.replace(old, new)), Path("boat.yaml"))
+    assert code in {finding.code for finding in caught.value.diagnostics}

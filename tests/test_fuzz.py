@@ -1,0 +1,94 @@
+"""Random, mutated and malicious inputs: diagnostics, no hang, no memory without end (`tools/fuzz.py`)."""
+
+from __future__ import annotations
+
+import itertools
+import random
+import sys
+from pathlib import Path
+
+import pytest
+
+from stlc.cli.render import render_text
+from stlc.diagnostics import StlcError
+from stlc.dynamics.schema import parse_system
+from stlc.source import Source
+
+TOOLS = Path(__file__).resolve().parents[1] / "tools"
+sys.path.insert(0, str(TOOLS))
+
+import fuzz  # noqa: E402
+import fuzz_bombs  # noqa: E402
+import fuzz_grammar  # noqa: E402
+import fuzz_inputs  # noqa: E402
+from fuzz_laws import HangError, laws, stage  # noqa: E402
+from fuzz_specs import SYSTEM  # noqa: E402
+
+SECONDS = 2.0
+
+
+def every(bombs: list[tuple[str, str]], count: int) -> list[tuple[str, str]]:
+    """So many of them, spread evenly."""
+    return list(itertools.islice(bombs, 0, None, max(1, len(bombs) // count)))
+
+
+def tread_system(text: str) -> None:
+    with stage("the system", SECONDS):
+        try:
+            parse_system(Source("b.yaml", text), Path("b.yaml"))
+        except StlcError as error:
+            render_text(error.diagnostics, color=False)
+
+
+def test_drawn_specifications() -> None:
+    numbers = random.Random(11)
+    codes = [laws(Source("a.stl", fuzz_grammar.specification(numbers)), SECONDS) for _ in range(25)]
+    assert set(codes) == {0, 3}
+
+
+def test_bombs_of_every_construct() -> None:
+    for _, text in every(list(fuzz_bombs.specifications(12)), 100):
+        laws(Source("a.stl", text), SECONDS)
+    for _, text in every(list(fuzz_bombs.systems(12, SYSTEM)), 60):
+        tread_system(text)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [12, 300, 3000, 100_000])
+def test_every_bomb(size: int) -> None:
+    for _, text in fuzz_bombs.specifications(size):
+        laws(Source("a.stl", text), SECONDS)
+    for _, text in fuzz_bombs.systems(size, SYSTEM):
+        tread_system(text)
+
+
+def test_the_same_seed_draws_the_same_inputs() -> None:
+    first, second = (fuzz_inputs.draw(random.Random("7:3")) for _ in range(2))
+    assert first == second
+
+
+def endless() -> None:
+    while True:
+        pass
+
+
+def test_a_hang_is_noticed() -> None:
+    with pytest.raises(HangError, match="a loop takes more than 0"), stage("a loop", 0.05):
+        endless()
+
+
+def run(count: int, seed: int) -> list[fuzz.Outcome]:
+    outcomes, _ = fuzz.fuzz(count, seed, fuzz.Limits(SECONDS, 1024))
+    assert [(outcome.index, outcome.fault) for outcome in outcomes if outcome.fault] == []
+    assert len(outcomes) == count
+    return outcomes
+
+
+def test_random_inputs_through_the_program() -> None:
+    assert {outcome.kind for outcome in run(40, seed=3)} == {"text", "spec", "system", "trace"}
+
+
+@pytest.mark.slow
+def test_many_random_inputs_through_the_program() -> None:
+    """All 100,000 take an hour: `python tools/fuzz.py --count 100000`."""
+    run(10_000, seed=4)
