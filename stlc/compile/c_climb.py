@@ -91,6 +91,7 @@ int climb(int64_t first, int64_t last, const double *x0, double *plans, double *
         double value = INFINITY;
         for (int i = 0; i < R; ++i) value = MIN(value, out[i][j] * factors[i]);
         if (!(bad[j] > 0.0) && value > best) {{ best = value; which = j; }}
+        if (g == 0 && best >= enough) break; /* the plan itself */
       }}
       if (which >= 0)
         for (int i = 0; i < M; ++i) for (int k = 0; k < T; ++k) plan[k * M + i] = v[i][k][which];

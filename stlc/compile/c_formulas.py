@@ -181,7 +181,7 @@ def over(start: int, count: int, heads: Mapping[str, str]) -> str:
 
 
 LARGE = 64
-"""Nodes of a number from which on its minima and maxima are computed apart: compilers take long over long loops."""
+"""Nodes of a number from which on its extrema are computed apart: compilers take long over long loops."""
 
 
 def _split(formula: ir.Formula) -> ir.Formula:

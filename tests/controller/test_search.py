@@ -2,38 +2,87 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
+from stlc import native
 from stlc.controller.buffer import CAPACITY, Buffer
-from stlc.controller.search import Effort, Searcher
+from stlc.controller.kernel import Effort
+from stlc.controller.search import Searcher
 from stlc.controller.task import Task
+from stlc.dynamics.system import System
 
 
-def test_search_repairs_most_of_what_zero_plans_fail(car_task: Task) -> None:
-    x0 = car_task.sample(200, seed=7)
-    start = torch.zeros(200, car_task.horizon, 1)
-    before = car_task.judge(x0, start).rho
-    searcher = Searcher(car_task, torch.Generator().manual_seed(0), enough=0.02)
-    found = searcher.repair(x0, start, torch.zeros(0, car_task.horizon, 1), (Effort(rounds=20, tries=64),))
-    assert (found.rho >= before).all()
-    assert torch.allclose(found.rho, car_task.judge(x0, found.plans).rho)
+@pytest.fixture(params=["native", "torch"])
+def task(request: pytest.FixtureRequest, car_task: Task, monkeypatch: pytest.MonkeyPatch) -> Task:
+    """The car, with and without a compiler."""
+    if request.param == "native":
+        if native.compiler() is None:
+            pytest.skip("there is no C compiler here")
+        return car_task
+    monkeypatch.setattr(native, "compiler", lambda: None)
+    return Task(car_task.compiled, System(car_task.system.decl))
+
+
+def test_search_repairs_most_of_what_zero_plans_fail(task: Task) -> None:
+    x0 = task.sample(200, seed=7)
+    start = torch.zeros(200, task.horizon, 1)
+    before = task.judge(x0, start).rho
+    searcher = Searcher(task, torch.Generator().manual_seed(0), enough=0.02)
+    found = searcher.repair(x0, start, start[:0], tries=1280)
+    assert (found.rho >= before - 1e-6).all()
+    assert torch.allclose(found.rho, task.judge(x0, found.plans).rho)
+    assert torch.equal(found.states, x0)
     assert (before >= 0).double().mean() < 0.6
     assert found.solved.double().mean() > 0.9
     assert found.plans.abs().max() <= 10.0
-    untouched = before >= 0.02
-    assert torch.equal(found.plans[untouched], start[untouched])
 
 
-def test_search_depends_on_its_generator_alone(car_task: Task) -> None:
-    x0 = car_task.sample(30, seed=8)
-    start = torch.zeros(30, car_task.horizon, 1)
+def test_a_plan_that_is_good_enough_is_left_alone(task: Task) -> None:
+    x0 = task.sample(100, seed=7)
+    start = torch.zeros(100, task.horizon, 1)
+    searcher = Searcher(task, torch.Generator().manual_seed(0), enough=0.02)
+    found = searcher.repair(x0, start, start[:0], tries=64)
+    good = task.judge(x0, start).rho >= 0.02
+    assert torch.equal(found.plans[good], start[good])
+    assert not torch.equal(found.plans[~good], start[~good])
+
+
+def test_search_depends_on_its_generator_alone(task: Task) -> None:
+    x0 = task.sample(30, seed=8)
+    start = torch.zeros(30, task.horizon, 1)
 
     def run() -> torch.Tensor:
         torch.rand(3)  # the global generator must not matter
-        searcher = Searcher(car_task, torch.Generator().manual_seed(5), enough=0.02)
-        return searcher.repair(x0, start, start[:0], (Effort(rounds=3, tries=16),)).plans
+        searcher = Searcher(task, torch.Generator().manual_seed(5), enough=0.02)
+        return searcher.repair(x0, start, start[:0], tries=48).plans
 
     assert torch.equal(run(), run())
+
+
+def test_a_bank_of_plans_is_tried(task: Task) -> None:
+    x0 = task.sample(100, seed=9)
+    start = torch.zeros(100, task.horizon, 1)
+    solved = Searcher(task, torch.Generator().manual_seed(0), enough=0.02).repair(x0, start, start[:0])
+    bank = solved.plans[solved.solved]
+    few = [
+        Searcher(task, torch.Generator().manual_seed(1), enough=0.02).repair(x0, start, plans, tries=64).rho
+        for plans in (bank, bank[:0])
+    ]
+    assert (few[0] >= 0).double().mean() >= (few[1] >= 0).double().mean() - 0.02
+
+
+@pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
+def test_a_native_climb_does_not_depend_on_how_it_is_shared(car_task: Task) -> None:
+    x0 = car_task.sample(50, seed=8)
+    start = torch.zeros(50, car_task.horizon, 1)
+    assert car_task.native is not None
+    alone, shared = (
+        car_task.native.climb(x0, start, start[:0], Effort(5, 0.02, seed=3, threads=threads))
+        for threads in (1, 3)
+    )
+    assert torch.equal(alone[0], shared[0])
+    assert torch.equal(alone[1], shared[1])
 
 
 def test_the_buffer_forgets_the_oldest() -> None:
