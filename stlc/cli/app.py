@@ -40,7 +40,7 @@ from stlc.cli import (
 from stlc.cli.coercion import HELP_NAMES, spare_adapters
 from stlc.cli.errors import INTERRUPTED, TERMINATED
 from stlc.cli.errors import report as report_error
-from stlc.cli.options import describe
+from stlc.cli.options import describe, only_help
 from stlc.cli.output import COLOR, ColorMode, emit, silence
 from stlc.version import __version__
 
@@ -78,9 +78,8 @@ def _global_options(
     ] = False,
 ) -> None:
     COLOR.set(color)
-    if context.invoked_subcommand is None and not version:
-        emit(context.get_help())
-        raise typer.Exit(2)
+    if not version:
+        only_help(context)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

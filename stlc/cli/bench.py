@@ -19,11 +19,11 @@ def register(app: typer.Typer) -> None:
     """Add the command to the program."""
     app.command(
         help=describe(
-            "Time the robustness of whole traces on one thread, forward and backward.",
+            "Time the robustness of whole traces, forward and backward.",
             "stlc bench robustness",
             "stlc bench robustness --samples 1000 --traces 1000",
-            note="`passes` is the time as a multiple of one pass over a signal (clone, and its backward); "
-            "`plain torch` is how many times longer plain torch takes.",
+            note="On one thread. `passes` is the time as a multiple of one pass over a signal (clone, and "
+            "its backward); `plain torch` is how many times longer plain torch takes.",
         )
     )(bench)
 

@@ -29,7 +29,7 @@ def register(app: typer.Typer) -> None:
     app.command(
         "check",
         help=describe(
-            "Judge recorded traces: a verdict per requirement, and the reason where one is violated.",
+            "Judge recorded traces: verdicts, and the reasons of violations.",
             "stlc check trace.npz",
             "stlc check specs/traffic.stl drive.csv --require give_way",
             "stlc check specs/traffic.stl drives/*.parquet --jobs 0 --junit checks.xml",

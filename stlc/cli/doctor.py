@@ -26,9 +26,10 @@ def register(app: typer.Typer) -> None:
     """Add the command to the program."""
     app.command(
         help=describe(
-            "Look at the installation: versions, devices, optional packages, completion.",
+            "Look at the installation: versions, devices, packages.",
             "stlc doctor",
-            note="Exit code: 0, or 5 if something that is always needed is missing.",
+            note="Completion of the shell too. Exit code: 0, or 5 if something that is always needed is "
+            "missing.",
         )
     )(doctor)
 

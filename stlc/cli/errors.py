@@ -50,8 +50,7 @@ def report(error: BaseException, argv: Sequence[str]) -> int:
             return _stopped(INTERRUPTED, argv)
     known = _known(error) or _crash(error, argv)
     if wants_json(argv):
-        schema = f"{_command(argv)}/1"
-        emit_json(schema, ok=False, exit_code=known.exit_code, diagnostics=known.diagnostics)
+        emit_json(_schema(argv), ok=False, exit_code=known.exit_code, diagnostics=known.diagnostics)
     else:
         show_diagnostics(known.diagnostics)
     return known.exit_code
@@ -60,7 +59,7 @@ def report(error: BaseException, argv: Sequence[str]) -> int:
 def _stopped(code: int, argv: Sequence[str]) -> int:
     """Nothing is said about a command that was stopped, but a reader of JSON gets its document."""
     if code in (INTERRUPTED, TERMINATED) and wants_json(argv):
-        emit_json(f"{_command(argv)}/1", ok=False, exit_code=code)
+        emit_json(_schema(argv), ok=False, exit_code=code)
     return code
 
 
@@ -71,8 +70,12 @@ def wants_json(argv: Sequence[str]) -> bool:
     return bool({"--json", "--format=json", "--ast=json"} & ({*options} | joined))
 
 
-def _command(argv: Sequence[str]) -> str:
-    return argv[0] if argv and argv[0].isidentifier() else "stlc"
+def _schema(argv: Sequence[str]) -> str:
+    """That of the command, where it has one; `stlc/1` is the frame with no result."""
+    from stlc.cli.schema import names
+
+    wanted = f"{argv[0]}/1" if argv else ""
+    return wanted if wanted in names() else "stlc/1"
 
 
 def _known(error: BaseException) -> StlcError | None:

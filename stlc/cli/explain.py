@@ -23,14 +23,15 @@ def register(app: typer.Typer) -> None:
     """Add the command to the program."""
     app.command(
         help=describe(
-            "Explain a code, the precedence of operators, a specification, or the violations of a trace.",
+            "Explain a code, a specification, or the violations of a trace.",
             "stlc explain E203",
             "stlc explain precedence",
             "stlc explain specs/traffic.stl",
             "stlc explain trace.npz --require give_way",
-            note="A code's page has a wrong and a right example; without an argument all codes are listed. A "
-            "specification is told in English, requirement by requirement. Of a trace each violated "
-            "requirement is traced back to the sub-formula, the instant, the signal and its value.",
+            note="A code's page has a wrong and a right example; without an argument all codes are listed. "
+            "`precedence` tells how operators bind. A specification is told in English, requirement "
+            "by requirement. Of a trace each violated requirement is traced back to the sub-formula, "
+            "the instant, the signal and its value.",
         )
     )(explain)
 

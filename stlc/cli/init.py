@@ -17,10 +17,11 @@ def register(app: typer.Typer) -> None:
     """Add the command to the program."""
     app.command(
         help=describe(
-            "Begin a project: folders, settings, and an example that trains in a minute.",
+            "Begin a project with an example that trains in a minute.",
             "stlc init my-project",
             "stlc init my-project --example car",
-            note="Nothing that is there is overwritten unless --force is given.",
+            note="Settings of git and of the editor come with it. Nothing that is there is overwritten "
+            "unless --force is given.",
         )
     )(init)
 

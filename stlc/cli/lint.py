@@ -27,7 +27,7 @@ def register(app: typer.Typer) -> None:
     """Add the command to the program."""
     app.command(
         help=describe(
-            "Say what is wrong with specifications, and what is worth a thought.",
+            "Say what is wrong with specifications, or worth a thought.",
             "stlc lint specs/traffic.stl",
             "stlc lint specs --strict --format github",
             "stlc lint specs/traffic.stl --system car.yaml --fix",

@@ -14,7 +14,7 @@ def register(app: typer.Typer) -> None:
     app.command(
         "lsp",
         help=describe(
-            "Serve an editor: findings, hover, completion, definitions, rename, formatting.",
+            "Serve an editor: findings, hover, completion, rename, format.",
             "stlc lsp",
             note="Speaks the language server protocol over the standard input and output. Editors start it. "
             "Needs `pip install 'stlc[lsp]'`. docs/editors.md says how to set up which.",

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from stlc.cli.options import JsonOption, describe
+from stlc.cli.options import JsonOption, describe, only_help
 from stlc.cli.output import emit, emit_json, say
 
 _Name = Annotated[str, typer.Argument(metavar="NAME", help="Of what is made; a path says where.")]
@@ -20,9 +20,10 @@ def register(app: typer.Typer) -> None:
     group = typer.Typer(
         name="new",
         help=describe("Make a specification or a system.", "stlc new spec parking"),
-        no_args_is_help=True,
+        invoke_without_command=True,
         rich_markup_mode=None,
     )
+    group.callback()(only_help)
     group.command(
         help=describe(
             "Write a specification to begin with.",

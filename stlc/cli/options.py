@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from stlc.cli.completion import requirement_names, run_names
+from stlc.cli.output import emit
 from stlc.diagnostics import Diagnostic, UsageError
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on the standard output.")]
@@ -50,6 +51,13 @@ def describe(sentence: str, *examples: str, note: str = "") -> str:
     shown = "\b\nExample:\n" if len(examples) == 1 else "\b\nExamples:\n"
     lines = "\n".join(f"  {example}" for example in examples)
     return "\n\n".join(part for part in (sentence, shown + lines, note) if part)
+
+
+def only_help(context: typer.Context) -> None:
+    """A group of commands without one of them: its help and exit code 2, as for `stlc` alone."""
+    if context.invoked_subcommand is None:
+        emit(context.get_help())
+        raise typer.Exit(2)
 
 
 def parse_overrides(pairs: Sequence[str] | None) -> dict[str, str]:

@@ -26,7 +26,7 @@ def register(app: typer.Typer) -> None:
     """Add the command to the program."""
     app.command(
         help=describe(
-            "Draw the signals of a trace, and the robustness of each requirement beneath them.",
+            "Draw signals, and the robustness of requirements beneath them.",
             "stlc plot trace.npz",
             "stlc plot latest --require give_way -o give_way.svg",
             "stlc plot latest --places -o map.png",

@@ -14,10 +14,11 @@ def register(app: typer.Typer) -> None:
     """Add the command to the program."""
     app.command(
         help=describe(
-            "Write a self-contained report.html with the pictures of a run into its folder.",
+            "Write a self-contained report.html with the pictures of a run.",
             "stlc report latest",
-            note="Training curves, signals with the robustness of each requirement, and the animation of a "
-            "simulation, as far as the run has them. The page opens without a network.",
+            note="It goes into the run's folder: training curves, signals with the robustness of each "
+            "requirement, and the animation of a simulation, as far as the run has them. The page "
+            "opens without a network.",
         )
     )(report)
 

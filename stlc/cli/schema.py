@@ -21,7 +21,7 @@ def register(app: typer.Typer) -> None:
     """Add the command to the program."""
     app.command(
         help=describe(
-            "Print the JSON Schema of what --json prints, or list the schemas.",
+            "Print the JSON Schema of what --json prints, or list them.",
             "stlc schema",
             "stlc schema check/1",
             note="Within a major number schemas only grow.",

@@ -29,12 +29,12 @@ def register(app: typer.Typer) -> None:
     app.command(
         "simulate",
         help=describe(
-            "Deploy a trained policy in the world of its system, with or without the backup policy.",
+            "Deploy a trained policy in the world of its system.",
             "stlc simulate --backup",
             "stlc simulate latest --backup --seeds 20 --record trace.npz",
-            note="The newest run unless one is named. With a guard the same seeds are driven without it too, "
-            "to compare. Trace, scene and figures go into the run's folder. Means over seeds come with "
-            "95 % intervals (Student's t).",
+            note="The newest run unless one is named. With --backup the paper's backup policy guards it, "
+            "and the same seeds are driven without it too, to compare. Trace, scene and figures go "
+            "into the run's folder. Means over seeds come with 95 % intervals (Student's t).",
         ),
     )(simulate)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stlc.cli.options import JsonOption, SetOption, describe, parse_overrides
+from stlc.cli.options import JsonOption, SetOption, describe, only_help, parse_overrides
 from stlc.cli.output import emit, emit_json, say, show_diagnostics, table
 
 if TYPE_CHECKING:
@@ -23,12 +23,13 @@ def register(app: typer.Typer) -> None:
     group = typer.Typer(
         name="system",
         help=describe("Show, check and list system files.", "stlc system show car.yaml"),
-        no_args_is_help=True,
+        invoke_without_command=True,
         rich_markup_mode=None,
     )
+    group.callback()(only_help)
     group.command(
         help=describe(
-            "Show a system: states, controls, flow, jumps and initial situations.",
+            "Show states, controls, flow, jumps and initial situations.",
             "stlc system show car.yaml",
         )
     )(show)

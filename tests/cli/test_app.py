@@ -17,8 +17,10 @@ from typing import Annotated
 
 import pytest
 import typer
+from documents import misfits
 
 from stlc.cli.app import app, main
+from stlc.cli.schema import load_schema
 from stlc.diagnostics import (
     Diagnostic,
     MissingError,
@@ -110,7 +112,7 @@ def test_failures_are_one_json_document(boundary, capsys, error, exit_code, code
     out, err = capsys.readouterr()
     document = json.loads(out)
     assert err.strip() == ""
-    assert document["schema"] == "act/1"
+    assert document["schema"] == "stlc/1"
     assert document["stlc"] == __version__
     assert (document["ok"], document["exit_code"], document["result"]) == (False, exit_code, None)
     assert [finding["code"] for finding in document["diagnostics"]] == [code]
@@ -186,7 +188,7 @@ def test_ctrl_c_that_surfaces_as_another_error_is_one(boundary, capsys):
     finally:
         signal.signal(signal.SIGINT, before)
     out, err = capsys.readouterr()
-    assert (json.loads(out)["exit_code"], json.loads(out)["schema"], err) == (130, "act/1", "")
+    assert (json.loads(out)["exit_code"], json.loads(out)["schema"], err) == (130, "stlc/1", "")
 
 
 # ---------------------------------------------------------------------- the real program
@@ -249,9 +251,28 @@ def test_help_opens_with_a_sentence_and_examples(capsys, flag):
         assert f"\n  {name} " in out
 
 
-def test_nothing_asked_shows_the_help(capsys):
-    assert main([]) == 2
-    assert "Usage: stlc" in capsys.readouterr().out
+@pytest.mark.parametrize("group", [[], ["new"], ["runs"], ["system"]])
+def test_sentences_of_a_list_of_commands_are_whole(capsys, group):
+    assert main([*group, "--help"]) == 0
+    listed = capsys.readouterr().out.partition("\nCommands:\n")[2].splitlines()
+    assert [line for line in listed if not line.endswith(".") or line.endswith("...")] == []
+
+
+@pytest.mark.parametrize("group", [[], ["new"], ["system"]])
+def test_nothing_asked_shows_the_help(capsys, group):
+    assert main(group) == 2
+    out, err = capsys.readouterr()
+    assert out.startswith(f"Usage: {' '.join(['stlc', *group])} ")
+    assert "\nCommands:\n" in out
+    assert err == ""
+
+
+@pytest.mark.parametrize("arguments", [["chek", "t.npz"], ["schema", "none"], ["--none"]])
+def test_a_document_of_no_schema_of_its_own(capsys, arguments):
+    assert main([*arguments, "--json"]) == 2
+    document = json.loads(capsys.readouterr().out)
+    assert document["schema"] == "stlc/1"
+    assert misfits(document, load_schema("stlc/1")) == []
 
 
 @pytest.mark.parametrize(
