@@ -107,7 +107,8 @@ class Reading:
         names: signal -> its name in the file; `t` names the clock.
         resample: put the signals on a grid of so many seconds; None takes the file's own, which is uniform.
         kinds: signal -> what its numbers mean, which says how it is resampled.
-        words: signal -> what its words are worth, of all signals of interest; None refuses words.
+        words: signal -> what its words are worth, of all signals of interest; those of no interest, and with
+            None all, are set aside among the extras.
     """
 
     names: Mapping[str, str] = field(default_factory=dict)
@@ -169,7 +170,7 @@ def _uniform(recording: Recording) -> Trace:
         raise TraceError(Diagnostic("E602", message, help=(RESAMPLE,)))
     (strand,) = strands
     longest = max((values.shape[-1] for values in strand.arrays.values() if values.ndim), default=0)
-    t0, dt, samples = read_clock(name, strand.clock, recording.meta.dt, longest)
+    t0, dt, samples = read_clock(name, strand.clock, recording.meta.dt, longest, others=strand.arrays)
     data = fit(name, strand.arrays, samples)
     whole = {n: np.ascontiguousarray(values, dtype=np.float64) for n, values in data.items()}
     return _trace(recording, t0, dt, whole)

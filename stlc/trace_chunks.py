@@ -19,7 +19,7 @@ from stlc.trace_csv import table_of_text
 from stlc.trace_extras import needed
 from stlc.trace_meta import TraceMeta, read_meta
 from stlc.trace_npz import Member, open_members, unreadable
-from stlc.trace_parquet import damage, numeric_fields, open_parquet, table_of
+from stlc.trace_parquet import damage, open_parquet, signal_fields, table_of
 from stlc.trace_recording import CLOCK, EXTRA, Recording, Strand, of_arrays
 from stlc.trace_table import of_table
 from stlc.trace_time import RESAMPLE, TOLERANCE
@@ -167,7 +167,7 @@ def _header(file: IO[bytes]) -> bytes:
 
 def _from_parquet(path: Path, samples: int) -> Iterator[Recording]:
     file = open_parquet(path, whole=False)
-    names = [name for name, _ in numeric_fields(file.schema_arrow)]
+    names = [name for name, _ in signal_fields(file.schema_arrow)]
     with damage(path):
         batches = file.iter_batches(batch_size=samples, columns=names)
     while True:

@@ -1,13 +1,15 @@
-"""Named columns in a `.csv` file, in and out; every cell is a number, a word or a diagnostic.
+"""Named columns in a `.csv` file, in and out; every cell is a number, a word, empty or a diagnostic.
 
 The first line names the columns, units in brackets if one likes: `t, x [m], v (km/h)`. A column `trace` or
-`agent` says to which of several traces a line belongs. A column whose first cell is a word holds words.
+`agent` says to which of several traces a line belongs. A column whose first
+cell is a word holds words; in the others an empty cell is NaN, which the monitor refuses where it is needed.
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,7 +33,7 @@ _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf
 _HEAD = re.compile(r"(?P<name>[^\[\]]*[^\[\]\s](?:\[\d+\])?)\s*(?:\[(?P<unit>[^\]]*)\])?")
 _ROUND = re.compile(r"(?P<name>.*[^\s(])\s*\((?P<unit>[^()]+)\)")
 _ANY = re.compile(r"\S")
-_FILLED = re.compile(r"[^\n]+")
+_FILLED = re.compile(r"[^\n]*\S[^\n]*")
 _COMMA = re.compile(r"(?<!\d),|,(?!\d)")
 """A comma that is not within a number."""
 _WORDS = {"true": 1.0, "false": 0.0}
@@ -65,7 +67,7 @@ def table_of_text(path: Path, data: bytes) -> Table:
     """The columns of a text; `path` is for messages. Raises TraceError as `read_csv`."""
     sheet = _sheet(path, data)
     names, units = _read_header(sheet)
-    texts = _text_columns(sheet)
+    texts = _text_columns(sheet, len(names))
     columns = _read_fast(sheet, len(names), texts)
     if columns is None:
         columns = _read_strict(sheet, len(names), texts)
@@ -149,45 +151,63 @@ def _cells(source: Source, start: int, line: str, delimiter: str) -> Iterator[tu
         start += len(raw) + 1
 
 
-def _text_columns(sheet: _Sheet) -> frozenset[int]:
-    """The columns whose first cell is a word."""
-    filled = _FILLED.search(sheet.source.text, sheet.body_at)
-    first = filled[0] if filled else ""
-    cells = enumerate(_cells(sheet.source, sheet.body_at, first, sheet.delimiter))
-    return frozenset(
-        i for i, (text, _) in cells if text and not _NUMBER.fullmatch(text) and text.lower() not in _WORDS
-    )
+def _text_columns(sheet: _Sheet, width: int) -> frozenset[int]:
+    """The columns whose first cell that is not empty is a word."""
+    words: set[int] = set()
+    open_ = set(range(width))
+    for line in _FILLED.finditer(sheet.source.text, sheet.body_at):
+        cells = line[0].split(sheet.delimiter)
+        filled = {i for i in open_ if i < len(cells) and cells[i].strip(' "')}
+        words |= {i for i in filled if not _is_number(cells[i].strip().strip('"').strip())}
+        open_ -= filled
+        if not open_:
+            break
+    return frozenset(words)
+
+
+def _is_number(text: str) -> bool:
+    return bool(_NUMBER.fullmatch(text)) or text.lower() in _WORDS
 
 
 def _read_fast(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array] | None:
     """All lines at once with NumPy's reader; None if anything about them is unusual."""
-    text, start = sheet.source.text, sheet.body_at
-    if not _ANY.search(text, start) or text.find('"', start) >= 0 or len(texts) == width:
+    body = sheet.source.text[sheet.body_at :]
+    if not _ANY.search(body) or '"' in body or len(texts) == width:
         return None
-    words: list[list[str]] = []
-    if texts:
-        words = [line.split(sheet.delimiter) for line in text[start:].split("\n") if line.strip()]
-        if any(len(cells) != width for cells in words):
-            return None
     numbers = [i for i in range(width) if i not in texts]
-    lines = io.TextIOWrapper(io.BytesIO(text[start:].encode()), "utf-8")  # a StringIO is four times as large
-    try:
-        values = np.loadtxt(
-            lines,
-            delimiter=sheet.delimiter,
-            comments=None,
-            ndmin=2,
-            dtype=np.float64,
-            usecols=numbers if texts else None,
-        )
-    except ValueError:
+    values = _load(body, sheet.delimiter, numbers if texts else None)
+    if values is None:
+        values = _load(_without_gaps(body, sheet.delimiter), sheet.delimiter, numbers if texts else None)
+    words = [line.split(sheet.delimiter) for line in body.split("\n") if texts and _told(line, sheet)]
+    if values is None or values.shape[1] != len(numbers) or any(len(cells) != width for cells in words):
         return None
-    if values.shape[1] != len(numbers):
-        return None
-    lines.close()
     columns: dict[int, Array] = {i: np.ascontiguousarray(values[:, k]) for k, i in enumerate(numbers)}
     columns |= {i: np.array([cells[i].strip() for cells in words]) for i in texts}
     return [columns[i] for i in range(width)]
+
+
+def _load(body: str, delimiter: str, columns: Sequence[int] | None) -> Array | None:
+    """The numbers of these columns; None where something is no number."""
+    lines = io.TextIOWrapper(io.BytesIO(body.encode()), "utf-8")  # a StringIO is four times as large
+    try:
+        with lines:
+            return np.loadtxt(
+                lines, delimiter=delimiter, comments=None, ndmin=2, dtype=np.float64, usecols=columns
+            )
+    except ValueError:
+        return None
+
+
+def _without_gaps(body: str, delimiter: str) -> str:
+    """The lines with `nan` in empty cells, without those that hold nothing else."""
+    mark = re.escape(delimiter)
+    kept = re.sub(rf"^[ {mark}]*\n|^[ {mark}]+\Z", "", body, flags=re.MULTILINE)
+    return re.sub(rf"(?<={mark}) *(?={mark}|$)|^ *(?={mark})", "nan", kept, flags=re.MULTILINE)
+
+
+def _told(line: str, sheet: _Sheet) -> bool:
+    """Whether any cell of a line is filled."""
+    return bool(line.strip(f" \t{sheet.delimiter}"))
 
 
 def _read_strict(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array]:
@@ -196,7 +216,7 @@ def _read_strict(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array
     rows: list[list[float | str]] = []
     start = sheet.body_at
     for line in sheet.source.text[sheet.body_at :].split("\n"):
-        if line.strip():
+        if _told(line, sheet):
             cells = list(_cells(sheet.source, start, line, sheet.delimiter))
             rows.append(_read_row(sheet, cells, (width, texts), findings))
         start += len(line) + 1
@@ -228,12 +248,12 @@ def _read_row(
             row.append(text)
         elif _NUMBER.fullmatch(text):
             row.append(float(text))
+        elif not text:
+            row.append(math.nan)
         elif text.lower() in _WORDS:
             row.append(_WORDS[text.lower()])
         else:
-            shown = f"`{text}` is not a number" if text else "an empty cell"
-            advice = ("a missing value is written as nan",) if not text else ()
-            findings.append(Diagnostic("E603", shown, span, help=advice))
+            findings.append(Diagnostic("E603", f"`{text}` is not a number", span))
     return row
 
 

@@ -1,7 +1,7 @@
-"""Named columns in a `.parquet` file (extra `parquet`): numbers, truth values, times, and lists as vectors.
+"""Named columns in a `.parquet` file (extra `parquet`): numbers, truth values, times, words, and lists.
 
 Units stand in brackets behind a name, `v [km/h]`, or in the field's metadata under `unit`. Columns that hold
-anything else, texts among them, are left out.
+anything else, such as structures, are left out.
 """
 
 from __future__ import annotations
@@ -23,10 +23,12 @@ from stlc.trace_table import Table, of_table
 Floats = NDArray[np.float64]
 
 MAX_COMPONENTS = 1000
+MAX_LETTERS = 64
+"""Longer texts are cut; no member of an enum has so long a name."""
 
 
 def read_parquet(path: Path) -> Recording:
-    """The numeric columns of a file.
+    """The columns of a file that can be signals, and its words.
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
@@ -35,7 +37,7 @@ def read_parquet(path: Path) -> Recording:
     """
     file = open_parquet(path)
     with damage(path):
-        table = file.read(columns=[name for name, _ in numeric_fields(file.schema_arrow)])
+        table = file.read(columns=[name for name, _ in signal_fields(file.schema_arrow)])
     return of_table(path, table_of(path, table))
 
 
@@ -69,12 +71,12 @@ class damage:  # noqa: N801 - reads as a word: with damage(path): …
             raise unreadable(self.path, f"it is damaged or of another format ({why})") from None
 
 
-def numeric_fields(schema: Any) -> Iterator[tuple[str, Any]]:
-    """Name and type of every column that can be a signal."""
+def signal_fields(schema: Any) -> Iterator[tuple[str, Any]]:
+    """Name and type of every column that can be a signal, or holds words."""
     types = needed("pyarrow").types
     for field in schema:
         kind = field.type.value_type if _list(field.type, types) else field.type
-        if _numeric(kind, types):
+        if _numeric(kind, types) or _text(field.type, types):
             yield field.name, field.type
 
 
@@ -83,17 +85,22 @@ def _numeric(kind: Any, types: Any) -> bool:
     return any(test(kind) for test in (*numbers, types.is_timestamp, types.is_duration))
 
 
+def _text(kind: Any, types: Any) -> bool:
+    plain = kind.value_type if types.is_dictionary(kind) else kind
+    return bool(types.is_string(plain) or types.is_large_string(plain))
+
+
 def _list(kind: Any, types: Any) -> bool:
     return bool(types.is_fixed_size_list(kind) or types.is_list(kind) or types.is_large_list(kind))
 
 
 def table_of(path: Path, table: Any) -> Table:
-    """An arrow table as numbers; a missing value is NaN.
+    """An arrow table as numbers and words; a missing number is NaN, a missing word empty.
 
     Raises:
         TraceError: E605, a name twice, lists of different lengths; E603, no line of numbers.
     """
-    columns: dict[str, Floats] = {}
+    columns: dict[str, NDArray[Any]] = {}
     units: dict[str, str] = {}
     for field, chunked in zip(table.schema, table.columns, strict=True):
         name, unit = split_head(field.name)
@@ -102,14 +109,17 @@ def table_of(path: Path, table: Any) -> Table:
             if part in columns:
                 raise TraceError(Diagnostic("E605", f"two columns of `{path}` are called `{part}`"))
             columns[part], units[part] = values, unit or told
-    if not columns or not table.num_rows:
+    if all(values.dtype.kind == "U" for values in columns.values()) or not table.num_rows:
         raise unreadable(path, "it holds no line of numbers")
     return Table(columns, units)
 
 
-def _values(path: Path, name: str, chunked: Any) -> Iterator[tuple[str, Floats]]:
+def _values(path: Path, name: str, chunked: Any) -> Iterator[tuple[str, NDArray[Any]]]:
     types = needed("pyarrow").types
     with damage(path):
+        if _text(chunked.type, types):
+            yield name, _words(chunked)
+            return
         if not _list(chunked.type, types):
             yield name, _floats(chunked)
             return
@@ -125,6 +135,14 @@ def _values(path: Path, name: str, chunked: Any) -> Iterator[tuple[str, Floats]]
 def _even(lists: Any, size: int) -> bool:
     lengths = needed("pyarrow.compute").list_value_length(lists)
     return bool((np.asarray(lengths) == size).all())
+
+
+def _words(values: Any) -> NDArray[np.str_]:
+    """Texts, each stored once until they are laid out."""
+    encoded = values if needed("pyarrow").types.is_dictionary(values.type) else values.dictionary_encode()
+    array = encoded.unify_dictionaries().combine_chunks()
+    texts = np.array(["", *(str(word)[:MAX_LETTERS].strip() for word in array.dictionary.to_pylist())])
+    return np.asarray(texts[np.asarray(array.indices.fill_null(-1), dtype=np.int64) + 1])
 
 
 def _floats(values: Any) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from fractions import Fraction
 from typing import Any
 
@@ -21,7 +22,7 @@ _SNAP = 1e-6
 
 
 def read_clock(
-    name: str, clock: NDArray[Any] | None, dt: float | None, samples: int
+    name: str, clock: NDArray[Any] | None, dt: float | None, samples: int, *, others: Iterable[str] = ()
 ) -> tuple[float, float, int]:
     """First time, time step and number of samples.
 
@@ -30,6 +31,7 @@ def read_clock(
         clock: the recorded times (samples,) in seconds, or None.
         dt: the recorded time step, or None; needed where there are no times, or only one.
         samples: of the signals, where there are no times.
+        others: what the trace holds besides, for messages.
 
     Raises:
         TraceError: E601, neither times nor a step; E602, times that are not uniform; E605, no samples.
@@ -39,7 +41,9 @@ def read_clock(
     if clock is None:
         if dt is None:
             help_ = ("add an array `t` with the time of every sample in seconds, or name it: --map t=NAME",)
-            raise TraceError(Diagnostic("E601", f"trace `{name}` has no `t`", help=help_))
+            known = ", ".join(others)
+            note = (f"arrays in {name}: {known}",) if known else ()
+            raise TraceError(Diagnostic("E601", f"trace `{name}` has no `t`", help=help_, note=note))
         return 0.0, dt, samples
     if clock.ndim != 1:
         shape = " x ".join(map(str, clock.shape)) or "a single number"

@@ -55,8 +55,10 @@ def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
 
 
 def wordless(recording: Recording) -> Recording:
-    """The recording, if all its signals are numbers. Raises TraceError (E603) otherwise."""
-    return in_numbers(recording, {name: {} for name in recording.signals})
+    """The recording, its words set aside. Raises TraceError (E603) where all signals are words."""
+    signals = [values for strand in recording.strands for values in strand.arrays.values()]
+    none_left = all(map(_is_text, signals))
+    return in_numbers(recording, {name: {} for name in recording.signals} if none_left else {})
 
 
 def _is_text(values: NDArray[Any] | None) -> bool:
@@ -102,7 +104,9 @@ def _unknown(trace: str, name: str, word: str, words: Words) -> Diagnostic:
             f"words need an enum in the specification: enum Kind {{ … }}  and  signal {name} : Kind",
         )
         return Diagnostic("E603", f"`{name}` in `{trace}` holds words (`{shown}`), not numbers", help=advice)
+    note = (f"it is one of {', '.join(words)}, or a number",)
+    if not word:
+        return Diagnostic("E603", f"`{name}` in `{trace}` is empty in some samples", note=note)
     near = closest(word, words)
     advice = (f"did you mean `{near}`?",) if near else ()
-    note = (f"it is one of {', '.join(words)}, or a number",)
     return Diagnostic("E603", f"`{name}` in `{trace}` cannot be `{shown}`", help=advice, note=note)

@@ -385,7 +385,7 @@ def test_csv_lines_of_agents_may_alternate(tmp_path: Path) -> None:
         ("t,x\nnow,1\nthen,2\n", "E603", None, "the clock `t` in .* holds words (`now`)"),
         ("t [m],x\n0,1\n1,2\n", "E605", None, "the clock `t` of .* is in [m], which is not a time"),
         ("time,Time,x\n0,1,1\n1,2,1\n", "E601", None, "no `t`"),
-        ("t,x\n0,1\n0.1,\n", "E603", (3, 5), "an empty cell"),
+        ("t,x\n0,1\n,2\n", "E604", None, "time in .* is nan at t[1]"),
         ("t,x\n0,1\n0.1,1_0\n", "E603", (3, 5), "`1_0` is not a number"),
         ("t,x\n0,1\n0.1,0x10\n", "E603", (3, 5), "`0x10` is not a number"),
         ("t,x\n0,1\n0.1,__import__('os')\n", "E603", (3, 5), "is not a number"),
@@ -466,6 +466,38 @@ def test_another_clock_than_the_usual_one(tmp_path: Path) -> None:
 
 
 WORDS = {"sign": {"stop": 0.0, "light": 1.0}, "on": TRUTH, "x": {}}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t,x,y\n0,1,2\n1,,3\n2,4, \n",
+        "t\tx\ty\n0\t1\t2\n1\t\t3\n2\t4\t\n\t\t\n",
+        "t;x;y\n0,0;1;2\n1,0;;3\n2,0;4;\n;;",
+        't,x,y\n0,1,"2"\n1,"",3\n2,4,\n,,\n',
+    ],
+)
+def test_an_empty_cell_is_no_number_and_an_empty_line_is_none(tmp_path: Path, text: str) -> None:
+    trace = load_trace(csv(tmp_path / "a.csv", text))
+    np.testing.assert_array_equal(trace.data["x"], [[1.0, np.nan, 4.0]])
+    np.testing.assert_array_equal(trace.data["y"], [[2.0, 3.0, np.nan]])
+
+
+def test_a_column_of_words_may_begin_with_an_empty_cell(tmp_path: Path) -> None:
+    path = csv(tmp_path / "a.csv", "t,Sign,x\n0,,1\n1,stop,\n2,,3\n")
+    trace = load_trace(path)
+    assert trace.extras["Sign"].tolist() == ["", "stop", ""]
+    np.testing.assert_array_equal(trace.data["x"], [[1.0, np.nan, 3.0]])
+    with pytest.raises(TraceError, match=r"`Sign` in .* is empty in some samples"):
+        load_trace(path, Reading({"sign": "Sign"}, words=WORDS))
+
+
+def test_without_a_clock_the_arrays_are_named(tmp_path: Path) -> None:
+    with pytest.raises(TraceError) as caught:
+        load_trace(csv(tmp_path / "a.csv", "stamp,x\n0,1\n1,2\n"))
+    (finding,) = caught.value.diagnostics
+    assert finding.message.endswith("has no `t`")
+    assert finding.note == (f"arrays in {tmp_path / 'a.csv'}: stamp, x",)
 
 
 @pytest.mark.parametrize("quote", ["", '"'])

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stlc.diagnostics import StlcError
+from stlc.diagnostics import StlcError, TraceError
 from stlc.trace import Reading, load_trace, save_trace
 
 pa = pytest.importorskip("pyarrow")
@@ -87,6 +87,21 @@ def test_parquet(tmp_path: Path) -> None:
     np.testing.assert_array_equal(trace.data["q[1]"][0], -X)
     np.testing.assert_array_equal(trace.data["on"][0], ON)
     assert [trace.signature[name].unit.text for name in ("x", "v")] == ["km/h", "m/s"]
+
+
+@pytest.mark.parametrize("encoded", [False, True])
+def test_words_of_parquet(tmp_path: Path, encoded: bool) -> None:
+    words = pa.chunked_array([["go", None], ["Stop", "x" * 100]])
+    column = words.dictionary_encode() if encoded else words
+    table = pa.table({"t": [0.0, 0.1, 0.2, 0.3], "x": [1.0, 2.0, 3.0, 4.0], "sign": column, "why": column})
+    parquet.write_table(table, tmp_path / "a.parquet", row_group_size=3)
+    assert load_trace(tmp_path / "a.parquet").extras["sign"].tolist() == ["go", "", "Stop", "x" * 64]
+    members = {"go": 0.0, "stop": 2.0, "": 1.0, "x" * 64: 3.0}
+    trace = load_trace(tmp_path / "a.parquet", Reading(words={"sign": members, "x": {}}))
+    assert trace.data["sign"].tolist() == [[0.0, 1.0, 2.0, 3.0]]
+    assert list(trace.extras) == ["why"]
+    with pytest.raises(TraceError, match="cannot be `x"):
+        load_trace(tmp_path / "a.parquet", Reading(words={"sign": {"go": 0.0, "stop": 2.0, "": 1.0}}))
 
 
 def test_parquet_times_and_traces(tmp_path: Path) -> None:

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from stlc.cli.checked import Checked
     from stlc.monitor.instants import At
     from stlc.monitor.verdict import Monitor
-    from stlc.signature import Kind
     from stlc.trace import Reading, Trace
     from stlc.trace_recording import Recording
 
@@ -145,36 +144,13 @@ def laid_out(recording: Recording, monitor: Monitor, question: Question) -> Trac
 
 
 def laid_reading(monitor: Monitor | None, question: Question) -> Reading:
-    """How files are read: names, and the grid, where a monitor says which signals are discrete."""
+    """How files are read: names and the grid; what a signal's values mean, where there is a monitor."""
+    from stlc.monitor.reading import reading_of
     from stlc.trace import Reading
 
     if monitor is None:
         return Reading(question.names, question.resample)
-    return Reading(question.names, question.resample, _kinds(monitor), _words(monitor))
-
-
-def _kinds(monitor: Monitor) -> dict[str, Kind]:
-    """What the numbers of a signal mean, as far as the specification says so."""
-    from stlc.grammar import ast
-
-    signals = [item for item in monitor.spec.items if isinstance(item, ast.Signal) and item.type is not None]
-    words: dict[str, Kind] = {"real": "real", "int": "int", "bool": "bool"}
-    return {s.column or s.name: words.get(s.type.name, "enum") for s in signals if s.type is not None}
-
-
-def _words(monitor: Monitor) -> dict[str, Mapping[str, float]]:
-    """What the words of every signal are worth, as far as the specification says so."""
-    from stlc.grammar import ast
-    from stlc.trace_words import TRUTH
-
-    items = monitor.spec.items
-    members = {item.name: dict(item.members) for item in items if isinstance(item, ast.Enum)}
-    worth: dict[str, Mapping[str, float]] = {"bool": TRUTH, **members}
-    return {
-        item.column or item.name: {} if item.type is None else worth.get(item.type.name, {})
-        for item in items
-        if isinstance(item, ast.Signal)
-    }
+    return reading_of(monitor.spec, question.names, question.resample)
 
 
 def _below(path: Path) -> Path:

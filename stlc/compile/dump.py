@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from fractions import Fraction
+from itertools import zip_longest
+from textwrap import wrap
 from typing import Literal, TypeAlias
 
 from stlc.compile import ir
@@ -15,6 +18,12 @@ from stlc.compile.pipeline import Compiled, Rule
 from stlc.compile.timers import Timer
 from stlc.grammar.printer import show
 
+WIDTH, LEFT = 110, 44
+"""Columns of the whole text, and at most of what was written."""
+
+_TIED = re.compile(r" (?=[<>=!*/+-]+ )|(?<= [<>=!*/+-]) |(?<=[<>=!]=) ")
+"""Blanks around the signs of comparisons and sums."""
+
 Part: TypeAlias = Literal["all", "steps", "states", "ir"]
 """What to show: everything, what became of time, the states, or the formulas."""
 
@@ -22,9 +31,10 @@ Part: TypeAlias = Literal["all", "steps", "states", "ir"]
 def dump(compiled: Compiled, part: Part = "all") -> str:
     """The text of `part`. It depends on nothing but the specification and the system's grid."""
     blocks = ["\n".join(_head(compiled))]
-    if part != "states":
-        blocks += ["\n".join(_rule(rule, compiled, part)) for rule in compiled.requirements]
-        blocks += ["\n".join(_rule(rule, compiled, part, "assume")) for rule in compiled.assumptions]
+    if part == "all":
+        blocks += list(_beside(compiled))
+    elif part != "states":
+        blocks += ["\n".join(_rule(*each, compiled, part)) for each in _rules(compiled)]
     if part in ("all", "states"):
         blocks.append("\n".join(_states(compiled)))
     return "\n\n".join(blocks) + "\n"
@@ -47,28 +57,71 @@ def _both(steps: int, grid: Grid) -> str:
     return count if grid.dt is None else f"{in_words(Fraction(steps), grid)} = {count}"
 
 
-def _rule(rule: Rule, compiled: Compiled, part: Part, kind: str = "") -> Iterator[str]:
+def _rules(compiled: Compiled) -> Iterator[tuple[Rule, str]]:
+    """Every requirement and every assumption, with a word for what it is."""
+    yield from ((rule, "") for rule in compiled.requirements)
+    yield from ((rule, "assume") for rule in compiled.assumptions)
+
+
+def _beside(compiled: Compiled) -> Iterator[str]:
+    """What was written on the left, what became of it on the right."""
+    written = [show(rule.typed.written) for rule, _ in _rules(compiled)]
+    left = min(max(map(len, [*written, "written"])), LEFT)
+    yield f"    {'written':<{left}}  compiled"
+    for (rule, kind), text in zip(_rules(compiled), written, strict=True):
+        right = [
+            line
+            for became in _became(rule, compiled)
+            for line in _wrapped(became, WIDTH - left - 6, hanging="  ")
+        ]
+        rows = zip_longest(_wrapped(text, left), right, fillvalue="")
+        lines = [_name(rule, kind), *(f"    {one:<{left}}  {other}".rstrip() for one, other in rows)]
+        yield "\n".join(lines)
+
+
+def _became(rule: Rule, compiled: Compiled) -> Iterator[str]:
+    """The formula, the states that the compiler adds for it, and its intervals."""
+    yield show_formula(rule.formula)
+    read = columns(rule.formula)
+    added = [timer for timer in compiled.timers if timer.name in read]
+    if added:
+        yield "+ " + ", ".join(t.name if t.name == t.kind else f"{t.kind} {t.name}" for t in added)
+    yield from (f"time  {line}" for line in _instants(rule, compiled.grid))
+
+
+def _wrapped(text: str, width: int, hanging: str = "") -> list[str]:
+    """Lines of a formula; comparisons and the like are not torn apart."""
+    tied = _TIED.sub("\N{NO-BREAK SPACE}", text)
+    lines = wrap(tied, width, subsequent_indent=hanging, break_long_words=False, break_on_hyphens=False)
+    return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines]
+
+
+def _name(rule: Rule, kind: str) -> str:
     tags = [f"@{tag}" for tag in sorted(rule.tags)]
     if rule.weight != 1:
         tags.append(f"@weight({rule.weight:g})")
     if rule.scale != 1:
         tags.append(f"@scale({rule.scale:g})")
-    yield "  ".join(["", *([kind] if kind else []), rule.name, *tags]).rstrip()
-    if part == "all":
-        yield f"    written   {show(rule.typed.written)}"
-        read = columns(rule.formula)
-        yield from (_added(timer, "    ") for timer in compiled.timers if timer.name in read)
-    if part in ("all", "ir"):
+    return "  ".join(["", *([kind] if kind else []), rule.name, *tags]).rstrip()
+
+
+def _rule(rule: Rule, kind: str, compiled: Compiled, part: Part) -> Iterator[str]:
+    yield _name(rule, kind)
+    if part == "ir":
         yield f"    compiled  {show_formula(rule.formula)}"
-    if part in ("all", "steps"):
-        lines = list(_times(rule, compiled.grid)) or ["the first sample alone"]
+    else:
+        lines = _instants(rule, compiled.grid)
         for label, line in zip(["time", *[""] * len(lines)], lines, strict=False):
             yield f"    {label:<8}  {line}"
 
 
-def _added(timer: Timer, indent: str) -> str:
+def _added(timer: Timer) -> str:
     """A state that the compiler adds, and what it says."""
-    return f"{indent}+ {timer.kind:<6}  {timer.name}  {timer.about}".rstrip()
+    return f"  + {timer.kind:<6}  {timer.name}  {timer.about}".rstrip()
+
+
+def _instants(rule: Rule, grid: Grid) -> list[str]:
+    return list(_times(rule, grid)) or ["the first sample alone"]
 
 
 def _times(rule: Rule, grid: Grid) -> Iterator[str]:
@@ -97,7 +150,7 @@ def _states(compiled: Compiled) -> Iterator[str]:
     yield "  columns   " + " ".join(read) + (f" | {' '.join(added)}" if added else "")
     for each in compiled.parameters:
         yield f"  + param   {each.column.name}  {each.text}, drawn for every trajectory"
-    yield from (_added(timer, "  ") for timer in compiled.timers)
+    yield from (_added(timer) for timer in compiled.timers)
     if compiled.mission is not None:
         yield f"  mission   {_both(compiled.mission, compiled.grid)}"
     safe = ", ".join(rule.name for rule in compiled.safety)

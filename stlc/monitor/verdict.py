@@ -24,6 +24,7 @@ from stlc.monitor.instants import At, require_length, rule_bounds, rule_signal, 
 from stlc.monitor.judgement import Bools, Judgement, Status, Verdict, unknown_requirement
 from stlc.monitor.needs import needs_of
 from stlc.monitor.prepared import Prepared
+from stlc.monitor.reading import reading_of
 from stlc.monitor.signals import Given, arrange
 from stlc.monitor.values import Ends, Record, by_truth
 from stlc.source import Source
@@ -228,7 +229,7 @@ class Monitor:
     # ------------------------------------------------------------------- compiling
 
     def _prepare(self, subject: Subject, require: Sequence[str], *, plain: bool = False) -> Prepared:
-        given = load_trace(subject) if isinstance(subject, (str, Path)) else subject
+        given = load_trace(subject, reading_of(self.spec)) if isinstance(subject, (str, Path)) else subject
         recorded = recorded_times(given, self._asked) if isinstance(given, Trace) else Times()
         compiled = self._ready(recorded)
         rules = _chosen(compiled.requirements, require)

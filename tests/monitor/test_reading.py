@@ -1,0 +1,57 @@
+"""What a specification says about the files that are judged by it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import stlc
+from stlc.cli.app import main
+from stlc.diagnostics import TraceError
+from stlc.monitor.reading import reading_of
+
+SPEC = """
+enum Light { red, green }
+signal light : Light from "Lamp"
+signal on : bool
+signal n : int
+signal x [m]
+require stop: always (light == red and on -> x < 1)
+"""
+
+
+def written(folder: Path, rows: str) -> Path:
+    path = folder / "drive.csv"
+    path.write_text("t,Lamp,on,n,x,note\n" + rows)
+    return path
+
+
+def test_kinds_and_words_are_those_of_the_declarations() -> None:
+    reading = reading_of(stlc.parse(SPEC), {"x": "px"}, 0.5)
+    assert reading.kinds == {"Lamp": "enum", "on": "bool", "n": "int"}
+    assert reading.words is not None
+    assert dict(reading.words["Lamp"]) == {"red": 0, "green": 1}
+    assert (reading.words["on"]["yes"], reading.words["x"]) == (1.0, {})
+    assert (dict(reading.names), reading.resample) == ({"x": "px"}, 0.5)
+
+
+@pytest.mark.parametrize(("x", "satisfied"), [("0.5", True), ("1.5", False)])
+def test_the_library_reads_the_words_that_the_program_reads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], x: str, satisfied: bool
+) -> None:
+    trace = written(tmp_path, f"0,green,no,1,2,fine\n1,red,yes,,{x},\n")
+    spec = tmp_path / "lights.stl"
+    spec.write_text(SPEC)
+    assert stlc.Monitor(SPEC).check(trace).satisfied is satisfied
+    assert stlc.Monitor(spec).check(str(trace)).satisfied is satisfied
+    assert main(["check", str(spec), str(trace)]) == (0 if satisfied else 1)
+    assert "VIOLATED" in capsys.readouterr().out or satisfied
+
+
+def test_a_word_that_is_no_member_and_a_cell_that_is_missing(tmp_path: Path) -> None:
+    monitor = stlc.Monitor(SPEC)
+    with pytest.raises(TraceError, match=r"E603.*cannot be `blue`"):
+        monitor.check(written(tmp_path, "0,green,no,1,2,\n1,blue,yes,1,0,\n"))
+    with pytest.raises(TraceError, match=r"E604.*`x` in .* is nan at trace 0, t = 1 s"):
+        monitor.check(written(tmp_path, "0,green,no,1,2,\n1,red,yes,1,,\n"))
