@@ -358,6 +358,13 @@ def test_the_architecture_names_files_that_exist():
             assert list((ROOT / "stlc").glob(full)), full
 
 
+def test_the_architecture_lists_the_decisions():
+    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    for path in (ROOT / "docs/decisions").glob("*.md"):
+        title = path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+        assert f"- [{title}](decisions/{path.name})\n" in text
+
+
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_a_page_is_readable_in_a_terminal(page):
     for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), start=1):

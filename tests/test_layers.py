@@ -82,6 +82,7 @@ HOMES = {
     "pyarrow": ("stlc.trace_parquet",),
     "h5py": ("stlc.trace_mat",),
     "mcap": ("stlc.trace_mcap",),
+    "tensorboardX": ("stlc.controller.logbook",),
     "mcap_ros2": ("stlc.trace_mcap",),
     "pickle": (),
     "marshal": (),

@@ -1,23 +1,45 @@
-"""`stlc bench`: how fast this machine computes robustness, as ratios."""
+"""`stlc bench`: the paper's benchmarks and its ablation made again, and how fast robustness is computed."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
 import typer
 
-from stlc.cli.options import JsonOption, describe
-from stlc.cli.output import emit, emit_json, say, table
+from stlc.cli.bench_ablation import ablation
+from stlc.cli.bench_paper import paper
+from stlc.cli.bench_robustness import robustness
+from stlc.cli.options import describe
 
-if TYPE_CHECKING:
-    from stlc.bench.robustness import Timing
-
-_HEADER = ("formula", "samples", "traces", "w", "", "time", "passes", "plain torch")
+_KEPT = (
+    "Results that are there are kept if specification, system and engine are still the same; "
+    "a training that was cut short goes on where it stopped. Exit code 1 if a training broke off."
+)
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command(
+    """Add the commands to the program."""
+    group = typer.Typer(
+        name="bench",
+        help=describe("Make the figures of the documentation again.", "stlc bench paper"),
+        no_args_is_help=True,
+        rich_markup_mode=None,
+    )
+    group.command(
+        help=describe(
+            "Train and judge the six benchmarks of the paper, and write the tables and curves.",
+            "stlc bench paper",
+            "stlc bench paper --only traffic,ship_safe --budget 60s --seeds 0 --jobs 2",
+            note=_KEPT,
+        )
+    )(paper)
+    group.command(
+        help=describe(
+            "Repeat the paper's tables for gamma, k, network size and number of samples on traffic.",
+            "stlc bench ablation",
+            "stlc bench ablation --only gamma,k --budget 60s --seeds 0",
+            note=_KEPT,
+        )
+    )(ablation)
+    group.command(
         help=describe(
             "Time the robustness of whole traces, forward and backward.",
             "stlc bench robustness",
@@ -25,63 +47,5 @@ def register(app: typer.Typer) -> None:
             note="On one thread. `passes` is the time as a multiple of one pass over a signal (clone, and "
             "its backward); `plain torch` is how many times longer plain torch takes.",
         )
-    )(bench)
-
-
-def bench(
-    what: Annotated[Literal["robustness"], typer.Argument(metavar="WHAT", help="robustness")] = "robustness",
-    samples: Annotated[
-        list[int] | None,
-        typer.Option("--samples", metavar="N", min=2, help="Length of a trace; 20, 100, 1000 and 10000."),
-    ] = None,
-    traces: Annotated[
-        list[int] | None, typer.Option("--traces", metavar="N", min=1, help="How many; 1 and 1000.")
-    ] = None,
-    seconds: Annotated[
-        float, typer.Option("--seconds", min=0.0, help="Seconds of measurement for a row.")
-    ] = 0.3,
-    as_json: JsonOption = False,
-) -> None:
-    """Print a row for every formula and size."""
-    from stlc.bench.robustness import BATCHES, SAMPLES, robustness_timings
-
-    timings = []
-    for timing in robustness_timings(samples or SAMPLES, traces or BATCHES, seconds=seconds):
-        timings.append(timing)
-        if not as_json:
-            say(f"{timing.case}, {timing.samples} samples x {timing.batch} traces")
-    if as_json:
-        result = {"what": what, "timings": [_json(timing) for timing in timings]}
-        emit_json("bench/1", ok=True, exit_code=0, result=result)
-        return
-    emit(table([_row(timing) for timing in timings], header=_HEADER, indent=""))
-
-
-def _row(timing: Timing) -> tuple[str, ...]:
-    return (
-        timing.case,
-        str(timing.samples),
-        str(timing.batch),
-        str(timing.width),
-        "with gradient" if timing.gradient else "",
-        _in_words(timing.seconds),
-        f"{timing.passes:.1f}x",
-        "" if timing.plain is None else f"{timing.plain:.1f}x",
-    )
-
-
-def _in_words(seconds: float) -> str:
-    return f"{seconds * 1e3:.2f} ms" if seconds >= 1e-3 else f"{seconds * 1e6:.0f} us"
-
-
-def _json(timing: Timing) -> dict[str, Any]:
-    return {
-        "formula": timing.case,
-        "samples": timing.samples,
-        "traces": timing.batch,
-        "width": timing.width,
-        "gradient": timing.gradient,
-        "seconds": timing.seconds,
-        "passes": timing.passes,
-        "plain": timing.plain,
-    }
+    )(robustness)
+    app.add_typer(group)

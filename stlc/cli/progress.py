@@ -59,6 +59,8 @@ class Summary:
         folder: of the run.
         next_command: what to do next.
         where: where the worst requirement fails, in words, or "".
+        unsolved: what remains, in words, or "".
+        picture: that shows it, or "".
         status: how the run ended: `finished`, `interrupted`, …
     """
 
@@ -71,6 +73,8 @@ class Summary:
     folder: str = ""
     next_command: str = "stlc simulate --backup"
     where: str = ""
+    unsolved: str = ""
+    picture: str = ""
     status: str = "finished"
 
 
@@ -138,6 +142,10 @@ class Progress:
             self._live.start()
         else:
             self._print(self._title())
+
+    def chosen(self, engine: Mapping[str, Any]) -> None:
+        """Say what the engine chose by itself."""
+        self._print(f"  engine          {engine_text(engine)}")
 
     def update(self, row: Mapping[str, Any]) -> None:
         """Take in a row of `train.jsonl`, or a part of one."""
@@ -265,6 +273,24 @@ def _packed(cells: list[str], width: int) -> list[str]:
     return lines
 
 
+def engine_text(engine: Mapping[str, Any]) -> str:
+    """What the engine chose, on a line: its method, its network, its states, its rate and its margin."""
+    network = "x".join(map(str, engine["hidden"]))
+    count, samples = int(engine["plans"]), int(engine.get("samples") or 0)
+    states = f"{engine['batch']} states a step"
+    if engine["hard"]:
+        states = f"{engine['batch']} fresh + {engine['hard']} hard states a step"
+    return " · ".join(
+        [
+            str(engine["method"]),
+            f"{count} plan{'' if count == 1 else 's'} of a network {network}",
+            states + (f" of {samples:,}" if samples else ""),
+            f"rate {engine['lr']:g}",
+            f"margin {engine['margin']:.3g}",
+        ]
+    )
+
+
 def final_screen(summary: Summary, spark: str = "") -> list[str]:
     """The lines that close a training run; the last one is the next command."""
     low, high = summary.interval
@@ -280,6 +306,10 @@ def final_screen(summary: Summary, spark: str = "") -> list[str]:
         lines.append(f"worst           {worst} {summary.requirements[worst]:.3f}")
         if summary.where:
             lines.append(f"                {summary.where}")
+    if summary.unsolved:
+        lines.append(f"unsolved        {summary.unsolved}")
+    if summary.picture:
+        lines.append(f"picture         {summary.picture}")
     took = f"{summary.seconds:.0f} s of training"
     lines.append(f"{summary.status:<15} {took}" + (f"   {summary.folder}" if summary.folder else ""))
     lines.append("")

@@ -6,7 +6,7 @@ import signal
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NoReturn, Self
 
 import typer
 
@@ -20,7 +20,11 @@ from stlc.rundir import LATEST, RUNS
 if TYPE_CHECKING:
     from types import FrameType, TracebackType
 
+    from stlc.controller.logbook import Logbook, Opener
     from stlc.rundir import RunDir
+
+FAILURES = "failures.png"
+"""What the report draws of the starts that fail."""
 
 
 @dataclass(slots=True)
@@ -31,22 +35,36 @@ class Sitting:
         folder: of the run.
         outcome: what training gave, once it did.
         progress: the panel.
+        logbook: how a log beside `train.jsonl` is opened, if one is wanted.
     """
 
     folder: RunDir
     outcome: Outcome | None = None
     progress: Progress = field(default_factory=Progress)
+    logbook: Opener | None = None
+    _log: Logbook | None = None
     _asked: list[int] = field(default_factory=list)
     _before: dict[int, Any] = field(default_factory=dict)
 
     @property
     def watch(self) -> Watch:
         """What training reports to."""
-        return Watch(row=self.progress.update, stop=lambda: bool(self._asked))
+        return Watch(begun=self._begun, row=self._row, stop=lambda: bool(self._asked))
+
+    def _begun(self, chosen: dict[str, Any]) -> None:
+        self.progress.chosen(chosen)
+        if self._log is not None:
+            self._log.begun(chosen)
+
+    def _row(self, row: dict[str, Any]) -> None:
+        self.progress.update(row)
+        if self._log is not None:
+            self._log.row(row)
 
     def __enter__(self) -> Self:
         for number in (signal.SIGINT, signal.SIGTERM):
             self._before[number] = signal.signal(number, self._ask)
+        self._log = None if self.logbook is None else self.logbook(self.folder.path)
         self.progress.start(_info(self.folder))
         return self
 
@@ -54,6 +72,8 @@ class Sitting:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.progress.stop()
+        if self._log is not None:
+            self._log.close()
         if error is not None:
             with suppress(StlcError):
                 self.folder.finish("interrupted" if kind is KeyboardInterrupt else "failed")
@@ -65,7 +85,7 @@ class Sitting:
             raise KeyboardInterrupt
         self._asked.append(number)
 
-    def conclude(self, *, pictures: bool, json: bool) -> None:
+    def conclude(self, *, pictures: bool, json: bool) -> NoReturn:
         """Pictures, then the closing screen or the JSON document; raises `typer.Exit` with the exit code."""
         outcome = self.outcome
         assert outcome is not None
@@ -85,7 +105,7 @@ class Sitting:
             result = {"run": self.folder.shown, "seconds": outcome.seconds, **outcome.score.summary()}
             emit_json("train/1", ok=found, exit_code=code, result=result)
         else:
-            self.progress.finish(_summary(outcome), to=console())
+            self.progress.finish(_summary(outcome, pictures=pictures), to=console())
         raise typer.Exit(code)
 
 
@@ -116,16 +136,18 @@ def _info(folder: RunDir) -> RunInfo:
     )
 
 
-def _summary(outcome: Outcome) -> Summary:
-    from stlc.view.held_out import find_weakness, load_held_out, weakness_text
+def _summary(outcome: Outcome, *, pictures: bool) -> Summary:
+    from stlc.view.held_out import find_weakness, load_held_out, unsolved_text, weakness_text
 
     score, folder = outcome.score, outcome.run.dir
     assert score is not None
     held = load_held_out(folder.path / "eval" / "held_out.npz")
     weakness = find_weakness(held) if held is not None else None
-    where = ""
+    where = unsolved = ""
     if held is not None and weakness is not None:
         where = weakness_text(weakness, held, outcome.run.task.system.signature)
+        unsolved = unsolved_text(held)
+    drawn = folder.path / FAILURES
     return Summary(
         accuracy=score.accuracy,
         interval=score.interval,
@@ -136,6 +158,8 @@ def _summary(outcome: Outcome) -> Summary:
         folder=folder.shown,
         next_command=_next(folder),
         where=where,
+        unsolved=unsolved,
+        picture=f"{folder.shown}/{FAILURES}" if pictures and weakness and drawn.is_file() else "",
     )
 
 

@@ -6,12 +6,14 @@ import math
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from stlc.cli.completion import run_names
+from stlc.cli import train_options as o
 from stlc.cli.options import JsonOption, SetOption, SystemOption, describe, parse_overrides
+from stlc.cli.ranges import parse_seconds, parse_seeds
+from stlc.cli.train_many import Many, train_many
 from stlc.diagnostics import Diagnostic, UsageError
 
 if TYPE_CHECKING:
@@ -20,21 +22,10 @@ if TYPE_CHECKING:
     from stlc.cli.sitting import Sitting
     from stlc.controller.config import Method, TrainConfig
     from stlc.controller.launch import Launch
+    from stlc.controller.logbook import Opener
     from stlc.controller.task import Task
 
 METHODS: tuple[Method, ...] = ("guided", "gradient")
-
-SeedOption = Annotated[
-    int | None,
-    typer.Option(min=0, max=2**63 - 1, help="Seed of everything random; the system file's if not given."),
-]
-MethodOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="guided|gradient",
-        help="Search and distil, or the paper's plain gradient; guided unless the system says otherwise.",
-    ),
-]
 
 
 def register(app: typer.Typer) -> None:
@@ -45,68 +36,91 @@ def register(app: typer.Typer) -> None:
             "Learn a policy that satisfies a specification.",
             "stlc train specs/traffic.stl --system car.yaml --budget 60s",
             "stlc train --resume latest",
+            "stlc train specs/traffic.stl --seeds 0..2 --jobs 2",
             note="The run's folder holds everything that repeats it. Ctrl-C saves a checkpoint and stops.",
         ),
     )(train)
 
 
 def train(
-    spec: Annotated[
-        Path | None, typer.Argument(metavar="SPEC", help="The specification, a .stl file.")
-    ] = None,
+    spec: o.SpecArgument = None,
     system: SystemOption = None,
-    budget: Annotated[
-        str | None, typer.Option(metavar="TIME", help="Time to train, such as 60s or 5min; becomes steps.")
-    ] = None,
-    steps: Annotated[
-        int | None, typer.Option(min=1, help="Steps of the optimiser instead of a budget.")
-    ] = None,
-    seed: SeedOption = None,
-    method: MethodOption = None,
-    resume: Annotated[
-        str | None,
-        typer.Option(metavar="RUN", help="Go on with an interrupted run.", autocompletion=run_names),
-    ] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the run; drawn if not given.")] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")] = "cpu",
-    threads: Annotated[int | None, typer.Option(min=1, help="Threads of torch.")] = None,
-    plans: Annotated[int | None, typer.Option(min=1, help="Plans that the network proposes.")] = None,
-    lr: Annotated[float | None, typer.Option(help="Peak learning rate.")] = None,
-    batch: Annotated[int | None, typer.Option(min=1, help="Fresh states a step.")] = None,
-    runs: Annotated[Path, typer.Option(help="Folder of all runs.")] = Path("runs"),
-    pictures: Annotated[bool, typer.Option(help="Draw the curves and the report.")] = True,
+    budget: o.BudgetOption = None,
+    steps: o.StepsOption = None,
+    seed: o.SeedOption = None,
+    seeds: o.SeedsOption = None,
+    jobs: o.JobsOption = 1,
+    method: o.MethodOption = None,
+    resume: o.ResumeOption = None,
+    name: o.NameOption = None,
+    device: o.DeviceOption = "cpu",
+    threads: o.ThreadsOption = None,
+    plans: o.PlansOption = None,
+    lr: o.RateOption = None,
+    batch: o.BatchOption = None,
+    held_out: o.HeldOutOption = None,
+    log: o.LogOption = None,
+    runs: o.RunsOption = Path("runs"),
+    pictures: o.PicturesOption = True,
     set_: SetOption = None,
     json: JsonOption = False,
 ) -> None:
     """Learn a policy, or go on with a run that was interrupted."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads of torch must not spin
+    _check_together(seed=seed, seeds=seeds, jobs=jobs, budget=budget, steps=steps)
+    logbook = _logbook(log)
     if resume is not None:
         _refuse_on_resume(
             {"SPEC": spec, "--system": system, "--budget": budget, "--seed": seed, "--method": method}
             | {"--name": name, "--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch}
-            | {"--set": set_}
+            | {"--set": set_, "--seeds": seeds, "--held-out": held_out}
         )
-        sitting = _resume(resume, runs=runs, steps=steps, device=device)
-    else:
-        from stlc.controller.config import TrainConfig
-        from stlc.controller.launch import Launch
+        sitting = _resume(resume, runs=runs, steps=steps, device=device, logbook=logbook)
+        sitting.conclude(pictures=pictures, json=json)
+    from stlc.controller.config import HELD_OUT, TrainConfig
+    from stlc.controller.launch import Launch
 
-        if budget is not None and steps is not None:
-            raise UsageError(Diagnostic("U101", "`--budget` and `--steps` contradict each other"))
-        config = TrainConfig(
-            method=_method(method) if method is not None else None,
-            budget=_seconds(budget) if budget is not None else None,
-            steps=steps,
-            seed=seed,
-            device=device,
-            threads=threads,
-            plans=plans,
-            lr=_rate(lr) if lr is not None else None,
-            batch=batch,
-        )
-        launch = Launch(root=runs, name=name, overrides=parse_overrides(set_), command=sys.argv[1:])
-        sitting = _train(_task(spec, system, launch.overrides), config, launch)
-    sitting.conclude(pictures=pictures, json=json)
+    config = TrainConfig(
+        method=_method(method) if method is not None else None,
+        budget=parse_seconds(budget) if budget is not None else None,
+        steps=steps,
+        seed=seed,
+        device=device,
+        threads=threads,
+        plans=plans,
+        lr=_rate(lr) if lr is not None else None,
+        batch=batch,
+        held_out=held_out or HELD_OUT,
+    )
+    launch = Launch(root=runs, name=name, overrides=parse_overrides(set_), command=sys.argv[1:])
+    task = _task(spec, system, launch.overrides)
+    if seeds is not None:
+        train_many(Many(spec, system, config, launch, parse_seeds(seeds), jobs, log, pictures), json=json)
+    _train(task, config, launch, logbook).conclude(pictures=pictures, json=json)
+
+
+def _check_together(
+    *, seed: int | None, seeds: str | None, jobs: int, budget: str | None, steps: int | None
+) -> None:
+    """Options that exclude each other, or mean nothing alone."""
+    if budget is not None and steps is not None:
+        raise UsageError(Diagnostic("U101", "`--budget` and `--steps` contradict each other"))
+    if seeds is not None and seed is not None:
+        raise UsageError(Diagnostic("U101", "`--seed` and `--seeds` contradict each other"))
+    if seeds is None and jobs > 1:
+        help_ = ("stlc train SPEC --seeds 0..2 --jobs 2",)
+        raise UsageError(Diagnostic("U101", "`--jobs` needs several runs", help=help_))
+
+
+def _logbook(name: str | None) -> Opener | None:
+    """What `--log` asks for. Raises MissingError R301 where it is not installed."""
+    if name is None:
+        return None
+    if name != "tensorboard":
+        raise UsageError(Diagnostic("U101", f"there is no log `{name}`", help=("--log tensorboard",)))
+    from stlc.controller.logbook import find_writer
+
+    return find_writer()
 
 
 def _method(name: str) -> Method:
@@ -120,24 +134,6 @@ def _rate(value: float) -> float:
     """A learning rate: a positive number."""
     if not 0.0 < value < math.inf:
         raise UsageError(Diagnostic("U101", f"`--lr {value:g}` is not a learning rate", help=("--lr 1e-3",)))
-    return value
-
-
-def _seconds(text: str) -> float:
-    """A duration such as `60s`, `5min`, `1.5 h`; a bare number is seconds."""
-    from stlc.units import parse_unit
-
-    number = text.strip().rstrip("abcdefghijklmnopqrstuvwxyz ").strip()
-    unit = text.strip()[len(number) :].strip() or "s"
-    try:
-        value = float(number) * float(parse_unit(unit).scale)
-        if parse_unit(unit).dims != parse_unit("s").dims or not 0.0 < value < 1e9:
-            raise ValueError
-    except ValueError as error:
-        finding = Diagnostic(
-            "U101", f"`{text}` is not a duration", help=("write it as --budget 60s or 5min",)
-        )
-        raise UsageError(finding) from error
     return value
 
 
@@ -165,7 +161,7 @@ def _task(path: Path | None, system: str | None, overrides: Mapping[str, str]) -
     return task
 
 
-def _train(task: Task, config: TrainConfig, launch: Launch) -> Sitting:
+def _train(task: Task, config: TrainConfig, launch: Launch, logbook: Opener | None) -> Sitting:
     """A new run, from its folder to its verdict."""
     from stlc.cli.sitting import Sitting
     from stlc.controller.launch import open_folder
@@ -173,19 +169,19 @@ def _train(task: Task, config: TrainConfig, launch: Launch) -> Sitting:
 
     find_device(config.device)
     folder = open_folder(task, config, launch)
-    with Sitting(folder) as sitting:
+    with Sitting(folder, logbook=logbook) as sitting:
         sitting.outcome = train(task, config, folder, sitting.watch)
     return sitting
 
 
-def _resume(where: str, *, runs: Path, steps: int | None, device: str) -> Sitting:
+def _resume(where: str, *, runs: Path, steps: int | None, device: str, logbook: Opener | None) -> Sitting:
     """An old run, from its last checkpoint to its verdict."""
     from stlc.cli.sitting import Sitting
     from stlc.controller.train import resume
     from stlc.rundir import RunDir
 
     folder = RunDir.open(where, runs)
-    with Sitting(folder) as sitting:
+    with Sitting(folder, logbook=logbook) as sitting:
         sitting.outcome = resume(folder, steps=steps, device=device, watch=sitting.watch)
     return sitting
 

@@ -10,6 +10,9 @@ if TYPE_CHECKING:
 
 Method = Literal["guided", "gradient"]
 
+ENGINE_VERSION = 1
+"""Raised with every change of what the engine reaches; figures that another one made are taken anew."""
+
 HELD_OUT = 5000
 HELD_OUT_SEED = 981_273
 """Seed of the held-out states: used for reports only, never while training or tuning."""

@@ -41,6 +41,7 @@ class Score:
         states: (n, dim), float64.
         rho: (n,).
         each: (n, requirements).
+        known: states for which some satisfying plan is known, (n,) bool.
     """
 
     accuracy: float
@@ -50,6 +51,7 @@ class Score:
     states: Tensor
     rho: Tensor
     each: Tensor
+    known: Tensor
 
     def summary(self) -> dict[str, object]:
         """The plain numbers, for `run.json`."""
@@ -73,27 +75,29 @@ def score(policy: Mlp, *, n: int = HELD_OUT, seed: int = HELD_OUT_SEED) -> Score
     good = satisfied(judged.rho)
     shares = satisfied(judged.requirements).double().mean(0)
     failing = (~good).nonzero()[:, 0]
-    solved = _solvable(task, states[failing], plans[failing], plans[good])
+    known = good.clone()
+    known[failing] = _solvable(task, states[failing], plans[failing], plans[good])
     accuracy = float(good.double().mean())
     return Score(
         accuracy=accuracy,
         interval=wilson(accuracy, n),
         requirements={rule.name: float(share) for rule, share in zip(task.rules, shares, strict=True)},
-        feasible=accuracy + solved / n,
+        feasible=float(known.double().mean()),
         states=states,
         rho=judged.rho,
         each=judged.requirements,
+        known=known,
     )
 
 
-def _solvable(task: Task, states: Tensor, plans: Tensor, bank: Tensor) -> int:
-    """How many of the failing states a search can solve."""
+def _solvable(task: Task, states: Tensor, plans: Tensor, bank: Tensor) -> Tensor:
+    """Which of the failing states a search can solve, (k,) bool."""
     if states.shape[0] == 0:
-        return 0
+        return torch.zeros(0, dtype=torch.bool)
     generator = torch.Generator().manual_seed(HELD_OUT_SEED + 1)
     searcher = Searcher(task, generator, enough=1e-4)
     found = searcher.repair(states.float(), plans.float(), bank.float(), tries=CEILING_TRIES)
-    return int(found.solved.sum())
+    return found.solved
 
 
 def wilson(share: float, n: int, z: float = 1.96) -> tuple[float, float]:
@@ -112,6 +116,7 @@ def save_states(path: Path, task: Task, result: Score) -> None:
         x0=result.states.numpy(),
         rho=result.rho.numpy(),
         requirements=result.each.numpy(),
+        known=result.known.numpy(),
         meta=np.array(json.dumps(meta)),
     )
     path.parent.mkdir(exist_ok=True)

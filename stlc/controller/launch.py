@@ -9,7 +9,7 @@ import torch
 
 from stlc.compile.dump import dump
 from stlc.compile.modules import library_of
-from stlc.controller.config import TrainConfig, decide
+from stlc.controller.config import ENGINE_VERSION, TrainConfig, decide
 from stlc.controller.run import SPEC, SYSTEM, Run, save_library, spec_hash, system_hash
 from stlc.controller.train import train
 from stlc.dynamics.functions import function_files
@@ -73,6 +73,7 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
             "device": config.device,
             "threads": config.threads or torch.get_num_threads(),
             "options": asdict(config),
+            "engine_version": ENGINE_VERSION,
             "versions": versions(),
             "git": git_state(),
             "hardware": hardware(),

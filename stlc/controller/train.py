@@ -36,10 +36,12 @@ class Watch:
     """How the outside follows a run and ends it early.
 
     Attributes:
+        begun: called once with what the engine chose, the margin and the number of steps among it.
         row: called with every row of `train.jsonl`.
         stop: asked after every step; True saves and ends.
     """
 
+    begun: Callable[[dict[str, Any]], None] = lambda _chosen: None
     row: Callable[[dict[str, Any]], None] = lambda _row: None
     stop: Callable[[], bool] = lambda: False
 
@@ -162,6 +164,7 @@ class _Session:
         """Train to the end, judge, and close the record."""
         trainer = self.trainer
         sat_down, first = time.perf_counter(), trainer.step
+        self.watch.begun({**asdict(trainer.engine), "margin": trainer.margin, "steps": trainer.steps})
         saved = sat_down
         self._revise()
         value = math.nan

@@ -20,6 +20,7 @@ from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.schedule import Extent, Run, Schedule, schedule
 from stlc.compile.semantics import Exact
 from stlc.compile.windows import Windows
+from stlc.monitor.endings import reads_seen, with_seen
 from stlc.monitor.streams import Latch, Latched, Leaf, Plan, column, read_by
 from stlc.monitor.values import by_truth
 
@@ -88,6 +89,7 @@ class Side:
     base: int = 0
     rows: dict[str, Floats] = field(default_factory=dict)
     _over: bool = False
+    _told: bool = False
     _seen: tuple[Mapping[str, Floats], int, int] | None = None
     _settled: dict[str, int] = field(default_factory=dict)
     _pads: dict[str, int] = field(default_factory=dict)
@@ -96,6 +98,7 @@ class Side:
 
     def __post_init__(self) -> None:
         leaves = [stream for stream in self.plan.streams if isinstance(stream, Leaf)]
+        self._told = any(reads_seen(leaf.formula) for leaf in leaves)
         for reads in dict.fromkeys((leaf.back, leaf.ahead) for leaf in leaves):
             alike = [leaf for leaf in leaves if (leaf.back, leaf.ahead) == reads]
             formulas = [by_truth(leaf.formula) if self.truth else leaf.formula for leaf in alike]
@@ -121,6 +124,7 @@ class Side:
             samples: how many there are by now.
         """
         self._seen = (signals, first, samples)
+        signals = with_seen(signals) if self._told else signals
         traces = next(iter(signals.values())).shape[1]
         self.rows[NOTHING] = np.zeros((samples + self.beyond - self.base, traces))
         for leaves, reader in self._leaves:

@@ -10,18 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile import ir
-from stlc.compile.horizon import nodes, reach
+from stlc.compile.horizon import reach
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.pipeline import Rule
-from stlc.compile.samples import farthest
 from stlc.monitor.columns import FAR, End, Reader, Side
-from stlc.monitor.frontier import Frontier, Skeleton, skeleton
+from stlc.monitor.endings import lengthened, may_end, with_seen
+from stlc.monitor.frontier import Frontier, skeleton
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.streams import EndlessError, Plan, endless, looks_on, plan
 from stlc.monitor.values import Record, by_truth, history, window_bounds
 
 Floats: TypeAlias = NDArray[np.float64]
 Ending: TypeAlias = Literal["open", "truncate"]
+Plans: TypeAlias = Mapping[End, Plan]
+"""Least and greatest value wherever the trace ends, and the requirement as it is written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,24 +80,38 @@ def tracker_of(rule: Rule, horizon: int | None, asked: Asked, *, everywhere: boo
     """
     window = window_of(rule, horizon)
     try:
-        planned = plan(rule.formula)
+        plans = _plans(rule.formula, asked.ending, window)
+        planned = plans["truncate"]
         if window is not None:
             if planned.lag or not everywhere:
                 raise EndlessError
-            return Everywhere(planned, asked, window)
+            return Everywhere(plans, asked, window)
         if endless(planned.formula):
             if everywhere:
                 raise EndlessError
-            return FromTheStart(planned, asked, skeleton(planned.formula))
-        return Everywhere(planned, asked, None)
+            return FromTheStart(plans, asked)
+        return Everywhere(plans, asked, None)
     except EndlessError:
         return Whole(rule, horizon, asked.ending, asked.truth)
 
 
-def _sides(planned: Plan, beyond: int, asked: Asked) -> list[Side]:
+def _plans(formula: ir.Formula, ending: Ending, window: int | None) -> Plans:
+    lower, upper = (_worst(formula, end, ending, window) for end in ("lower", "upper"))
+    return {"lower": plan(lower), "upper": plan(upper), "truncate": plan(formula)}
+
+
+def _worst(
+    formula: ir.Formula, end: Literal["lower", "upper"], ending: Ending, window: int | None
+) -> ir.Formula:
+    """The formula for one end of what is possible; with a `window`, an early end is unknown or cuts."""
+    cut = ending == "truncate"
+    return may_end(formula, end, cut=cut) if cut or window is None else formula
+
+
+def _sides(plans: Plans, beyond: int, asked: Asked) -> list[Side]:
     """Both ends of what is possible, and the ending where it is another one."""
     ends: list[End] = ["lower", "upper"] if asked.ending == "open" else ["lower", "upper", "truncate"]
-    return [Side(planned, end, 0 if end == "truncate" else beyond, asked.truth) for end in ends]
+    return [Side(plans[end], end, 0 if end == "truncate" else beyond, asked.truth) for end in ends]
 
 
 @dataclass(slots=True)
@@ -105,7 +121,7 @@ class Everywhere:
     With a `window`, the windows to the end of the trace end so many samples after their instant.
     """
 
-    planned: Plan
+    plans: Plans
     asked: Asked
     window: int | None
     samples: int = 0
@@ -118,8 +134,13 @@ class Everywhere:
         formula = self.planned.formula
         self._ahead = reach(formula).future if self.window is None else self.window
         self._back = history(formula)
-        self._sides = _sides(self.planned, self._ahead, self.asked)
-        self._readers = [Reader([formula], side.end) for side in self._sides]
+        self._sides = _sides(self.plans, self._ahead, self.asked)
+        self._readers = [Reader([side.plan.formula], side.end) for side in self._sides]
+
+    @property
+    def planned(self) -> Plan:
+        """The requirement as it is written."""
+        return self.plans["truncate"]
 
     @property
     def settled(self) -> int:
@@ -176,7 +197,7 @@ class Everywhere:
         record = Record(side.rows, NUMPY)
         starts = range(start - side.base, stop - side.base)
         ends: Ending = "truncate" if side.end == "truncate" else "open"
-        low, high = window_bounds(self.planned.formula, record, starts, self.window, ends)
+        low, high = window_bounds(side.plan.formula, record, starts, self.window, ends)
         return np.asarray((high if side.end == "upper" else low)[:, 0])
 
 
@@ -190,20 +211,20 @@ def _first_needed(planned: Plan, samples: int) -> int:
 class FromTheStart:
     """A formula with endless windows, at the first sample."""
 
-    planned: Plan
+    plans: Plans
     asked: Asked
-    bones: Skeleton
     samples: int = 0
     _fronts: list[Frontier] = field(default_factory=list)
     _lag: int = 0
     _back: int = 0
 
     def __post_init__(self) -> None:
-        self._lag = self.bones.reach + self.planned.lag + 1
-        self._back = self.bones.back
-        beyond = self.bones.reach + self.bones.unsure(self.planned)
-        sides = _sides(self.planned, beyond, self.asked)
-        self._fronts = [Frontier(self.bones, side) for side in sides]
+        bones = {end: skeleton(planned.formula) for end, planned in self.plans.items()}
+        self._lag = max(bones[end].reach + planned.lag for end, planned in self.plans.items()) + 1
+        self._back = max(each.back for each in bones.values())
+        beyond = max(bones[end].reach + bones[end].unsure(planned) for end, planned in self.plans.items())
+        sides = _sides(self.plans, beyond, self.asked)
+        self._fronts = [Frontier(bones[side.end], side) for side in sides]
 
     @property
     def settled(self) -> int:
@@ -228,14 +249,14 @@ class FromTheStart:
         """Where the trace is over."""
         fronts = self._fronts[:2] if self.asked.ending == "open" else [self._fronts[2]] * 2
         last = [replace(front, side=front.side.over()) for front in fronts]
-        found = [front.ended(self.planned.formula, self.samples)[0] for front in last]
+        found = [front.ended(front.side.plan.formula, self.samples)[0] for front in last]
         return Bounds(found[0][: len(starts)], found[1][: len(starts)])
 
     def drop(self, start: int) -> int:  # noqa: ARG002 - only the first instant is judged
         """Forget what the frontier has passed."""
         for front in self._fronts:
             front.side.drop(front.at - self._back)
-        return _first_needed(self.planned, self.samples)
+        return _first_needed(self.plans["truncate"], self.samples)
 
 
 @dataclass(slots=True)
@@ -276,13 +297,18 @@ class Whole:
         if stop <= start:
             return Bounds(np.zeros(0), np.zeros(0))
         rule, record = self._subject()
+        starts = range(start, stop)
+        return Bounds(self._end(rule, record, starts, "lower"), self._end(rule, record, starts, "upper"))
+
+    def _end(self, rule: Rule, record: Record, starts: range, end: Literal["lower", "upper"]) -> Floats:
+        """One end of what is possible, wherever the trace ends."""
         window = window_of(rule, self.horizon)
+        formula = _worst(rule.formula, end, self.ending, window)
+        record = replace(record, env=with_seen(record.env))
         if window is None:
-            longer, starts = lengthened(rule.formula, self.samples), range(start, stop)
-            low, high = (record.values([longer], starts, end, FAR)[0] for end in _BOTH)
-            return Bounds(low[:, 0], high[:, 0])
-        low, high = rule_bounds(rule, record, range(start, stop), self.horizon, "open")
-        return Bounds(low[:, 0], high[:, 0])
+            return np.asarray(record.values([lengthened(formula, self.samples)], starts, end, FAR)[0][:, 0])
+        both = window_bounds(formula, record, starts, window, "open")
+        return np.asarray(both[end == "upper"][:, 0])
 
     def ended(self, starts: range) -> Bounds:
         """Where the trace is over."""
@@ -309,47 +335,3 @@ def _decided_first(tracker: Everywhere | Whole, start: int, stop: int) -> Bounds
         return tracker.either(start, stop)
     known, rest = tracker.certain(range(start, middle)), tracker.either(middle, stop)
     return Bounds(*map(np.concatenate, zip(known, rest, strict=True)))
-
-
-_BOTH: tuple[Literal["lower"], Literal["upper"]] = ("lower", "upper")
-
-
-def lengthened(formula: ir.Formula, samples: int) -> ir.Formula:
-    """The formula where windows to the end of the trace reach beyond all of which anything is known."""
-    bounds = [abs(node.steps) if isinstance(node, ir.Shift) else _farthest(node) for node in nodes(formula)]
-    return _long(formula, samples + sum(bounds) + 1)
-
-
-def _farthest(node: ir.Formula) -> int:
-    match node:
-        case (
-            ir.Over(window=window)
-            | ir.Until(window=window)
-            | ir.Past(window=window)
-            | ir.Since(window=window)
-        ):
-            return window.lo if window.hi is None else window.hi
-        case ir.Atom(num=num):
-            return sum(farthest(num))
-        case _:
-            return 0
-
-
-def _long(formula: ir.Formula, length: int) -> ir.Formula:
-    match formula:
-        case ir.Join(items=items):
-            return replace(formula, items=tuple(_long(item, length) for item in items))
-        case ir.Over(window=window, body=body):
-            return replace(formula, window=_longer(window, length), body=_long(body, length))
-        case ir.Until(window=window, left=left, right=right):
-            left, right = _long(left, length), _long(right, length)
-            return replace(formula, window=_longer(window, length), left=left, right=right)
-        case ir.Past(body=body) | ir.Shift(body=body) | ir.Freeze(body=body) | ir.AtStart(body=body):
-            return replace(formula, body=_long(body, length))
-        case ir.Since(left=left, right=right):
-            return replace(formula, left=_long(left, length), right=_long(right, length))
-    return formula
-
-
-def _longer(window: ir.Window, length: int) -> ir.Window:
-    return window if window.hi is not None else ir.Window(window.lo, window.lo + length)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 
 from stlc.view.failures import draw_failures
+from stlc.view.held_out import unsolved_text
 from stlc.view.highlight import spec_html, yaml_html
 from stlc.view.html import classed, el, figure, join
 from stlc.view.material import Material
@@ -31,7 +32,8 @@ def failures_section(material: Material) -> Section | None:
         "named above. Right: how far the plans are from failing (counts on a logarithmic scale)."
     )
     body = figure(picture.data_uri(), picture.alt, caption)
-    return Section("failures", "Where plans fail", join(el("p", picture.alt), body), picture)
+    left = el("p", f"Unsolved: {unsolved_text(material.held_out)}.")
+    return Section("failures", "Where plans fail", join(left, el("p", picture.alt), body), picture)
 
 
 def repeat_section(material: Material) -> Section:

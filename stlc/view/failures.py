@@ -47,10 +47,13 @@ def _draw_starts(axes: Axes, held: HeldOut, weakness: Weakness, signature: Signa
     where = region_text(labels, held.names, signature)
     axes.set_title(f"starts with {where}" if where else "all held-out starts")
     a, b = weakness.axes
-    for mask, color, size, label in (
-        (shown & ~failing, BLUE, 5, "satisfied"),
-        (shown & failing, RED, 9, f"{name} fails"),
-    ):
+    kinds = [(shown & ~failing, BLUE, 5, "satisfied")]
+    if held.known is None:
+        kinds.append((shown & failing, RED, 9, f"{name} fails"))
+    else:
+        kinds.append((shown & failing & ~held.known, MUTED, 7, "no plan is known"))
+        kinds.append((shown & failing & held.known, RED, 9, f"{name} fails"))
+    for mask, color, size, label in kinds:
         axes.scatter(
             held.x0[mask, a],
             held.x0[mask, b],
@@ -66,7 +69,7 @@ def _draw_starts(axes: Axes, held: HeldOut, weakness: Weakness, signature: Signa
     axes.set_ylabel(_label(held.names[b], signature))
     axes.margins(0.02)
     legend = axes.legend(
-        loc="upper right", bbox_to_anchor=(1.01, 1.12), ncols=2, handletextpad=0.1, markerscale=1.6
+        loc="upper right", bbox_to_anchor=(1.01, 1.12), ncols=len(kinds), handletextpad=0.1, markerscale=1.6
     )
     for handle in legend.legend_handles:
         if handle is not None:

@@ -39,6 +39,7 @@ class HeldOut:
         x0: (starts, columns).
         rho: (starts,) over all requirements.
         each: (starts, requirements).
+        known: starts that some satisfying plan is known for, (starts,); None in runs that did not keep it.
     """
 
     names: tuple[str, ...]
@@ -46,11 +47,18 @@ class HeldOut:
     x0: Array
     rho: Array
     each: Array
+    known: Mask | None = None
 
     @property
     def worst(self) -> int:
         """Index of the requirement that fails most often."""
         return int(np.argmax((self.each < -TOLERANCE).mean(axis=0)))
+
+    @property
+    def unsolved(self) -> tuple[int, int]:
+        """Starts whose plan fails, and how many of these a satisfying plan is known for."""
+        failing = ~(self.rho >= -TOLERANCE)
+        return int(failing.sum()), 0 if self.known is None else int((failing & self.known).sum())
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,13 +103,16 @@ def load_held_out(path: Path) -> HeldOut | None:
         with np.load(path, allow_pickle=False) as file:
             meta = json.loads(str(file["meta"]))
             x0, rho, each = (np.asarray(file[key], dtype=float) for key in ("x0", "rho", "requirements"))
+            known = np.asarray(file["known"], dtype=bool) if "known" in file else None
     except (OSError, KeyError, ValueError, BadZipFile):
         return None
     names, requirements = tuple(meta.get("names", ())), tuple(meta.get("requirements", ()))
     shapes_fit = x0.ndim == 2 and each.shape == (len(x0), len(requirements)) and rho.shape == (len(x0),)
     if not shapes_fit or x0.shape[1] != len(names) or not len(x0) or not requirements:
         return None
-    return HeldOut(names, requirements, x0, rho, each)
+    if known is not None and known.shape != rho.shape:
+        return None
+    return HeldOut(names, requirements, x0, rho, each, known)
 
 
 def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | None:
@@ -253,3 +264,12 @@ def weakness_text(weakness: Weakness, held: HeldOut, signature: Signature | None
         f"fails in {100 * weakness.inside:.0f} % of the starts with {region}"
         f" ({100 * weakness.covered:.0f} % of its failures)"
     )
+
+
+def unsolved_text(held: HeldOut) -> str:
+    """How many starts are left, and for how many of them it is known that something can be done."""
+    failing, known = held.unsolved
+    text = f"{failing:,} of {len(held.x0):,} starts"
+    if held.known is None:
+        return text
+    return f"{text}; a satisfying plan is known for {known:,} of them, for {failing - known:,} none was found"

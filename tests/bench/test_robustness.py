@@ -50,7 +50,7 @@ def test_timings_and_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     assert len(out.splitlines()) == 1 + 2 * len(CASES)
     assert "with gradient" in out
-    assert main(["bench", "--samples", "20", "--traces", "1", "--seconds", "0", "--json"]) == 0
+    assert main(["bench", "robustness", "--samples", "20", "--traces", "1", "--seconds", "0", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["schema"] == "bench/1"
     assert len(document["result"]["timings"]) == 2 * len(CASES)

@@ -194,16 +194,19 @@ def test_ctrl_c_that_surfaces_as_another_error_is_one(boundary, capsys):
 # ---------------------------------------------------------------------- the real program
 
 
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-def test_ctrl_c_at_any_time_of_the_imports(share, tmp_path):
-    words = [sys.executable, "-c", "print(flush=True)\nfrom stlc.__main__ import main\nexit(main())"]
-    words += ["simulate", "none", "--runs", str(tmp_path)]
-    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+@pytest.fixture(scope="module")
+def a_whole_run(tmp_path_factory):
+    """Seconds that a command takes that imports much and then finds nothing to do."""
     begun = time.monotonic()
-    with _started(words, environment) as whole:
+    with _started(*_importing(tmp_path_factory.mktemp("whole"))) as whole:
         assert whole.wait(timeout=60) == 2
-    with _started(words, environment) as process:
-        time.sleep(share * (time.monotonic() - begun) * 0.5)
+    return time.monotonic() - begun
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_ctrl_c_at_any_time_of_the_imports(share, tmp_path, a_whole_run):
+    with _started(*_importing(tmp_path)) as process:
+        time.sleep(share * a_whole_run * 0.5)
         process.send_signal(signal.SIGINT)
         code = process.wait(timeout=60)
         said = process.stderr.read()
@@ -211,6 +214,11 @@ def test_ctrl_c_at_any_time_of_the_imports(share, tmp_path):
     assert "B001" not in said
     assert code in (130, 2)
     assert list(tmp_path.iterdir()) == []
+
+
+def _importing(folder):
+    words = [sys.executable, "-c", "print(flush=True)\nfrom stlc.__main__ import main\nexit(main())"]
+    return [*words, "simulate", "none", "--runs", str(folder)], {**os.environ, "TMPDIR": str(folder)}
 
 
 def _started(words, environment):

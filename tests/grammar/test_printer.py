@@ -22,13 +22,13 @@ def expr(text: str) -> ast.Expr:
     return parse_expr(Source("text", text))
 
 
-@settings(max_examples=400)
+@settings(max_examples=250)
 @given(expressions)
 def test_an_expression_reads_back(tree):
     assert expr(show(tree)) == tree
 
 
-@settings(max_examples=200)
+@settings(max_examples=120)
 @given(declarations)
 def test_a_declaration_reads_back(tree):
     assert parse(Source("text", show(tree))).items == (tree,)

@@ -21,8 +21,9 @@ from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.simplify import simplify
 from stlc.diagnostics import StlcError
 from stlc.monitor.columns import FAR
+from stlc.monitor.endings import lengthened, may_end, with_seen
 from stlc.monitor.online import How
-from stlc.monitor.tracking import Asked, Everywhere, FromTheStart, Whole, lengthened, tracker_of
+from stlc.monitor.tracking import Asked, Everywhere, FromTheStart, Whole, tracker_of
 from stlc.monitor.values import Record, bounds
 from stlc.monitor.verdict import Monitor
 
@@ -42,20 +43,22 @@ def a_rule(formula: ir.Formula) -> Any:
 
 
 def at_ends(
-    formula: ir.Formula, known: dict[str, np.ndarray], starts: range
+    formula: ir.Formula, known: dict[str, np.ndarray], starts: range, *, cut: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds over all continuations, by the evaluator: endless windows run over many unknown samples."""
-    record = Record(known, NUMPY)
-    longer = lengthened(formula, record.samples + 60)
-    low, high = (record.values([longer], starts, end, FAR)[0][:, 0] for end in ("lower", "upper"))
-    return low, high
+    """Bounds wherever the trace ends, by the evaluator: endless windows run over many unknown samples."""
+    record = Record(with_seen(known), NUMPY)
+    low, high = (
+        record.values([lengthened(may_end(formula, end, cut=cut), record.samples + 60)], starts, end, FAR)
+        for end in ("lower", "upper")
+    )
+    return low[0][:, 0], high[0][:, 0]
 
 
 def so_far(
-    formula: ir.Formula, known: dict[str, np.ndarray], starts: range, certain: range
+    formula: ir.Formula, known: dict[str, np.ndarray], starts: range, certain: range, *, cut: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """The same, where `certain` instants need nothing more: windows that the start cuts are cut."""
-    low, high = at_ends(formula, known, starts)
+    low, high = at_ends(formula, known, starts, cut=cut)
     if certain:
         first, last = certain.start - starts.start, certain.stop - starts.start
         (value, _) = bounds(formula, Record(known, NUMPY), certain, "truncate")
@@ -87,7 +90,7 @@ def test_a_stream_gives_what_the_whole_trace_gives(written, trace, ending, steps
             found = tracker.live(done, stop)
             known = {name: x[:now] for name, x in trace.items()}
             certain = range(done, tracker.settled) if ending == "truncate" else range(0)
-            wanted = so_far(formula, known, range(done, stop), certain)
+            wanted = so_far(formula, known, range(done, stop), certain, cut=ending == "truncate")
             np.testing.assert_array_equal(found, wanted)
         done = max(done, min(tracker.settled, stop)) if everywhere else 0
         needed = tracker.drop(done)
@@ -118,7 +121,8 @@ def test_frozen_values_and_other_samples_give_what_the_whole_trace_gives(written
         starts = range(now if everywhere else 1)
         low, high = tracker.live(starts.start, starts.stop)
         certain = range(tracker.settled) if ending == "truncate" and everywhere else range(0)
-        np.testing.assert_array_equal((low, high), so_far(formula, known, starts, certain))
+        wanted = so_far(formula, known, starts, certain, cut=ending == "truncate")
+        np.testing.assert_array_equal((low, high), wanted)
     wanted = [end[:, 0] for end in bounds(formula, Record(trace, NUMPY), starts, ending)]
     np.testing.assert_array_equal(tracker.ended(starts), wanted)
 
@@ -187,10 +191,38 @@ def test_the_end_of_a_stream_is_the_verdict_of_the_monitor(
         assert tally.share == wanted.share
         if wanted.overall != "inconclusive":
             assert tally.worst == wanted.worst[1]
-    if end == "open":  # what was decided stays so
-        for i in range(wanted.instants):
-            if i in decided:
-                assert decided[i] == ("satisfied" if wanted.holds[i, 0] else "violated")
+    for i in range(wanted.instants):  # what was decided stays so
+        if i in decided:
+            assert decided[i] == ("satisfied" if wanted.holds[i, 0] else "violated")
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        "always eventually[0.3 s, inf] once b > 0",  # the last windows are empty, wherever the end is
+        "next(always once b > 0)",
+        "rise(b > 0) release[0 s, 0.2 s] (false until[0, end] b < 0)",
+        "eventually[0.3 s, 0.5 s] once b > 0",  # the end may cut the window away
+        "always[0.3 s, 0.5 s] not once b > 0",
+        "not next(always[0.3 s, inf] once b > 0)",
+        "prev(b > 0 since[1 steps, inf] false)",
+    ],
+)
+def test_a_verdict_is_never_taken_back(written: str) -> None:
+    monitor = Monitor(f"{HEAD}require r: {written}\n", dt=0.1)
+    whole = {"b": np.arange(1.0, 13.0) / 8}
+    for end in ("open", "truncate"):
+        online = monitor.online(How(end=end))
+        low, high, said = -np.inf, np.inf, set()
+        for k in range(12):
+            said |= {decision.status for decision in online.push({"b": whole["b"][k]})}
+            for _, least, most in online.open_starts("r"):
+                low, high = max(low, least), min(high, most)
+            final = online.finish()["r"]
+            assert low <= final.low <= final.high <= high, (end, k)
+            assert said <= {final.status}, (end, k)
+            known = {"b": whole["b"][: k + 1]}
+            assert (final.low, final.high) == monitor.check(known, end=end)["r"].bounds, (end, k)
 
 
 @pytest.mark.parametrize(

@@ -56,6 +56,11 @@ class Case:
         seen = self.rows if until is None else rows({name: x[:until] for name, x in self.signals.items()})
         return Record(seen, end, ahead(self.formula), stop or until or 0)
 
+    def growing(self, until: int, end: End) -> Record:
+        """The samples so far of a trace of which nobody knows where it ends."""
+        seen = rows({name: x[:until] for name, x in self.signals.items()})
+        return Record(seen, end, 2 * ahead(self.formula) + 8, until, growing=True)
+
     def __str__(self) -> str:
         requirement = self.text[self.text.index("region block") :].split("\n", 1)[1]
         return f"case {self.seed}: {requirement.strip()}\non {self.signals}"

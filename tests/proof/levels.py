@@ -7,7 +7,8 @@ nowhere. Boolean semantics are the same sets with predicates that are plainly tr
 
 A set of instants is an integer, bit t for instant t. Beyond the last sample of a trace that may go on nothing
 is known: pessimists (`lower`) take no predicate there for met nor for failed, optimists (`upper`) take it
-for both.
+for both. Windows to the end of a trace that is `growing` may end with any sample from its last one on:
+pessimists let those that search end at once and those that guard never, optimists the other way round.
 """
 
 from __future__ import annotations
@@ -51,12 +52,16 @@ FUTURE = ("always", "eventually", "until", "release", "unless")
 
 @dataclass(frozen=True)
 class Record:
-    """A trace, and what is thought of the time after it: with `stop` it will have so many samples."""
+    """A trace, and what is thought of the time after it: with `stop` it will have so many samples.
+
+    `growing`: it may end with any sample from the last one on.
+    """
 
     rows: Sequence[Row]
     end: End
     ahead: int = 0
     stop: int = 0
+    growing: bool = False
     margins: dict[tuple[object, ...], float | None] = field(default_factory=dict)
     """What predicates were worth: (predicate, instant, frozen values) -> margin."""
 
@@ -253,7 +258,9 @@ class _Look:
 
     @cached_property
     def _visible(self) -> Instants:
-        """A window to the end takes the samples there are."""
+        """A window to the end takes the samples there are; while a trace grows it may take more."""
+        if self._to_the_end and self.record.growing and self.every is (self.record.end == "lower"):
+            return self.record.everywhere
         return (1 << self.record.length) - 1 if self._to_the_end else self.record.everywhere
 
     def at(self, instants: Instants, k: int) -> Instants:
@@ -269,7 +276,7 @@ class _Look:
         if not self._to_the_end or self.record.end == "truncate":
             return found
         first = next(k for k in count() if inside(self.window, k, outward=self.every))
-        none = self.record.everywhere & ~(self._visible >> first)
+        none = self.record.everywhere & ~((1 << self.record.length) - 1 >> first)
         return found & ~none | (none if self.record.end == "upper" else 0)
 
 

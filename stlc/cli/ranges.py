@@ -1,0 +1,49 @@
+"""Values of options that are written in short: durations and lists of seeds."""
+
+from __future__ import annotations
+
+import re
+
+from stlc.diagnostics import Diagnostic, UsageError
+
+MOST_SEEDS = 1000
+_RANGE = re.compile(r"\s*(\d{1,18})\s*(?:\.\.\s*(\d{1,18})\s*)?")
+
+
+def parse_seconds(text: str) -> float:
+    """A duration such as `60s`, `5min`, `1.5 h`, in seconds; a bare number is seconds.
+
+    Raises:
+        UsageError: U101, it is none.
+    """
+    from stlc.units import parse_unit
+
+    number = text.strip().rstrip("abcdefghijklmnopqrstuvwxyz ").strip()
+    unit = text.strip()[len(number) :].strip() or "s"
+    try:
+        value = float(number) * float(parse_unit(unit).scale)
+        if parse_unit(unit).dims != parse_unit("s").dims or not 0.0 < value < 1e9:
+            raise ValueError
+    except ValueError as error:
+        finding = Diagnostic(
+            "U101", f"`{text}` is not a duration", help=("write it as --budget 60s or 5min",)
+        )
+        raise UsageError(finding) from error
+    return value
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Seeds such as `0..2`, `3`, or `0..2,7`, in order and each once.
+
+    Raises:
+        UsageError: U101, it is no such list.
+    """
+    seeds: dict[int, None] = {}
+    for part in text.split(","):
+        match = _RANGE.fullmatch(part)
+        low, high = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        if high < low or high - low >= MOST_SEEDS:
+            help_ = ("write it as --seeds 0..2 or 0,3,7",)
+            raise UsageError(Diagnostic("U101", f"`{text}` is not a list of seeds", help=help_))
+        seeds.update(dict.fromkeys(range(low, high + 1)))
+    return tuple(seeds)

@@ -1,0 +1,81 @@
+"""The rows of a training as TensorBoard reads them (`pip install 'stlc[log]'`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+
+from stlc.diagnostics import Diagnostic, MissingError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+FOLDER = "tensorboard"
+_PLAIN = ("accuracy", "feasible", "loss", "lr", "s_per_step")
+
+
+class Writer(Protocol):
+    """What a `SummaryWriter` is used for."""
+
+    def add_scalar(self, tag: str, value: float, step: int, /) -> None:
+        """Enter a number."""
+
+    def add_text(self, tag: str, text: str, step: int, /) -> None:
+        """Enter a text."""
+
+    def close(self) -> None:
+        """Write all that is left."""
+
+
+Opener: TypeAlias = "Callable[[Path], Logbook]"
+"""The folder of a run -> its log."""
+
+
+class Logbook:
+    """Events of one run."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+
+    def begun(self, chosen: Mapping[str, Any]) -> None:
+        """Enter what the engine chose."""
+        lines = "\n".join(f"| {key} | {value} |" for key, value in chosen.items())
+        self._writer.add_text("engine", f"| | |\n|---|---|\n{lines}", 0)
+
+    def row(self, row: Mapping[str, Any]) -> None:
+        """Enter a row of `train.jsonl`: each number under its name, requirements in a group of theirs."""
+        step = int(row["step"])
+        for key in _PLAIN:
+            if row.get(key) is not None:
+                self._writer.add_scalar(key, float(row[key]), step)
+        for name, share in (row.get("requirements") or {}).items():
+            self._writer.add_scalar(f"requirements/{name}", float(share), step)
+        if row.get("failing"):
+            self._writer.add_scalar("repaired", row["repaired"] / row["failing"], step)
+
+    def close(self) -> None:
+        """Write all that is left."""
+        self._writer.close()
+
+
+def find_writer() -> Opener:
+    """How logs are opened here: by tensorboardX, else by torch with tensorboard.
+
+    Raises:
+        MissingError: R301, neither is installed.
+    """
+    if find_spec("tensorboardX") is not None:
+        module = "tensorboardX"
+    elif find_spec("tensorboard") is not None:
+        module = "torch.utils.tensorboard"
+    else:
+        raise MissingError(
+            Diagnostic(
+                "R301",
+                "`--log tensorboard` needs tensorboardX, which is not installed",
+                help=("pip install 'stlc[log]'",),
+            )
+        )
+    return lambda run: Logbook(import_module(module).SummaryWriter(str(run / FOLDER)))

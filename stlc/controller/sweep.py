@@ -1,0 +1,168 @@
+"""Training runs side by side, each in a process of its own: one that breaks off costs none of the others."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import suppress
+from dataclasses import dataclass, field
+from queue import SimpleQueue
+from typing import Any
+
+TAIL = 12
+"""Lines of what a process said that are kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class Errand:
+    """One run.
+
+    Attributes:
+        name: by which it is told from the others.
+        arguments: of `stlc train`, without `--json`.
+    """
+
+    name: str
+    arguments: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Returned:
+    """What came of an errand.
+
+    Attributes:
+        errand: that was run.
+        code: exit code; negative where a signal ended the process.
+        document: that it printed; None where it did not get so far.
+        said: the last lines of its standard error.
+        cores: that it had to itself.
+    """
+
+    errand: Errand
+    code: int
+    document: dict[str, Any] | None
+    said: str
+    cores: int
+
+    @property
+    def result(self) -> dict[str, Any]:
+        """What the document says of the run; empty without one."""
+        return (self.document or {}).get("result") or {}
+
+
+def side_by_side(
+    errands: Sequence[Errand], *, jobs: int, begun: Callable[[Errand], None] = lambda _: None
+) -> Iterator[Returned]:
+    """Run errands, `jobs` at a time, and give each as it ends.
+
+    With several jobs every process keeps to its own share of the cores. When the caller is interrupted, or
+    wants no more, every process is asked to save and stop, and is waited for; a second time it is ended.
+
+    Args:
+        errands: what to run, in order.
+        jobs: processes at a time.
+        begun: called (in another thread) as each starts.
+    """
+    crew = _Crew(jobs)
+    with ThreadPoolExecutor(jobs) as pool:
+        futures = [pool.submit(crew.send, errand, begun) for errand in errands]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            crew.stop()
+            raise
+
+
+@dataclass(slots=True)
+class _Crew:
+    """The processes that are going, and the cores that they share."""
+
+    jobs: int
+    live: set[subprocess.Popen[str]] = field(default_factory=set)
+    stopped: bool = False
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    shares: SimpleQueue[frozenset[int]] = field(default_factory=SimpleQueue)
+
+    def __post_init__(self) -> None:
+        for share in core_shares(self.jobs):
+            self.shares.put(share)
+
+    def send(self, errand: Errand, begun: Callable[[Errand], None]) -> Returned:
+        """Run one errand from beginning to end."""
+        share = self.shares.get()
+        try:
+            process = self._start(errand, share)
+            if process is None:
+                return Returned(errand, -signal.SIGINT, None, "", len(share))
+            begun(errand)
+            out, said = process.communicate()
+            with self.lock:
+                self.live.discard(process)
+        finally:
+            self.shares.put(share)
+        tail = "\n".join(said.splitlines()[-TAIL:])
+        return Returned(errand, process.returncode, _document(out), tail, len(share))
+
+    def _start(self, errand: Errand, share: frozenset[int]) -> subprocess.Popen[str] | None:
+        """The process, on its share of the cores; None once everything is to stop."""
+        with self.lock:
+            if self.stopped:
+                return None
+            process = subprocess.Popen(
+                [sys.executable, "-m", "stlc", "train", *errand.arguments, "--json"],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                encoding="utf-8",
+                env={**os.environ, "PYTHONIOENCODING": "utf-8"},
+                start_new_session=True,  # Ctrl-C reaches it through `stop` alone, once
+            )
+            self.live.add(process)
+        if self.jobs > 1 and hasattr(os, "sched_setaffinity"):
+            with suppress(OSError):
+                os.sched_setaffinity(process.pid, share)
+        return process
+
+    def stop(self) -> None:
+        """Ask every process to save and stop, and wait for it; end it where that is interrupted too."""
+        with self.lock:
+            self.stopped = True
+            going = tuple(self.live)
+        try:
+            for process in going:
+                with suppress(OSError, ValueError):
+                    process.send_signal(signal.SIGINT)
+            for process in going:
+                process.wait()
+        except BaseException:
+            for process in going:
+                process.kill()
+            raise
+
+
+def core_shares(jobs: int) -> list[frozenset[int]]:
+    """The cores of this process in `jobs` shares of one size; with more jobs than cores, all in each."""
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    cores = cores or list(range(os.cpu_count() or 1))
+    if jobs > len(cores):
+        return [frozenset(cores)] * jobs
+    edges = [round(i * len(cores) / jobs) for i in range(jobs + 1)]
+    return [frozenset(cores[edges[i] : edges[i + 1]]) for i in range(jobs)]
+
+
+def _document(text: str) -> dict[str, Any] | None:
+    """The JSON document that a process printed, if it did."""
+    with suppress(ValueError):
+        found = json.loads(text)
+        if isinstance(found, dict):
+            return found
+    return None

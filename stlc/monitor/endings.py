@@ -1,0 +1,142 @@
+"""Bounds for a stream that may end with any sample: windows that an early end cuts say so themselves.
+
+A window to the end of the trace has no end yet. `eventually` is worth least if the trace ends now, `always`
+if it goes on; the greatest values are the other way round. `may_end` writes that into the formula, with a
+predicate that is true at every sample and unknown afterwards: what is found beyond the last sample then does
+not count. So the two ends of what is possible are two formulas.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias, assert_never
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile import ir
+from stlc.compile.horizon import columns, nodes
+from stlc.compile.samples import farthest
+
+Floats: TypeAlias = NDArray[np.float64]
+
+SEEN = "@seen"
+"""A column that is 1 at every sample."""
+
+_SEEN = ir.Atom(ir.Col(SEEN), guard=True)
+_UNSEEN = ir.Atom(ir.Col(SEEN), sign=-1, guard=True)
+
+
+def may_end(formula: ir.Formula, end: Literal["lower", "upper"], *, cut: bool) -> ir.Formula:
+    """The formula whose least (or greatest) value holds wherever the trace ends from the last sample on.
+
+    Args:
+        formula: what is judged.
+        end: which end of what is possible.
+        cut: the end of the trace cuts windows that have an end of their own, too.
+    """
+    return _Ending(end == "lower", cut).of(formula)
+
+
+@dataclass(frozen=True, slots=True)
+class _Ending:
+    least: bool
+    cut: bool
+
+    def of(self, formula: ir.Formula) -> ir.Formula:
+        """The formula with what its windows may miss."""
+        match formula:
+            case ir.Atom() | ir.Truth():
+                return formula
+            case ir.Join(items=items):
+                return replace(formula, items=tuple(map(self.of, items)))
+            case ir.Over(op, window, body):
+                found = self._found(body, some=op == "eventually", cut=self._cuts(window))
+                return self._begun(replace(formula, body=found), window, some=op == "eventually")
+            case ir.Until(op, window, left, right):
+                found = self._found(right, some=op == "until", cut=self._cuts(window))
+                whole = replace(formula, left=self.of(left), right=found)
+                return self._begun(whole, window, some=op == "until")
+            case ir.Shift(steps, body):
+                found = self._found(body, some=not formula.weak, cut=self.cut and steps > 0)
+                return replace(formula, body=found)
+            case ir.Past(body=body) | ir.Freeze(body=body) | ir.AtStart(body=body):
+                return replace(formula, body=self.of(body))
+            case ir.Since(left=left, right=right):
+                return replace(formula, left=self.of(left), right=self.of(right))
+        assert_never(formula)
+
+    def _cuts(self, window: ir.Window) -> bool:
+        return self.cut or window.hi is None
+
+    def _found(self, body: ir.Formula, *, some: bool, cut: bool) -> ir.Formula:
+        """What a window finds: where an early end is the worst for it, at samples only."""
+        inner = self.of(body)
+        return self._seen(inner, 0) if cut and some is self.least else inner
+
+    def _begun(self, formula: ir.Formula, window: ir.Window, *, some: bool) -> ir.Formula:
+        """A window to the end that starts after it is worth nobody knows what, or nothing where it is cut."""
+        if window.hi is not None or self.cut or some is self.least:
+            return formula
+        return self._seen(formula, window.lo)
+
+    def _seen(self, formula: ir.Formula, later: int) -> ir.Formula:
+        """The formula, and for the greatest value its dual, where there is a sample so many steps later."""
+        there = _SEEN if self.least else _UNSEEN
+        then = ir.Shift(later, there) if later else there
+        return ir.Join("and" if self.least else "or", (formula, then))
+
+
+def reads_seen(formula: ir.Formula) -> bool:
+    """Whether `with_seen` is needed."""
+    return SEEN in columns(formula)
+
+
+def with_seen(signals: Mapping[str, Floats]) -> Mapping[str, Floats]:
+    """The columns (samples, traces), and the one that says which samples there are."""
+    return {**signals, SEEN: np.broadcast_to(1.0, next(iter(signals.values())).shape)}
+
+
+# ---------------------------------------------------------------- windows without an end
+
+
+def lengthened(formula: ir.Formula, samples: int) -> ir.Formula:
+    """The formula where windows to the end of the trace reach beyond all of which anything is known."""
+    bounds = [abs(node.steps) if isinstance(node, ir.Shift) else _farthest(node) for node in nodes(formula)]
+    return _long(formula, samples + sum(bounds) + 1)
+
+
+def _farthest(node: ir.Formula) -> int:
+    match node:
+        case (
+            ir.Over(window=window)
+            | ir.Until(window=window)
+            | ir.Past(window=window)
+            | ir.Since(window=window)
+        ):
+            return window.lo if window.hi is None else window.hi
+        case ir.Atom(num=num):
+            return sum(farthest(num))
+        case _:
+            return 0
+
+
+def _long(formula: ir.Formula, length: int) -> ir.Formula:
+    match formula:
+        case ir.Join(items=items):
+            return replace(formula, items=tuple(_long(item, length) for item in items))
+        case ir.Over(window=window, body=body):
+            return replace(formula, window=_longer(window, length), body=_long(body, length))
+        case ir.Until(window=window, left=left, right=right):
+            left, right = _long(left, length), _long(right, length)
+            return replace(formula, window=_longer(window, length), left=left, right=right)
+        case ir.Past(body=body) | ir.Shift(body=body) | ir.Freeze(body=body) | ir.AtStart(body=body):
+            return replace(formula, body=_long(body, length))
+        case ir.Since(left=left, right=right):
+            return replace(formula, left=_long(left, length), right=_long(right, length))
+    return formula
+
+
+def _longer(window: ir.Window, length: int) -> ir.Window:
+    return window if window.hi is not None else ir.Window(window.lo, window.lo + length)
