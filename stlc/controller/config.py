@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
+
+import torch
 
 if TYPE_CHECKING:
     from stlc.controller.task import Task
@@ -33,7 +36,7 @@ class TrainConfig:
         steps: of the optimiser; wins over `budget`.
         seed: of everything random in training.
         device: of torch.
-        threads: of torch; None leaves its default.
+        threads: of torch; None leaves a core to the search beside it.
         plans: number of plans of the network.
         lr: peak learning rate.
         batch: fresh states a step.
@@ -76,6 +79,7 @@ class Engine:
         share: weight of the mean over plans beside the winner's loss.
         performance: factor of the performance terms.
         held_out: states of the last verdict.
+        threads: of torch; sums over other numbers of them round otherwise. 0 leaves what is set.
         samples: size of a fixed training set; 0: fresh states in every step.
     """
 
@@ -98,6 +102,7 @@ class Engine:
     share: float = 0.05
     performance: float = 0.3
     held_out: int = HELD_OUT
+    threads: int = 0
     samples: int = 0
 
 
@@ -122,5 +127,17 @@ def decide(task: Task, config: TrainConfig) -> Engine:
         share=0.05 if plans > 1 else 0.0,
         performance=0.3 if guided else 1.0,
         held_out=config.held_out,
+        threads=config.threads or _threads(searching=guided and config.device == "cpu"),
         samples=0 if guided else declared.samples or 0,
     )
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _threads(*, searching: bool) -> int:
+    """Threads of torch: as they are set, or one less than there are cores where a search runs beside it."""
+    most = int(torch.get_num_threads())
+    return max(1, min(most, cores() - 1)) if searching else most

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from stlc.controller.policy import Mlp
     from stlc.controller.task import Task
 
-CEILING_TRIES = 16_000
+CEILING_TRIES = 8000
 """Plans that are tried for a held-out state before it counts as infeasible."""
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING
 
-import torch
-
 from stlc.compile.dump import dump
 from stlc.compile.modules import library_of
 from stlc.controller.config import ENGINE_VERSION, TrainConfig, decide
@@ -71,7 +69,7 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
             "seed": decide(task, config).seed,
             "budget": config.budget,
             "device": config.device,
-            "threads": config.threads or torch.get_num_threads(),
+            "threads": decide(task, config).threads,
             "options": asdict(config),
             "engine_version": ENGINE_VERSION,
             "versions": versions(),

@@ -15,17 +15,13 @@ from typing import TYPE_CHECKING
 from stlc.controller.trainer import Trainer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     import torch
 
     from stlc.controller.config import Engine
     from stlc.controller.task import Task
 
-WARM_UP = 10
-TIMED_STEPS = 60
-LATER_LOOKS = 1.5
-"""A late search round costs more than a first one: what still fails is hard, and takes the whole effort."""
+TIMED = 3
+"""Intervals between search rounds that are timed; a round goes on beside the steps of the one after it."""
 RESERVE = 0.04
 """Share of the budget that is kept for the verdict on held-out states."""
 
@@ -39,12 +35,20 @@ def steps_within(task: Task, engine: Engine, seconds: float, device: torch.devic
     begun = time.perf_counter()
     trial = Trainer(task, engine, steps=10_000, device=device)
     built = time.perf_counter() - begun
-    look = LATER_LOOKS * _time(trial.look, 2)  # first, so that the steps have hard states to work on
-    for _ in range(WARM_UP):
-        trial.advance()
-    step = _time(trial.advance, TIMED_STEPS)
+    trial.look()
+    _interval(trial)  # what is slow once only
+    cost = min(_interval(trial) for _ in range(TIMED - 1)) / engine.every
     left = seconds * (1.0 - RESERVE) - (time.perf_counter() - begun) - built
-    return max(engine.every, int(left / (step + look / (1.5 * engine.every))))
+    return max(engine.every, int(left / cost))
+
+
+def _interval(trainer: Trainer) -> float:
+    """Seconds of the steps up to the next search round, and of the round as far as it is waited for."""
+    begun = time.perf_counter()
+    for _ in range(trainer.engine.every):
+        trainer.advance()
+    trainer.look()
+    return time.perf_counter() - begun
 
 
 class OpenEnd:
@@ -75,11 +79,3 @@ class OpenEnd:
         steps = trainer.step + int((self._end - now) / cost) if cost > 0 else trainer.steps
         self.settled = trainer.step > 0 and trainer.step + soon > hold * steps
         trainer.steps = max(steps, math.ceil((trainer.step if self.settled else trainer.step + soon) / hold))
-
-
-def _time(call: Callable[[], object], times: int) -> float:
-    """Mean seconds of a call."""
-    begun = time.perf_counter()
-    for _ in range(times):
-        call()
-    return (time.perf_counter() - begun) / times

@@ -8,7 +8,6 @@ native kernel does it where there is one, torch elsewhere.
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -17,6 +16,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.emit_c import LANES
+from stlc.controller.config import cores
 from stlc.controller.kernel import Effort
 from stlc.controller.task import FLOAT32_SLACK
 
@@ -70,16 +70,18 @@ class Searcher:
             bank: plans that solved other states, (k, T, m); may be empty.
             tries: plans per state at most.
         """
-        return self.begin(x0, plans, bank, tries=tries).result()
+        return self.begin(x0, plans, bank, tries=tries, threads=cores()).result()
 
     @torch.no_grad()
-    def begin(self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH) -> Future[Repaired]:
+    def begin(
+        self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH, threads: int | None = None
+    ) -> Future[Repaired]:
         """`repair` beside whatever else goes on; what it gives depends on arguments and generator alone."""
         native = self.task.native
         if native is not None and x0.device.type == "cpu":
             seed = int(torch.randint(2**62, (), generator=self.generator))
             x0, plans, bank = x0.clone(), plans.clone(), bank.clone()
-            effort = Effort(-(-tries // LANES), self.enough, seed, idle_cores())
+            effort = Effort(-(-tries // LANES), self.enough, seed, threads or idle_cores())
 
             def climb() -> Repaired:
                 best, _ = native.climb(x0, plans, bank, effort)
@@ -154,4 +156,4 @@ class Searcher:
 
 def idle_cores() -> int:
     """Cores that torch leaves to a search beside it, at least one."""
-    return max(1, len(os.sched_getaffinity(0)) - torch.get_num_threads())
+    return max(1, cores() - int(torch.get_num_threads()))

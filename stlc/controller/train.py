@@ -79,9 +79,8 @@ def train(task: Task, config: TrainConfig, folder: RunDir, watch: Watch | None =
     begun = time.perf_counter()
     keep_freed_memory()
     device = find_device(config.device)
-    if config.threads is not None:
-        torch.set_num_threads(config.threads)
     engine = decide(task, config)
+    torch.set_num_threads(engine.threads)
     save_engine(folder, engine)
     declared = task.system.decl.train
     steps = config.steps or (declared.steps if config.budget is None else None)
@@ -112,8 +111,8 @@ def resume(
     task = load_task(folder)
     engine: Engine = load_engine(folder)
     saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
-    if asked := folder.record().get("options", {}).get("threads"):
-        torch.set_num_threads(asked)  # sums of other lengths round otherwise
+    if engine.threads:
+        torch.set_num_threads(engine.threads)
     trainer = Trainer(task, engine, steps=int(saved.facts["steps"]), device=find_device(device))
     trainer.restore(saved.tensors, saved.facts)
     trainer.steps = steps or trainer.steps
