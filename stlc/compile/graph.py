@@ -28,7 +28,7 @@ from stlc.diagnostics import Diagnostic, TraceError
 from stlc.signature import Signature
 
 MAX_BEYOND = 1 << 24
-"""Instants beyond the last sample at which bounds are computed, over all parts of a formula: a second or so."""
+"""Instants beyond the last sample at which bounds are computed, over all parts of a formula."""
 
 MAX_VALUES = 1 << 27
 """The same over all traces: a gigabyte."""
