@@ -137,7 +137,7 @@ class Row:
     Attributes:
         axis: name.
         value: of it.
-        length: such as `60s`.
+        length: such as `60 s`.
         seeds: how many.
         training: accuracy on the training states, mean over seeds.
         accuracies: on the held-out states, one a seed.
@@ -162,7 +162,7 @@ def ablation_rows(documents: Iterable[Mapping[str, Any]]) -> list[Row]:
     """The tables one after the other, each with the defaults in their place."""
     groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
     for document in documents:
-        length = Length(document["budget"], document["steps_asked"]).name
+        length = Length(document["budget"], document["steps_asked"]).text
         groups.setdefault((document["axis"], document["value"], length), []).append(document)
     lengths = dict.fromkeys(length for _, _, length in groups)
     rows = []

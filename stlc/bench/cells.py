@@ -42,6 +42,11 @@ class Length:
         return f"{self.steps}steps" if self.steps is not None else f"{self.seconds:g}s"
 
     @property
+    def text(self) -> str:
+        """The same for people."""
+        return f"{self.steps:,} steps" if self.steps is not None else f"{self.seconds:g} s"
+
+    @property
     def options(self) -> tuple[str, ...]:
         """For `stlc train`."""
         if self.steps is not None:

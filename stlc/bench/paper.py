@@ -55,7 +55,7 @@ class Row:
     Attributes:
         benchmark: name.
         method: of training.
-        length: such as `60s`.
+        length: such as `60 s`.
         seeds: in order.
         accuracies: one a seed, on the same held-out states.
         interval: 95 % Wilson interval of the mean, over the states of all seeds.
@@ -96,7 +96,7 @@ def paper_rows(documents: Iterable[Mapping[str, Any]], ceilings: Mapping[str, fl
     """The table of the results of cells: benchmarks in the paper's order, then methods, then lengths."""
     groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
     for document in documents:
-        length = Length(document["budget"], document["steps_asked"]).name
+        length = Length(document["budget"], document["steps_asked"]).text
         key = (document["benchmark"], document["method"], length)
         groups.setdefault(key, []).append(document)
     rows = [_row(key, group, ceilings.get(key[0])) for key, group in groups.items()]

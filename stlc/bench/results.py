@@ -143,7 +143,7 @@ def ablation_section(documents: Sequence[Mapping[str, Any]]) -> str:
     header = ("", "budget", "seeds", "training", "held out", "paper: training", "paper: validation")
     for axis in ablation.AXES:
         own = [_ablation_cells(row) for row in rows if row.axis == axis.name]
-        if own:
+        if len({cells[0] for cells in own}) > 1:
             lines += ["", f"### {axis.title}", "", *markdown(header, own)]
     return "\n".join([*lines, "", *provenance(documents)])
 

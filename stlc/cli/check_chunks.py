@@ -30,16 +30,7 @@ def outcome_in_chunks(path: Path, work: Work) -> Outcome:
     from stlc.trace_recording import Recording
 
     question = work.question
-    whole = {
-        "--resample": question.resample is not None,
-        "--out": work.out is not None,
-        "--semantics": question.semantics != "exact",
-    }
-    for option, asked in whole.items():
-        if asked:
-            raise usage(f"`{option}` needs the whole trace, and `{path}` is read in pieces")
-    if question.at not in (None, "all"):
-        raise usage(f"`--at {question.at}` needs the whole trace, and `{path}` is read in pieces")
+    _require_pieces(path, work)
     begun = time.perf_counter()
     given = None if question.spec is None else monitor_of(read_source(question.spec), question)
     read = pieces(path, work.chunk or CHUNK, laid_reading(given, question))
@@ -54,3 +45,18 @@ def outcome_in_chunks(path: Path, work: Work) -> Outcome:
         online.feed(piece)
     told = Told(str(path), source, first.dt, online.samples)
     return outcome_of_tallies(online, told, (note,) if note else (), time.perf_counter() - begun)
+
+
+def _require_pieces(path: Path, work: Work) -> None:
+    """Refuse what needs all samples at once."""
+    question = work.question
+    whole = {
+        "--resample": question.resample is not None,
+        "--out": work.out is not None,
+        "--semantics": question.semantics != "exact",
+        f"--at {question.at}": question.at not in (None, "all"),
+    }
+    advice = "leave out --chunk" if work.chunk else "cut out what is of interest"
+    for option, asked in whole.items():
+        if asked:
+            raise usage(f"`{option}` needs the whole trace, and `{path}` is read in pieces", advice)

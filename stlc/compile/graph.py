@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Protocol
 
@@ -24,7 +24,14 @@ from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.schedule import End, Extent, Run, Runner, Schedule, schedule
 from stlc.compile.semantics import Exact, Semantics, semantics_of
 from stlc.compile.windows import Windows
+from stlc.diagnostics import Diagnostic, TraceError
 from stlc.signature import Signature
+
+MAX_BEYOND = 1 << 24
+"""Instants beyond the last sample at which bounds are computed, over all parts of a formula."""
+
+MAX_VALUES = 1 << 27
+"""The same over all traces: a gigabyte."""
 
 
 def evaluate(  # noqa: PLR0913 - the instants and the end of the trace belong to the question
@@ -56,24 +63,45 @@ def evaluate(  # noqa: PLR0913 - the instants and the end of the trace belong to
 
     Raises:
         ValueError: a window leaves the trace, and `end` is "strict".
+        TraceError: E306, bounds over all continuations of the trace look too far beyond it.
     """
+    windows = Windows(semantics or Exact(), ops)
+    extent = _extent(env, end, windows, stop)
+    return execute(planned(tuple(formulas), Run(start, count), extent), env, windows)
+
+
+def evaluate_parts(
+    formula: ir.Formula, env: Mapping[str, Array], instants: range, *, ops: Ops, end: End
+) -> Iterator[tuple[ir.Formula, range, Array]]:
+    """Exact robustness of a formula at consecutive instants, and of its parts where it needs them.
+
+    Where `end` is "lower" or "upper", instants may lie beyond the last sample.
+
+    Yields:
+        Formulas, instants and values `(instants, batch)`, parts first; not what stands in a `Freeze`.
+    """
+    windows = Windows(Exact(), ops)
+    plan = planned((formula,), Run(instants.start, len(instants)), _extent(env, end, windows))
+    for step, values in zip(plan.steps, _all_values(plan, env, windows), strict=True):
+        yield step.node, range(step.run.start, step.run.last + 1), values
+
+
+def _extent(env: Mapping[str, Array], end: End, windows: Windows, stop: int | None = None) -> Extent:
     samples = len(next(iter(env.values())))
-    plan = planned(tuple(formulas), samples, Run(start, count), end, stop)
-    return execute(plan, env, Windows(semantics or Exact(), ops))
+    return Extent(samples, end, stop, counted=not windows.semantics.idempotent)
 
 
 @lru_cache(maxsize=512)
-def planned(
-    formulas: tuple[ir.Formula, ...], samples: int, run: Run, end: End, stop: int | None = None
-) -> Schedule:
-    """The schedule for a trace of `samples`, remembered. Raises ValueError as `evaluate` does."""
-    if run.start < 0 or run.last >= samples:
+def planned(formulas: tuple[ir.Formula, ...], run: Run, extent: Extent) -> Schedule:
+    """The schedule for a trace, remembered. Raises ValueError as `evaluate` does."""
+    samples = extent.samples
+    if run.start < 0 or (run.last >= samples and not extent.open):
         raise ValueError(f"instants {run.start}..{run.last} of a trace with {samples} samples")
-    if end == "strict":
+    if extent.end == "strict":
         for formula in formulas:
             if not defined(formula, samples)[run.start : run.last + 1].all():
                 raise ValueError(f"the formula looks beyond the end of a trace of {samples} samples")
-    return schedule(formulas, run, Extent(samples, end, stop))
+    return schedule(formulas, run, extent)
 
 
 def robustness_signal(
@@ -85,28 +113,54 @@ def robustness_signal(
     end: End = "strict",
 ) -> Array:
     """Robustness at every sample, `(time, batch)`; NaN where `end` "strict" leaves it undefined."""
-    samples = len(next(iter(env.values())))
-    cut: End = "truncate" if end == "strict" else end
-    plan = planned((formula,), samples, Run(0, samples), cut)
-    (signal,) = execute(plan, env, Windows(semantics or Exact(), ops))
+    windows = Windows(semantics or Exact(), ops)
+    extent = _extent(env, "truncate" if end == "strict" else end, windows)
+    samples = extent.samples
+    (signal,) = execute(planned((formula,), Run(0, samples), extent), env, windows)
     if end != "strict":
         return signal
     return ops.rows(defined(formula, samples), signal, math.nan)
 
 
 def execute(plan: Schedule, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """The values of the roots of a schedule, each `(count, batch)`."""
+    """The values of the roots of a schedule, each `(count, batch)`.
+
+    Raises:
+        TraceError: E306, bounds over all continuations of the trace look too far beyond it.
+    """
+    values = _all_values(plan, env, windows)
+    return [values[root] for root in plan.roots]
+
+
+def _all_values(plan: Schedule, env: Mapping[str, Array], windows: Windows) -> list[Array]:
+    """The values of all steps."""
+    ops, like = windows.ops, next(iter(env.values()))
+    if plan.beyond > MAX_BEYOND or (plan.beyond and plan.beyond * math.prod(like.shape[1:]) > MAX_VALUES):
+        raise TraceError(_too_far(plan))
     runners = plan.runners.get(windows)
     if runners is None:
         machine = Machine(plan.extent, windows)
         runners = tuple(_runner(plan, index, machine) for index in range(len(plan.steps)))
         plan.runners[windows] = runners
-    ops, like = windows.ops, next(iter(env.values()))
     outputs = [batch.program(inputs(batch.program, env, batch.run, ops), ops) for batch in plan.batches]
     values: list[Array] = []
     for runner in runners:
         values.append(runner(values, outputs, env, like))
-    return [values[root] for root in plan.roots]
+    return values
+
+
+def _too_far(plan: Schedule) -> Diagnostic:
+    """E306 for a formula whose parts would be needed at too many instants beyond the trace."""
+    step = max(plan.steps, key=lambda step: step.run.last)
+    return Diagnostic(
+        "E306",
+        f"this looks {step.run.last - plan.extent.samples + 1:,} samples beyond the last one",
+        step.node.span,
+        help=(
+            "record more, or shorten the intervals: a trace that ends so early says nothing certain here",
+            "`--end truncate` evaluates on what there is",
+        ),
+    )
 
 
 def _runner(plan: Schedule, index: int, machine: Machine) -> Runner:

@@ -22,7 +22,7 @@ from stlc.source import Source
 STD = "@std"
 _STD_FILE = Path(__file__).with_name("std.stl")
 _MOST = 100
-"""How many files one specification may import, directly or not."""
+"""How many files one specification may import, directly or not; one that is imported twice counts twice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,9 +86,22 @@ class _Loader:
         self.library = spec.library
         self.home = Path(spec.source.name).parent
         self.specs: dict[str, ast.Spec] = {}
+        self.sizes: dict[str, int] = {}
+        self.found: dict[str, tuple[Module, ...] | SpecError] = {}
 
     def imports(self, spec: ast.Spec, key: str, around: tuple[str, ...]) -> tuple[Module, ...]:
         """The modules of one file; `around` are the keys of the files that import it."""
+        if key not in self.found:
+            try:
+                self.found[key] = self._imports(spec, key, around)
+            except SpecError as error:
+                self.found[key] = error
+        found = self.found[key]
+        if isinstance(found, SpecError):
+            raise found
+        return found
+
+    def _imports(self, spec: ast.Spec, key: str, around: tuple[str, ...]) -> tuple[Module, ...]:
         found: list[Module] = []
         faults: list[Diagnostic] = []
         for written in spec.imports:
@@ -96,8 +109,12 @@ class _Loader:
                 found.append(self._module(written, key, (*around, key)))
             except SpecError as error:
                 faults += error.diagnostics
+            if sum(self.sizes[module.key] for module in found) > _MOST:
+                faults += _refused(written, f"more than {_MOST} files are imported").diagnostics
+                break
         if faults:
-            raise SpecError(*faults)
+            raise SpecError(*dict.fromkeys(faults))
+        self.sizes[key] = 1 + sum(self.sizes[module.key] for module in found)
         return tuple(found)
 
     def _module(self, written: ast.Import, importer: str, around: tuple[str, ...]) -> Module:
@@ -107,7 +124,7 @@ class _Loader:
             raise _refused(written, f"`{written.target}` imports itself", note=chain)
         alias = written.alias or _stem(written)
         if key not in self.specs:
-            if len(self.specs) >= _MOST:
+            if max(len(self.specs), len(around)) >= _MOST:
                 raise _refused(written, f"more than {_MOST} files are imported")
             self.specs[key] = parse(self._source(written, key))
         spec = self.specs[key]

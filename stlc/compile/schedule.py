@@ -15,6 +15,7 @@ from stlc.compile import ir
 from stlc.compile.arith import Program
 from stlc.compile.ops import Array
 from stlc.compile.samples import Reach, farthest, reach_of
+from stlc.compile.tails import tail
 
 End: TypeAlias = Literal["strict", "truncate", "lower", "upper"]
 """What stands beyond the last sample.
@@ -23,6 +24,9 @@ End: TypeAlias = Literal["strict", "truncate", "lower", "upper"]
 trace may go on, and unknown predicates are -inf or +inf there; windows to the end of the trace end at the
 last known sample all the same.
 """
+
+_FAR = 256
+"""Instants beyond the last sample that are computed without asking whether they are all alike."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,11 +38,13 @@ class Extent:
         end: what stands beyond them.
         stop: how many the trace will have where it goes on: windows to its end end there, and not with the
             last known sample.
+        counted: every instant counts, unknown ones as well: the semantics is a mean.
     """
 
     samples: int
     end: End = "strict"
     stop: int | None = None
+    counted: bool = False
 
     @property
     def open(self) -> bool:
@@ -50,11 +56,21 @@ class Extent:
         """Where windows to the end of the trace end."""
         return self.samples if self.stop is None else self.stop
 
-    def last(self, window: ir.Window, latest: int) -> int:
-        """The last instant that a window of the future reads when asked at `latest` at the latest."""
+    def last(self, window: ir.Window, latest: int, parts: Sequence[ir.Formula]) -> int:
+        """The last instant of `parts` that a window of the future needs when asked at `latest` at the latest.
+
+        Of the instants beyond the trace at which all parts stay as they are it takes one.
+        """
         if window.hi is None:
             return self.length - 1
-        return latest + window.hi if self.open else min(latest + window.hi, self.samples - 1)
+        if not self.open:
+            return min(latest + window.hi, self.samples - 1)
+        last = latest + window.hi
+        if last < self.samples + _FAR or self.counted:
+            return last
+        tails = [tail(part, self.samples, self.length) for part in parts]
+        known = [found for found in tails if found is not None]
+        return min(last, max(*known, latest + window.lo)) if len(known) == len(tails) else last
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +99,7 @@ def operands(node: ir.Formula, run: Run, extent: Extent) -> tuple[tuple[ir.Formu
         case ir.Join(_, items):
             return tuple((item, run) for item in items)
         case ir.Over(_, window, body):
-            return ((body, upto(run.start + window.lo, extent.last(window, run.last))),)
+            return ((body, upto(run.start + window.lo, extent.last(window, run.last, (body,)))),)
         case ir.Past(_, window, body):
             return ((body, upto(_first(window, run), run.last - window.lo)),)
         case ir.Until() | ir.Since():
@@ -103,7 +119,7 @@ def _both(
     """What `until` and `since` need: the right side in the window, the left one from now up to there."""
     window, left, right = node.window, node.left, node.right
     if isinstance(node, ir.Until):
-        last = extent.last(window, run.last)
+        last = extent.last(window, run.last, (left, right))
         if last >= run.start + window.lo:
             return (left, upto(run.start, last)), (right, upto(run.start + window.lo, last))
     elif run.last >= window.lo:
@@ -155,6 +171,7 @@ class Schedule:
         atoms: step of a predicate -> (batch, name of the output, at which instants it has a value); without
             a batch the name is that of a column; absent where it has no value.
         roots: steps of the formulas that were asked for.
+        beyond: how many values beyond the last sample there are in all.
         runners: what computes the steps, by semantics and array library; made when it is first needed.
     """
 
@@ -163,6 +180,7 @@ class Schedule:
     steps: tuple[Step, ...]
     atoms: dict[int, tuple[int | None, str, Run]]
     roots: tuple[int, ...]
+    beyond: int = 0
     runners: dict[Hashable, tuple[Runner, ...]] = field(default_factory=dict, compare=False, repr=False)
 
 
@@ -183,7 +201,8 @@ def schedule(formulas: Sequence[ir.Formula], run: Run, extent: Extent) -> Schedu
 
     roots = tuple(index for formula in formulas if (index := place(formula, run)) is not None)
     batches, atoms = _batches(steps, extent)
-    return Schedule(extent, batches, tuple(steps), atoms, roots)
+    beyond = sum(max(min(step.run.last - extent.samples + 1, step.run.count), 0) for step in steps)
+    return Schedule(extent, batches, tuple(steps), atoms, roots, beyond)
 
 
 def _batches(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from stlc.compile import ir, typed
 from stlc.compile.defined import defined
+from stlc.compile.graph import evaluate_parts
 from stlc.compile.horizon import columns, parts
 from stlc.compile.interface import Grid
 from stlc.compile.lower import lower
@@ -79,11 +80,14 @@ class Blamer:
     Attributes:
         record: columns of the one trace, (samples, 1), up to what `end` is.
         grid: of time.
+        cache: formulas, or their negations, as lowered.
+        known: the most that lowered formulas can be, at which instants.
     """
 
     record: Record
     grid: Grid
     cache: dict[tuple[typed.Formula, bool], ir.Formula] = field(default_factory=dict)
+    known: dict[ir.Formula, list[tuple[range, Floats]]] = field(default_factory=dict)
 
     def blame(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> Blame:
         """Why `formula` is not `wanted` at `sample`."""
@@ -134,13 +138,24 @@ class Blamer:
 
     def _margins(self, formula: typed.Formula, wanted: bool, instants: range) -> Floats:
         """By how much the formula is as wanted, at best, at consecutive instants: (instants,)."""
-        lowered, last = self._lowered(formula, wanted), self.record.samples - 1
-        inside = range(instants.start, min(instants.stop, last + 1))
-        found = [bounds(lowered, self.record, inside, "open")[1][:, 0]] if inside else []
-        for later in range(max(instants.start, last + 1), instants.stop):
-            seen = ir.Shift(later - last, lowered)
-            found.append(bounds(seen, self.record, range(last, last + 1), "open")[1][:, 0])
-        return np.concatenate(found).astype(np.float64)
+        lowered = self._lowered(formula, wanted)
+        found = self._found(lowered, instants)
+        if found is None:
+            for node, its, values in evaluate_parts(
+                lowered, self.record.env, instants, ops=self.record.ops, end="upper"
+            ):
+                self.known.setdefault(node, []).append((its, values[:, 0]))
+            found = self._found(lowered, instants)
+        assert found is not None
+        return found
+
+    def _found(self, lowered: ir.Formula, instants: range) -> Floats | None:
+        """Its values, where an evaluation of something around it has told them already."""
+        for known, values in self.known.get(lowered, ()):
+            if known.start <= instants.start and instants.stop <= known.stop:
+                rows = values[instants.start - known.start : instants.stop - known.start]
+                return rows.astype(np.float64)
+        return None
 
     def _node(self, formula: typed.Formula, wanted: bool, sample: int) -> Blame:
         margin = float(self._margins(formula, wanted, range(sample, sample + 1))[0])

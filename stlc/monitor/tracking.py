@@ -269,13 +269,25 @@ class Whole:
     truth: bool = False
     samples: int = 0
     _signals: Mapping[str, Floats] = field(default_factory=dict)
+    _ends: dict[End, ir.Formula] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.truth:
+            self.rule = replace(self.rule, formula=by_truth(self.rule.formula))
+        for end in ("lower", "upper"):
+            self._ends[end] = _worst(self.rule.formula, end, self.ending, self.window)
+
+    @property
+    def window(self) -> int | None:
+        """How many samples after its instant `end` is; None: the end of the trace."""
+        return window_of(self.rule, self.horizon)
 
     @property
     def settled(self) -> int:
         """The first instant whose value may still change."""
-        if window_of(self.rule, self.horizon) is None and endless(self.rule.formula):
+        if self.window is None and endless(self.rule.formula):
             return 0
-        ahead = self.horizon or 0 if window_of(self.rule, self.horizon) is not None else self.rule.reach
+        ahead = self.rule.reach if self.window is None else self.window
         return max(self.samples - ahead - looks_on(self.rule.formula), 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:  # noqa: ARG002
@@ -296,32 +308,21 @@ class Whole:
         """At any instants, where nothing is assumed of what lies outside of the trace."""
         if stop <= start:
             return Bounds(np.zeros(0), np.zeros(0))
-        rule, record = self._subject()
         starts = range(start, stop)
-        return Bounds(self._end(rule, record, starts, "lower"), self._end(rule, record, starts, "upper"))
+        return Bounds(self._end(starts, "lower"), self._end(starts, "upper"))
 
-    def _end(self, rule: Rule, record: Record, starts: range, end: Literal["lower", "upper"]) -> Floats:
+    def _end(self, starts: range, end: Literal["lower", "upper"]) -> Floats:
         """One end of what is possible, wherever the trace ends."""
-        window = window_of(rule, self.horizon)
-        formula = _worst(rule.formula, end, self.ending, window)
-        record = replace(record, env=with_seen(record.env))
-        if window is None:
+        record, formula = Record(with_seen(self._signals), NUMPY), self._ends[end]
+        if self.window is None:
             return np.asarray(record.values([lengthened(formula, self.samples)], starts, end, FAR)[0][:, 0])
-        both = window_bounds(formula, record, starts, window, "open")
+        both = window_bounds(formula, record, starts, self.window, "open")
         return np.asarray(both[end == "upper"][:, 0])
 
     def ended(self, starts: range) -> Bounds:
         """Where the trace is over."""
-        rule, record = self._subject()
-        low, high = rule_bounds(rule, record, starts, self.horizon, self.ending)
+        low, high = rule_bounds(self.rule, Record(self._signals, NUMPY), starts, self.horizon, self.ending)
         return Bounds(low[:, 0], high[:, 0])
-
-    def _subject(self) -> tuple[Rule, Record]:
-        record = Record(self._signals, NUMPY)
-        if not self.truth:
-            return self.rule, record
-        formula = by_truth(self.rule.formula)
-        return replace(self.rule, formula=formula), record
 
     def drop(self, start: int) -> int:  # noqa: ARG002
         """Nothing can be forgotten."""

@@ -69,7 +69,7 @@ def _draw_starts(axes: Axes, held: HeldOut, weakness: Weakness, signature: Signa
     axes.set_ylabel(_label(held.names[b], signature))
     axes.margins(0.02)
     legend = axes.legend(
-        loc="upper right", bbox_to_anchor=(1.01, 1.12), ncols=len(kinds), handletextpad=0.1, markerscale=1.6
+        loc="upper left", bbox_to_anchor=(-0.02, -0.14), ncols=len(kinds), handletextpad=0.1, markerscale=1.6
     )
     for handle in legend.legend_handles:
         if handle is not None:

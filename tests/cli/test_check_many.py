@@ -197,6 +197,7 @@ def test_pieces_that_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     (name,) = files(a_trace())
     for option in (("--resample", "1s"), ("--at", "3"), ("--out", "x.npz")):
         assert check("s.stl", name, "--chunk", "9", *option) == 2
+        assert "help: leave out --chunk" in capsys.readouterr().err
     several = Trace(a_trace().signature, 0.1, {n: np.repeat(x, 3, axis=0) for n, x in a_trace().data.items()})
     for suffix in (".npz", ".csv"):
         (name,) = files(several, suffix=suffix)

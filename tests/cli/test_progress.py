@@ -2,6 +2,7 @@
 
 import io
 import re
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -14,6 +15,7 @@ from stlc.cli.progress import (
     RunInfo,
     Summary,
     clock_text,
+    engine_text,
     final_screen,
     sparkline,
 )
@@ -225,3 +227,23 @@ def test_an_empty_sparkline():
 )
 def test_clock(seconds, text):
     assert clock_text(seconds) == text
+
+
+def test_what_the_engine_chose_is_said():
+    progress, stream, _ = piped()
+    progress.start(INFO)
+    chosen = {"method": "guided", "hidden": [64, 64], "plans": 4, "batch": 256, "hard": 128, "lr": 1e-3}
+    progress.chosen({**chosen, "margin": 0.0512, "samples": 0})
+    assert stream.getvalue().splitlines()[1] == (
+        "  engine          guided · 4 plans of a network 64x64 · 256 fresh + 128 hard states a step"
+        " · rate 0.001 · margin 0.0512"
+    )
+    fixed = {**chosen, "method": "gradient", "plans": 1, "hard": 0, "samples": 50000, "margin": 0.5}
+    assert "1 plan of a network 64x64 · 256 states a step of 50,000 ·" in engine_text(fixed)
+
+
+def test_the_closing_screen_says_what_remains_and_where_it_is_drawn():
+    lines = final_screen(replace(SUMMARY, unsolved="7 of 9 starts", picture="runs/a/failures.png"))
+    assert "unsolved        7 of 9 starts" in lines
+    assert "picture         runs/a/failures.png" in lines
+    assert not any(line.startswith(("unsolved", "picture")) for line in final_screen(SUMMARY))

@@ -17,7 +17,7 @@ from stlc.compile.horizon import nodes, parts
 from stlc.compile.lower import lower
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.ops_torch import TORCH
-from stlc.compile.schedule import Run
+from stlc.compile.schedule import Extent, Run
 from stlc.compile.semantics import Exact, LogSumExp
 from stlc.compile.simplify import simplify
 from stlc.signature import Column, Signature
@@ -261,7 +261,7 @@ def test_gradients_are_never_nan(formula: typed.Formula, env: Env, k: float | No
 def test_predicates_are_read_only_where_they_are_needed() -> None:
     x, y = ir.Col("x"), ir.Col("y")
     node = ir.Join("or", (ir.Atom(x), ir.Over("always", ir.Window(0, 25), ir.Atom(y))))
-    plan = planned((node,), 51, Run(0, 1), "strict")
+    plan = planned((node,), Run(0, 1), Extent(51))
     assert sorted(inside.count for _, _, inside in plan.atoms.values()) == [1, 26]
     assert not plan.batches
 
@@ -276,14 +276,14 @@ def test_predicates_over_one_stretch_share_a_program() -> None:
             ir.Over("always", ir.Window(0, 25), ir.Join("and", (ir.Atom(twice), more))),
         ),
     )
-    plan = planned((node,), 51, Run(0, 1), "strict")
+    plan = planned((node,), Run(0, 1), Extent(51))
     assert sorted(batch.run.count for batch in plan.batches) == [1, 26]
 
 
 def test_equal_parts_are_computed_once() -> None:
     p = ir.Over("always", ir.Window(0, 3), ir.Atom(ir.Col("x")))
     twin = ir.Over("always", ir.Window(0, 3), ir.Atom(ir.Col("x")))
-    plan = planned((p, ir.Join("or", (twin, ir.Atom(ir.Col("y"))))), 5, Run(0, 1), "strict")
+    plan = planned((p, ir.Join("or", (twin, ir.Atom(ir.Col("y"))))), Run(0, 1), Extent(5))
     assert sum(isinstance(step.node, ir.Over) for step in plan.steps) == 1
 
 

@@ -222,3 +222,22 @@ def test_the_library_documents_every_pattern() -> None:
     assert {item.name for item in spec.items} == set(PATTERNS)
     with pytest.raises(SpecError):
         resolve(parse(Source("s.stl", "import std\nrequire r: std.nothing")), sink=[])
+
+
+def test_files_that_import_each_other_twice_do_not_multiply(tmp_path: Path) -> None:
+    for i in range(40):
+        below = f'import "m{i + 1}.stl" as a\nimport "m{i + 1}.stl" as b\n' if i < 39 else "signal x\n"
+        (tmp_path / f"m{i}.stl").write_text(below + f"def d = {'a.d' if i < 39 else 'x > 0'}\n")
+    (finding,) = findings(tmp_path / "m0.stl")
+    assert (finding.code, finding.message) == ("E106", "more than 100 files are imported")
+    (tmp_path / "few.stl").write_text('import "m35.stl" as m\nrequire r: m.d\n')
+    assert len(typed_of(tmp_path / "few.stl").requirements) == 1
+
+
+def test_files_that_all_import_each_other(tmp_path: Path) -> None:
+    for i in range(12):
+        lines = [f'import "m{j}.stl" as a{j}' for j in range(12)]
+        (tmp_path / f"m{i}.stl").write_text("\n".join([*lines, "require r: true\n"]))
+    found = findings(tmp_path / "m0.stl")
+    assert {finding.code for finding in found} == {"E106"}
+    assert len(found) == 78, "one for every import that closes a circle"

@@ -13,6 +13,7 @@ from hypothesis import assume, given, settings
 
 from stlc.cli.render import render_place
 from stlc.compile import typed
+from stlc.compile.graph import evaluate_parts
 from stlc.compile.ops_numpy import NUMPY
 from stlc.diagnostics import UsageError
 from stlc.monitor.blame import Blame, Blamer
@@ -171,3 +172,19 @@ def test_names_are_found_in_every_kind_of_expression() -> None:
         "near",
         "v",
     ]
+
+
+def test_a_deep_formula_is_evaluated_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    deep = "always[0, 50 s] once[0, 50 s] " * 30
+    verdict = Monitor(f"signal x\nrequire r: {deep}x > 0", dt=0.1).check({"x": -np.ones(12)})
+    seen = []
+
+    def counted(*given, **more):
+        seen.append(given)
+        return evaluate_parts(*given, **more)
+
+    monkeypatch.setattr("stlc.monitor.blame.evaluate_parts", counted)
+    cause = explain(verdict, "r")
+    assert cause is not None
+    assert (cause.predicate, cause.sample) == ("x > 0", 0)
+    assert len(seen) == 1

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import stlc
-from stlc.diagnostics import SpecError, TraceError, UsageError
+from stlc.diagnostics import SpecError, StlcError, TraceError, UsageError
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.trace import Trace, TraceMeta, save_trace
@@ -479,3 +479,16 @@ def test_a_million_samples_take_seconds() -> None:
     given_signals = {name: values[0] for name, values in signals(200_000, 1).items()}
     verdict = monitor.check(given_signals)
     assert verdict["r5"].instants == 199_975
+
+
+def test_deadlines_far_beyond_a_short_trace() -> None:
+    text = "signal a\nrequire far: always[0, 1e9 steps] eventually[0, 1e9 steps] a > 0\n"
+    verdict = Monitor(text, dt=0.1).check({"a": np.array([1.0, -1.0])}, at="all")
+    assert verdict.overall == "inconclusive"
+    seen = "signal a\nrequire seen: always[0, 1e9 steps] once[0, 1e9 steps] a > 0\n"
+    with pytest.raises(StlcError) as caught:
+        Monitor(seen, dt=0.1).check({"a": np.array([1.0, -1.0])})
+    (finding,) = caught.value.diagnostics
+    assert finding.code == "E306"
+    assert finding.span is not None
+    assert Monitor(seen, dt=0.1).check({"a": np.array([1.0, -1.0])}, end="truncate").satisfied

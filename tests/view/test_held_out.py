@@ -1,12 +1,20 @@
 """Where a policy fails, as numbers and as a sentence."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from stlc.view.failures import draw_failures
-from stlc.view.held_out import HeldOut, find_weakness, load_held_out, region_text, weakness_text
+from stlc.view.held_out import (
+    HeldOut,
+    find_weakness,
+    load_held_out,
+    region_text,
+    unsolved_text,
+    weakness_text,
+)
 
 
 def held(x0, each, names=None, requirements=None):
@@ -132,3 +140,21 @@ def test_constant_columns_draw():
     each = np.ones((10, 1))
     each[0] = -np.inf
     assert draw_failures(held(x0, each)).svg()
+
+
+def test_starts_without_a_known_plan_are_told_apart():
+    data, failing = boxed()
+    hopeless = failing & (data.x0[:, 1] > 3)
+    told = replace(data, known=~hopeless)
+    left, known = told.unsolved
+    assert (left, known) == (failing.sum(), (failing & ~hopeless).sum())
+    assert unsolved_text(told) == (
+        f"{left} of 4,000 starts; a satisfying plan is known for {known} of them, "
+        f"for {left - known} none was found"
+    )
+    assert unsolved_text(data) == f"{left} of 4,000 starts"
+    (legend,) = [axes.get_legend() for axes in draw_failures(told).figure.axes if axes.get_legend()]
+    assert [text.get_text() for text in legend.get_texts()][1:] == [
+        f"no plan is known ({hopeless.sum()})",
+        f"r0 fails ({known})",
+    ]

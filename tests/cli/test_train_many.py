@@ -1,0 +1,76 @@
+"""`stlc train --seeds`: a run a seed, side by side, and a table at the end."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from documents import misfits
+
+from stlc.cli.app import main
+from stlc.cli.schema import load_schema
+from stlc.controller.sweep import Errand, Returned
+from stlc.rundir import every_run
+
+ROOT = Path(__file__).parents[2]
+SPEC = str(ROOT / "specs/traffic.stl")
+QUICK = ["--batch", "8", "--held-out", "20", "--no-pictures"]
+
+
+def returned(errand: Errand, seed: int, code: int) -> Returned:
+    if seed == 1:
+        return Returned(errand, code, {"result": None}, "error[R401]: training diverged", 1)
+    result = {
+        "run": f"runs/traffic/000{seed}-a",
+        "seconds": 61.2,
+        "accuracy": 0.95 + 0.01 * seed,
+        "interval": [0.94, 0.98],
+        "held_out": 100,
+        "requirements": {"stop": 0.96, "go": 0.99},
+        "feasible": 0.97,
+    }
+    return Returned(errand, 0, {"result": result}, "", 1)
+
+
+def test_every_seed_is_a_run_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["train", SPEC, "--seeds", "3..4", "--jobs", "2", "--steps", "2", "--set", "T_red=3s", *QUICK]
+    code = main([*words, "--name", "pair", "--runs", str(tmp_path), "--json"])
+    document = json.loads(capsys.readouterr().out)
+    assert document["exit_code"] == code == max(run["exit_code"] for run in document["result"]["runs"])
+    assert misfits(document, load_schema("train/1")) == []
+    records = [run.record() for run in every_run(tmp_path)]
+    assert sorted(record["seed"] for record in records) == [3, 4]
+    assert all(record["overrides"] == {"T_red": "3s"} for record in records)
+    assert all(record["threads"] == 1 for record in records)
+    assert {run.name.partition("-")[2] for run in every_run(tmp_path)} == {"pair-seed3", "pair-seed4"}
+
+
+@pytest.mark.parametrize(("ended", "code"), [(3, 3), (-9, 70)])
+def test_the_table_has_a_line_for_each_and_the_mean_of_those_that_ended_well(
+    ended: int, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def pretended(errands, *, jobs, begun):
+        assert jobs == 3
+        for errand in reversed(errands):
+            begun(errand)
+            yield returned(errand, int(errand.arguments[errand.arguments.index("--seed") + 1]), ended)
+
+    monkeypatch.setattr("stlc.controller.sweep.side_by_side", pretended)
+    assert main(["train", SPEC, "--seeds", "0..2", "--jobs", "3", "--steps", "2"]) == code
+    told = capsys.readouterr()
+    header, *lines = told.out.splitlines()
+    assert header.split()[:2] == ["seed", "accuracy"]
+    assert lines[0].split()[:5] == ["0", "0.9500", "[0.9400,", "0.9800]", "0.9700"]
+    assert lines[1].split() == ["1", "exit", "code", str(ended)]
+    assert lines[3].split()[:5] == ["mean", "0.9600", "0.9500", "to", "0.9700"]
+    assert f"seed 1 broke off with exit code {ended}\nerror[R401]: training diverged" in told.err
+
+
+@pytest.mark.parametrize(
+    "options",
+    [["--seeds", "0..2", "--seed", "1"], ["--jobs", "2"], ["--seeds", "2..1"], ["--seeds", "0", "--lr", "0"]],
+)
+def test_options_that_contradict_each_other(options: list[str], tmp_path: Path) -> None:
+    assert main(["train", SPEC, "--steps", "1", "--runs", str(tmp_path / "runs"), *options]) == 2
+    assert not (tmp_path / "runs").exists()

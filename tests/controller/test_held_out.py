@@ -1,0 +1,32 @@
+"""The verdict on held-out states: what is known to be possible beside what a policy does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from stlc.controller.config import TrainConfig, decide
+from stlc.controller.held_out import save_states, score
+from stlc.controller.policy import Mlp, PlanNetwork
+from stlc.controller.task import Task, satisfied
+from stlc.view.held_out import load_held_out, unsolved_text
+
+
+def test_what_is_known_is_kept_state_by_state(car_task: Task, tmp_path: Path) -> None:
+    engine = decide(car_task, TrainConfig())
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        policy = Mlp(car_task, PlanNetwork(car_task, hidden=engine.hidden, plans=1))
+    found = score(policy, n=60)
+    good = satisfied(found.rho)
+    assert 0 < int(good.sum()) < 60
+    assert bool(found.known[good].all())
+    assert found.feasible == float(found.known.double().mean()) > found.accuracy
+    save_states(tmp_path / "held_out.npz", car_task, found)
+    held = load_held_out(tmp_path / "held_out.npz")
+    assert held is not None
+    failing, known = held.unsolved
+    assert failing == 60 - int(good.sum())
+    assert known == int(found.known.sum()) - int(good.sum())
+    assert unsolved_text(held).startswith(f"{failing} of 60 starts; a satisfying plan is known for {known} ")
