@@ -31,8 +31,10 @@ if TYPE_CHECKING:
 
 FORMAT = "bench-ceilings/1"
 FILE = "ceilings.json"
-PASSES = 40
-"""Searches of some thousand plans for every state that is still open."""
+PASSES = 10
+"""Searches for every state that is still open."""
+TRIES = 20_000
+"""Plans of a search for one state, at most."""
 BANK = 4096
 """Plans of other states that a search may try, at most."""
 
@@ -48,6 +50,7 @@ class Ceiling:
         open: states without one.
         by_search: states that only the search here has solved.
         passes: searches so far.
+        tries: plans that were tried for each open state.
     """
 
     benchmark: str
@@ -56,6 +59,7 @@ class Ceiling:
     open: int
     by_search: int
     passes: int
+    tries: int
 
 
 def ceilings_of(folder: Path, documents: Iterable[Mapping[str, Any]]) -> dict[str, Ceiling]:
@@ -99,7 +103,8 @@ def search_on(
     found = torch.tensor(unpack(entry["found"], count))
     for number in range(int(entry["passes"]) + 1, passes + 1):
         found[hunt.search(number)] = True
-        entry = {**entry, "passes": number, "found": pack(found.tolist())}
+        tries = int(entry["tries"]) + TRIES
+        entry = {**entry, "passes": number, "tries": tries, "found": pack(found.tolist())}
         _keep(folder, benchmark, entry, own)
         told(number, len(hunt.open))
     _keep(folder, benchmark, entry, own)
@@ -147,7 +152,7 @@ class _Hunt:
         if number % 2 == 0 and len(self.bank):
             start = self.bank[torch.randint(len(self.bank), (len(self.open),), generator=generator)]
         searcher = Searcher(self.task, generator, enough=1e-4)
-        plans = searcher.repair(x0.float(), start, self.bank).plans
+        plans = searcher.repair(x0.float(), start, self.bank, tries=TRIES).plans
         rho = self.task.judge(x0, plans.double(), states=False).rho
         better = rho > self.rho
         self.plans = torch.where(better[:, None, None], plans, self.plans)
@@ -179,11 +184,8 @@ def _same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 
 
 def _blank(facts: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        **{key: facts[key] for key in _KEYS},
-        "passes": 0,
-        "found": pack([False] * int(facts["held_out"])),
-    }
+    nothing = pack([False] * int(facts["held_out"]))
+    return {**{key: facts[key] for key in _KEYS}, "passes": 0, "tries": 0, "found": nothing}
 
 
 def _known(entry: Mapping[str, Any], own: Sequence[Mapping[str, Any]]) -> list[bool]:
@@ -197,7 +199,13 @@ def _ceiling(benchmark: str, entry: Mapping[str, Any], own: Sequence[Mapping[str
     policies = sum(union((unpack(each["solved"], count) for each in own), count))
     share = known / count
     return Ceiling(
-        benchmark, share, wilson(share, count), count - known, known - policies, int(entry["passes"])
+        benchmark=benchmark,
+        share=share,
+        interval=wilson(share, count),
+        open=count - known,
+        by_search=known - policies,
+        passes=int(entry["passes"]),
+        tries=int(entry["tries"]),
     )
 
 

@@ -106,6 +106,16 @@ def filled(cells: Sequence[Cell], place: Place) -> Filling:
         found[each.cell.name] = dict(each.document)
         kept += each.kept
         accuracy, seconds = float(each.document["accuracy"]), float(each.document["seconds"])
-        say(f"{counted}  accuracy {accuracy:.4f}  {seconds:.0f} s" + ("  kept" if each.kept else ""))
+        told = "  kept" if each.kept else _left(cells, (*found, *(name for name, _ in failed)), place.jobs)
+        say(f"{counted}  accuracy {accuracy:.4f}  {seconds:.0f} s{told}")
     documents = tuple(found[cell.name] for cell in cells if cell.name in found)
     return Filling(documents, len(documents) - kept, kept, tuple(failed))
+
+
+def _left(cells: Sequence[Cell], done: Sequence[str], jobs: int) -> str:
+    """About how long the other trainings take, by their budgets."""
+    lengths = [cell.length.seconds for cell in cells if cell.name not in done]
+    if not lengths or None in lengths:
+        return ""
+    minutes = sum(length or 0.0 for length in lengths) / jobs / 60.0
+    return f"  {len(lengths)} left, about {minutes:.0f} min"

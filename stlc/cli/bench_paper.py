@@ -49,8 +49,8 @@ def paper(
     seeds: SeedsOption = "0..2",
     passes: Annotated[
         int,
-        typer.Option("--passes", min=0, help="Searches for the ceiling, some thousand plans a state each."),
-    ] = 40,
+        typer.Option("--passes", min=0, help="Searches for the ceiling, 20,000 plans a state each."),
+    ] = 10,
     jobs: JobsOption = 1,
     threads: ThreadsOption = 1,
     held_out: HeldOutOption = 5000,

@@ -16,11 +16,12 @@ from hypothesis import strategies as st
 
 from stlc.bench.ablation import AXES, ablation_cells, ablation_rows
 from stlc.bench.ablation import Extent as AblationExtent
-from stlc.bench.ceilings import ceilings_of, search_on
+from stlc.bench.ceilings import TRIES, ceilings_of, search_on
 from stlc.bench.cells import BENCHMARKS, Cell, Length, inputs_of, load, pack, read_json, union, unpack
 from stlc.bench.paper import Extent, paper_cells, paper_rows
 from stlc.bench.study import Filled, Place, cell_of, fill, runs_of, valid_results
 from stlc.cli.app import main
+from stlc.cli.bench_options import _left
 from stlc.cli.schema import load_schema
 from stlc.controller.config import HELD_OUT_SEED
 from stlc.controller.launch import Launch, open_folder
@@ -209,6 +210,7 @@ def test_a_search_goes_on_where_it_stopped(tmp_path: Path, result: Callable[...,
     known = ceilings_of(tmp_path, [nothing])["traffic"]
     assert (known.passes, known.open) == (2, told[-1][1])
     assert known.share == 1.0 - known.open / 24
+    assert known.tries == 2 * TRIES
     assert known.share > 0.7
     assert known.by_search == 24 - known.open
 
@@ -268,3 +270,10 @@ def test_the_defaults_stand_in_every_table_of_the_ablation() -> None:
     reported = {(row.axis, row.value): row.reported for row in rows}
     assert reported["gamma", "1.0"] == (0.958, 0.955)
     assert reported["k", "500"] is None
+
+
+def test_how_long_the_rest_takes_is_said_by_budgets() -> None:
+    cells = [quick(seed=seed, length=Length(seconds)) for seed, seconds in enumerate([60.0, 300.0, 300.0])]
+    assert _left(cells, [cells[0].name], 2) == "  2 left, about 5 min"
+    assert _left(cells, [cell.name for cell in cells], 2) == ""
+    assert _left([quick()], [], 1) == ""
