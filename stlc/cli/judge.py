@@ -106,7 +106,7 @@ def taken(name: str, runs: Path) -> list[str]:
 def judged(path: Path, question: Question) -> tuple[Checked, list[str]]:
     """The result for one file, and what is to be said about it."""
     from stlc.cli.checked import Checked
-    from stlc.monitor.explain import explain
+    from stlc.monitor.explain import explain_all
     from stlc.trace import read_recording
 
     recording = read_recording(path)
@@ -121,9 +121,7 @@ def judged(path: Path, question: Question) -> tuple[Checked, list[str]]:
         require=question.require,
         semantics=question.semantics,
     )
-    causes = {judgement.name: explain(verdict, judgement.name) for judgement in verdict}
-    known = {name: cause for name, cause in causes.items() if cause}
-    return Checked(trace, source, verdict, known, spoken(question)), [note] if note else []
+    return Checked(trace, source, verdict, explain_all(verdict), spoken(question)), [note] if note else []
 
 
 def spoken(question: Question) -> str:

@@ -78,12 +78,18 @@ def explain(verdict: Verdict, name: str) -> Cause | None:
     judgement = verdict[name]
     if judgement.overall != "violated":
         return None
-    trace, start = judgement.worst
-    return _cause(judgement, verdict.subject, trace, start)
+    return _cause(judgement, verdict.subject, _definitions(verdict.subject.compiled.spec))
 
 
-def _cause(judgement: Judgement, subject: Prepared, trace: int, start: int) -> Cause:
-    rule = judgement.rule
+def explain_all(verdict: Verdict) -> dict[str, Cause]:
+    """The causes of all violated requirements, by their names."""
+    definitions = _definitions(verdict.subject.compiled.spec)
+    violated = [judgement for judgement in verdict if judgement.overall == "violated"]
+    return {judgement.name: _cause(judgement, verdict.subject, definitions) for judgement in violated}
+
+
+def _cause(judgement: Judgement, subject: Prepared, definitions: dict[str, ast.Expr]) -> Cause:
+    rule, (trace, start) = judgement.rule, judgement.worst
     record = Record(
         {name: column[:, trace : trace + 1] for name, column in subject.record.env.items()},
         subject.record.ops,
@@ -92,7 +98,7 @@ def _cause(judgement: Judgement, subject: Prepared, trace: int, start: int) -> C
     record = record if window is None else record.cut(start + window + 1)
     formula = recorded(rule.typed.formula) if rule.absolute else rule.typed.formula
     tree = Blamer(record, subject.compiled.grid).blame(formula, start)
-    words = _Words(subject, record, rule.typed.written, _definitions(subject.compiled.spec))
+    words = _Words(subject, record, rule.typed.written, definitions)
     leaf = tree.leaf
     place, *labels = words.labels(tree)
     return Cause(

@@ -211,20 +211,26 @@ class Verdict:
 
         Requirements that are judged once hold, or not, at every instant.
         """
-        return self._mean(np.logical_and.reduce([self._spread(j, j.holds) for j in self.requirements]))
+        most = self._most_instants
+        return self._mean(np.logical_and.reduce([self._spread(j, j.holds, most) for j in self.requirements]))
 
     @property
     def failed_share(self) -> float:
         """Share of the instants of all traces at which a requirement is certainly violated."""
-        return self._mean(np.logical_or.reduce([self._spread(j, j.fails) for j in self.requirements]))
+        most = self._most_instants
+        return self._mean(np.logical_or.reduce([self._spread(j, j.fails, most) for j in self.requirements]))
+
+    @property
+    def _most_instants(self) -> int:
+        """Of the requirement that has most of them."""
+        return max(judgement.instants for judgement in self.requirements)
 
     def _mean(self, truth: Bools) -> float:
         counted = self.requirements[0].counted(truth)
         return float(counted.mean()) if counted.size else 0.0
 
-    def _spread(self, judgement: Judgement, truth: Bools) -> Bools:
+    def _spread(self, judgement: Judgement, truth: Bools, most: int) -> Bools:
         """At as many instants as the requirement that has most of them: (instants, traces)."""
-        most = max(judgement.instants for judgement in self.requirements)
         if judgement.instants == most:
             return truth
         once = truth.all(axis=0) if truth is judgement.holds else truth.any(axis=0)

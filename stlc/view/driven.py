@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stlc.diagnostics import StlcError
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
-from stlc.monitor.explain import Cause, explain
+from stlc.monitor.explain import Cause, explain_all
 from stlc.monitor.verdict import Judgement, Monitor, Verdict
 from stlc.source import Source
 from stlc.trace import Trace
@@ -152,7 +152,7 @@ def _caption(trace: Trace) -> Html:
 
 def causes_of(verdict: Verdict, names: list[str], spec: ast.Spec) -> Html | None:
     """Of each violated requirement its worst violation: which part, when, with which values."""
-    causes = [cause for judgement in verdict if (cause := explain(verdict, judgement.name)) is not None]
+    causes = list(explain_all(verdict).values())
     if not causes:
         return None
     declared = {item.name: item for item in spec.items if isinstance(item, ast.Require)}

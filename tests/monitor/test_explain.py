@@ -17,7 +17,7 @@ from stlc.compile.graph import evaluate_parts
 from stlc.compile.ops_numpy import NUMPY
 from stlc.diagnostics import UsageError
 from stlc.monitor.blame import Blame, Blamer
-from stlc.monitor.explain import explain, names_in, shown
+from stlc.monitor.explain import explain, explain_all, names_in, shown
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column
@@ -188,3 +188,11 @@ def test_a_deep_formula_is_evaluated_once(monkeypatch: pytest.MonkeyPatch) -> No
     assert cause is not None
     assert (cause.predicate, cause.sample) == ("x > 0", 0)
     assert len(seen) == 1
+
+
+def test_all_causes_are_those_of_each() -> None:
+    text = "signal x\nrequire a: always x > 0\nrequire b: x > -5\nrequire c: eventually x > 2"
+    verdict = Monitor(text, dt=0.1).check({"x": -np.ones(12)})
+    causes = explain_all(verdict)
+    assert list(causes) == ["a", "c"]
+    assert causes == {name: explain(verdict, name) for name in causes}
