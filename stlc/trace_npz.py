@@ -29,6 +29,10 @@ Array = NDArray[Any]
 MAX_BYTES = 4_000_000_000
 MAX_ARRAYS = 10_000
 
+_ROOM = 500_000_000
+_RATIO = 200
+"""An archive may unpack to `_ROOM` or to so many times its size; what sensors record takes a tenth of that."""
+
 _NUMERIC = "biuf"
 _TEXT = "U"
 _ZIP_MAGIC = (b"PK\x03\x04", b"PK\x05\x06")
@@ -141,10 +145,10 @@ def _read_members(path: Path, archive: zipfile.ZipFile) -> dict[str, Array]:
     if len(members) > MAX_ARRAYS:
         raise unreadable(path, f"it holds {len(members)} arrays, more than {MAX_ARRAYS}")
     size = sum(member.file_size for member in members)
-    if size > MAX_BYTES:
-        raise unreadable(
-            path, f"it unpacks to {size / 1e9:.1f} GB, more than {MAX_BYTES / 1e9:.0f} GB", advice="split it"
-        )
+    most = min(MAX_BYTES, max(_ROOM, _RATIO * path.stat().st_size))
+    if size > most:
+        reason = f"it unpacks to {size / 1e9:.1f} GB, more than {most / 1e9:.1f} GB"
+        raise unreadable(path, reason, advice="split it, or do not compress it")
     arrays: dict[str, Array] = {}
     for member in members:
         name = member.filename.removesuffix(".npy")

@@ -214,6 +214,16 @@ def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, monkeypatch
     assert "unpacks to" in message_of(tmp_path / "a.npz")
 
 
+def test_a_small_archive_that_unpacks_to_a_large_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, t=np.arange(1_000_000.0), x=np.zeros(1_000_000))
+    assert load_trace(path).samples == 1_000_000
+    monkeypatch.setattr("stlc.trace_npz._ROOM", 1_000_000)
+    assert load_trace(path).samples == 1_000_000, "what is not all alike is packed far less"
+    np.savez_compressed(path, t=np.zeros(1_000_000), x=np.zeros(1_000_000))
+    assert "unpacks to" in message_of(path)
+
+
 def test_too_many_arrays_and_arrays_given_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stlc.trace_npz.MAX_ARRAYS", 2)
     assert "3 arrays" in message_of(npz(tmp_path / "a.npz", t=[0.0], x=[0.0], y=[0.0]))
