@@ -31,7 +31,7 @@ MAX_ARRAYS = 10_000
 
 _ROOM = 500_000_000
 _RATIO = 200
-"""An archive may unpack to `_ROOM` or to so many times its size; what sensors record takes a tenth of that."""
+"""An archive may unpack to `_ROOM`, or to so many times its size; records of sensors take a tenth of that."""
 
 _NUMERIC = "biuf"
 _TEXT = "U"

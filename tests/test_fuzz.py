@@ -42,14 +42,14 @@ def tread_system(text: str) -> None:
 
 def test_drawn_specifications() -> None:
     numbers = random.Random(11)
-    codes = [laws(Source("a.stl", fuzz_grammar.specification(numbers)), SECONDS) for _ in range(25)]
+    codes = [laws(Source("a.stl", fuzz_grammar.specification(numbers)), SECONDS) for _ in range(20)]
     assert set(codes) == {0, 3}
 
 
 def test_bombs_of_every_construct() -> None:
-    for _, text in every(list(fuzz_bombs.specifications(12)), 100):
+    for _, text in every(list(fuzz_bombs.specifications(12)), 70):
         laws(Source("a.stl", text), SECONDS)
-    for _, text in every(list(fuzz_bombs.systems(12, SYSTEM)), 60):
+    for _, text in every(list(fuzz_bombs.systems(12, SYSTEM)), 40):
         tread_system(text)
 
 
@@ -85,7 +85,8 @@ def run(count: int, seed: int) -> list[fuzz.Outcome]:
 
 
 def test_random_inputs_through_the_program() -> None:
-    assert {outcome.kind for outcome in run(40, seed=3)} == {"text", "spec", "system", "trace"}
+    kinds = {outcome.kind for outcome in run(40, seed=3)}
+    assert {"text", "spec", "system", "trace"} <= kinds
 
 
 @pytest.mark.slow

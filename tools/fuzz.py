@@ -27,6 +27,7 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+import fuzz_foreign
 import fuzz_inputs
 import typer
 from fuzz_laws import laws, stage
@@ -34,6 +35,8 @@ from fuzz_specs import SMALL, SYSTEM
 from fuzz_traces import small_trace
 
 BATCH = 1000
+EVERY = 5000
+"""Inputs after which the table so far is printed."""
 PATIENCE = 60
 """Seconds of the clock without a sign of life, after which a worker is taken for hung in foreign code."""
 
@@ -108,7 +111,7 @@ def _read(limits):
     noise = []
     try:
         with _captured(io.StringIO(), noise):
-            return laws(read_source(Path("a.stl")), limits.seconds), "", noise
+            return laws(read_source(Path("a.stl")), limits.seconds, one_in=4), "", noise
     except StlcError as error:
         return error.exit_code, "", noise
     except BaseException:
@@ -132,7 +135,12 @@ def worker(seed, indices, limits, results):
     os.chdir(folder)
     tempfile.tempdir = str(folder)  # crash reports
     limit_address_space(4 * limits.memory)
-    typer.main.get_command = functools.cache(typer.main.get_command)  # a third of the time of most inputs
+    from stlc.cli import app
+
+    app._asked = functools.cache(
+        app._asked
+    )  # to describe the commands takes a third of the time of most inputs
+    typer.main.get_command = functools.cache(typer.main.get_command)
     base = peak()
     try:
         for index in indices:
@@ -164,6 +172,7 @@ def limit_address_space(megabytes):
 def import_everything():
     """What commands import must not count as the time of an input: workers are forked with all of it."""
     limits = Limits(60.0, 0)
+    fuzz_foreign.prepare()
     Path("a.stl").write_text(SMALL)
     Path("t.npz").write_bytes(small_trace())
     for suffix in ("csv", "mat", "mcap", "parquet"):
@@ -234,7 +243,7 @@ def fuzz(count, seed, limits, *, first=0, jobs=1, tell=lambda *_: None):
         for found, its_most in pool.map(lambda indices: batch(seed, indices, limits), ranges):
             outcomes += found
             most = max(most, its_most)
-            tell(found, len(outcomes))
+            tell(outcomes, most, len(found))
     return outcomes, most
 
 
@@ -265,18 +274,25 @@ def main():
     asked = parser.parse_args()
     started = time.monotonic()
 
-    def tell(found, many):
-        print(f"{many} inputs, {time.monotonic() - started:.0f} s", file=sys.stderr, flush=True)
-        for outcome in [outcome for outcome in found if outcome.fault]:
-            print(f"  {outcome.index} ({outcome.kind}): {outcome.fault}", file=sys.stderr, flush=True)
+    def tell(outcomes, most, new):
+        """The table so far, now and then, and every fault at once: a run that is stopped is evidence, too."""
+        faults = [
+            f"  {outcome.index} ({outcome.kind}): {outcome.fault}"
+            for outcome in outcomes[-new:]
+            if outcome.fault
+        ]
+        print(*faults, sep="\n", end="\n" * bool(faults))
+        if len(outcomes) // EVERY > (len(outcomes) - new) // EVERY:
+            spent = f"{time.monotonic() - started:.0f} s, {sum(os.times()[:4]):.0f} s of processor time"
+            print(f"{len(outcomes)} inputs from {asked.first} on, seed {asked.seed}, {spent}")
+            print(table(outcomes, most), flush=True)
 
     limits = Limits(asked.seconds, asked.memory)
     outcomes, most = fuzz(asked.count, asked.seed, limits, first=asked.first, jobs=asked.jobs, tell=tell)
     failed = [outcome for outcome in outcomes if outcome.fault]
     keep(asked.keep, asked.seed, failed)
+    print(f"in all {len(outcomes)} inputs, {len(failed)} faults, seed {asked.seed}")
     print(table(outcomes, most))
-    for outcome in failed:
-        print(f"  {outcome.index} ({outcome.kind}): {outcome.fault}")
     sys.exit(1 if failed else 0)
 
 

@@ -116,15 +116,3 @@ def table(rng: random.Random) -> tuple[str, bytes]:
         )
     data = text.encode(rng.choice(["utf-8", "utf-8", "utf-8", "utf-8-sig", "utf-16", "utf-7"]))
     return ".csv", mutated(data, rng) if rng.random() < 0.5 else data
-
-
-def foreign(rng: random.Random) -> tuple[str, bytes]:
-    """Formats that are read by other libraries."""
-    suffix = rng.choice([".mat", ".mcap", ".parquet", ".txt", ""])
-    starts = {
-        ".mat": b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM",
-        ".mcap": b"\x89MCAP0\r\n",
-        ".parquet": b"PAR1",
-    }
-    start = rng.choice([starts.get(suffix, b""), b"\x89HDF\r\n\x1a\n", b""])
-    return suffix, start + rng.randbytes(rng.choice([0, 8, 100, 2000])) + rng.choice([b"", b"PAR1", start])
