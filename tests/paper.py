@@ -107,8 +107,8 @@ def apart(benchmark: Benchmark, task: Task, count: int = COUNT) -> tuple[float, 
 def kernel_apart(benchmark: Benchmark, task: Task) -> tuple[float, float]:
     """How far the native kernel is from the torch graph: states and robustness, at most."""
     x0, u = (torch.tensor(part) for part in benchmark.cases(2))
-    assert task._native is not None
-    rho, columns = task._native.judge(x0, u, columns=True)
+    assert task.native is not None
+    rho, columns = task.native.judge(x0, u, columns=True)
     wanted = task.rollout(x0, u)
     states = torch.stack([columns[name].t() for name in task.names], 2)
     each = task.requirement_robustness(wanted)
