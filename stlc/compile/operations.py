@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import lru_cache
 from types import MappingProxyType
 from typing import Any
 
@@ -41,14 +43,22 @@ def _quantity(expr: ast.Quantity, _values: Sequence[Value], scope: Scope) -> Val
             scope.fail(unsupported("a number of steps", expr.span, scope))
         return Moment(steps=expr.value, span=expr.span)
     try:
-        unit = parse_unit(expr.unit)
+        number = _measured(expr.value, expr.unit)
     except ValueError as error:
         scope.fail(Diagnostic("E203", str(error), expr.span))
-    exact = expr.value * unit.ratio
-    if not math.isfinite(nearest(exact)):
+    if number is None:
         scope.fail(too_large(expr.span))
-    number = literal(exact, expr.span)
-    return replace(number, unit=unit, flexible=False, bare=False, kind="real")
+    return replace(number, span=expr.span)
+
+
+@lru_cache(maxsize=256)
+def _measured(value: Fraction, unit_text: str) -> Number | None:
+    """A number with a unit; None where it is too large for a float. Raises ValueError for an unknown unit."""
+    unit = parse_unit(unit_text)
+    exact = value * unit.ratio
+    if not math.isfinite(nearest(exact)):
+        return None
+    return replace(literal(exact), unit=unit, flexible=False, bare=False, kind="real")
 
 
 def _bool(expr: ast.Bool, _values: Sequence[Value], _scope: Scope) -> Value:

@@ -26,7 +26,7 @@ from stlc.source import Source
 MAX_ERRORS = 20
 MAX_DEPTH = 150
 MAX_TEXT = 1_000_000
-MAX_LEXEMES = 25_000
+MAX_LEXEMES = 30_000
 
 _RULES: Mapping[str, Rule] = MappingProxyType({**EXPRESSIONS, **DECLARATIONS})
 
