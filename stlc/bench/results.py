@@ -175,7 +175,8 @@ def provenance(documents: Iterable[Mapping[str, Any]]) -> list[str]:
         key = (
             f"{machine.get('processor') or machine.get('machine')}, {machine.get('cores')} cores",
             f"torch {versions.get('torch')}, Python {versions.get('python')}, stlc {document['stlc']}",
-            f"{document['threads']} torch thread{'' if document['threads'] == 1 else 's'} a run",
+            ", ".join(_counted(document[part], part) for part in ("threads", "cores") if document[part])
+            + " a training",
         )
         groups.setdefault(key, []).append(document)
     lines = []
@@ -185,6 +186,11 @@ def provenance(documents: Iterable[Mapping[str, Any]]) -> list[str]:
         commits = ", ".join(f"`{commit}`" for commit in sorted({_commit(document) for document in group}))
         lines += [f"- {len(group)} trainings on {key[0]}; {key[1]}; {key[2]}; {when}; commit {commits}"]
     return lines
+
+
+def _counted(count: int, what: str) -> str:
+    """Such as `1 core`."""
+    return f"{count} {what if count != 1 else what.removesuffix('s')}"
 
 
 def _commit(document: Mapping[str, Any]) -> str:

@@ -27,6 +27,7 @@ def test_a_line_for_every_machine_with_commits_and_dates() -> None:
         "versions": {"torch": "2.13.0", "python": "3.11.7"},
         "stlc": "0.1.0",
         "threads": 1,
+        "cores": None,
         "git": {"commit": "0123456789abcdef", "dirty": False},
         "finished": "2026-01-02T10:00:00+00:00",
     }
@@ -35,12 +36,12 @@ def test_a_line_for_every_machine_with_commits_and_dates() -> None:
         "git": {"commit": "fedcba9876543210", "dirty": True},
         "finished": "2026-01-03T10:00:00+00:00",
     }
-    first, second = provenance([made, later, {**made, "threads": 2, "git": None}])
+    first, second = provenance([made, later, {**made, "threads": 2, "cores": 1, "git": None}])
     assert first == (
         "- 2 trainings on a processor, 2 cores; torch 2.13.0, Python 3.11.7, stlc 0.1.0; "
-        "1 torch thread a run; 2026-01-02 to 2026-01-03; commit `0123456789`, `fedcba9876+`"
+        "1 thread a training; 2026-01-02 to 2026-01-03; commit `0123456789`, `fedcba9876+`"
     )
-    assert second.endswith("2 torch threads a run; 2026-01-02; commit `unknown`")
+    assert second.endswith("2 threads, 1 core a training; 2026-01-02; commit `unknown`")
 
 
 def test_a_bar_in_a_cell_is_no_column() -> None:
