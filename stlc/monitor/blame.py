@@ -20,9 +20,10 @@ from stlc.compile.graph import evaluate_parts
 from stlc.compile.horizon import columns, parts
 from stlc.compile.interface import Grid
 from stlc.compile.lower import lower
+from stlc.compile.samples import columns_of
 from stlc.compile.thaw import thaw
 from stlc.compile.walk import from_now, on_clock
-from stlc.monitor.values import Record, bounds, history
+from stlc.monitor.values import Record, bounds, granted, history
 from stlc.source import Span
 
 Floats = NDArray[np.float64]
@@ -121,7 +122,8 @@ class Blamer:
         values: dict[str, ir.Num] = {}
         last = self.record.samples - 1
         for name, num in formula.bindings:
-            if sample <= last and defined(ir.Atom(num), last + 1)[sample]:
+            given = columns_of(num) <= self.record.env.keys()
+            if given and sample <= last and defined(ir.Atom(num), last + 1)[sample]:
                 value, _ = bounds(ir.Atom(num), self.record, range(sample, sample + 1), "open")
                 values[name] = ir.Lit(float(value[0, 0]))
             else:
@@ -129,11 +131,14 @@ class Blamer:
         return values
 
     def _lowered(self, formula: typed.Formula, wanted: bool) -> ir.Formula:
-        """The formula, or its negation where it is not wanted: what fails."""
+        """The formula, or its negation where it is not wanted: what fails.
+
+        A requirement may not depend on all that it mentions, and what it does not depend on is not given.
+        """
         key = (formula, wanted)
         if key not in self.cache:
             goal = formula if wanted else typed.Not(formula.span, formula)
-            self.cache[key] = lower(goal, self.grid, [])
+            self.cache[key] = granted(lower(goal, self.grid, []), self.record.env)
         return self.cache[key]
 
     def _margins(self, formula: typed.Formula, wanted: bool, instants: range) -> Floats:

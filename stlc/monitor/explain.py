@@ -130,10 +130,11 @@ class _Words:
     def readings(self, blame: Blame) -> tuple[Reading, ...]:
         """The signals that the predicates below read, each at its instant."""
         seen: dict[tuple[str, int], Reading] = {}
+        read = self.subject.compiled.signature
         for leaf in blame.leaves:
-            for name in _in_order(leaf):
+            for name in filter(read.__contains__, _in_order(leaf)):
                 value = float(self.record.env[name][leaf.sample, 0])
-                text = f"{name} = {shown(value, self.subject.compiled.signature[name])}"
+                text = f"{name} = {shown(value, read[name])}"
                 seen.setdefault((name, leaf.sample), Reading(name, value, text))
         return tuple(seen.values())
 

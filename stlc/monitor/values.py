@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias, assert_never
 
@@ -13,7 +13,7 @@ from stlc.compile.defined import defined
 from stlc.compile.graph import evaluate
 from stlc.compile.horizon import parts
 from stlc.compile.ops import Array, Ops
-from stlc.compile.samples import farthest
+from stlc.compile.samples import columns_of, everything, farthest
 from stlc.compile.schedule import End
 from stlc.compile.semantics import Exact, Semantics
 
@@ -145,6 +145,37 @@ def history(formula: ir.Formula) -> int:
 def _back(window: ir.Window) -> int:
     """More than any record has where the window is unbounded."""
     return 1 << 40 if window.hi is None else window.hi
+
+
+# ------------------------------------------------------------------ signals that nobody gave
+
+
+def granted(formula: ir.Formula, names: Collection[str]) -> ir.Formula:
+    """The formula where a predicate is true that reads other columns than those: the most that it can be.
+
+    Names that `freeze` binds to what nobody gave are such columns, too.
+    """
+    match formula:
+        case ir.Atom(num=num):
+            return formula if _read(num) <= set(names) else ir.Truth(True)
+        case ir.Truth():
+            return formula
+        case ir.Join(items=items):
+            return replace(formula, items=tuple(granted(item, names) for item in items))
+        case ir.Freeze(bindings=bindings, body=body):
+            known = tuple(each for each in bindings if _read(each[1]) <= set(names))
+            inner = granted(body, {*names, *(name for name, _ in known)})
+            return replace(formula, bindings=known, body=inner) if known else inner
+        case ir.Over() | ir.Past() | ir.Shift() | ir.AtStart():
+            return replace(formula, body=granted(formula.body, names))
+        case ir.Until(left=left, right=right) | ir.Since(left=left, right=right):
+            return replace(formula, left=granted(left, names), right=granted(right, names))
+    assert_never(formula)
+
+
+def _read(num: ir.Num) -> set[str]:
+    """The columns that a number reads, and the names that are frozen in it."""
+    return {*columns_of(num), *(part.name for part in everything(num) if isinstance(part, ir.Held))}
 
 
 # ------------------------------------------------------------------ strict predicates

@@ -196,3 +196,23 @@ def test_all_causes_are_those_of_each() -> None:
     causes = explain_all(verdict)
     assert list(causes) == ["a", "c"]
     assert causes == {name: explain(verdict, name) for name in causes}
+
+
+@pytest.mark.parametrize(
+    ("written", "because"),
+    [
+        (
+            "(x > 0 or historically y > 0) and always[0 s, 3 s] false",
+            "`false` is false whatever the signals are",
+        ),
+        ("x > 1 and not (freeze k = y in eventually[0 s, 2 s] (x > k or true))", "`true` is true whatever"),
+        ("always (x > 0 -> (y > 0 and false))", "`false` is false whatever the signals are"),
+        ("not eventually (y > 3 or true)", "`true` is true whatever the signals are"),
+        ("x > 9 and (y > 3 or true)", "`x > 9` is false where x = 2, at t = 0 s"),
+    ],
+)
+def test_a_signal_that_makes_no_difference_need_not_be_there(written: str, because: str) -> None:
+    monitor = Monitor(f"signal x\nsignal y\nrequire r: {written}", dt=1)
+    cause = explain(monitor.check({"x": np.arange(2.0, 8.0)}, end="truncate"), "r")
+    assert cause is not None
+    assert cause.because.startswith(because)
