@@ -96,7 +96,7 @@ class Engine:
     average: float = 0.99
     pool: int = 2048
     every: int = 50
-    most: int = 256
+    most: int = 768
     slope: float = 5.0
     imitation: float = 1.0
     share: float = 0.05
@@ -123,7 +123,7 @@ def decide(task: Task, config: TrainConfig) -> Engine:
         hard=batch if guided else 0,
         lr=config.lr or declared.lr or 1e-3,
         hold=MISSION_HOLD if mission else 0.0,
-        most=MISSION_MOST if mission else 256,
+        most=MISSION_MOST if mission else 768,
         share=0.05 if plans > 1 else 0.0,
         performance=0.3 if guided else 1.0,
         held_out=config.held_out,
