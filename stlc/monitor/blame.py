@@ -106,7 +106,9 @@ class Blamer:
                 return self._timed(formula, sample, wanted)
             case typed.Shift(_, steps, body):
                 there = sample + steps
-                inside = there >= 0
+                inside = there >= 0 and (
+                    there < self.record.samples or not self._unknown(body, there, wanted)
+                )
                 parts = (self.blame(body, there, wanted=wanted),) if inside else ()
                 return replace(self._node(formula, wanted, sample), parts=parts)
             case typed.Edge():
@@ -153,6 +155,10 @@ class Blamer:
             found = self._found(lowered, instants)
         assert found is not None
         return found
+
+    def _unknown(self, formula: typed.Formula, sample: int, wanted: bool) -> bool:
+        """Whether the trace does not tell: it was cut, and what is not there is not as it is wanted."""
+        return bool(np.isposinf(self._margins(formula, wanted, range(sample, sample + 1))[0]))
 
     def _found(self, lowered: ir.Formula, instants: range) -> Floats | None:
         """Its values, where an evaluation of something around it has told them already."""
@@ -242,7 +248,7 @@ class Blamer:
         if (formula.op in ("always", "historically")) is wanted:
             worst = instants[int(np.argmin(margins))]
             return replace(node, parts=(self.blame(formula.body, worst, wanted=wanted),))
-        best = instants[int(np.argmax(margins))]
+        best = instants[int(np.argmax(np.where(np.isposinf(margins), -np.inf, margins)))]
         part = self.blame(formula.body, best, wanted=wanted)
         return replace(node, sample=instants[0], until=instants[-1], parts=(part,))
 

@@ -216,3 +216,13 @@ def test_a_signal_that_makes_no_difference_need_not_be_there(written: str, becau
     cause = explain(monitor.check({"x": np.arange(2.0, 8.0)}, end="truncate"), "r")
     assert cause is not None
     assert cause.because.startswith(because)
+
+
+def test_a_window_that_the_end_cuts_is_explained_by_what_there_is() -> None:
+    monitor = Monitor("signal x\nrequire r: eventually[0 s, 3 s] eventually[0 s, 7 s] next(x > 9)", dt=1)
+    cause = explain(monitor.check({"x": np.arange(2.0, 8.0)}, end="truncate"), "r")
+    assert cause is not None
+    assert cause.sample == 5
+    alone = explain(monitor.check({"x": np.array([2.0])}, end="truncate"), "r")
+    assert alone is not None
+    assert alone.readings == ()
