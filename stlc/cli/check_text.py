@@ -34,6 +34,10 @@ def _parts(result: Checked, color: bool) -> Iterator[str]:
         elif judged.overall == "inconclusive" and result.verdict.in_scope:
             yield ""
             yield _inconclusive(judged, result)
+    silent = sum(judged.overall == "violated" for judged in result.verdict) - len(result.causes)
+    if silent > 0:
+        yield ""
+        yield f"{silent:,} more are violated; --require NAME says why."
     yield ""
     yield _summary(result.verdict)
     folder = _run_of(result)

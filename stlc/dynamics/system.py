@@ -31,6 +31,8 @@ from stlc.dynamics.step import Step, build_step
 from stlc.files import find_system
 
 HARD = Hard()
+PROBED = 1000
+"""Steps that a probe drives at most: what explodes does so soon, and a horizon may be long."""
 
 
 class System:
@@ -351,14 +353,14 @@ class System:
         )
 
     def probe(self, n: int = 256, *, seed: int = 0) -> tuple[Diagnostic, ...]:
-        """Try the system: initial states, random plans, their gradients; warnings come back.
+        """Try the system: initial states, random plans of at most `PROBED` steps; warnings come back.
 
         Raises SystemFileError where states cannot be drawn (S301) or are not finite (S302).
         """
         x0 = self.sample(n, seed=seed, dtype=torch.float64)
         self.require_finite(x0)
         generator = torch.Generator().manual_seed(seed)
-        shape = (n, self.horizon, len(self.controls))
+        shape = (n, min(self.horizon, PROBED), len(self.controls))
         low, high = self.control_low.double(), self.control_high.double()
         u = low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
         self.require_finite(self.rollout(x0, u))

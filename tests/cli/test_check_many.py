@@ -302,3 +302,15 @@ def test_columns_of_a_stream_may_be_renamed(monkeypatch: pytest.MonkeyPatch) -> 
     assert stream(monkeypatch, text, "-q") == 3
     assert stream(monkeypatch, text, "-q", "--map", "a=height") == 0
     assert stream(monkeypatch, text, "-q", "--map", "a=width") == 3
+
+
+def test_of_thousands_of_violations_the_first_are_explained(tmp_path: Path, capsys) -> None:
+    rules = "".join(f"require r{i}: x > {i}\n" for i in range(503))
+    (tmp_path / "many.stl").write_text(f"spec many\nsignal x\n{rules}")
+    (tmp_path / "many.csv").write_text("t,x\n0,-1\n0.1,-2\n")
+    with pytest.raises(SystemExit) as caught:
+        main(["check", str(tmp_path / "many.stl"), str(tmp_path / "many.csv")])
+    assert caught.value.code == 1
+    said = capsys.readouterr().out
+    assert said.count("= because:") == 500
+    assert "3 more are violated; --require NAME says why." in said

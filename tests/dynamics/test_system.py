@@ -15,7 +15,7 @@ from stlc.compile.switch import Tanh
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.controls import raw_width, squash
 from stlc.dynamics.describe import describe
-from stlc.dynamics.system import System
+from stlc.dynamics.system import PROBED, System
 
 Make = Callable[..., System]
 
@@ -162,3 +162,17 @@ def test_a_declaration_needs_no_torch() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=False)
     assert done.returncode == 0, done.stderr
     assert "leave_stop_line  when sign == stop and x > 0" in done.stdout
+
+
+def test_a_probe_of_a_long_horizon_is_short(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = MIXED.replace("horizon: 4 steps", "horizon: 99999 steps")
+    seen: list[int] = []
+    rollout = System.rollout
+
+    def watched(self: System, x0: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        seen.append(u.shape[1])
+        return rollout(self, x0, u)
+
+    monkeypatch.setattr(System, "rollout", watched)
+    make(text).probe(4)
+    assert seen == [PROBED]
