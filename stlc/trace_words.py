@@ -76,7 +76,8 @@ def _seconds(trace: str, strand: Strand) -> NDArray[np.float64]:
         message = f"the clock `{strand.named}` in `{trace}` holds words (`{shown}`)"
         advice = ("seconds, or dates and times such as 2026-01-31T12:00:00.5",)
         raise TraceError(Diagnostic("E603", message, help=advice)) from None
-    return np.asarray((instants - instants.flat[0]) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)
+    first = instants.flat[0] if instants.size else np.datetime64(0, "ns")
+    return np.asarray((instants - first) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)
 
 
 def _numbers(trace: str, name: str, values: NDArray[Any], words: Words) -> NDArray[np.float64]:

@@ -572,3 +572,10 @@ def test_both_csv_readers_agree(tmp_path: Path, rows: list[list[float]]) -> None
         csv(tmp_path / "b.csv", "a,b\n\n" + body.replace(",", ',"', 1).replace("\n", '"\n', 1))
     )
     assert all(np.array_equal(fast.columns[name], strict.columns[name]) for name in ("a", "b"))
+
+
+def test_a_clock_of_words_without_samples_is_a_diagnostic(tmp_path: Path) -> None:
+    empty = np.zeros(0)
+    np.savez(tmp_path / "none.npz", x=empty, t=empty.astype("U4"))
+    with pytest.raises(TraceError):
+        load_trace(tmp_path / "none.npz")
