@@ -294,8 +294,8 @@ class TorchOps:
         return _constant(value, like.dtype, like.device)
 
     def full(self, shape: tuple[int, ...], value: float, like: Tensor) -> Tensor:
-        """A constant array."""
-        return like.new_full(shape, value)
+        """A constant array; infinite where the dtype cannot hold the value."""
+        return self.constant(value, like).expand(shape).clone()
 
     def cat(self, parts: Sequence[Tensor]) -> Tensor:
         """Joined along axis 0."""

@@ -63,3 +63,10 @@ def test_reduction(pick: Pick, shape: tuple[int, int]) -> None:
         weights = torch.randn_like(wanted)
         mine, theirs = (torch.autograd.grad(v, x, weights) for v in (value, wanted))
         torch.testing.assert_close(mine, theirs)
+
+
+def test_a_constant_beyond_the_dtype_is_infinite() -> None:
+    like = torch.zeros(3)
+    assert torch.equal(TORCH.full((2,), 1e200, like), torch.full((2,), torch.inf))
+    assert torch.equal(TORCH.full((2,), -1e200, like), torch.full((2,), -torch.inf))
+    assert TORCH.full((), 0.25, like).item() == 0.25
