@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from stlc.compile.extremum import Pick
+from stlc.compile.ops_torch import TORCH
 from stlc.compile.ops_torch_choice import choice, reduction
 
 SHAPES = [(2, 3), (40, 700)]
