@@ -187,7 +187,9 @@ def _read_fast(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array] 
 
 
 def _load(body: str, delimiter: str, columns: Sequence[int] | None) -> Array | None:
-    """The numbers of these columns; None where something is no number."""
+    """The numbers of these columns; None where something is no number, or nothing is there."""
+    if not _ANY.search(body):
+        return None
     lines = io.TextIOWrapper(io.BytesIO(body.encode()), "utf-8")  # a StringIO is four times as large
     try:
         with lines:

@@ -579,3 +579,9 @@ def test_a_clock_of_words_without_samples_is_a_diagnostic(tmp_path: Path) -> Non
     np.savez(tmp_path / "none.npz", x=empty, t=empty.astype("U4"))
     with pytest.raises(TraceError):
         load_trace(tmp_path / "none.npz")
+
+
+def test_a_csv_of_empty_cells_is_a_diagnostic(tmp_path: Path) -> None:
+    (tmp_path / "gaps.csv").write_text("t,x\n,\n,\n,,")
+    with pytest.raises(TraceError):
+        load_trace(tmp_path / "gaps.csv")
