@@ -55,7 +55,7 @@ def _requirement(judged: Judgement, result: Checked) -> dict[str, Any]:
         "verdict": judged.overall,
         "robustness": {
             "min": _least(least),
-            "mean": float(least.mean()) if least.size else None,
+            "mean": _mean(least),
             "low": _least(low),
             "high": _least(high),
             "argmin": {"trace": trace, "start": time, "time": time if cause is None else cause.time},
@@ -69,6 +69,12 @@ def _requirement(judged: Judgement, result: Checked) -> dict[str, Any]:
 
 def _least(values: NDArray[np.float64]) -> float | None:
     return float(values.min()) if values.size else None
+
+
+def _mean(values: NDArray[np.float64]) -> float | None:
+    """Divided first: the sum of margins may be more than a float holds."""
+    with np.errstate(invalid="ignore"):  # of +inf and -inf there is none
+        return float((values / values.size).sum()) if values.size else None
 
 
 def _cause(cause: Cause) -> dict[str, Any]:

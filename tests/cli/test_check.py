@@ -388,3 +388,13 @@ def test_torch_is_not_imported() -> None:
         "assert 'torch' not in sys.modules and 'yaml' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+def test_the_mean_of_huge_margins_is_a_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "huge.stl").write_text("spec huge\nsignal x\nrequire r: x > 0\n")
+    (tmp_path / "huge.csv").write_text("t,x\n0,1.5e308\n0.1,1.5e308\n")
+    assert (
+        main(["check", str(tmp_path / "huge.stl"), str(tmp_path / "huge.csv"), "--at", "all", "--json"]) == 0
+    )
+    (found,) = json.loads(capsys.readouterr().out)["result"]["requirements"]
+    assert found["robustness"]["mean"] == pytest.approx(1.5e308)
