@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from stlc.compile.pipeline import Compiled, Rule
 from stlc.compile.semantics import TOLERANCE
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.monitor.asked import Asked, Bounds
 from stlc.monitor.instants import check_length, starts_of
 from stlc.monitor.judgement import Status, unknown_requirement
 from stlc.monitor.needs import Need, needs_of
 from stlc.monitor.signals import arrange
 from stlc.monitor.tally import Tally
-from stlc.monitor.tracking import Asked, Bounds, Tracker, tracker_of
+from stlc.monitor.tracking import Tracker, tracker_of
 from stlc.trace import Trace
 
 Floats: TypeAlias = NDArray[np.float64]

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.monitor.asked import Bounds
 from stlc.monitor.judgement import Status
-from stlc.monitor.tracking import Bounds
 
 Floats = NDArray[np.float64]
 Verdicts = NDArray[np.int8]

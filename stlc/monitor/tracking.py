@@ -4,46 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple, Protocol, TypeAlias
+from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stlc.compile import ir
-from stlc.compile.horizon import reach
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.pipeline import Rule
-from stlc.monitor.columns import FAR, End, Reader, Side
-from stlc.monitor.endings import lengthened, may_end, with_seen
+from stlc.monitor.asked import (
+    Asked,
+    Bounds,
+    Ending,
+    Floats,
+    Plans,
+    decided_first,
+    first_needed,
+    sides_of,
+    worst,
+)
+from stlc.monitor.columns import FAR, End
+from stlc.monitor.endings import lengthened, with_seen
+from stlc.monitor.everywhere import Everywhere
 from stlc.monitor.frontier import Frontier, skeleton
 from stlc.monitor.instants import rule_bounds, window_of
-from stlc.monitor.streams import EndlessError, Plan, endless, looks_on, plan
-from stlc.monitor.values import Record, by_truth, history, window_bounds
-
-Floats: TypeAlias = NDArray[np.float64]
-Ending: TypeAlias = Literal["open", "truncate"]
-Plans: TypeAlias = Mapping[End, Plan]
-"""Least and greatest value wherever the trace ends, and the requirement as it is written."""
-
-
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """How values are taken.
-
-    Attributes:
-        ending: what becomes of windows that the end of the trace cuts.
-        truth: predicates are true or false (+inf or -inf), without any tolerance.
-    """
-
-    ending: Ending = "open"
-    truth: bool = False
-
-
-class Bounds(NamedTuple):
-    """Least and greatest robustness at consecutive instants, each (instants,)."""
-
-    low: Floats
-    high: Floats
+from stlc.monitor.streams import EndlessError, endless, looks_on, plan
+from stlc.monitor.values import Record, by_truth, window_bounds
+from stlc.monitor.windowed import Windowed
 
 
 class Tracker(Protocol):
@@ -85,126 +71,19 @@ def tracker_of(rule: Rule, horizon: int | None, asked: Asked, *, everywhere: boo
         if window is not None:
             if planned.lag or not everywhere:
                 raise EndlessError
-            return Everywhere(plans, asked, window)
+            return Windowed(plans, asked, window)
         if endless(planned.formula):
             if everywhere:
                 raise EndlessError
             return FromTheStart(plans, asked)
-        return Everywhere(plans, asked, None)
+        return Everywhere(plans, asked)
     except EndlessError:
         return Whole(rule, horizon, asked.ending, asked.truth)
 
 
 def _plans(formula: ir.Formula, ending: Ending, window: int | None) -> Plans:
-    lower, upper = (_worst(formula, end, ending, window) for end in ("lower", "upper"))
+    lower, upper = (worst(formula, end, ending, window) for end in ("lower", "upper"))
     return {"lower": plan(lower), "upper": plan(upper), "truncate": plan(formula)}
-
-
-def _worst(
-    formula: ir.Formula, end: Literal["lower", "upper"], ending: Ending, window: int | None
-) -> ir.Formula:
-    """The formula for one end of what is possible; with a `window`, an early end is unknown or cuts."""
-    cut = ending == "truncate"
-    return may_end(formula, end, cut=cut) if cut or window is None else formula
-
-
-def _sides(plans: Plans, beyond: int, asked: Asked) -> list[Side]:
-    """Both ends of what is possible, and the ending where it is another one."""
-    ends: list[End] = ["lower", "upper"] if asked.ending == "open" else ["lower", "upper", "truncate"]
-    return [Side(plans[end], end, 0 if end == "truncate" else beyond, asked.truth) for end in ends]
-
-
-@dataclass(slots=True)
-class Everywhere:
-    """A formula whose windows have an end, at consecutive instants.
-
-    With a `window`, the windows to the end of the trace end so many samples after their instant.
-    """
-
-    plans: Plans
-    asked: Asked
-    window: int | None
-    samples: int = 0
-    _sides: list[Side] = field(default_factory=list)
-    _readers: list[Reader] = field(default_factory=list)
-    _ahead: int = 0
-    _back: int = 0
-
-    def __post_init__(self) -> None:
-        formula = self.planned.formula
-        self._ahead = reach(formula).future if self.window is None else self.window
-        self._back = history(formula)
-        self._sides = _sides(self.plans, self._ahead, self.asked)
-        self._readers = [Reader([side.plan.formula], side.end) for side in self._sides]
-
-    @property
-    def planned(self) -> Plan:
-        """The requirement as it is written."""
-        return self.plans["truncate"]
-
-    @property
-    def settled(self) -> int:
-        """The first instant whose value may still change."""
-        return max(self.samples - self._ahead - self.planned.lag, 0)
-
-    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take new samples in."""
-        for side in self._sides:
-            side.grow(signals, first, samples)
-        self.samples = samples
-
-    def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations."""
-        if self.asked.ending == "truncate":
-            return _decided_first(self, start, stop)
-        return self.either(start, stop)
-
-    def certain(self, starts: range) -> Bounds:
-        """At settled instants, where windows are cut to the trace."""
-        values = self._values(2, starts.start, starts.stop)
-        return Bounds(values, values)
-
-    def either(self, start: int, stop: int) -> Bounds:
-        """At any instants, where nothing is assumed of what lies outside of the trace."""
-        return Bounds(self._values(0, start, stop), self._values(1, start, stop))
-
-    def ended(self, starts: range) -> Bounds:
-        """Where the trace is over."""
-        sides = self._sides
-        self._sides = [side.over() for side in sides]
-        try:
-            return self._ended(starts)
-        finally:
-            self._sides = sides
-
-    def _ended(self, starts: range) -> Bounds:
-        if self.asked.ending == "open":
-            return self.either(starts.start, starts.stop)
-        return self.certain(starts)
-
-    def drop(self, start: int) -> int:
-        """Forget instants before `start`."""
-        for side in self._sides:
-            side.drop(start - self._back)
-        return _first_needed(self.planned, self.samples)
-
-    def _values(self, which: int, start: int, stop: int) -> Floats:
-        side = self._sides[which]
-        if stop <= start:
-            return np.zeros(0)
-        if self.window is None:
-            return side.values(self._readers[which], start, stop - start)[0][:, 0]
-        record = Record(side.rows, NUMPY)
-        starts = range(start - side.base, stop - side.base)
-        ends: Ending = "truncate" if side.end == "truncate" else "open"
-        low, high = window_bounds(side.plan.formula, record, starts, self.window, ends)
-        return np.asarray((high if side.end == "upper" else low)[:, 0])
-
-
-def _first_needed(planned: Plan, samples: int) -> int:
-    """The first sample whose signals a column still reads."""
-    reads = [samples - stream.ahead - stream.back for stream in planned.streams if hasattr(stream, "formula")]
-    return max(min(reads, default=samples), 0)
 
 
 @dataclass(slots=True)
@@ -223,7 +102,7 @@ class FromTheStart:
         self._lag = max(bones[end].reach + planned.lag for end, planned in self.plans.items()) + 1
         self._back = max(each.back for each in bones.values())
         beyond = max(bones[end].reach + bones[end].unsure(planned) for end, planned in self.plans.items())
-        sides = _sides(self.plans, beyond, self.asked)
+        sides = sides_of(self.plans, beyond, self.asked)
         self._fronts = [Frontier(bones[side.end], side) for side in sides]
 
     @property
@@ -256,7 +135,7 @@ class FromTheStart:
         """Forget what the frontier has passed."""
         for front in self._fronts:
             front.side.drop(front.at - self._back)
-        return _first_needed(self.plans["truncate"], self.samples)
+        return first_needed(self.plans["truncate"], self.samples)
 
 
 @dataclass(slots=True)
@@ -275,7 +154,7 @@ class Whole:
         if self.truth:
             self.rule = replace(self.rule, formula=by_truth(self.rule.formula))
         for end in ("lower", "upper"):
-            self._ends[end] = _worst(self.rule.formula, end, self.ending, self.window)
+            self._ends[end] = worst(self.rule.formula, end, self.ending, self.window)
 
     @property
     def window(self) -> int | None:
@@ -297,7 +176,7 @@ class Whole:
     def live(self, start: int, stop: int) -> Bounds:
         """Bounds over all continuations."""
         if self.ending == "truncate":
-            return _decided_first(self, start, stop)
+            return decided_first(self, start, stop)
         return self.either(start, stop)
 
     def certain(self, starts: range) -> Bounds:
@@ -327,12 +206,3 @@ class Whole:
     def drop(self, start: int) -> int:  # noqa: ARG002
         """Nothing can be forgotten."""
         return 0
-
-
-def _decided_first(tracker: Everywhere | Whole, start: int, stop: int) -> Bounds:
-    """Where windows are cut, what a settled instant reads before the first sample is false, not unknown."""
-    middle = min(max(tracker.settled, start), stop)
-    if middle <= start:
-        return tracker.either(start, stop)
-    known, rest = tracker.certain(range(start, middle)), tracker.either(middle, stop)
-    return Bounds(*map(np.concatenate, zip(known, rest, strict=True)))

@@ -55,6 +55,15 @@ def test_samples_one_by_one(numbers: range) -> None:
     assert judged > len(numbers) / 2
 
 
+@pytest.mark.parametrize(
+    "seed", [pytest.param(600000003709, id="what the past tells beyond the end of a planning window")]
+)
+def test_a_case_that_was_wrong_once(seed: int) -> None:
+    found = drawn(seed)
+    assert found is not None
+    check_stream(*found)
+
+
 def check_stream(case: Case, monitor: Monitor) -> None:
     (rule,) = monitor.compiled.requirements
     at: Literal["all"] | None = "all" if case.seed % 2 and (rule.windowed or not rule.uses_end) else None

@@ -1,0 +1,83 @@
+"""What is asked of a requirement whose signals come in, and what its trackers share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile import ir
+from stlc.monitor.columns import End, Side
+from stlc.monitor.endings import may_end
+from stlc.monitor.streams import Plan
+
+Floats: TypeAlias = NDArray[np.float64]
+Ending: TypeAlias = Literal["open", "truncate"]
+Plans: TypeAlias = Mapping[End, Plan]
+"""Least and greatest value wherever the trace ends, and the requirement as it is written."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """How values are taken.
+
+    Attributes:
+        ending: what becomes of windows that the end of the trace cuts.
+        truth: predicates are true or false (+inf or -inf), without any tolerance.
+    """
+
+    ending: Ending = "open"
+    truth: bool = False
+
+
+class Bounds(NamedTuple):
+    """Least and greatest robustness at consecutive instants, each (instants,)."""
+
+    low: Floats
+    high: Floats
+
+
+def worst(
+    formula: ir.Formula, end: Literal["lower", "upper"], ending: Ending, window: int | None
+) -> ir.Formula:
+    """The formula for one end of what is possible; with a `window`, an early end is unknown or cuts."""
+    cut = ending == "truncate"
+    return may_end(formula, end, cut=cut) if cut or window is None else formula
+
+
+def sides_of(plans: Plans, beyond: int, asked: Asked) -> list[Side]:
+    """Both ends of what is possible, and the ending where it is another one."""
+    ends: list[End] = ["lower", "upper"] if asked.ending == "open" else ["lower", "upper", "truncate"]
+    return [Side(plans[end], end, 0 if end == "truncate" else beyond, asked.truth) for end in ends]
+
+
+def first_needed(planned: Plan, samples: int) -> int:
+    """The first sample whose signals a column still reads."""
+    reads = [samples - stream.ahead - stream.back for stream in planned.streams if hasattr(stream, "formula")]
+    return max(min(reads, default=samples), 0)
+
+
+class Cutting(Protocol):
+    """A tracker that knows settled instants where windows are cut, and bounds of any others."""
+
+    @property
+    def settled(self) -> int:
+        """The first instant whose value may still change."""
+
+    def certain(self, starts: range) -> Bounds:
+        """At settled instants, where windows are cut to the trace."""
+
+    def either(self, start: int, stop: int) -> Bounds:
+        """At any instants, where nothing is assumed of what lies outside of the trace."""
+
+
+def decided_first(tracker: Cutting, start: int, stop: int) -> Bounds:
+    """Where windows are cut, what a settled instant reads before the first sample is false, not unknown."""
+    middle = min(max(tracker.settled, start), stop)
+    if middle <= start:
+        return tracker.either(start, stop)
+    known, rest = tracker.certain(range(start, middle)), tracker.either(middle, stop)
+    return Bounds(*map(np.concatenate, zip(known, rest, strict=True)))
