@@ -204,6 +204,7 @@ CODES: dict[str, str] = {
     "S301": "initial states that are (nearly) all rejected",
     "S302": "dynamics that give NaN or infinity",
     "S303": "initial states in a file that cannot be used",
+    "S304": "a mirror that is not a symmetry",
     "W601": "an acceptance rate of initial states below 1 %",
     # runs
     "R101": "no run, or a run folder that is damaged",

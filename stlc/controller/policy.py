@@ -31,8 +31,12 @@ class Policy(Protocol):
 class PlanNetwork(nn.Module):
     """An MLP from what the policy observes to `plans` open-loop plans of the whole horizon.
 
+    Where the system declares a mirror, the MLP sees states of one side only, and gives the others the images
+    of their images' plans.
+
     Attributes:
         plans: number of plans.
+        mirror: the system's; None where it has none, or where the method does without.
         centre: mean of the observations over initial states, (k,).
         spread: their standard deviation, (k,).
     """
@@ -43,6 +47,7 @@ class PlanNetwork(nn.Module):
     def __init__(self, task: Task, *, hidden: Sequence[int], plans: int) -> None:
         super().__init__()
         self.plans = plans
+        self.mirror = task.system.mirror
         self._task = task
         self._width = raw_width(task.system.controls)
         widths = [task.system.observed_count, *hidden]
@@ -59,7 +64,7 @@ class PlanNetwork(nn.Module):
 
         Those of timers are taken from their ranges: at first no mission gets far.
         """
-        observed = self._task.system.observe(x0)
+        observed = self._task.system.observe(self._folded(x0)[0])
         centre, spread = observed.mean(0), observed.std(0)
         for index, timer in enumerate(reversed(self._task.compiled.timers), start=1):
             centre[-index] = 0.5 * (timer.low + timer.high)
@@ -69,10 +74,18 @@ class PlanNetwork(nn.Module):
 
     def forward(self, x0: Tensor) -> Tensor:
         """All plans, within the bounds of the controls: (B, n) -> (B, plans, T, m)."""
+        x0, swapped = self._folded(x0)
         observed = self._task.system.observe(x0).to(self.centre.dtype)
         raw = self.body((observed - self.centre) / self.spread)
         raw = raw.view(-1, self.plans, self._task.horizon, self._width)
-        return squash(raw, self._task.system.controls)
+        plans = squash(raw, self._task.system.controls)
+        if self.mirror is None or swapped is None:
+            return plans
+        return torch.where(swapped[:, None, None, None], self.mirror.plans(plans), plans)
+
+    def _folded(self, x0: Tensor) -> tuple[Tensor, Tensor | None]:
+        """States on the mirror's side, and which of them are images, (B,); as they are without a mirror."""
+        return (x0, None) if self.mirror is None else self.mirror.fold(x0)
 
 
 class Mlp:

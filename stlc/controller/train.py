@@ -14,6 +14,7 @@ from stlc.controller.config import Engine, TrainConfig, decide
 from stlc.controller.held_out import Score, save_states, score
 from stlc.controller.pace import OpenEnd, steps_within
 from stlc.controller.run import Run, load_engine, load_task, save_engine, spec_hash, system_hash
+from stlc.controller.symmetry import check_mirror
 from stlc.controller.trainer import Look, Trainer
 from stlc.diagnostics import Diagnostic, MissingError, RunError
 from stlc.dynamics.memory import keep_freed_memory
@@ -73,11 +74,13 @@ def train(task: Task, config: TrainConfig, folder: RunDir, watch: Watch | None =
         watch: progress and interruption.
 
     Raises:
+        SystemFileError: S304, the mirror of the policy is no symmetry.
         MissingError: R201, a checkpoint cannot be written; R302, there is no such device.
         RunError: R401, the loss is not finite.
     """
     begun = time.perf_counter()
     keep_freed_memory()
+    check_mirror(task)
     device = find_device(config.device)
     engine = decide(task, config)
     torch.set_num_threads(engine.threads)

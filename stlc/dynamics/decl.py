@@ -137,12 +137,17 @@ class ObjectiveDecl:
 
 @dataclass(frozen=True, slots=True)
 class PolicyDecl:
-    """Shape of the network and what it sees; no `observe` means every state."""
+    """Shape of the network and what it sees; no `observe` means every state.
+
+    `mirror`: images of states and controls under a symmetry of system and specification; none where empty.
+    """
 
     type: str = "mlp"
     hidden: tuple[int, ...] = (256, 256, 256)
     observe: tuple[ir.Num, ...] = ()
     observe_text: tuple[str, ...] = field(default=(), compare=False)
+    mirror: tuple[Assign, ...] = ()
+    mirror_span: Span | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from stlc.compile.values import Number
 from stlc.dynamics.decl import BackupDecl, ObjectiveDecl, PolicyDecl, Term, TrainDecl
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import component_texts
+from stlc.dynamics.schema_mirror import read_mirror
 from stlc.dynamics.schema_names import Names
 from stlc.dynamics.schema_reader import Reader
 from stlc.dynamics.yaml_nodes import Node, Scalar, Sequence, as_int
@@ -15,7 +16,7 @@ from stlc.grammar import ast
 
 OBJECTIVE_KEYS = ("gamma", "smoothing", "lambda", "terms")
 TERM_KEYS = ("name", "weight", "expr")
-POLICY_KEYS = ("type", "hidden", "observe")
+POLICY_KEYS = ("type", "hidden", "observe", "mirror")
 POLICIES = ("mlp",)
 TRAIN_KEYS = ("budget", "steps", "seed", "lr", "batch", "samples", "method")
 METHODS = ("guided", "gradient")
@@ -66,6 +67,8 @@ def read_policy(node: Node | None, reader: Reader, names: Names) -> PolicyDecl:
         _integers(found.get("hidden"), "`hidden`", reader) or default.hidden,
         tuple(number for number, _ in seen),
         tuple(text for _, text in seen),
+        read_mirror(found.get("mirror"), reader, names),
+        found["mirror"].span if "mirror" in found else None,
     )
 
 

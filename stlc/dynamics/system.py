@@ -23,6 +23,7 @@ from stlc.dynamics.decl import Assign, ControlDecl, SystemDecl
 from stlc.dynamics.describe import describe
 from stlc.dynamics.draws import Drawing, Rows
 from stlc.dynamics.functions import load_functions
+from stlc.dynamics.mirror import Mirror
 from stlc.dynamics.rollout import Columns, Stepper
 from stlc.dynamics.samplers import InitialStates
 from stlc.dynamics.scenario import truth, under
@@ -276,6 +277,12 @@ class System:
         observe = self.decl.policy.observe
         seen = (*observe, *(ir.Col(column.name) for column in self.added))
         return Program({str(i): num for i, num in enumerate(seen)}) if observe else None
+
+    @cached_property
+    def mirror(self) -> Mirror | None:
+        """The symmetry that the file declares; None where it declares none."""
+        images = self.decl.policy.mirror
+        return Mirror(images, self.names, self.controls) if images else None
 
     def performance(
         self,
