@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
-from stlc.bench.cells import Cell, Length
+from stlc.bench.cells import Cell, Length, length_of
 from stlc.controller.config import HELD_OUT
 
 BENCHMARK = "traffic"
@@ -162,7 +162,7 @@ def ablation_rows(documents: Iterable[Mapping[str, Any]]) -> list[Row]:
     """The tables one after the other, each with the defaults in their place."""
     groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
     for document in documents:
-        length = Length(document["budget"], document["steps_asked"]).text
+        length = length_of(document).text
         groups.setdefault((document["axis"], document["value"], length), []).append(document)
     lengths = dict.fromkeys(length for _, _, length in groups)
     rows = []

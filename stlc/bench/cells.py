@@ -22,7 +22,7 @@ from stlc.jsontext import dumps, plain
 from stlc.provenance import sha256
 
 if TYPE_CHECKING:
-    from stlc.controller.config import Method
+    from stlc.controller.config import Clock, Method
 
 FORMAT = "bench-cell/1"
 BENCHMARKS = ("traffic", "reach_n_avoid", "ship_safe", "ship_track", "navigation", "manipulation")
@@ -31,10 +31,11 @@ BENCHMARKS = ("traffic", "reach_n_avoid", "ship_safe", "ship_track", "navigation
 
 @dataclass(frozen=True, slots=True)
 class Length:
-    """How long is trained: a budget in seconds, or a number of steps."""
+    """How long is trained: a budget in seconds of a clock, or a number of steps."""
 
     seconds: float | None = None
     steps: int | None = None
+    clock: Clock = "wall"
 
     @property
     def name(self) -> str:
@@ -44,14 +45,21 @@ class Length:
     @property
     def text(self) -> str:
         """The same for people."""
-        return f"{self.steps:,} steps" if self.steps is not None else f"{self.seconds:g} s"
+        if self.steps is not None:
+            return f"{self.steps:,} steps"
+        return f"{self.seconds:g} s" + (" of processor time" if self.clock == "processor" else "")
 
     @property
     def options(self) -> tuple[str, ...]:
         """For `stlc train`."""
         if self.steps is not None:
             return ("--steps", str(self.steps))
-        return ("--budget", f"{self.seconds:g}s")
+        return ("--budget", f"{self.seconds:g}s", "--clock", self.clock)
+
+
+def length_of(document: Mapping[str, Any]) -> Length:
+    """How long the result `document` was trained."""
+    return Length(document["budget"], document["steps_asked"], document["engine"].get("clock", "wall"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +100,7 @@ class Cell:
             steps=self.length.steps,
             seed=self.seed,
             held_out=self.held_out,
+            clock=self.length.clock,
         )
 
 

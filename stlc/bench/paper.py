@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
-from stlc.bench.cells import BENCHMARKS, Cell, Length
+from stlc.bench.cells import BENCHMARKS, Cell, Length, length_of
 from stlc.controller.config import HELD_OUT
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def paper_rows(documents: Iterable[Mapping[str, Any]], ceilings: Mapping[str, fl
     """The table of the results of cells: benchmarks in the paper's order, then methods, then lengths."""
     groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
     for document in documents:
-        length = Length(document["budget"], document["steps_asked"]).text
+        length = length_of(document).text
         key = (document["benchmark"], document["method"], length)
         groups.setdefault(key, []).append(document)
     rows = [_row(key, group, ceilings.get(key[0])) for key, group in groups.items()]

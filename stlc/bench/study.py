@@ -7,7 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from stlc.bench.cells import FORMAT, Cell, Inputs, Length, inputs_of, pack, read_cells, read_json, spec_path
+from stlc.bench.cells import (
+    FORMAT,
+    Cell,
+    Inputs,
+    inputs_of,
+    length_of,
+    pack,
+    read_cells,
+    read_json,
+    spec_path,
+)
 from stlc.bench.fixed_set import training_accuracy
 from stlc.compile.semantics import TOLERANCE
 from stlc.controller.sweep import Errand, side_by_side
@@ -160,7 +170,7 @@ def cell_of(document: Mapping[str, Any]) -> Cell:
         document["benchmark"],
         document["method"],
         document["seed"],
-        Length(document["budget"], document["steps_asked"]),
+        length_of(document),
         document["held_out"],
         document["axis"],
         document["value"],

@@ -10,6 +10,7 @@ import typer
 
 from stlc.cli.bench_options import (
     BudgetOption,
+    ClockOption,
     HeldOutOption,
     JobsOption,
     OutOption,
@@ -38,6 +39,7 @@ def ablation(
         typer.Option("--only", metavar="NAMES", help="Some of gamma,k,network,samples; all if not given."),
     ] = None,
     budget: BudgetOption = None,
+    clock: ClockOption = "wall",
     steps: StepsOption = None,
     seeds: SeedsOption = "0..2",
     jobs: JobsOption = 1,
@@ -54,7 +56,7 @@ def ablation(
     from stlc.bench.study import Place, valid_results
 
     axes = chosen(only, [axis.name for axis in AXES], "table")
-    extent = Extent(axes, parse_seeds(seeds), lengths_of(budget, steps, LENGTHS), held_out)
+    extent = Extent(axes, parse_seeds(seeds), lengths_of(budget, steps, LENGTHS, clock), held_out)
     filling = filled(ablation_cells(extent), Place(out, runs, jobs, threads))
     documents = valid_results(out, "ablation")
     write_section(page, "ablation", ablation_section(documents))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from stlc.cli.output import say
-from stlc.cli.ranges import parse_seconds
+from stlc.cli.ranges import parse_clock, parse_seconds
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.registry import closest
 
@@ -21,6 +21,14 @@ if TYPE_CHECKING:
 BudgetOption = Annotated[
     list[str] | None,
     typer.Option("--budget", metavar="TIME", help="Time of a training, such as 60s or 5min; repeatable."),
+]
+ClockOption = Annotated[
+    str,
+    typer.Option(
+        "--clock",
+        metavar="wall|processor",
+        help="What budgets count; processor time as on an idle machine, for busy ones.",
+    ),
 ]
 StepsOption = Annotated[
     int | None, typer.Option("--steps", min=1, help="Steps of the optimiser instead of budgets.")
@@ -37,7 +45,7 @@ PageOption = Annotated[Path, typer.Option("--page", metavar="FILE", help="The pa
 
 
 def lengths_of(
-    budget: Sequence[str] | None, steps: int | None, usual: Sequence[Length]
+    budget: Sequence[str] | None, steps: int | None, usual: Sequence[Length], clock: str = "wall"
 ) -> tuple[Length, ...]:
     """How long is trained. Raises UsageError (U101) for budgets and steps at once."""
     from stlc.bench.cells import Length
@@ -46,7 +54,9 @@ def lengths_of(
         raise UsageError(Diagnostic("U101", "`--budget` and `--steps` contradict each other"))
     if steps is not None:
         return (Length(steps=steps),)
-    return tuple(Length(parse_seconds(text)) for text in dict.fromkeys(budget or ())) or tuple(usual)
+    counted = parse_clock(clock)
+    lengths = tuple(Length(parse_seconds(text)) for text in dict.fromkeys(budget or ())) or usual
+    return tuple(replace(length, clock=counted) for length in lengths)
 
 
 def chosen(text: str | None, known: Sequence[str], what: str) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ import typer
 
 from stlc.cli.bench_options import (
     BudgetOption,
+    ClockOption,
     HeldOutOption,
     JobsOption,
     OutOption,
@@ -45,6 +46,7 @@ def paper(
         str | None, typer.Option("--methods", metavar="NAMES", help="guided,gradient if not given.")
     ] = None,
     budget: BudgetOption = None,
+    clock: ClockOption = "wall",
     steps: StepsOption = None,
     seeds: SeedsOption = "0..2",
     passes: Annotated[
@@ -68,7 +70,7 @@ def paper(
         chosen(only, BENCHMARKS, "benchmark"),
         [method for method in METHODS if method in chosen(methods, METHODS, "method")],
         parse_seeds(seeds),
-        lengths_of(budget, steps, LENGTHS),
+        lengths_of(budget, steps, LENGTHS, clock),
         held_out,
     )
     place = Place(out, runs, jobs, threads)

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import re
+from typing import TYPE_CHECKING
 
 from stlc.diagnostics import Diagnostic, UsageError
+
+if TYPE_CHECKING:
+    from stlc.controller.config import Clock
 
 MOST_SEEDS = 1000
 _RANGE = re.compile(r"\s*(\d{1,18})\s*(?:\.\.\s*(\d{1,18})\s*)?")
@@ -30,6 +34,14 @@ def parse_seconds(text: str) -> float:
         )
         raise UsageError(finding) from error
     return value
+
+
+def parse_clock(text: str) -> Clock:
+    """What a budget counts. Raises UsageError (U101) for anything but `wall` and `processor`."""
+    match text:
+        case "wall" | "processor":
+            return text
+    raise UsageError(Diagnostic("U101", f"there is no clock `{text}`", help=("wall or processor",)))
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:

@@ -12,7 +12,7 @@ import typer
 
 from stlc.cli import train_options as o
 from stlc.cli.options import JsonOption, SetOption, SystemOption, describe, parse_overrides
-from stlc.cli.ranges import parse_seconds, parse_seeds
+from stlc.cli.ranges import parse_clock, parse_seconds, parse_seeds
 from stlc.cli.train_many import Many, train_many
 from stlc.diagnostics import Diagnostic, UsageError
 
@@ -46,6 +46,7 @@ def train(
     spec: o.SpecArgument = None,
     system: SystemOption = None,
     budget: o.BudgetOption = None,
+    clock: o.ClockOption = "wall",
     steps: o.StepsOption = None,
     seed: o.SeedOption = None,
     seeds: o.SeedsOption = None,
@@ -91,6 +92,7 @@ def train(
         lr=_rate(lr) if lr is not None else None,
         batch=batch,
         held_out=held_out or HELD_OUT,
+        clock=parse_clock(clock),
     )
     launch = Launch(root=runs, name=name, overrides=parse_overrides(set_), command=sys.argv[1:])
     task = _task(spec, system, launch.overrides)

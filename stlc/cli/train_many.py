@@ -56,6 +56,7 @@ class Many:
         options: Mapping[str, object] = {
             "--system": self.system,
             "--budget": None if config.budget is None else f"{config.budget!r}s",
+            "--clock": config.clock,
             "--steps": config.steps,
             "--method": config.method,
             "--name": name,

@@ -13,6 +13,12 @@ SpecArgument = Annotated[Path | None, typer.Argument(metavar="SPEC", help="The s
 BudgetOption = Annotated[
     str | None, typer.Option(metavar="TIME", help="Time to train, such as 60s or 5min; becomes steps.")
 ]
+ClockOption = Annotated[
+    str,
+    typer.Option(
+        metavar="wall|processor", help="What a budget counts; processor time as on an idle machine."
+    ),
+]
 StepsOption = Annotated[int | None, typer.Option(min=1, help="Steps of the optimiser instead of a budget.")]
 SeedOption = Annotated[
     int | None,

@@ -12,8 +12,10 @@ if TYPE_CHECKING:
     from stlc.controller.task import Task
 
 Method = Literal["guided", "gradient"]
+Clock = Literal["wall", "processor"]
+"""What a budget counts: time that passes, or processor time as it would pass on an idle machine."""
 
-ENGINE_VERSION = 1
+ENGINE_VERSION = 2
 """Raised with every change of what the engine reaches; figures that another one made are taken anew."""
 
 HELD_OUT = 5000
@@ -33,6 +35,7 @@ class TrainConfig:
     Attributes:
         method: `guided` (the default) searches and distils; `gradient` is the paper's.
         budget: seconds, turned into steps in the first of them.
+        clock: of the budget.
         steps: of the optimiser; wins over `budget`.
         seed: of everything random in training.
         device: of torch.
@@ -53,6 +56,7 @@ class TrainConfig:
     lr: float | None = None
     batch: int | None = None
     held_out: int = HELD_OUT
+    clock: Clock = "wall"
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +85,7 @@ class Engine:
         held_out: states of the last verdict.
         threads: of torch; sums over other numbers of them round otherwise. 0 leaves what is set.
         samples: size of a fixed training set; 0: fresh states in every step.
+        clock: of budgets and of the times on record.
     """
 
     method: Method
@@ -104,6 +109,7 @@ class Engine:
     held_out: int = HELD_OUT
     threads: int = 0
     samples: int = 0
+    clock: Clock = "wall"
 
 
 def decide(task: Task, config: TrainConfig) -> Engine:
@@ -129,6 +135,7 @@ def decide(task: Task, config: TrainConfig) -> Engine:
         held_out=config.held_out,
         threads=config.threads or _threads(searching=guided and config.device == "cpu"),
         samples=0 if guided else declared.samples or 0,
+        clock=config.clock,
     )
 
 

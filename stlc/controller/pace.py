@@ -12,12 +12,15 @@ import math
 import time
 from typing import TYPE_CHECKING
 
+from stlc.controller.config import cores
 from stlc.controller.trainer import Trainer
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import torch
 
-    from stlc.controller.config import Engine
+    from stlc.controller.config import Clock, Engine
     from stlc.controller.task import Task
 
 TIMED = 3
@@ -26,29 +29,45 @@ RESERVE = 0.04
 """Share of the budget that is kept for the verdict on held-out states."""
 
 
+def processor() -> float:
+    """Seconds that this would have taken on an idle machine.
+
+    The training thread and the search beside it take their turns with the cores: whichever of the two has
+    more to do is what is waited for.
+    """
+    return max(time.thread_time(), time.process_time() / cores())
+
+
+def clock_of(name: Clock) -> Callable[[], float]:
+    """The clock of that name, in seconds from any beginning."""
+    return processor if name == "processor" else time.perf_counter
+
+
 def steps_within(task: Task, engine: Engine, seconds: float, device: torch.device) -> int:
     """How many steps fit into `seconds`, measured on a trainer that is thrown away.
 
     The real run starts afresh, so a run of the same seed and the same number of steps gives the same weights
     whether the steps were named or found here.
     """
-    begun = time.perf_counter()
+    now = clock_of(engine.clock)
+    begun = now()
     trial = Trainer(task, engine, steps=10_000, device=device)
-    built = time.perf_counter() - begun
+    built = now() - begun
     trial.look()
     _interval(trial)  # what is slow once only
     cost = min(_interval(trial) for _ in range(TIMED - 1)) / engine.every
-    left = seconds * (1.0 - RESERVE) - (time.perf_counter() - begun) - built
+    left = seconds * (1.0 - RESERVE) - (now() - begun) - built
     return max(engine.every, int(left / cost))
 
 
 def _interval(trainer: Trainer) -> float:
     """Seconds of the steps up to the next search round, and of the round as far as it is waited for."""
-    begun = time.perf_counter()
+    now = clock_of(trainer.engine.clock)
+    begun = now()
     for _ in range(trainer.engine.every):
         trainer.advance()
     trainer.look()
-    return time.perf_counter() - begun
+    return now() - begun
 
 
 class OpenEnd:
@@ -59,7 +78,7 @@ class OpenEnd:
     """
 
     def __init__(self, seconds: float, begun: float) -> None:
-        """`seconds` from `begun`, by `time.perf_counter`."""
+        """`seconds` from `begun`, by the clock of the engine."""
         self.settled = False
         self._end = begun + seconds * (1.0 - RESERVE)
         self._marks: list[tuple[int, float]] = []

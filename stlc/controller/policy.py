@@ -18,7 +18,9 @@ from stlc.dynamics.controls import raw_width, squash
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from stlc.controller.config import Engine
     from stlc.controller.task import Task
+    from stlc.dynamics.mirror import Mirror
 
 
 class Policy(Protocol):
@@ -44,10 +46,10 @@ class PlanNetwork(nn.Module):
     centre: Tensor
     spread: Tensor
 
-    def __init__(self, task: Task, *, hidden: Sequence[int], plans: int) -> None:
+    def __init__(self, task: Task, *, hidden: Sequence[int], plans: int, mirrored: bool = True) -> None:
         super().__init__()
         self.plans = plans
-        self.mirror = task.system.mirror
+        self.mirror: Mirror | None = task.system.mirror if mirrored else None
         self._task = task
         self._width = raw_width(task.system.controls)
         widths = [task.system.observed_count, *hidden]
@@ -86,6 +88,12 @@ class PlanNetwork(nn.Module):
     def _folded(self, x0: Tensor) -> tuple[Tensor, Tensor | None]:
         """States on the mirror's side, and which of them are images, (B,); as they are without a mirror."""
         return (x0, None) if self.mirror is None else self.mirror.fold(x0)
+
+
+def network_of(task: Task, engine: Engine) -> PlanNetwork:
+    """The network that an engine trains; the paper's own method does without a mirror."""
+    guided = engine.method == "guided"
+    return PlanNetwork(task, hidden=engine.hidden, plans=engine.plans, mirrored=guided)
 
 
 class Mlp:

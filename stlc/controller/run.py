@@ -11,7 +11,7 @@ import torch
 from stlc.compile.modules import file_of
 from stlc.controller.checkpoint import load_checkpoint, weights
 from stlc.controller.config import Engine
-from stlc.controller.policy import Mlp, PlanNetwork
+from stlc.controller.policy import Mlp, network_of
 from stlc.controller.task import Task
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.dynamics.scenario import scenario_constants
@@ -71,7 +71,7 @@ class Run:
         task = load_task(folder, overrides, scenario)
         engine = load_engine(folder)
         saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
-        network = PlanNetwork(task, hidden=engine.hidden, plans=engine.plans)
+        network = network_of(task, engine)
         try:
             network.load_state_dict(weights(saved, "average"))
         except RuntimeError as error:

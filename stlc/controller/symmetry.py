@@ -44,8 +44,8 @@ def check_mirror(task: Task) -> None:
     last = torch.stack([column[-1] for column in one.columns.values()], -1)
     moved = torch.stack([column[-1] for column in two.columns.values()], -1)
     _compare(task, task.names, moved, mirror.states(last), "where the image of a state gets to")
-    truths = (satisfied(each.requirements).double() for each in (two, one))
-    _compare(task, names, *truths, "whether an image satisfies a requirement")
+    there_true, here_true = (satisfied(each.requirements).double() for each in (two, one))
+    _compare(task, names, there_true, here_true, "whether an image satisfies a requirement")
 
 
 def _compare(task: Task, names: tuple[str, ...], found: Tensor, wanted: Tensor, what: str) -> None:

@@ -12,7 +12,7 @@ import torch
 from stlc.controller.checkpoint import load_checkpoint, save_checkpoint
 from stlc.controller.config import Engine, TrainConfig, decide
 from stlc.controller.held_out import Score, save_states, score
-from stlc.controller.pace import OpenEnd, steps_within
+from stlc.controller.pace import OpenEnd, clock_of, steps_within
 from stlc.controller.run import Run, load_engine, load_task, save_engine, spec_hash, system_hash
 from stlc.controller.symmetry import check_mirror
 from stlc.controller.trainer import Look, Trainer
@@ -78,7 +78,7 @@ def train(task: Task, config: TrainConfig, folder: RunDir, watch: Watch | None =
         MissingError: R201, a checkpoint cannot be written; R302, there is no such device.
         RunError: R401, the loss is not finite.
     """
-    begun = time.perf_counter()
+    begun = clock_of(config.clock)()
     keep_freed_memory()
     check_mirror(task)
     device = find_device(config.device)
@@ -109,10 +109,10 @@ def resume(
     Raises:
         RunError: R101, R102, or R103 when there is nothing left to do.
     """
-    begun = time.perf_counter()
     keep_freed_memory()
-    task = load_task(folder)
     engine: Engine = load_engine(folder)
+    begun = clock_of(engine.clock)()
+    task = load_task(folder)
     saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
     if engine.threads:
         torch.set_num_threads(engine.threads)
@@ -159,21 +159,22 @@ class _Session:
         self.trainer = trainer
         self.watch = watch
         self.begun = begun
+        self.now = clock_of(trainer.engine.clock)
         self.end = end
         self.hashes = {"spec_hash": spec_hash(folder), "system_hash": system_hash(folder)}
 
     def finish(self) -> Outcome:
         """Train to the end, judge, and close the record."""
         trainer = self.trainer
-        sat_down, first = time.perf_counter(), trainer.step
+        sat_down, first = self.now(), trainer.step
         self.watch.begun({**asdict(trainer.engine), "margin": trainer.margin, "steps": trainer.steps})
-        saved = sat_down
+        saved = time.perf_counter()
         self._revise()
         value = math.nan
         while trainer.step < trainer.steps:
             if trainer.step >= trainer.next_look:
                 self._revise()
-                pace = (time.perf_counter() - sat_down) / max(1, trainer.step - first)
+                pace = (self.now() - sat_down) / max(1, trainer.step - first)
                 self._row(trainer.look(), value, pace)
             value = trainer.advance()
             if not math.isfinite(value):
@@ -189,14 +190,14 @@ class _Session:
     def _revise(self) -> None:
         """Where a budget is still open, say anew how many steps it is worth."""
         if self.end is not None:
-            self.end.mark(self.trainer, time.perf_counter())
+            self.end.mark(self.trainer, self.now())
             self.folder.update({"steps": self.trainer.steps})
 
     def _judged(self) -> Outcome:
         policy = self.trainer.policy
         result = score(policy, n=self.trainer.engine.held_out)
         save_states(self.folder.path / "eval" / "held_out.npz", self.trainer.task, result)
-        seconds = time.perf_counter() - self.begun
+        seconds = self.now() - self.begun
         self.folder.finish("finished", {**result.summary(), "seconds": seconds})
         return Outcome(Run(self.folder, self.trainer.task, policy), result, seconds, interrupted=False)
 
@@ -204,7 +205,7 @@ class _Session:
         self._save()
         self.folder.finish("interrupted")
         run = Run(self.folder, self.trainer.task, self.trainer.policy)
-        return Outcome(run, None, time.perf_counter() - self.begun, interrupted=True)
+        return Outcome(run, None, self.now() - self.begun, interrupted=True)
 
     def _save(self) -> None:
         facts = {**self.trainer.facts(), **self.hashes}
@@ -216,7 +217,7 @@ class _Session:
         row = {
             "step": trainer.step,
             "steps": trainer.steps,
-            "seconds": time.perf_counter() - self.begun,
+            "seconds": self.now() - self.begun,
             "loss": value,
             "accuracy": look.accuracy,
             "requirements": dict(zip(names, look.requirements, strict=True)),

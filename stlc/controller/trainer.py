@@ -19,7 +19,7 @@ from torch import Tensor
 from stlc.controller.buffer import Buffer
 from stlc.controller.missions import Missions
 from stlc.controller.objective import Objective, guided_objective, loss, paper_objective
-from stlc.controller.policy import Mlp, PlanNetwork
+from stlc.controller.policy import Mlp, PlanNetwork, network_of
 from stlc.controller.search import Repaired, Searcher
 from stlc.controller.supply import Draws, Fixed, Supply
 from stlc.controller.task import rank, satisfied
@@ -279,7 +279,7 @@ def _network(task: Task, engine: Engine, device: torch.device) -> PlanNetwork:
     """A network whose first weights depend on the seed alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(engine.seed)
-        return PlanNetwork(task, hidden=engine.hidden, plans=engine.plans).to(device)
+        return network_of(task, engine).to(device)
 
 
 def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -6,8 +6,8 @@ from stlc.dynamics.decl import Assign
 from stlc.dynamics.schema_expressions import Expressions, written
 from stlc.dynamics.schema_flow import state_assigns
 from stlc.dynamics.schema_names import Names
-from stlc.dynamics.schema_reader import Entry, Reader
-from stlc.dynamics.yaml_nodes import Node
+from stlc.dynamics.schema_reader import Reader
+from stlc.dynamics.yaml_nodes import Entry, Node
 
 
 def read_mirror(node: Node | None, reader: Reader, names: Names) -> tuple[Assign, ...]:

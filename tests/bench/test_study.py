@@ -235,7 +235,7 @@ def test_other_states_are_searched_anew(tmp_path: Path, result: Callable[..., di
 
 def cell_result(benchmark: str, method: str, seed: int, accuracy: float) -> dict[str, Any]:
     facts = {"benchmark": benchmark, "method": method, "seed": seed, "accuracy": accuracy, "held_out": 5000}
-    numbers = {"seconds": 60.0 + seed, "steps": 100, "budget": 60.0, "steps_asked": None}
+    numbers = {"seconds": 60.0 + seed, "steps": 100, "budget": 60.0, "steps_asked": None, "engine": {}}
     return {**facts, **numbers, "requirements": {"stop": accuracy}}
 
 
@@ -254,6 +254,12 @@ def test_rows_are_means_over_seeds_as_shares_of_the_ceiling() -> None:
     assert low < 0.81 < high < low + 0.014
     assert [row.benchmark for row in paper_rows(documents, {})] == ["traffic", "ship_safe"]
     assert set(BENCHMARKS) >= {"traffic", "ship_safe"}
+
+
+def test_clocks_do_not_share_a_row() -> None:
+    wall, busy = (cell_result("traffic", "guided", seed, 0.9) for seed in (0, 1))
+    busy["engine"] = {"clock": "processor"}
+    assert [row.length for row in paper_rows([wall, busy], {})] == ["60 s", "60 s of processor time"]
 
 
 def test_the_defaults_stand_in_every_table_of_the_ablation() -> None:

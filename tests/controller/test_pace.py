@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import pytest
 
-from stlc.controller.pace import RESERVE, OpenEnd
+from stlc.controller.pace import RESERVE, OpenEnd, clock_of
 
 
 @dataclass
@@ -56,3 +57,14 @@ def test_a_budget_is_met_and_not_wasted(budget: float, look) -> None:
 def test_steps_that_get_dearer_are_found_out() -> None:
     trainer, _ = run(120.0, lambda step: 0.05 if step < 400 else 0.1, lambda _step: 1.0)
     assert trainer.now == pytest.approx(120.0, rel=0.1)
+
+
+def test_processor_time_stands_still_while_nothing_is_done() -> None:
+    wall, busy = clock_of("wall"), clock_of("processor")
+    first = wall(), busy()
+    time.sleep(0.1)
+    slept = wall() - first[0], busy() - first[1]
+    assert slept[0] >= 0.1
+    assert slept[1] < 0.05
+    while busy() - first[1] < 0.06:
+        math.sqrt(2.0)
