@@ -18,7 +18,7 @@ from stlc.compile.ops import Array, Mask, Ops
 _WIDE = 8
 """From so many columns on sliding windows beat putting pairs together,"""
 
-_LONG = 1000
+_LONG = 20_000
 """and for `until` also from so many rows of a window on."""
 
 

@@ -6,6 +6,7 @@ array are absent, and a window without rows has the neutral value (+inf for a mi
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import final
 
@@ -17,6 +18,12 @@ __all__ = ["Windows", "dual", "neutral"]
 
 _SCAN_BATCH = 64
 """From this batch size on a sequential scan beats the log-depth one."""
+
+_TILE = 1 << 17
+"""Numbers of a long trace that are dealt with at a time: what is made of them stays near the processor."""
+
+_OVERLAP = 8
+"""How many times as long as a window such a stretch is at least."""
 
 
 @final
@@ -38,6 +45,11 @@ class Windows:
         """`count` windows of `width` rows: `(time, batch)` -> `(count, batch)`."""
         rows = x.shape[0]
         width = min(width, max(rows, 1))
+        if tiles := self._tiles(x, count, width):
+            out = self.ops.empty((count, *x.shape[1:]), x)
+            for asked, seen in tiles:
+                out[asked] = self.extrema(x[seen], pick, count=asked.stop - asked.start, width=width)
+            return out
         if count == 1 and rows:
             return self.semantics.reduce(self.padded(x, width, neutral(pick)), pick, self.ops)
         if self.semantics.exact and rows:
@@ -47,6 +59,17 @@ class Windows:
         if width >= rows > 1 and self.semantics.idempotent:
             return self.padded(self._to_end(x, pick), count, neutral(pick))
         return self._doubling(self.padded(x, count + width - 1, neutral(pick)), pick, width)
+
+    def _tiles(self, x: Array, count: int, width: int) -> list[tuple[slice, slice]]:
+        """Windows of a long recorded trace that are computed together, and the rows that they see.
+
+        Nothing where all of them are.
+        """
+        size = max(_TILE // max(math.prod(x.shape[1:]), 1), _OVERLAP * width)
+        if not self.semantics.exact or self.ops.name != "numpy" or count < 2 * size:
+            return []
+        asked = [slice(first, min(first + size, count)) for first in range(0, count, size)]
+        return [(some, slice(some.start, some.stop + width - 1)) for some in asked]
 
     def _to_end(self, x: Array, pick: Pick) -> Array:
         """Every window reaches the last row: a running extremum from behind."""
@@ -97,6 +120,12 @@ class Windows:
         """
         rows = left.shape[0]
         width = min(width, max(rows, 1))
+        if tiles := self._tiles(left, count, width):
+            out = self.ops.empty((count, *left.shape[1:]), left)
+            for asked, seen in tiles:
+                many = asked.stop - asked.start
+                out[asked] = self.until(left[seen], right[seen], pick, count=many, width=width)
+            return out
         if not self.semantics.associative:
             return self._until_by_offset(left, right, pick, count, width)
         if count == 1 and rows:

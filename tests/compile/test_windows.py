@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stlc.compile import windows as module
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.semantics import ArithmeticGeometricMean, Exact, GeneralizedMean, LogSumExp, Pick, Semantics
 from stlc.compile.windows import Windows
@@ -52,3 +53,24 @@ def test_windows_are_the_definition(
         slack = 1e-9 if semantics.exact or not semantics.associative else 3 * math.log(len(values) + 1)
         wanted = semantics.reduce(np.concatenate(met), pick, NUMPY)[0]
         np.testing.assert_allclose(until[j], wanted, atol=slack)
+
+
+@pytest.mark.parametrize("pick", ["min", "max"])
+@settings(max_examples=60)
+@given(rows=st.integers(1, 90), count=st.integers(1, 100), width=st.integers(1, 12), batch=st.integers(1, 9))
+def test_long_traces_are_judged_in_stretches(
+    pick: Pick, rows: int, count: int, width: int, batch: int
+) -> None:
+    """Whatever their length, also where they end within the trace or beyond it."""
+    x, y = np.random.default_rng(rows).normal(size=(2, rows, batch))
+    windows = Windows(Exact(), NUMPY)
+    whole = (
+        windows.extrema(x, pick, count=count, width=width),
+        windows.until(y, x, pick, count=count, width=width),
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_TILE", 8)
+        patch.setattr(module, "_OVERLAP", 1)
+        assert len(windows._tiles(x, 100, 1)) > 10
+        np.testing.assert_array_equal(windows.extrema(x, pick, count=count, width=width), whole[0])
+        np.testing.assert_array_equal(windows.until(y, x, pick, count=count, width=width), whole[1])
