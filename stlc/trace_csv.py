@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,21 +21,24 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.files import write_atomic
 from stlc.source import Source, Span
+from stlc.trace_cells import NUMBER, Lines, bare, load, read_lines, value_of
 from stlc.trace_npz import unreadable
 from stlc.trace_table import Table, is_unit
 
 Array = NDArray[Any]
 
 MAX_BYTES = 1_000_000_000
+LARGE = 4_000_000
+"""Bytes of a file from which on its numbers are read from its bytes, without a text beside them."""
 
-_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
+_HEAD_BYTES = 1 << 16
+_END = re.compile(rb"\r\n|\r|\n")
 _HEAD = re.compile(r"(?P<name>[^\[\]]*[^\[\]\s](?:\[\d+\])?)\s*(?:\[(?P<unit>[^\]]*)\])?")
 _ROUND = re.compile(r"(?P<name>.*[^\s(])\s*\((?P<unit>[^()]+)\)")
 _ANY = re.compile(r"\S")
 _FILLED = re.compile(r"[^\n]*\S[^\n]*")
 _COMMA = re.compile(r"(?<!\d),|,(?!\d)")
 """A comma that is not within a number."""
-_WORDS = {"true": 1.0, "false": 0.0}
 _MAX_FINDINGS = 20
 
 
@@ -65,6 +67,8 @@ def read_csv(path: Path) -> Table:
 
 def table_of_text(path: Path, data: bytes) -> Table:
     """The columns of a text; `path` is for messages. Raises TraceError as `read_csv`."""
+    if len(data) >= LARGE and (table := _read_large(path, data)) is not None:
+        return table
     sheet = _sheet(path, data)
     names, units = _read_header(sheet)
     texts = _text_columns(sheet, len(names))
@@ -84,6 +88,23 @@ def _read(path: Path) -> bytes:
     if len(data) > MAX_BYTES:
         raise unreadable(path, f"it is larger than {MAX_BYTES / 1e9:.0f} GB", advice="save it as `.npz`")
     return data
+
+
+def _read_large(path: Path, data: bytes) -> Table | None:
+    """The same where the first lines are those of a table of numbers; None if anything is unusual."""
+    try:
+        sheet = _sheet(path, data[: data.rfind(b"\n", 0, _HEAD_BYTES) + 1])
+        names, units = _read_header(sheet)
+    except TraceError:
+        return None
+    if _text_columns(sheet, len(names)):
+        return None
+    start = 0
+    for _ in range(sheet.source.text.count("\n", 0, sheet.body_at)):
+        end = _END.search(data, start)
+        start = len(data) if end is None else end.end()
+    columns = read_lines(Lines(data, start, len(names), sheet.delimiter))
+    return None if columns is None else Table(dict(zip(names, columns, strict=True)), units)
 
 
 def _sheet(path: Path, data: bytes) -> _Sheet:
@@ -119,7 +140,7 @@ def _read_header(sheet: _Sheet) -> tuple[list[str], dict[str, str]]:
             findings.append(Diagnostic("E605", shown, span, label="expected a signal's name"))
         elif name in units:
             findings.append(Diagnostic("E605", f"two columns are called `{name}`", span))
-        elif _NUMBER.fullmatch(name):
+        elif NUMBER.fullmatch(name):
             message, advice = "the first line must name the columns", ("e.g. `t,x,v`",)
             findings.append(Diagnostic("E605", message, span, help=advice))
         names.append(name)
@@ -143,11 +164,8 @@ def split_head(text: str) -> tuple[str, str]:
 def _cells(source: Source, start: int, line: str, delimiter: str) -> Iterator[tuple[str, Span]]:
     """Cells of a line with blanks and quotes taken off, and where each stands."""
     for raw in line.split(delimiter):
-        text = raw.strip()
         at = start + (len(raw) - len(raw.lstrip()))
-        if len(text) >= 2 and text[0] == text[-1] == '"':
-            text = text[1:-1].strip()
-        yield text, source.span(at, max(at + len(raw.strip()), at + 1))
+        yield bare(raw), source.span(at, max(at + len(raw.strip()), at + 1))
         start += len(raw) + 1
 
 
@@ -156,17 +174,14 @@ def _text_columns(sheet: _Sheet, width: int) -> frozenset[int]:
     words: set[int] = set()
     open_ = set(range(width))
     for line in _FILLED.finditer(sheet.source.text, sheet.body_at):
-        cells = line[0].split(sheet.delimiter)
-        filled = {i for i in open_ if i < len(cells) and cells[i].strip(' "')}
-        words |= {i for i in filled if not _is_number(cells[i].strip().strip('"').strip())}
+        cells = line[0].split(sheet.delimiter)[:width]
+        texts = {i: cell.strip().strip('"').strip() for i, cell in enumerate(cells) if i in open_}
+        filled = {i for i, text in texts.items() if text}
+        words |= {i for i in filled if value_of(texts[i]) is None}
         open_ -= filled
         if not open_:
             break
     return frozenset(words)
-
-
-def _is_number(text: str) -> bool:
-    return bool(_NUMBER.fullmatch(text)) or text.lower() in _WORDS
 
 
 def _read_fast(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array] | None:
@@ -175,29 +190,15 @@ def _read_fast(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array] 
     if not _ANY.search(body) or '"' in body or len(texts) == width:
         return None
     numbers = [i for i in range(width) if i not in texts]
-    values = _load(body, sheet.delimiter, numbers if texts else None)
+    values = load(body, sheet.delimiter, numbers if texts else None)
     if values is None:
-        values = _load(_without_gaps(body, sheet.delimiter), sheet.delimiter, numbers if texts else None)
+        values = load(_without_gaps(body, sheet.delimiter), sheet.delimiter, numbers if texts else None)
     words = [line.split(sheet.delimiter) for line in body.split("\n") if texts and _told(line, sheet)]
     if values is None or values.shape[1] != len(numbers) or any(len(cells) != width for cells in words):
         return None
     columns: dict[int, Array] = {i: np.ascontiguousarray(values[:, k]) for k, i in enumerate(numbers)}
     columns |= {i: np.array([cells[i].strip() for cells in words]) for i in texts}
     return [columns[i] for i in range(width)]
-
-
-def _load(body: str, delimiter: str, columns: Sequence[int] | None) -> Array | None:
-    """The numbers of these columns; None where something is no number, or nothing is there."""
-    if not _ANY.search(body):
-        return None
-    lines = io.TextIOWrapper(io.BytesIO(body.encode()), "utf-8")  # a StringIO is four times as large
-    try:
-        with lines:
-            return np.loadtxt(
-                lines, delimiter=delimiter, comments=None, ndmin=2, dtype=np.float64, usecols=columns
-            )
-    except ValueError:
-        return None
 
 
 def _without_gaps(body: str, delimiter: str) -> str:
@@ -248,12 +249,8 @@ def _read_row(
     for i, (text, span) in enumerate(cells):
         if i in texts:
             row.append(text)
-        elif _NUMBER.fullmatch(text):
-            row.append(float(text))
-        elif not text:
-            row.append(math.nan)
-        elif text.lower() in _WORDS:
-            row.append(_WORDS[text.lower()])
+        elif (value := value_of(text)) is not None:
+            row.append(value)
         else:
             findings.append(Diagnostic("E603", f"`{text}` is not a number", span))
     return row

@@ -48,7 +48,7 @@ def read_clock(
     if clock.ndim != 1:
         shape = " x ".join(map(str, clock.shape)) or "a single number"
         raise TraceError(Diagnostic("E605", f"`t` in `{name}` is {shape}; it has one value per sample"))
-    times = clock.astype(np.float64)
+    times = clock.astype(np.float64, copy=False)
     if not len(times):
         raise TraceError(Diagnostic("E605", f"trace `{name}` has no samples"))
     _check_finite(name, times)
@@ -68,6 +68,24 @@ def _check_finite(name: str, times: Floats) -> None:
 
 
 def _step(name: str, times: Floats, dt: float | None) -> float:
+    _require_even(name, times)
+    mean = float(times[-1] - times[0]) / (len(times) - 1)
+    steps = np.arange(len(times), dtype=np.float64)
+    steps *= mean
+    drift = times - times[0]
+    drift -= steps
+    np.abs(drift, out=drift)
+    if drift.max() > TOLERANCE * mean:
+        i = int(np.argmax(drift))
+        message = (
+            f"time in `{name}` is not uniform: t[{i}] = {times[i]:.6g} s is {drift[i]:.3g} s beside the grid"
+        )
+        raise TraceError(Diagnostic("E602", message, help=(RESAMPLE,)))
+    return _snap(mean, dt)
+
+
+def _require_even(name: str, times: Floats) -> None:
+    """Every sample comes after the one before it, about as much as usual."""
     gaps = np.diff(times)
     usual = float(np.median(gaps))
     backwards = np.flatnonzero(gaps <= 0)
@@ -77,7 +95,8 @@ def _step(name: str, times: Floats, dt: float | None) -> float:
             f"time in `{name}` does not increase: t[{i}] = {times[i]:g} s, t[{i + 1}] = {times[i + 1]:g} s"
         )
         raise TraceError(Diagnostic("E602", message))
-    odd = np.abs(gaps - usual)
+    odd = gaps - usual
+    np.abs(odd, out=odd)
     if odd.max() > TOLERANCE * usual:
         i = int(np.argmax(odd > TOLERANCE * usual))
         message = (
@@ -85,15 +104,6 @@ def _step(name: str, times: Floats, dt: float | None) -> float:
             f"where it is {gaps[i]:.6g} s"
         )
         raise TraceError(Diagnostic("E602", message, help=(RESAMPLE,)))
-    mean = float(times[-1] - times[0]) / len(gaps)
-    drift = np.abs(times - times[0] - mean * np.arange(len(times)))
-    if drift.max() > TOLERANCE * mean:
-        i = int(np.argmax(drift))
-        message = (
-            f"time in `{name}` is not uniform: t[{i}] = {times[i]:.6g} s is {drift[i]:.3g} s beside the grid"
-        )
-        raise TraceError(Diagnostic("E602", message, help=(RESAMPLE,)))
-    return _snap(mean, dt)
 
 
 def snapped(step: float) -> float:

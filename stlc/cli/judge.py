@@ -113,6 +113,7 @@ def judged(path: Path, question: Question) -> tuple[Checked, list[str]]:
     source, note = specification(recording, question.spec)
     monitor = monitor_of(source, question, recording.meta.spec_library)
     trace = laid_out(recording, monitor, question)
+    del recording  # what was converted is not kept twice
     verdict = monitor.check(
         trace,
         at=instant(question.at, trace),
