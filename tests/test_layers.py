@@ -15,6 +15,7 @@ PACKAGE = ROOT / "stlc"
 
 TRACE_FORMATS = (
     *(
+        "trace_cells",
         "trace_chunks",
         "trace_csv",
         "trace_extras",
