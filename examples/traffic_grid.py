@@ -41,7 +41,7 @@ SPAN = {STRAIGHT: WIDTH, LEFT: math.pi / 2 * RADIUS[LEFT], RIGHT: math.pi / 2 * 
 STEP, BEFORE = 0.1, 2.0  # m: resolution of the conflict tables, and how long before the box they begin
 ROAD, MARKING = "#e3e5e8", "#ffffff"
 SHOWN = {-1: "#4a4f57", 0: "#d43d3d", 1: "#2f9e57"}  # stop sign, red, green
-DECIDED = ("#2563a8", "#e08a00", "#c0267e")  # policy, backup, safest
+DECIDED = ("#2563a8", "#e08a00", "#c0267e", "#2e9e5b")  # policy, backup, safest, polished
 
 
 def right_of(direction: int) -> np.ndarray:

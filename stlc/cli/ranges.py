@@ -36,6 +36,11 @@ def parse_seconds(text: str) -> float:
     return value
 
 
+def parse_limit(text: str) -> float | None:
+    """A duration in seconds, or None for `none`. Raises UsageError (U101) for anything else."""
+    return None if text.strip() == "none" else parse_seconds(text)
+
+
 def parse_clock(text: str) -> Clock:
     """What a budget counts. Raises UsageError (U101) for anything but `wall` and `processor`."""
     match text:

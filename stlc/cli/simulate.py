@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 import typer
 
 from stlc.cli.options import JsonOption, RunArgument, RunsOption, SetOption, describe, parse_overrides
+from stlc.cli.ranges import parse_limit
 from stlc.diagnostics import Diagnostic, UsageError
 
 if TYPE_CHECKING:
@@ -21,7 +22,12 @@ if TYPE_CHECKING:
 
 Record: TypeAlias = "dict[str, Any]"
 
-GUARDS: dict[Mode, tuple[Mode, ...]] = {"none": ("none",), "paper": ("none", "paper")}
+GUARDS: dict[Mode, tuple[Mode, ...]] = {
+    "none": ("none",),
+    "paper": ("none", "paper"),
+    "full": ("none", "full"),
+}
+NAMES: dict[Mode, str] = {"none": "no guard", "paper": "paper's guard", "full": "full guard"}
 
 
 def register(app: typer.Typer) -> None:
@@ -44,7 +50,13 @@ def simulate(
     backup: Annotated[
         bool | None, typer.Option("--backup/--no-backup", help="The paper's backup policy.")
     ] = None,
-    guard: Annotated[str | None, typer.Option(metavar="none|paper", help="What guards the policy.")] = None,
+    guard: Annotated[
+        str | None,
+        typer.Option(metavar="none|paper|full", help="What guards the policy; `full` polishes plans first."),
+    ] = None,
+    time_limit: Annotated[
+        str, typer.Option(metavar="TIME", help="Of a decision of the full guard, per agent; or `none`.")
+    ] = "100ms",
     seeds: Annotated[int, typer.Option(min=1, help="How many deployments.")] = 10,
     seed: Annotated[int, typer.Option(min=0, max=2**62, help="Seed of the first; the others follow.")] = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Of each; by default the system's.")] = None,
@@ -75,7 +87,11 @@ def simulate(
     opened = Run.open(run, root=runs, overrides=parse_overrides(set_), scenario=scenario)
     test = opened.task.system.decl.test
     setting = Setting(
-        tuple(range(seed, seed + seeds)), agents or test.agents, steps or test.steps, test.replan
+        tuple(range(seed, seed + seeds)),
+        agents or test.agents,
+        steps or test.steps,
+        test.replan,
+        parse_limit(time_limit),
     )
     found = {mode: _deploy(opened, setting, mode, record) for mode in GUARDS[chosen]}
     document = _save(opened, setting, found, record)
@@ -104,12 +120,15 @@ def _print(lines: Iterator[str]) -> None:
 def _guard(backup: bool | None, guard: str | None) -> Mode:
     if guard not in (None, *GUARDS):
         raise UsageError(
-            Diagnostic("U101", f"there is no guard `{guard}`", help=("--guard none or --guard paper",))
+            Diagnostic("U101", f"there is no guard `{guard}`", help=("--guard none, paper or full",))
         )
     if backup is not None and guard is not None and backup != (guard == "paper"):
         option = "--backup" if backup else "--no-backup"
         raise UsageError(Diagnostic("U101", f"`{option}` and `--guard {guard}` contradict each other"))
-    return "paper" if backup or guard == "paper" else "none"
+    for mode in GUARDS:
+        if mode == guard:
+            return mode
+    return "paper" if backup else "none"
 
 
 def _deploy(run: Run, setting: Setting, mode: Mode, record: Path | None) -> Deployment:
@@ -119,7 +138,7 @@ def _deploy(run: Run, setting: Setting, mode: Mode, record: Path | None) -> Depl
     from stlc.controller.evaluate import InterruptedDeploymentError, deploy
 
     try:
-        with _bar("no guard" if mode == "none" else "paper's guard") as tick:
+        with _bar(NAMES[mode]) as tick:
             return deploy(run.task, run.policy, setting, mode, tick=tick)
     except InterruptedDeploymentError as error:
         if error.recording is not None:
@@ -208,7 +227,7 @@ def _screen(document: Record) -> Iterator[str]:
     world = document["world"] or f"{document['system']} and its events"
     scenario = [f"scenario {document['scenario']}"] if document["scenario"] else []
     yield " · ".join((document["spec"], f"run {document['run']}", f"world {world}", *scenario, size))
-    header = ("", *({"none": "no guard", "paper": "paper's guard"}[name] for name in guards))
+    header = ("", *(NAMES[name] for name in guards))
     yield table([*_shares(guards), *_progress(guards), *_times(guards)], header=header)
     for name, guard in guards.items():
         if name != "none":
@@ -274,6 +293,6 @@ def _acted(decisions: Mapping[str, float]) -> str:
     if total <= 0.0:
         return "0 % of decisions"
     kinds = {name.removeprefix("backup "): share for name, share in decisions.items() if "T0=" in name}
-    kinds["longest safe prefix"] = decisions["safest"]
+    kinds |= {"polished": decisions["polished"], "longest safe prefix": decisions["safest"]}
     parts = ", ".join(f"{name} {share / total:.0%}" for name, share in kinds.items() if share)
     return f"{total:.1%} of decisions ({parts})"

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from math import prod
 from typing import TYPE_CHECKING
 
 import torch
@@ -42,6 +43,10 @@ class Grid:
         lengths = tuple(length for length in decl.backup.lengths if 0 < length < task.horizon)
         return cls(values, lengths, decl.backup.batch)
 
+    def count(self, length: int) -> int:
+        """How many prefixes there are, M = L^(m T0)."""
+        return int(prod(len(values) for values in self.values) ** length)
+
     def prefixes(self, length: int) -> Tensor:
         """All prefixes, (M, length, m) float64."""
         actions = torch.tensor(list(product(*self.values)), dtype=torch.float64)
@@ -69,7 +74,7 @@ class Found:
 
 
 @dataclass(frozen=True, slots=True)
-class _Candidates:
+class Candidates:
     """Plans of several agents: (agents, choices, …); choice 0 begins as the policy's own plan does."""
 
     plans: Tensor
@@ -93,7 +98,7 @@ class Backup:
         self._formulas = [rule.formula for rule in task.compiled.safety]
 
     @torch.no_grad()
-    def search(self, x: Tensor, plan: Tensor) -> Found:
+    def search(self, x: Tensor, plan: Tensor, _rest: Tensor | None = None) -> Found:
         """Better plans for states whose own plan was found wanting.
 
         Among plans of the same rank robustness decides, then the performance terms of the objective, because
@@ -114,7 +119,7 @@ class Backup:
             last = length == self.grid.lengths[-1]
             left = []
             for group in _pieces(todo, max(self.grid.batch // (len(prefixes) + 1), 1)):
-                candidates = self._candidates(x[group], plan[group], prefixes)
+                candidates = self.candidates(x[group], plan[group], prefixes)
                 done = self._enter(found, candidates, group, length)
                 if last and not bool(done.all()):
                     self._enter_safest(found, _at(candidates, ~done), (x[group[~done]], group[~done]), length)
@@ -122,7 +127,7 @@ class Backup:
             todo = torch.cat(left) if left else todo
         return found
 
-    def _candidates(self, x: Tensor, own: Tensor, prefixes: Tensor) -> _Candidates:
+    def candidates(self, x: Tensor, own: Tensor, prefixes: Tensor) -> Candidates:
         """All plans of one T0 for some agents, judged; at most `grid.batch` trajectories at a time."""
         agents, (count, length, _) = len(x), prefixes.shape
         heads = torch.cat((own[:, None, :length], prefixes.expand(agents, -1, -1, -1)), 1).flatten(0, 1)
@@ -132,7 +137,7 @@ class Backup:
             for start, head in zip(self._parts(starts), self._parts(heads), strict=True)
         ]
         columns = [torch.cat(column) for column in zip(*parts, strict=True)]
-        return _Candidates(*(column.view(agents, count + 1, *column.shape[1:]) for column in columns))
+        return Candidates(*(column.view(agents, count + 1, *column.shape[1:]) for column in columns))
 
     def _finish(self, x: Tensor, head: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Plans that begin with `head` and go on as the policy plans from its end, and their verdicts."""
@@ -145,7 +150,7 @@ class Backup:
     def _parts(self, rows: Tensor) -> list[Tensor]:
         return _pieces(rows, self.grid.batch)
 
-    def _enter(self, found: Found, candidates: _Candidates, group: Tensor, length: int) -> Tensor:
+    def _enter(self, found: Found, candidates: Candidates, group: Tensor, length: int) -> Tensor:
         """Take the best plan where one satisfies phi, or else phi_safe; returns where that was so."""
         good = candidates.rho >= -TOLERANCE
         eligible = torch.where(good.any(1, keepdim=True), good, candidates.safe)
@@ -155,7 +160,7 @@ class Backup:
         return done
 
     def _enter_safest(
-        self, found: Found, candidates: _Candidates, where: tuple[Tensor, Tensor], length: int
+        self, found: Found, candidates: Candidates, where: tuple[Tensor, Tensor], length: int
     ) -> None:
         """Take the plan with the longest safe prefix; of several the most robust, the latest to fail."""
         x, group = where
@@ -208,13 +213,13 @@ def _nothing(plan: Tensor) -> Found:
     )
 
 
-def _at(candidates: _Candidates, rows: Tensor) -> _Candidates:
-    return _Candidates(
+def _at(candidates: Candidates, rows: Tensor) -> Candidates:
+    return Candidates(
         candidates.plans[rows], candidates.rho[rows], candidates.safe[rows], candidates.cost[rows]
     )
 
 
-def _take(found: Found, candidates: _Candidates, pick: Tensor, group: Tensor, how: tuple[int, int]) -> None:
+def _take(found: Found, candidates: Candidates, pick: Tensor, group: Tensor, how: tuple[int, int]) -> None:
     """Enter the picked candidates for the agents of a group."""
     row = torch.arange(len(group), device=group.device)
     found.plan[group] = candidates.plans[row, pick]

@@ -10,14 +10,15 @@ from torch import Tensor
 
 from stlc.compile.semantics import TOLERANCE
 from stlc.controller.backup import Backup, Found, Grid
+from stlc.controller.polish import FullBackup, Limits
 from stlc.controller.task import rank
 
 if TYPE_CHECKING:
     from stlc.controller.policy import Policy
     from stlc.controller.task import Judged, Task
 
-Mode: TypeAlias = Literal["none", "paper"]
-SOURCES = ("policy", "backup", "safest")
+Mode: TypeAlias = Literal["none", "paper", "full"]
+SOURCES = ("policy", "backup", "safest", "polished")
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,13 +63,28 @@ class Guard:
     Args:
         task: specification and system.
         policy: plans.
-        mode: "paper" calls the backup policy where the monitor finds a plan violated, "none" only records.
+        mode: where the monitor finds a plan violated, "paper" calls the paper's backup policy and "full" the
+            polishing one; "none" only records.
         grid: candidates of the backup; by default what the system file says.
+        limits: of a decision of the full guard.
     """
 
-    def __init__(self, task: Task, policy: Policy, mode: Mode = "paper", *, grid: Grid | None = None) -> None:
+    def __init__(
+        self,
+        task: Task,
+        policy: Policy,
+        mode: Mode = "paper",
+        *,
+        grid: Grid | None = None,
+        limits: Limits | None = None,
+    ) -> None:
         self.task, self.policy, self.mode = task, policy, mode
-        self.backup = Backup(task, policy, grid=grid) if mode == "paper" else None
+        self.backup: Backup | FullBackup | None = None
+        match mode:
+            case "paper":
+                self.backup = Backup(task, policy, grid=grid)
+            case "full":
+                self.backup = FullBackup(task, policy, grid=grid, limits=limits)
 
     @torch.no_grad()
     def decide(self, x: Tensor, begun: Decision | None = None) -> Decision:
@@ -91,7 +107,8 @@ class Guard:
         plan, source, t0, rho, safe = found.plan, found.source, found.t0, found.rho, found.safe
         failing = torch.nonzero(~(rho >= -TOLERANCE)).squeeze(1)
         if self.backup is not None and len(failing):
-            found = self.backup.search(x[failing], fresh[failing])
+            rest = None if begun is None else begun.plan[failing]
+            found = self.backup.search(x[failing], fresh[failing], rest)
             plan = plan.index_copy(0, failing, found.plan)
             source, t0 = source.index_copy(0, failing, found.source), t0.index_copy(0, failing, found.t0)
             rho, safe = rho.index_copy(0, failing, found.rho), safe.index_copy(0, failing, found.safe)

@@ -106,12 +106,16 @@ class Recorder:
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A deployment: which seeds, how many agents each, how long, and how often they plan anew."""
+    """A deployment: which seeds, how many agents each, how long, and how often they plan anew.
+
+    `limit`: seconds that a decision of the full guard may take per agent; None: as long as it takes.
+    """
 
     seeds: tuple[int, ...]
     agents: int
     steps: int
     replan: int = 1
+    limit: float | None = 0.1
 
 
 class _Worlds:

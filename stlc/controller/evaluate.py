@@ -16,6 +16,7 @@ from stlc.controller.deploy import SOURCES, Guard, Mode
 from stlc.controller.drive import Recorder, Recording, Setting, Tick, drive
 from stlc.controller.executed import Executed, judge_executed
 from stlc.controller.intervals import Interval
+from stlc.controller.polish import Limits
 from stlc.controller.world import world_type
 
 if TYPE_CHECKING:
@@ -88,7 +89,8 @@ def deploy(
         SystemFileError: S206, the world cannot be loaded.
     """
     make = world_type(task.system.decl)
-    guarded, recorder = Guard(task, policy, guard), Recorder(setting.agents)
+    guarded = Guard(task, policy, guard, limits=Limits(seconds=setting.limit))
+    recorder = Recorder(setting.agents)
     try:
         drive(guarded, make, setting, recorder, tick)
     except BaseException as error:
@@ -173,6 +175,7 @@ def as_json(
         "agents": setting.agents,
         "steps": setting.steps,
         "replan": setting.replan,
+        "time_limit": setting.limit,
         "interval": "95 %, Student's t over the deployment seeds",
         "guards": {
             name: {

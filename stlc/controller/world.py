@@ -104,7 +104,7 @@ class ModelWorld:
         names, state = scene["names"][index], scene["state"]
         decided = scene["decision"][index] if "decision" in scene else np.zeros(state.shape[1], dtype=int)
         second = min(1, state.shape[2] - 1)
-        for source, color in enumerate(("#2563a8", "#e08a00", "#c0267e")):
+        for source, color in enumerate(("#2563a8", "#e08a00", "#c0267e", "#2e9e5b")):
             points = state[index][decided == source]
             axes.scatter(points[:, 0], points[:, second], s=18, color=color, lw=0)
         for column, limit in ((0, axes.set_xlim), (second, axes.set_ylim)):

@@ -14,7 +14,7 @@ from stlc.view.words import count, seconds, share, spread
 
 Record = Mapping[str, Any]
 
-GUARDS = {"none": "no guard", "paper": "with the backup"}
+GUARDS = {"none": "no guard", "paper": "with the backup", "full": "with the full guard"}
 SHARES = {
     "plan_accuracy": (
         "plan accuracy",
@@ -44,7 +44,7 @@ SHARES = {
 }
 HOLDS = "holds."
 FORESEEN = "driven safely, where the world did as the model says"
-SOURCES = ("policy", "backup", "safest", "")
+SOURCES = ("policy", "polished", "backup", "safest", "")
 
 
 def deployment_tiles(material: Material) -> list[tuple[str, str]]:
@@ -54,7 +54,7 @@ def deployment_tiles(material: Material) -> list[tuple[str, str]]:
         return []
     name, guard = list(guards.items())[-1]
     metrics = guard.get("metrics") or {}
-    beside = "with backup" if name == "paper" else "no guard"
+    beside = GUARDS.get(name, name)
     foreseen, all_ = _mean(metrics, "foreseen_safe_starts"), _mean(metrics, "executed_safe_starts")
     tiles = [
         (share(_mean(metrics, "plan_accuracy")), f"of deployed plans, {beside}"),
@@ -89,6 +89,7 @@ def film_section(material: Material) -> Section | None:
     caption = join(
         "In real time. Who decided: ",
         _key("#2563a8", "policy"),
+        _key("#2e9e5b", "polished plan"),
         _key("#e08a00", "backup"),
         _key("#c0267e", "safest prefix"),
     )
@@ -200,6 +201,7 @@ def _decision_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
 def _decided(name: str) -> Child:
     words = {
         "policy": "the policy decided",
+        "polished": "a polished plan was taken",
         "backup": "the backup decided",
         "safest": "the safest prefix was taken",
     }

@@ -34,8 +34,13 @@ if TYPE_CHECKING:
 
 Margins: TypeAlias = Mapping[str, NDArray[np.float64]]
 
-POLICY, BACKUP, SAFEST = 0, 1, 2
-DECISIONS = {POLICY: ("policy", FAINT), BACKUP: ("backup", ORANGE), SAFEST: ("safest prefix", RED)}
+POLICY, BACKUP, SAFEST, POLISHED = 0, 1, 2, 3
+DECISIONS = {
+    POLICY: ("policy", FAINT),
+    BACKUP: ("backup", ORANGE),
+    SAFEST: ("safest prefix", RED),
+    POLISHED: ("polished", GREEN),
+}
 MOST_LINES = 8  # panels of numbers; beyond that those that move come first
 _HEIGHTS = {"line": 0.62, "strip": 0.2, "robustness": 0.5, "decision": 0.2}
 

@@ -78,6 +78,18 @@ def test_the_same_seed_gives_the_same_trace(there: RunDir) -> None:
     assert all((found[0].data[signal] == found[1].data[signal]).all() for signal in found[0].data)
 
 
+def test_the_full_guard_is_shown_beside_none(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", there.name, *SMALL, "--guard", "full", "--time-limit", "none", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert misfits(document, load_schema("simulate/1")) == []
+    guards = document["result"]["guards"]
+    assert list(guards) == ["none", "full"]
+    assert document["result"]["time_limit"] is None
+    accuracy = [guard["metrics"]["plan_accuracy"]["mean"] for guard in guards.values()]
+    assert accuracy[1] > accuracy[0]
+    assert guards["full"]["decisions"]["polished"] > 0.0
+
+
 @pytest.mark.usefixtures("there")
 def test_fail_under_is_exit_code_1() -> None:
     assert main(["simulate", *SMALL, "--fail-under", "1.01"]) == 1
@@ -87,7 +99,8 @@ def test_fail_under_is_exit_code_1() -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--guard", "full"], "no guard `full`"),
+        (["--guard", "fuller"], "no guard `fuller`"),
+        (["--guard", "full", "--time-limit", "soon"], "not a duration"),
         (["--backup", "--guard", "none"], "contradict"),
         (["--no-backup", "--guard", "paper"], "contradict"),
         (["0099"], "0099"),
