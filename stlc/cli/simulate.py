@@ -29,6 +29,14 @@ GUARDS: dict[Mode, tuple[Mode, ...]] = {
 }
 NAMES: dict[Mode, str] = {"none": "no guard", "paper": "paper's guard", "full": "full guard"}
 
+GuardOption = Annotated[
+    str | None,
+    typer.Option(metavar="none|paper|full", help="What guards the policy; `full` polishes plans first."),
+]
+LimitOption = Annotated[
+    str, typer.Option(metavar="TIME", help="Of a decision of the full guard, per agent; or `none`.")
+]
+
 
 def register(app: typer.Typer) -> None:
     """Add the command to the program."""
@@ -50,13 +58,8 @@ def simulate(
     backup: Annotated[
         bool | None, typer.Option("--backup/--no-backup", help="The paper's backup policy.")
     ] = None,
-    guard: Annotated[
-        str | None,
-        typer.Option(metavar="none|paper|full", help="What guards the policy; `full` polishes plans first."),
-    ] = None,
-    time_limit: Annotated[
-        str, typer.Option(metavar="TIME", help="Of a decision of the full guard, per agent; or `none`.")
-    ] = "100ms",
+    guard: GuardOption = None,
+    time_limit: LimitOption = "100ms",
     seeds: Annotated[int, typer.Option(min=1, help="How many deployments.")] = 10,
     seed: Annotated[int, typer.Option(min=0, max=2**62, help="Seed of the first; the others follow.")] = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Of each; by default the system's.")] = None,
