@@ -97,8 +97,8 @@ class RunDir:
     def open(cls, where: Path | str, root: Path = RUNS) -> RunDir:
         """The run called `where`.
 
-        That is a folder (or a file in one), `latest`, a spec's name (its newest run), a run's number,
-        its words, or both, with or without `SPEC/` before it.
+        That is a folder (or a file in one), `latest`, a spec's name or file (its newest run), a run's
+        number, its words, or both, with or without `SPEC/` before it.
 
         Raises:
             UsageError: R101, there is no such run, or several fit.
@@ -106,7 +106,10 @@ class RunDir:
         """
         given = Path(where)
         if given.exists() and given.resolve() != Path.cwd() / root:
-            return cls(_folder_of(given).resolve()).checked()
+            folder = _folder_of(given)
+            if given.suffix == ".stl" and folder == given:
+                return _of_spec(given, root)
+            return cls(folder.resolve()).checked()
         if str(where) == LATEST:
             return cls.newest(root).checked()
         return _by_name(str(where), root).checked()
@@ -266,6 +269,25 @@ def _by_name(where: str, root: Path) -> RunDir:
     )
     advice = (f"did you mean `{near}`?",) if near else ()
     raise UsageError(Diagnostic("R101", f"there is no run `{where}` in `{root}`", help=advice))
+
+
+def _of_spec(path: Path, root: Path) -> RunDir:
+    """The newest run that was trained for a specification file, or for one of its name."""
+    runs = every_run(root)
+    trained = [run for run in runs if _spec_path(run) == path.resolve()]
+    found = trained or [run for run in runs if run.path.parent.name == _slug(path.stem)]
+    if not found:
+        help_ = (f"train one: stlc train {path}",)
+        raise UsageError(Diagnostic("R101", f"there is no run of `{path}` in `{root}`", help=help_))
+    return found[-1]
+
+
+def _spec_path(run: RunDir) -> Path | None:
+    """The specification file of a run, as far as its record can be read."""
+    try:
+        return Path(str(run.record().get("spec_path"))).resolve()
+    except RunError:
+        return None
 
 
 def _names(run: RunDir) -> tuple[str, str, str, str]:

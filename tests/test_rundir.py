@@ -130,6 +130,24 @@ def test_a_run_is_found_by_any_path_into_it(root, monkeypatch):
     assert RunDir.open("runs/latest", root).path == run.path
 
 
+def test_a_specification_file_names_its_newest_run(root, tmp_path):
+    path, other = tmp_path / "mine.stl", tmp_path / "traffic.stl"
+    path.touch()
+    other.touch()
+    made(root, "named_otherwise", "a-a").update({"spec_path": str(path)})
+    newest = made(root, "named_otherwise", "b-b")
+    newest.update({"spec_path": str(path)})
+    traffic = made(root, "traffic", "c-c")
+    assert RunDir.open(path, root).path == newest.path
+    assert RunDir.open(other, root).path == traffic.path
+    (traffic.path / "spec.stl").touch()
+    assert RunDir.open(traffic.path / "spec.stl", root).path == traffic.path
+    (tmp_path / "none.stl").touch()
+    with pytest.raises(UsageError) as caught:
+        RunDir.open(tmp_path / "none.stl", root)
+    assert "stlc train" in caught.value.diagnostics[0].help[0]
+
+
 def test_an_ambiguous_name_lists_its_runs(root):
     made(root, "traffic", "red-fox")
     made(root, "patrol", "tall-swan")

@@ -26,7 +26,7 @@ RunArgument = Annotated[
     str,
     typer.Argument(
         metavar="RUN",
-        help="A run's folder, number, words, spec, or latest.",
+        help="A run's folder, number, words, spec (its name or file), or latest.",
         autocompletion=run_names,
     ),
 ]

@@ -13,7 +13,7 @@ from stlc.cli.ranges import parse_limit
 from stlc.diagnostics import Diagnostic, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from stlc.controller.deploy import Mode
     from stlc.controller.drive import Setting, Tick
@@ -22,12 +22,13 @@ if TYPE_CHECKING:
 
 Record: TypeAlias = "dict[str, Any]"
 
+ALL = "all"
+SCENARIOS = "eval/scenarios.json"
 GUARDS: dict[Mode, tuple[Mode, ...]] = {
     "none": ("none",),
     "paper": ("none", "paper"),
     "full": ("none", "full"),
 }
-NAMES: dict[Mode, str] = {"none": "no guard", "paper": "paper's guard", "full": "full guard"}
 
 GuardOption = Annotated[
     str | None,
@@ -46,6 +47,7 @@ def register(app: typer.Typer) -> None:
             "Deploy a trained policy in the world of its system.",
             "stlc simulate --backup",
             "stlc simulate latest --backup --seeds 20 --record trace.npz",
+            "stlc simulate specs/ship_track.stl --backup --scenario all",
             note="The newest run unless one is named. With --backup the paper's backup policy guards it, "
             "and the same seeds are driven without it too, to compare. Trace, scene and figures go "
             "into the run's folder. Means over seeds come with 95 % intervals (Student's t).",
@@ -71,7 +73,7 @@ def simulate(
         float | None, typer.Option(metavar="SHARE", help="Exit with 1 if the plan accuracy is less.")
     ] = None,
     scenario: Annotated[
-        str | None, typer.Option(metavar="NAME", help="An overlay of the system file, such as an OOD case.")
+        str | None, typer.Option(metavar="NAME", help="An overlay of the system file, or all of them.")
     ] = None,
     set_: SetOption = None,
     runs: RunsOption = Path("runs"),
@@ -80,6 +82,7 @@ def simulate(
 ) -> None:
     """Deploy the policy of a run, record it, and say how it did."""
     chosen = _guard(backup, guard)
+    from stlc.cli.simulate_text import closing, screen
     from stlc.controller.drive import Setting
     from stlc.controller.run import Run
     from stlc.trace import check_writable
@@ -87,30 +90,54 @@ def simulate(
     if record is not None:
         check_writable(record)
 
-    opened = Run.open(run, root=runs, overrides=parse_overrides(set_), scenario=scenario)
+    overrides = parse_overrides(set_)
+    opened = Run.open(run, root=runs, overrides=overrides)
     test = opened.task.system.decl.test
-    setting = Setting(
-        tuple(range(seed, seed + seeds)),
-        agents or test.agents,
-        steps or test.steps,
-        test.replan,
-        parse_limit(time_limit),
-    )
-    found = {mode: _deploy(opened, setting, mode, record) for mode in GUARDS[chosen]}
-    document = _save(opened, setting, found, record)
-    accuracy = found[chosen].metrics["plan_accuracy"].mean
-    code = 1 if fail_under is not None and accuracy < fail_under else 0
+    which = tuple(range(seed, seed + seeds))
+    limit = parse_limit(time_limit)
+    setting = Setting(which, agents or test.agents, steps or test.steps, test.replan, limit)
+
+    def driven(name: str | None) -> Record:
+        laid = opened
+        if name is not None:
+            laid = Run.open(opened.dir.path, root=runs, overrides=overrides, scenario=name)
+        found = {mode: _deploy(laid, setting, mode, record) for mode in GUARDS[chosen]}
+        return _save(laid, setting, found, record)
+
+    document = _all(opened, driven) if scenario == ALL else driven(scenario)
+    code = 1 if fail_under is not None and _accuracy(document, chosen) < fail_under else 0
     if not json:
-        _print(_screen(document))  # before the pictures: what was measured must not depend on them
+        _print(screen(document))  # before the pictures: what was measured must not depend on them
     drawn = _draw(opened) if pictures else {}
     if json:
         from stlc.cli.output import emit_json
 
         emit_json("simulate/1", ok=code == 0, exit_code=code, result=document | drawn)
     else:
-        _print(_closing(document["trace"], drawn, record))
+        _print(closing(document["trace"], drawn, record))
     if code:
         raise typer.Exit(code)
+
+
+def _accuracy(document: Record, guard: Mode) -> float:
+    """The plan accuracy, the least one over all scenarios that were driven."""
+    each = [document, *document.get("scenarios", {}).values()]
+    return min(float(one["guards"][guard]["metrics"]["plan_accuracy"]["mean"]) for one in each)
+
+
+def _all(run: Run, driven: Callable[[str | None], Record]) -> Record:
+    """The deployment as it is, and all scenarios beside it; the trace is that of the former."""
+    scenarios = {}
+    for scenario in run.task.system.decl.scenarios:
+        found = driven(scenario.name)
+        scenarios[scenario.name] = {
+            "doc": scenario.doc,
+            "expect": scenario.expect,
+            "guards": found["guards"],
+        }
+    document = {**driven(None), "scenarios": scenarios}
+    run.dir.write_json(SCENARIOS, document)
+    return document
 
 
 def _print(lines: Iterator[str]) -> None:
@@ -137,11 +164,12 @@ def _guard(backup: bool | None, guard: str | None) -> Mode:
 def _deploy(run: Run, setting: Setting, mode: Mode, record: Path | None) -> Deployment:
     """One deployment with a progress bar; what was driven before a failure is saved."""
     from stlc.cli.output import say
+    from stlc.cli.simulate_text import TITLES
     from stlc.controller.archive import save_trace_of
     from stlc.controller.evaluate import InterruptedDeploymentError, deploy
 
     try:
-        with _bar(NAMES[mode]) as tick:
+        with _bar(TITLES[mode]) as tick:
             return deploy(run.task, run.policy, setting, mode, tick=tick)
     except InterruptedDeploymentError as error:
         if error.recording is not None:
@@ -206,96 +234,3 @@ def _draw(run: Run) -> dict[str, str]:
     write_report(run.dir)
     drawn = {"report": f"{run.dir.shown}/report.html"}
     return drawn if gif is None else {"animation": f"{run.dir.shown}/{gif.name}", **drawn}
-
-
-ROWS = {
-    "plan accuracy": "plan_accuracy",
-    "plan safety": "plan_safety",
-    "policy's own plans": "policy_accuracy",
-    "executed, agents": "executed",
-    "executed, starts": "executed_starts",
-    "  safely": "executed_safe_starts",
-    "  where foreseen": "foreseen_starts",
-    "  safely, where foreseen": "foreseen_safe_starts",
-}
-
-
-def _screen(document: Record) -> Iterator[str]:
-    """What was measured, as a person reads it."""
-    from stlc.cli.output import table
-
-    guards = document["guards"]
-    seeds, agents, steps = len(document["seeds"]), document["agents"], document["steps"]
-    size = f"{seeds} seed{'s' * (seeds > 1)} x {agents} agents x {steps} steps"
-    world = document["world"] or f"{document['system']} and its events"
-    scenario = [f"scenario {document['scenario']}"] if document["scenario"] else []
-    yield " · ".join((document["spec"], f"run {document['run']}", f"world {world}", *scenario, size))
-    header = ("", *(NAMES[name] for name in guards))
-    yield table([*_shares(guards), *_progress(guards), *_times(guards)], header=header)
-    for name, guard in guards.items():
-        if name != "none":
-            yield f"  guard acted in {_acted(guard['decisions'])}"
-    foreseen = list(guards.values())[-1]["metrics"].get("foreseen")
-    if foreseen:
-        yield f"  foreseen: the {foreseen['mean']:.0%} of starts from which the world did as the model says"
-
-
-def _closing(trace: str, drawn: Mapping[str, str], record: Path | None) -> Iterator[str]:
-    """Where things are; the last line is the next command."""
-    from stlc.files import find_trace
-
-    yield ""
-    yield f"  trace      {trace}"
-    for what, path in drawn.items():
-        yield f"  {what:<10} {path}"
-    found = (
-        find_trace("trace.npz")
-        if Path("trace.npz").exists() or Path("runs/latest/trace.npz").exists()
-        else None
-    )
-    short = found is not None and found.resolve() == Path(trace).resolve()
-    yield f"  next       stlc check {record or ('trace.npz' if short else trace)}"
-
-
-def _shares(guards: Record) -> Iterator[tuple[str, ...]]:
-    for label, name in ROWS.items():
-        found = [guard["metrics"].get(name) for guard in guards.values()]
-        if any(found):
-            yield (label, *("" if metric is None else _number(metric, "", 3) for metric in found))
-
-
-def _progress(guards: Record) -> Iterator[tuple[str, ...]]:
-    """What the world tells of itself: every metric that is not one of ours."""
-    from stlc.controller.evaluate import METRICS
-
-    first = next(iter(guards.values()))
-    for name in first["metrics"]:
-        if name not in METRICS and not name.startswith("holds."):
-            unit = first["units"].get(name, "")
-            cells = (_number(guard["metrics"][name], unit, 2) for guard in guards.values())
-            yield (name.replace("_", " "), *cells)
-
-
-def _times(guards: Record) -> Iterator[tuple[str, ...]]:
-    from stlc.view.words import seconds
-
-    for label, name in (("decision, median", "median"), ("decision, 99 %", "p99")):
-        yield (label, *(seconds(guard["latency"][name]) for guard in guards.values()))
-
-
-def _number(metric: Record, unit: str, digits: int) -> str:
-    """A mean and half its interval: `0.957 ± 0.012`, `4.10 ± 0.20 m/s`."""
-    mean, high = metric["mean"], metric["high"]
-    text = f"{mean:.{digits}f}" if high is None else f"{mean:.{digits}f} ± {high - mean:.{digits}f}"
-    return f"{text} {unit}".rstrip()
-
-
-def _acted(decisions: Mapping[str, float]) -> str:
-    """`3.1 % of decisions (T0=1 71 %, T0=2 22 %, longest safe prefix 7 %)`."""
-    total = 1.0 - decisions["policy"]
-    if total <= 0.0:
-        return "0 % of decisions"
-    kinds = {name.removeprefix("backup "): share for name, share in decisions.items() if "T0=" in name}
-    kinds |= {"polished": decisions["polished"], "longest safe prefix": decisions["safest"]}
-    parts = ", ".join(f"{name} {share / total:.0%}" for name, share in kinds.items() if share)
-    return f"{total:.1%} of decisions ({parts})"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, runtime_checkable
 
 import torch
@@ -43,11 +43,28 @@ class Decision:
     safe: Tensor
     policy_rho: Tensor
 
-    def later(self, steps: int = 1) -> Decision:
-        """The same decision `steps` later: what is left of the plans, their last actions held on."""
-        rest = (self.plan[:, steps:], self.plan[:, -1:].expand(-1, steps, -1))
-        plan = torch.cat(rest, 1)
+    def later(self, steps: int | Tensor = 1) -> Decision:
+        """The same decision so many steps later, (agents,) or one number: what is left of the plans.
+
+        Their last actions are held on.
+        """
+        agents, length, controls = self.plan.shape
+        ahead = torch.as_tensor(steps).expand(agents)[:, None] + torch.arange(length)
+        index = ahead.clamp(max=length - 1)[..., None].expand(-1, -1, controls)
+        plan = self.plan.gather(1, index.to(self.plan.device))
         return replace(self, plan=plan, action=plan[:, 0])
+
+    def of(self, rows: Tensor) -> Decision:
+        """Those of some agents, (k,) indices."""
+        return Decision(*(getattr(self, name)[rows] for name in _FIELDS))
+
+    def with_new(self, rows: Tensor, new: Decision) -> Decision:
+        """These decisions, but for some agents, (k,) indices, which have decided anew."""
+        pairs = ((getattr(self, name), getattr(new, name)) for name in _FIELDS)
+        return Decision(*(old.index_copy(0, rows, fresh) for old, fresh in pairs))
+
+
+_FIELDS = tuple(each.name for each in fields(Decision))
 
 
 @runtime_checkable
@@ -113,6 +130,29 @@ class Guard:
             source, t0 = source.index_copy(0, failing, found.source), t0.index_copy(0, failing, found.t0)
             rho, safe = rho.index_copy(0, failing, found.rho), safe.index_copy(0, failing, found.safe)
         return Decision(plan[:, 0], plan, source, t0, rho, safe, judged.rho)
+
+    @torch.no_grad()
+    def prefer(self, options: Tensor, begun: Decision | None = None) -> Tensor:
+        """Which of its options each agent plans best for; of equals the first.
+
+        Args:
+            options: (agents, k, n) states; option 0 is how things are.
+            begun: what is left of the decision before, which belongs to option 0.
+
+        Returns:
+            (agents,) int64.
+        """
+        agents, count, _ = options.shape
+        options = options.to(torch.float64)
+        _, judged = self._plan(options.flatten(0, 1))
+        score = self._score(judged).view(agents, count)
+        if begun is not None:
+            rest = self._score(self.task.judge(options[:, 0], begun.plan))
+            score[:, 0] = torch.maximum(score[:, 0], rest)
+        return (score >= score.amax(1, keepdim=True)).to(torch.uint8).argmax(1)
+
+    def _score(self, judged: Judged) -> Tensor:
+        return rank(judged.rho, self.task.cost(judged), judged.safe)
 
     def _kept(self, x: Tensor, begun: Decision | None, fresh: Tensor, judged: Judged) -> Found:
         """The policy's plans, or what is left of those that were begun."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stlc.controller.disturbance import Disturbance
+from stlc.controller.world import Choosing
 from stlc.diagnostics import Diagnostic, RunError, StlcError, SystemFileError
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ class Recording:
         progress: of each seed.
         units: of entries of `progress`.
         scene: snapshots of the first seed, stacked over time, and `decision` (frames, agents).
+        options: (rows, steps, k, n), among which agents chose; None where the world leaves no choice.
     """
 
     agents: int
@@ -52,6 +54,7 @@ class Recording:
     progress: tuple[Mapping[str, float], ...]
     units: Mapping[str, str]
     scene: Mapping[str, NDArray[Any]]
+    options: NDArray[np.float64] | None = None
 
     @property
     def steps(self) -> int:
@@ -68,6 +71,7 @@ class Recorder:
     actions: list[Tensor] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     frames: list[Mapping[str, NDArray[Any]]] = field(default_factory=list)
+    options: list[Tensor] = field(default_factory=list)
     progress: tuple[Mapping[str, float], ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
 
@@ -81,6 +85,11 @@ class Recorder:
         self.decisions.append(decision)
         self.actions.append(action)
         self.start(x, world)
+
+    def chosen(self, x: Tensor, options: Tensor) -> None:
+        """The present sample is `x` (rows, n) by the choice of the agents among `options` (rows, k, n)."""
+        self.states[-1] = x
+        self.options.append(options)
 
     def recording(self) -> Recording | None:
         """What there is so far; None before the first step."""
@@ -101,12 +110,15 @@ class Recorder:
             progress=self.progress,
             units=self.units,
             scene=scene,
+            options=torch.stack(self.options, 1).numpy(force=True) if self.options else None,
         )
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
     """A deployment: which seeds, how many agents each, how long, and how often they plan anew.
+
+    An agent that the world tells something new (a signal of role `env` has changed) plans at once.
 
     `limit`: seconds that a decision of the full guard may take per agent; None: as long as it takes.
     """
@@ -150,6 +162,23 @@ class _Worlds:
         moved = self.disturbance.pushed(self._checked(states, step), known, step)
         return torch.cat((moved, self.system.added_later(x)), 1)
 
+    def options(self, x: Tensor) -> Tensor | None:
+        """States under every choice that there is, (rows, k, n); None where the worlds leave none."""
+        choosing = [world for world in self.worlds if isinstance(world, Choosing)]
+        if not choosing:
+            return None
+        with _blame("give options"):
+            options = torch.cat([world.options() for world in choosing]).to(torch.float64)
+        later = x[:, None, self.size[1] :].expand(-1, options.shape[1], -1)
+        return torch.cat((options, later), 2)
+
+    def choose(self, pick: Tensor, x: Tensor) -> Tensor:
+        """The (rows, n) states when every agent has taken an option, (rows,)."""
+        each = zip(self.worlds, torch.split(pick, self.parts), strict=True)
+        with _blame("take a choice"):
+            states = [world.choose(part) for world, part in each if isinstance(world, Choosing)]
+        return torch.cat((self._checked(states, 0), x[:, self.size[1] :]), 1)
+
     def _checked(self, states: list[Tensor], step: int) -> Tensor:
         with _blame(f"give states at step {step}"):
             x = torch.cat(states).to(torch.float64)
@@ -175,6 +204,45 @@ def _blame(what: str) -> Iterator[None]:
         ) from error
 
 
+class _Pilot:
+    """Who follows which plan, and since when."""
+
+    def __init__(self, guard: Guard, setting: Setting) -> None:
+        self.guard, self.replan = guard, setting.replan
+        columns = guard.task.plain.signature.columns
+        self.told = [index for index, column in enumerate(columns) if column.role == "env"]
+        self.decision: Decision | None = None
+        self.age = torch.zeros(0, dtype=torch.int64)
+
+    def due(self, x: Tensor, step: int) -> Tensor:
+        """Who plans now, (k,) rows: everybody every `replan` steps, and whom the world told something."""
+        if self.decision is None or step % self.replan == 0:
+            return torch.arange(len(x))
+        return torch.nonzero((x != self.before)[:, self.told].any(1)).squeeze(1)
+
+    def prefer(self, options: Tensor, due: Tensor) -> Tensor:
+        """Which option everybody takes, (rows,); those who do not plan now stay with theirs."""
+        pick = torch.zeros(len(options), dtype=torch.int64)
+        if len(due):
+            pick[due] = self.guard.prefer(options[due], self._begun(due))
+        return pick
+
+    def decide(self, x: Tensor, seen: Tensor, due: Tensor) -> tuple[Decision, Tensor]:
+        """Decisions, and actions (rows, m), where those in rows `due` plan for what they see of `x`."""
+        if len(due):
+            new = self.guard.decide(seen[due], self._begun(due))
+            whole = self.decision is None or len(due) == len(x)
+            self.decision = new if self.decision is None or whole else self.decision.with_new(due, new)
+            self.age = torch.zeros(len(x), dtype=torch.int64) if whole else self.age.index_fill(0, due, 0)
+        assert self.decision is not None
+        action = self.decision.later(self.age).action
+        self.age, self.before = self.age + 1, x
+        return self.decision, action
+
+    def _begun(self, due: Tensor) -> Decision | None:
+        return None if self.decision is None else self.decision.of(due).later(self.age[due])
+
+
 def drive(
     guard: Guard, make: WorldType, setting: Setting, recorder: Recorder, tick: Tick | None = None
 ) -> None:
@@ -184,16 +252,19 @@ def drive(
         SystemFileError: S207, a world fails; S302, it gives states that are no numbers.
         RunError: R402, a plan that is no number would have to be executed.
     """
-    worlds = _Worlds(guard.task, make, setting)
+    worlds, pilot = _Worlds(guard.task, make, setting), _Pilot(guard, setting)
     x = worlds.reset()
     recorder.start(x, worlds.worlds[0])
     recorder.units = dict(worlds.worlds[0].units())
-    decision = None
     for step in range(setting.steps):
-        if decision is None or step % setting.replan == 0:
-            seen = worlds.disturbance.seen(x, step)
-            decision = guard.decide(seen, decision and decision.later(setting.replan))
-        action = decision.plan[:, step % setting.replan]
+        due = pilot.due(x, step)
+        seen = worlds.disturbance.seen(x, step) if len(due) else x
+        options = worlds.options(x)
+        if options is not None:
+            chosen = worlds.choose(pilot.prefer(options + (seen - x)[:, None], due), x)
+            seen, x = seen + (chosen - x), chosen
+            recorder.chosen(x, options)
+        decision, action = pilot.decide(x, seen, due)
         if not bool(torch.isfinite(action).all()):
             raise RunError(Diagnostic("R402", f"the policy's plan at step {step} is not a number"))
         x = worlds.advance(x, action, step + 1)

@@ -33,6 +33,8 @@ METRICS = {
     "plan_safety": "share of followed plans that satisfy the safety requirements",
     "executed": "share of agents that satisfied it at every start",
     "executed_safe": "share of agents that satisfied the safety requirements at every start",
+    "savable": "share of agents that were driven safely, or from whose start a search finds a safe plan",
+    "saved": "share of those that were driven safely",
     "executed_starts": "share of starts from which what was driven satisfies it",
     "executed_safe_starts": "share of starts from which it satisfies the safety requirements",
     "foreseen": "share of starts from which the world did as the model says, through the window",
@@ -52,6 +54,15 @@ class Latency:
 
 
 @dataclass(frozen=True, slots=True)
+class Unsafe:
+    """An agent that was not driven safely: its seed (by position), its number, and whether it is savable."""
+
+    seed: int
+    agent: int
+    savable: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Deployment:
     """One guard in all seeds.
 
@@ -62,6 +73,7 @@ class Deployment:
             share of starts that satisfy one requirement, and the progress of the world.
         decisions: share of decisions by source, and those of the backup by T0 ("backup T0=1").
         latency: of one decision.
+        unsafe: the agents that were not driven safely.
     """
 
     guard: Mode
@@ -69,6 +81,7 @@ class Deployment:
     metrics: Mapping[str, Interval]
     decisions: Mapping[str, float]
     latency: Latency
+    unsafe: tuple[Unsafe, ...]
 
 
 class InterruptedDeploymentError(Exception):
@@ -97,13 +110,21 @@ def deploy(
         raise InterruptedDeploymentError(recorder.recording()) from error
     recording = recorder.recording()
     assert recording is not None
+    executed = judge_executed(task, recording)
     return Deployment(
         guard,
         recording,
-        measure(recording, judge_executed(task, recording)),
+        measure(recording, executed),
         decided(recording),
         latency(guarded, recording),
+        unsafe_agents(executed, setting.agents),
     )
+
+
+def unsafe_agents(executed: Executed, agents: int) -> tuple[Unsafe, ...]:
+    """Who was not driven safely, of so many agents a seed."""
+    rows = np.flatnonzero(~executed.agents(executed.safety)).tolist()
+    return tuple(Unsafe(*divmod(row, agents), bool(executed.savable[row])) for row in rows)
 
 
 def measure(recording: Recording, executed: Executed) -> dict[str, Interval]:
@@ -126,6 +147,8 @@ def _of_seed(recording: Recording, executed: Executed, seed: int) -> dict[str, f
         "plan_safety": recording.safe[rows],
         "executed": executed.agents(names)[rows],
         "executed_safe": executed.agents(safety)[rows],
+        "savable": executed.savable[rows],
+        "saved": executed.agents(safety)[rows][executed.savable[rows]],
         "executed_starts": starts,
         "executed_safe_starts": safe_starts,
         "foreseen": foreseen,
@@ -158,6 +181,8 @@ def latency(guard: Guard, recording: Recording, samples: int = LATENCY_SAMPLES) 
         before, now = torch.from_numpy(recording.states[row, [max(step - 1, 0), step]])[:, None]
         begun = guard.decide(before).later()
         begin = perf_counter()
+        if recording.options is not None:
+            guard.prefer(torch.from_numpy(recording.options[row, step])[None], begun)
         guard.decide(now, begun)
         seconds.append(perf_counter() - begin)
         if perf_counter() > stop:
@@ -185,6 +210,10 @@ def as_json(
                 },
                 "units": dict(found.recording.units),
                 "decisions": dict(found.decisions),
+                "unsafe": [
+                    {"seed": setting.seeds[each.seed], "agent": each.agent, "savable": each.savable}
+                    for each in found.unsafe
+                ],
                 "latency": {
                     "median": found.latency.median,
                     "p99": found.latency.p99,

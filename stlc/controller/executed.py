@@ -17,6 +17,7 @@ from stlc.compile.lower import lower
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.semantics import TOLERANCE
 from stlc.compile.simplify import simplify
+from stlc.controller.savable import savable
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import Rule
@@ -35,11 +36,13 @@ class Executed:
         rules: requirement -> (starts, rows), whether it holds there; one start where it does not mention T.
         safety: names of the requirements that are tagged `@safety`.
         foreseen: (starts, rows), whether the world did as the model says all through the window from there.
+        savable: (rows,), who was driven safely, or could have been from its first state by a known plan.
     """
 
     rules: Mapping[str, Mask]
     safety: tuple[str, ...]
     foreseen: Mask
+    savable: Mask
 
     def agents(self, names: Sequence[str]) -> Mask:
         """(rows,), who satisfies all of `names` at all starts."""
@@ -60,7 +63,9 @@ def judge_executed(task: Task, recording: Recording) -> Executed:
     starts = max(recording.steps + 1 - task.horizon, 0)
     rules = {rule.name: _held(_driven(rule, task), columns, task.horizon) for rule in task.rules}
     safety = tuple(rule.name for rule in task.compiled.safety)
-    return Executed(rules, safety, _foreseen(task, recording, starts))
+    found = savable(task, torch.from_numpy(recording.states[:, 0])).numpy()
+    executed = Executed(rules, safety, _foreseen(task, recording, starts), found)
+    return replace(executed, savable=found | executed.agents(safety))
 
 
 def _driven(rule: Rule, task: Task) -> Rule:

@@ -80,8 +80,8 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
     write_atomic(folder.path / SPEC, task.compiled.spec.source.text)
     save_library(folder, library_of(task.compiled.spec))
     write_atomic(folder.path / SYSTEM, decl.source.text)
-    if decl.test.world is not None:
-        write_atomic(folder.path / decl.test.world.path.name, decl.test.world.path.read_bytes())
+    for path in {world.path for world in decl.worlds if world.path.is_file()}:
+        write_atomic(folder.path / path.name, path.read_bytes())
     for name, path in function_files(decl).items():
         write_atomic(folder.path / name, path.read_bytes())
     write_atomic(folder.path / "compiled.txt", dump(task.compiled))

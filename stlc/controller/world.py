@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
@@ -52,6 +52,20 @@ class World(Protocol):
     @staticmethod
     def draw(axes: Any, scene: Scene, index: int) -> None:
         """Draw frame `index` of snapshots stacked to (frames, …); `decision` is (frames, agents)."""
+
+
+@runtime_checkable
+class Choosing(Protocol):
+    """What a world has, too, where agents choose among ways to take it, such as the station to go to.
+
+    A choice is made whenever a plan is, and takes the one that can be planned for best.
+    """
+
+    def options(self) -> Tensor:
+        """The present states under every choice, (agents, k, n); option 0 is how things are."""
+
+    def choose(self, pick: Tensor) -> Tensor:
+        """Every agent takes an option, (agents,) int64; returns the states, (agents, n)."""
 
 
 class WorldType(Protocol):

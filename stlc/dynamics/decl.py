@@ -273,6 +273,7 @@ class ScenarioDecl:
         disturb: what is added to derivatives of the truth, not of the model.
         noise: what is added to the states that agents see.
         mismatch: constants of the truth that the model does not know, as text.
+        world: in the place of that of `test`.
     """
 
     name: str
@@ -284,6 +285,7 @@ class ScenarioDecl:
     disturb: tuple[Assign, ...] = ()
     noise: tuple[Assign, ...] = ()
     mismatch: Mapping[str, str] = field(default_factory=dict)
+    world: WorldRef | None = None
 
 
 @dataclass(frozen=True)
@@ -352,6 +354,12 @@ class SystemDecl:
         changes = "".join(f"\0{key}={value}" for key, value in sorted(self.overrides.items()))
         texts = "".join(base.text for base in self.bases)
         return hashlib.sha256((self.source.text + texts + changes).encode()).hexdigest()
+
+    @property
+    def worlds(self) -> tuple[WorldRef, ...]:
+        """Every world that the file names, for `test` and for scenarios."""
+        named = (self.test.world, *(scenario.world for scenario in self.scenarios))
+        return tuple(world for world in named if world is not None)
 
     @property
     def grid(self) -> Grid:

@@ -101,7 +101,7 @@ class InitialStates:
             rate = max(kept / drawn, 1e-4) if drawn else 0.5
             batch = min(int(missing / rate * 1.1) + 64, MAX_BATCH)
             proposed = self._propose(batch, generator)
-            good = proposed[self._holds(proposed)]
+            good = proposed[self.holds(proposed)]
             drawn, kept = drawn + batch, kept + len(good)
             found.append(good[:missing])
             missing -= len(found[-1])
@@ -123,9 +123,10 @@ class InitialStates:
             table[drawing.name] = drawing(table, rows)
         return torch.stack([table[name] for name in self.names], 1)
 
-    def _holds(self, states: Tensor) -> Tensor:
-        """Where every condition holds, (n,) booleans."""
-        assert self._where is not None
+    def holds(self, states: Tensor) -> Tensor:
+        """Where (n, dim) states meet every condition of `where`, (n,) booleans."""
+        if self._where is None:
+            return torch.ones(len(states), dtype=torch.bool, device=states.device)
         env = dict(zip(self.names, states.unbind(1), strict=True))
         marks = self._where(env, TORCH, _HARD)
         return torch.stack([mark.expand(len(states)) > 0.5 for mark in marks.values()]).all(0)

@@ -49,7 +49,8 @@ def truth(decl: SystemDecl) -> SystemDecl:
 def _laid_over(decl: SystemDecl, name: str) -> SystemDecl:
     scenario = find_scenario(decl, name)
     init = replace(decl.init, override=(*decl.init.override, *scenario.override))
-    test = replace(decl.test, events=(*decl.test.events, *scenario.events))
+    events = (*decl.test.events, *scenario.events)
+    test = replace(decl.test, events=events, world=scenario.world or decl.test.world)
     return replace(decl, init=init, test=test, scenario=scenario)
 
 

@@ -40,7 +40,7 @@ def read_test(node: Node | None, reader: Reader, names: Names, dt: Fraction) -> 
         reader.integer(found.get("replan"), "`replan`") or default.replan,
         tuple(read_event(item, index, here, names, dt) for index, item in enumerate(items)),
         tuple(metric for metric in metrics if metric),
-        _world(found.get("world"), reader),
+        read_world(found.get("world"), reader),
     )
 
 
@@ -87,7 +87,7 @@ def _condition(node: Node | None, here: Expressions) -> tuple[ir.Formula | None,
             return here.formula_of(expr), None
 
 
-def _world(node: Node | None, reader: Reader) -> WorldRef | None:
+def read_world(node: Node | None, reader: Reader) -> WorldRef | None:
     """`file.py:Class`, relative to the system file."""
     if node is None or (isinstance(node, Scalar) and node.is_null):
         return None

@@ -8,14 +8,24 @@ from stlc.compile import ir
 from stlc.compile.scope import Known
 from stlc.compile.values import Number
 from stlc.dynamics.decl import Assign, ScenarioDecl
-from stlc.dynamics.schema_deploy import read_event
+from stlc.dynamics.schema_deploy import read_event, read_world
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import rate_unit, read_sets, states_of
 from stlc.dynamics.schema_names import Clockwork, Names
 from stlc.dynamics.schema_reader import Reader
 from stlc.dynamics.yaml_nodes import Entry, Node
 
-SCENARIO_KEYS = ("doc", "expect", "const", "override", "events", "disturb", "noise", "model_mismatch")
+SCENARIO_KEYS = (
+    "doc",
+    "expect",
+    "const",
+    "override",
+    "events",
+    "disturb",
+    "noise",
+    "model_mismatch",
+    "world",
+)
 EXPECTED = ("nominal", "ood")
 
 
@@ -43,6 +53,7 @@ def _scenario(entry: Entry, reader: Reader, names: Names, clock: Clockwork) -> S
         MappingProxyType(
             _constants(found.get("model_mismatch"), f"`model_mismatch` of {where}", reader, names)
         ),
+        read_world(found.get("world"), reader),
     )
 
 

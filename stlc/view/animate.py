@@ -17,6 +17,7 @@ from stlc.view.film import MAX_BYTES, MAX_FRAMES, Film, Scene, save_gif, save_st
 
 SCENE = "scene.npz"
 TRACE = "trace.npz"
+RESULT = "eval/simulate.json"
 STILL = "scene.png"
 
 
@@ -69,16 +70,28 @@ def _scene_film(run: RunDir) -> Film | None:
     if scene is None:
         return None
     from stlc.controller.world import world_type
+    from stlc.dynamics.scenario import under
     from stlc.dynamics.schema import load_system_decl
 
     try:
         decl = load_system_decl(run.path / "system.yaml")
+        scenario = _scenario(run)
+        decl = decl if scenario is None else under(decl, scenario)
         if decl.test.world is None:
             return None
         world = world_type(decl)
     except StlcError:
         return None
     return scene_film(scene, world.draw, float(decl.dt), title=_title(run))
+
+
+def _scenario(run: RunDir) -> str | None:
+    """The scenario of the newest deployment, if there was one."""
+    try:
+        name = run.read_json(RESULT).get("scenario")
+    except (StlcError, AttributeError):
+        return None
+    return None if name is None else str(name)
 
 
 def _signal_film(run: RunDir) -> Film | None:

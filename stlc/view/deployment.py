@@ -30,6 +30,11 @@ SHARES = {
         "executed safely, agents",
         "agents whose drive satisfied what is tagged @safety from every start",
     ),
+    "savable": (
+        "savable, agents",
+        "agents that were driven safely, or from whose start a search finds a plan that is safe",
+    ),
+    "saved": ("of these driven safely", "the share of them whose drive satisfied what is tagged @safety"),
     "executed_starts": ("executed, starts", "starts from which what was driven satisfies the specification"),
     "executed_safe_starts": ("executed safely, starts", "the same for what is tagged @safety"),
     "foreseen": (

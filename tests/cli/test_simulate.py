@@ -12,6 +12,7 @@ from stlc.rundir import RunDir
 from stlc.trace import load_trace
 
 ROOT = Path(__file__).parents[2]
+SCENARIO = "scenario: {slippery: {expect: ood, doc: wet leaves, model_mismatch: {vmax: 9 m/s}}}\n"
 SMALL = ["--seeds", "2", "--agents", "4", "--steps", "6", "--no-pictures"]
 
 
@@ -21,7 +22,9 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("home")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        spec, system = ROOT / "specs/traffic.stl", ROOT / "examples/car.yaml"
+        spec, system = ROOT / "specs/traffic.stl", folder / "car.yaml"
+        system.write_text((ROOT / "examples/car.yaml").read_text() + SCENARIO)
+        (folder / "traffic_grid.py").write_text((ROOT / "examples/traffic_grid.py").read_text())
         command = ["train", str(spec), "--system", str(system), "--steps", "30", "--batch", "64"]
         assert main([*command, "--no-pictures"]) == 0
     return folder
@@ -88,6 +91,25 @@ def test_the_full_guard_is_shown_beside_none(there: RunDir, capsys: pytest.Captu
     accuracy = [guard["metrics"]["plan_accuracy"]["mean"] for guard in guards.values()]
     assert accuracy[1] > accuracy[0]
     assert guards["full"]["decisions"]["polished"] > 0.0
+
+
+def test_all_scenarios_are_driven_and_compared(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
+    spec = str(ROOT / "specs/traffic.stl")
+    assert main(["simulate", spec, "--backup", "--scenario", "all", *SMALL]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert f"run {there.name}" in lines[0]
+    assert "scenario" not in lines[0]
+    rows = [line.split() for line in lines]
+    (header,) = (row for row in rows if row[:1] == ["scenario"])
+    assert header.count("guard:") == 6
+    assert {row[0] for row in rows if len(row) > 5} >= {"as", "slippery"}
+    assert main(["simulate", spec, "--scenario", "all", *SMALL, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert misfits(document, load_schema("simulate/1")) == []
+    (found,) = document["result"]["scenarios"].items()
+    assert (found[0], found[1]["doc"], found[1]["expect"]) == ("slippery", "wet leaves", "ood")
+    assert found[1]["guards"] != document["result"]["guards"]
+    assert there.read_json("eval/simulate.json")["scenario"] is None
 
 
 @pytest.mark.usefixtures("there")

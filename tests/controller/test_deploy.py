@@ -74,6 +74,55 @@ def test_the_rest_of_a_plan_holds_its_last_action(car_task: Task) -> None:
     assert torch.equal(rest.action, rest.plan[:, 0])
 
 
+def test_each_agent_may_be_as_far_into_its_plan_as_it_likes(car_task: Task) -> None:
+    decision = Guard(car_task, Rule(car_task, 10.0)).decide(car_task.sample(3, seed=5))
+    rest = decision.later(torch.tensor([0, 2, 40]))
+    assert torch.equal(rest.plan[0], decision.plan[0])
+    assert torch.equal(rest.plan[1, :-2], decision.plan[1, 2:])
+    assert torch.equal(rest.plan[2], decision.plan[2, -1:].expand_as(rest.plan[2]))
+
+
+def test_some_agents_decide_anew(car_task: Task) -> None:
+    guard, x = Guard(car_task, Rule(car_task, 10.0)), car_task.sample(5, seed=6)
+    old, rows = guard.decide(x), torch.tensor([1, 4])
+    new = Guard(car_task, Rule(car_task, -10.0), "none").decide(x[rows])
+    mixed = old.with_new(rows, new)
+    assert torch.equal(mixed.plan[rows], new.plan)
+    assert torch.equal(mixed.of(torch.tensor([0, 2, 3])).rho, old.rho[[0, 2, 3]])
+    assert torch.equal(mixed.of(rows).policy_rho, new.policy_rho)
+
+
+def test_the_option_that_can_be_planned_for_is_preferred(car_task: Task) -> None:
+    """To brake is right before a line, and a free road asks for nothing else."""
+    guard, columns = Guard(car_task, Rule(car_task, -10.0), "none"), list(car_task.names)
+    x = car_task.sample(400, seed=7).double()
+    fine = x[guard.decide(x).rho >= 0.0][:3]
+    hit = fine.clone()
+    hit[:, columns.index("dx")] = 0.5
+    assert guard.prefer(torch.stack((hit, fine), 1)).tolist() == [1, 1, 1]
+    assert guard.prefer(torch.stack((fine, hit), 1)).tolist() == [0, 0, 0]
+    assert guard.prefer(torch.stack((fine, fine), 1)).tolist() == [0, 0, 0]
+
+
+def test_what_was_begun_speaks_for_the_option_that_it_belongs_to(car_task: Task) -> None:
+    x = car_task.sample(400, seed=8).double()
+    brake, go = (Guard(car_task, Rule(car_task, action), "none") for action in (-10.0, 10.0))
+    rows = torch.nonzero((brake.decide(x).rho >= 0.0) & (go.decide(x).rho < 0.0)).squeeze(1)[:3]
+    x, easy = x[rows], x[rows].clone()
+    columns = list(car_task.names)
+    for name, value in {"x": 1.0, "sign": 1.0, "dx": -1.0, "v_lead": 0.0, "yielding": 0.0}.items():
+        easy[:, columns.index(name)] = value
+    options = torch.stack((x, easy), 1)
+    assert go.prefer(options).tolist() == [1, 1, 1]
+    begun = brake.decide(x)
+    assert float(begun.rho.min()) >= 0.0
+    kept = go.prefer(options, begun)
+    better = go.task.cost(go.task.judge(easy, go.policy.plan(easy).double())) < go.task.cost(
+        go.task.judge(x, begun.plan)
+    )
+    assert torch.equal(kept == 1, better)
+
+
 def test_a_begun_plan_goes_on_while_it_holds_and_is_no_worse(car_task: Task) -> None:
     """A policy that would wait at every step is overruled by what was begun."""
     state = {"x": -1.3, "v": 0.0, "sign": 0.0, "tau": 0.0, "dx": -1.0, "v_lead": 0.0, "yielding": 0.0}

@@ -81,6 +81,76 @@ def test_actions_are_held_between_plans(car_task: Task) -> None:
     assert (found.actions[:, 1:4] == -2.0).all()
 
 
+class Signals:
+    """Cars that nobody moves, one of which is told at every fifth step that the light has changed."""
+
+    def __init__(self, system: Any, agents: int, generator: torch.Generator) -> None:
+        self.x = system.sample(agents, generator=generator, dtype=torch.float64)
+        self.sign, self.step = system.names.index("sign"), 0
+
+    def reset(self) -> Tensor:
+        return self.x
+
+    def advance(self, x: Tensor, action: Tensor) -> Tensor:
+        self.step, moved = self.step + 1, x + 0.0 * action[:, :1]
+        if self.step % 5 == 0:
+            moved[1, self.sign] = 1.0 - moved[1, self.sign]
+        return moved
+
+    def options(self) -> Tensor:
+        """A second option that nobody takes for long: the car stands far before the line."""
+        return torch.stack((self.x, self.x), 1)
+
+    def choose(self, pick: Tensor) -> Tensor:
+        self.picks = [*getattr(self, "picks", []), pick.tolist()]
+        return self.x
+
+    def progress(self) -> Mapping[str, float]:
+        return {}
+
+    units = progress
+
+    def snapshot(self) -> Mapping[str, Any]:
+        return {"x": np.zeros(1)}
+
+    def draw(self, axes: Any, scene: Any, index: int) -> None: ...
+
+
+def test_who_is_told_something_plans_at_once(car_task: Task) -> None:
+    class Counting(Careful):
+        def plan(self, x0: Tensor) -> Tensor:
+            self.asked = getattr(self, "asked", [])
+            self.asked.append(len(x0))
+            return super().plan(x0)
+
+    class Silent(Signals):
+        options = choose = None  # type: ignore[assignment]
+
+    policy, recorder = Counting(car_task), Recorder(3)
+    drive(Guard(car_task, policy, "none"), Silent, Setting((0,), 3, 12, replan=4), recorder)
+    assert policy.asked == [3, 3, 1, 3, 1]  # steps 0, 4, 5, 8, 10
+    found = recorder.recording()
+    assert found is not None
+    assert (found.actions[0, 1:4] == -2.0).all()
+    assert found.options is None
+
+
+def test_agents_choose_when_they_plan(car_task: Task) -> None:
+    worlds: list[Signals] = []
+
+    def make(*arguments: Any) -> Signals:
+        worlds.append(Signals(*arguments))
+        return worlds[-1]
+
+    recorder = Recorder(3)
+    drive(Guard(car_task, Careful(car_task), "none"), make, Setting((0,), 3, 4, replan=2), recorder)  # type: ignore[arg-type]
+    assert worlds[0].picks == [[0, 0, 0]] * 4
+    found = recorder.recording()
+    assert found is not None
+    assert found.options is not None
+    assert found.options.shape == (3, 4, 2, 7)
+
+
 class Failing:
     """A world that goes wrong at some step."""
 

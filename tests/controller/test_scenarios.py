@@ -129,6 +129,16 @@ def test_the_truth_has_constants_of_its_own(driven: Driven) -> None:
     assert not bool(task_of("drifting").system.step(torch.zeros(1, 5), torch.zeros(1, 1))[0, 1:].any())
 
 
+def test_a_scenario_may_name_a_world_of_its_own() -> None:
+    text = SYSTEM.replace("  nominal: {}\n", '  nominal: {}\n  else: {world: "river.py:Else"}\n')
+    decl = parse_system(Source("boat.yaml", text), Path("boat.yaml"))
+    assert decl.test.world is None
+    world = under(decl, "else").test.world
+    assert world is not None
+    assert (world.path.name, world.name) == ("river.py", "Else")
+    assert decl.worlds == (world,)
+
+
 def test_an_unknown_scenario_is_said() -> None:
     with pytest.raises(StlcError) as caught:
         task_of("fats")

@@ -1,0 +1,268 @@
+"""The rivers of Meng & Fan (2023): ships that pass one obstacle after the other on a river 4 m wide.
+
+The truth beside the models of `ship_safe.yaml` and `ship_track.yaml`. All ships of a seed share the river
+and do not meet each other; each moves as the model's own step says. What a ship knows is the next obstacle,
+or the next two; metres, seconds.
+
+* `SafeRiver`: an obstacle of radius 1 every 7.5 m. A ship has passed one when it is beside its centre.
+* `TrackRiver`: obstacles on the centreline, 15 to 25 m apart. A ship has passed one when it is 1 m ahead of
+  its centre. An obstacle that comes into view (8 m) renews the allowance: 15 steps of it if its radius is
+  less than .8, 20 if less than 1, else 25.
+* `ShiftedRiver`: what the paper tests the backup policy with. Obstacles every 12 m, the first 4 m ahead and
+  .25 m off the centreline, the others .2 m, the second half as large again, and an allowance of 20 or 25
+  steps. Ships start .3 to 1.8 m off the line, straight ahead at 5 m/s; their allowance ran out 5 steps ago.
+
+Ships start where the system file lets them, also with the river's first obstacle in the place of their own.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from stlc.controller.streams import Streams
+
+OBSTACLES = 100
+PROPOSED = 64  # starts that are drawn for a ship, of which the first that the system file allows is taken
+SPACING = 7.5  # of SafeRiver
+BEHIND = 1.0  # m that a ship of TrackRiver must be ahead of an obstacle
+NEAREST, FARTHEST = 15.0, 25.0  # from one obstacle of TrackRiver to the next
+ALLOWANCES = ((0.8, 15), (1.0, 20), (math.inf, 25))  # radius less than -> steps
+SHIFTED = 20  # obstacles of ShiftedRiver
+FOLD = 40.0  # m of river in one row of the picture
+WATER, BANK, STONE = "#e6eef5", "#cfd6c4", "#8a8f98"
+DECIDED = ("#2563a8", "#e08a00", "#c0267e", "#2e9e5b")  # policy, backup, safest, polished
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """The obstacles of a river in order: where, how large, and what allowance (s) they give; (M,) each."""
+
+    x: torch.Tensor
+    y: torch.Tensor
+    r: torch.Tensor
+    allowance: torch.Tensor
+
+
+class River(ABC):
+    """What the three rivers share. Implements `stlc.controller.world.World`."""
+
+    def __init__(self, system: Any, agents: int, generator: torch.Generator) -> None:
+        self.system, self.agents, self.generator = system, agents, generator
+        self.at = {name: index for index, name in enumerate(system.names)}
+        self.seen = 2 if "x2" in self.at else 1
+        self.half = float(system.decl.constants["D"][0]) / 2
+
+    def reset(self) -> torch.Tensor:
+        """A new river and its ships, all at x = 0."""
+        self.streams = Streams.of(self.generator, self.agents)
+        proposed = self._calmed(self.streams.states(self.system, PROPOSED))
+        self.first = proposed[0, self._allowed(proposed[0])]
+        self.chain = self._chain()
+        self.next = torch.zeros(self.agents, dtype=torch.int64)
+        x = torch.stack([self._start(own) for own in proposed])
+        self.begin, self.state, self.hit = x[:, self.at["x"]], x, self._touching(x)
+        return x
+
+    def advance(self, x: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """Move every ship as the model says for one step; (agents, n), (agents, m) -> (agents, n)."""
+        self.hit |= self._touching(x)
+        moved = self.system.step(x, action)
+        self.switched = self._passed(moved[:, self.at["x"]], self.chain.x[self.next])
+        self.next = (self.next + self.switched).clamp(max=len(self.chain.x) - self.seen)
+        self.state = self._facing(moved)
+        self.hit |= self._touching(self.state)
+        return self.state
+
+    def progress(self) -> Mapping[str, float]:
+        """Mean distance and obstacles passed, and how many ships ever touched an obstacle or a bank."""
+        travelled = self.state[:, self.at["x"]] - self.begin
+        return {
+            "distance": float(travelled.mean()),
+            "obstacles_passed": float(self.next.double().mean()),
+            "ships_aground": float(self.hit.sum()),
+        }
+
+    def units(self) -> Mapping[str, str]:
+        """Of entries of `progress`."""
+        return {"distance": "m"}
+
+    def snapshot(self) -> Mapping[str, np.ndarray]:
+        """Ships (agents, 3) as x, y, heading; obstacles (M, 3) as x, y, r; half the width of the river."""
+        columns = [self.at[name] for name in ("x", "y", "psi")]
+        return {
+            "ships": self.state[:, columns].numpy(),
+            "obstacles": torch.stack((self.chain.x, self.chain.y, self.chain.r), 1).numpy(),
+            "half": np.float64(self.half),
+        }
+
+    @staticmethod
+    def draw(axes: Any, scene: Mapping[str, np.ndarray], index: int) -> None:
+        """One frame: the river in rows of 40 m from the top, the ships coloured by who decided."""
+        from matplotlib.patches import Circle, Polygon, Rectangle
+
+        ships, half = scene["ships"][index], float(scene["half"][index])
+        rows = max(int(scene["ships"][..., 0].max() // FOLD) + 1, 2)
+        pitch = 2 * half + 1.6
+        for row in range(rows):
+            middle = -row * pitch
+            axes.add_patch(Rectangle((0, middle - half - 0.25), FOLD, 2 * half + 0.5, color=BANK, lw=0))
+            water = Rectangle((0, middle - half), FOLD, 2 * half, color=WATER, lw=0)
+            axes.add_patch(water)
+            for x, y, r in scene["obstacles"][index]:
+                if -r < x - row * FOLD < FOLD + r:
+                    stone = axes.add_patch(Circle((x - row * FOLD, middle + y), r, color=STONE, lw=0))
+                    stone.set_clip_path(water)
+            axes.text(-0.6, middle, f"{row * FOLD:.0f} m", ha="right", va="center", size=7, color="#4a4f57")
+        decided = scene["decision"][index] if "decision" in scene else np.zeros(len(ships), dtype=int)
+        for (x, y, heading), source in zip(ships, decided, strict=True):
+            row = int(min(max(x // FOLD, 0), rows - 1))
+            cos, sin = math.cos(heading), math.sin(heading)
+            hull = np.array([(0.7, 0.0), (-0.5, 0.28), (-0.3, 0.0), (-0.5, -0.28)])
+            placed = hull @ np.array([(cos, sin), (-sin, cos)]) + (x - row * FOLD, y - row * pitch)
+            color = DECIDED[int(source)]
+            axes.add_patch(Polygon(placed, color=color, lw=0, zorder=3))
+        axes.set(xlim=(-4, FOLD + 1), ylim=(-(rows - 0.5) * pitch, pitch / 2), aspect="equal")
+        axes.set_axis_off()
+
+    # ------------------------------------------------------------- what rivers differ in
+
+    @abstractmethod
+    def _calmed(self, states: torch.Tensor) -> torch.Tensor:
+        """Proposed starts (…, n), drawn as in training, as this river has them."""
+
+    @abstractmethod
+    def _chain(self) -> Chain:
+        """The obstacles; `self.first` holds starts (k, n) that the first ship could have."""
+
+    @abstractmethod
+    def _passed(self, x: torch.Tensor, obstacle: torch.Tensor) -> torch.Tensor:
+        """Whether ships at `x` have passed obstacles at `obstacle`, (agents,) each."""
+
+    # ------------------------------------------------------------------------------ parts
+
+    def _start(self, proposed: torch.Tensor) -> torch.Tensor:
+        """The first of the proposed starts (k, n) that is allowed on this river."""
+        placed = self._facing(proposed, torch.zeros(len(proposed), dtype=torch.int64))
+        allowed = placed[self._allowed(placed)]
+        if not len(allowed):
+            raise ValueError("no start of a ship fits in front of the first obstacle of the river")
+        return allowed[0]
+
+    def _allowed(self, states: torch.Tensor) -> torch.Tensor:
+        return self.system.initial.holds(states)
+
+    def _facing(self, states: torch.Tensor, front: torch.Tensor | None = None) -> torch.Tensor:
+        """States (k, n) whose obstacles are those of the river, from index `front` (k,) on."""
+        front, states = self.next if front is None else front, states.clone()
+        for offset in range(self.seen):
+            for name, column in (("x", self.chain.x), ("y", self.chain.y), ("r", self.chain.r)):
+                states[:, self.at[f"{name}{offset + 1}"]] = column[front + offset]
+        return states
+
+    def _touching(self, states: torch.Tensor) -> torch.Tensor:
+        """Whether ships are inside any obstacle of the river, or on a bank, (agents,)."""
+        x, y = states[:, self.at["x"], None], states[:, self.at["y"], None]
+        inside = torch.hypot(x - self.chain.x, y - self.chain.y) < self.chain.r
+        return inside.any(1) | (y[:, 0].abs() > self.half)
+
+    def _uniform(self, low: float, high: float, count: int) -> torch.Tensor:
+        """Numbers of the river itself, (count,)."""
+        drawn = torch.rand(count, generator=self.streams.shared, dtype=torch.float64)
+        return low + (high - low) * drawn
+
+
+class SafeRiver(River):
+    """The river of `ship_safe.yaml`."""
+
+    def _calmed(self, states: torch.Tensor) -> torch.Tensor:
+        return states
+
+    def _chain(self) -> Chain:
+        x = SPACING * torch.arange(1, OBSTACLES + 1, dtype=torch.float64)
+        y = self._uniform(-self.half, self.half, OBSTACLES)
+        y[:2] = self.first[0, [self.at["y1"], self.at["y2"]]]
+        return Chain(x, y, torch.ones_like(x), torch.zeros_like(x))
+
+    def _passed(self, x: torch.Tensor, obstacle: torch.Tensor) -> torch.Tensor:
+        return x > obstacle
+
+
+class TrackRiver(River):
+    """The river of `ship_track.yaml`."""
+
+    def reset(self) -> torch.Tensor:
+        self.view = float(self.system.decl.constants["view"][0])
+        x = super().reset()
+        self.given = x[:, self.at["tau"]] >= 0.0
+        self.late = torch.zeros_like(self.given)
+        return x
+
+    def advance(self, x: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """The same; an obstacle that comes into view renews the allowance."""
+        saw, now, tau = self._in_view(x), super().advance(x, action), self.at["tau"]
+        comes = self._in_view(now) & (self.switched | ~saw)
+        now[:, tau] = torch.where(comes, self.chain.allowance[self.next], now[:, tau])
+        self.given |= comes
+        self.late |= self.given & (now[:, tau] < -1e-6)
+        return now
+
+    def progress(self) -> Mapping[str, float]:
+        """Also how many ships overran an allowance that they had been given."""
+        return {**super().progress(), "ships_late": float(self.late.sum())}
+
+    def _calmed(self, states: torch.Tensor) -> torch.Tensor:
+        calm = states.clone()
+        calm[..., self.at["y"]] *= 0.5
+        calm[..., self.at["psi"]] = 0.0
+        calm[..., self.at["tau"]] = 15 * self.system.dt
+        return calm
+
+    def _chain(self) -> Chain:
+        gaps = self._uniform(NEAREST, FARTHEST, OBSTACLES)
+        gaps[0] = self.first[0, self.at["x1"]]
+        r = self._uniform(0.6, 1.2, OBSTACLES)
+        r[0] = self.first[0, self.at["r1"]]
+        steps = torch.full_like(r, ALLOWANCES[-1][1])
+        for below, allowed in reversed(ALLOWANCES):
+            steps = torch.where(r < below, torch.full_like(r, allowed), steps)
+        return Chain(gaps.cumsum(0), torch.zeros_like(r), r, self.system.dt * steps)
+
+    def _passed(self, x: torch.Tensor, obstacle: torch.Tensor) -> torch.Tensor:
+        return obstacle - x < -BEHIND
+
+    def _in_view(self, states: torch.Tensor) -> torch.Tensor:
+        """Whether ships see their next obstacle, (agents,)."""
+        return states[:, self.at["x1"]] - states[:, self.at["x"]] <= self.view
+
+
+class ShiftedRiver(TrackRiver):
+    """The river that `ship_track.yaml` was not made for (the paper's out-of-distribution experiment)."""
+
+    def _calmed(self, states: torch.Tensor) -> torch.Tensor:
+        calm = states.clone()
+        for ship, generator in zip(calm, self.streams.own, strict=True):
+            off, side = torch.rand(2, len(ship), generator=generator, dtype=torch.float64)
+            ship[:, self.at["y"]] = torch.where(side < 0.5, -1.0, 1.0) * (0.3 + 1.5 * off)
+        for name, value in (("psi", 0.0), ("u", 5.0), ("v", 0.0), ("r", 0.0), ("tau", -5 * self.system.dt)):
+            calm[..., self.at[name]] = value
+        return calm
+
+    def _chain(self) -> Chain:
+        x = 4.0 + 12.0 * torch.arange(SHIFTED, dtype=torch.float64)
+        y = torch.full_like(x, 0.2)
+        y[0] = 0.25
+        r = self._uniform(0.6, 1.2, SHIFTED)
+        r[1] *= 1.5
+        steps = torch.where(self._uniform(0.0, 1.0, SHIFTED) < 0.5, 20.0, 25.0)
+        return Chain(x, y, r, self.system.dt * steps)
+
+    def _allowed(self, states: torch.Tensor) -> torch.Tensor:
+        """Every start: it is not one that the system file draws."""
+        return torch.ones(len(states), dtype=torch.bool)

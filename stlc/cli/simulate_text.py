@@ -1,0 +1,147 @@
+"""What `stlc simulate` measured, as a person reads it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+Record: TypeAlias = "dict[str, Any]"
+
+MOST_LISTED = 12
+TITLES = {"none": "no guard", "paper": "paper's guard", "full": "full guard"}
+COMPARED = {"plan accuracy": "plan_accuracy", "savable": "savable", "saved": "saved"}
+"""What scenarios are compared by."""
+
+ROWS = {
+    "plan accuracy": "plan_accuracy",
+    "plan safety": "plan_safety",
+    "policy's own plans": "policy_accuracy",
+    "executed, agents": "executed",
+    "  safely": "executed_safe",
+    "  safely, of the savable": "saved",
+    "executed, starts": "executed_starts",
+    "  safely ": "executed_safe_starts",
+    "  where foreseen": "foreseen_starts",
+    "  safely, where foreseen": "foreseen_safe_starts",
+}
+
+
+def screen(document: Record) -> Iterator[str]:
+    """What was measured, as a person reads it."""
+    from stlc.cli.output import table
+
+    guards = document["guards"]
+    seeds, agents, steps = len(document["seeds"]), document["agents"], document["steps"]
+    size = f"{seeds} seed{'s' * (seeds > 1)} x {agents} agents x {steps} steps"
+    world = document["world"] or f"{document['system']} and its events"
+    scenario = [f"scenario {document['scenario']}"] if document["scenario"] else []
+    yield " · ".join((document["spec"], f"run {document['run']}", f"world {world}", *scenario, size))
+    header = ("", *(TITLES[name] for name in guards))
+    yield table([*_shares(guards), *_progress(guards), *_times(guards)], header=header)
+    for name, guard in guards.items():
+        if name != "none":
+            yield f"  guard acted in {_acted(guard['decisions'])}"
+    yield f"  {_unsafe(list(guards.values())[-1]['unsafe'], seeds * agents)}"
+    foreseen = list(guards.values())[-1]["metrics"].get("foreseen")
+    if foreseen and foreseen["mean"] > 0:
+        yield f"  foreseen: the {foreseen['mean']:.0%} of starts from which the world did as the model says"
+    if document.get("scenarios"):
+        yield from compared(document)
+
+
+def compared(document: Record) -> Iterator[str]:
+    """All scenarios in one table."""
+    from stlc.cli.output import table
+
+    guards = list(document["guards"])
+    header = ("scenario", *(f"{TITLES[name]}: {label}" for name in guards for label in COMPARED))
+    rows = []
+    for name, each in {"as it is": document, **document["scenarios"]}.items():
+        metrics = [each["guards"][guard]["metrics"].get(key) for guard in guards for key in COMPARED.values()]
+        rows.append((name, *("" if metric is None else _number(metric, "", 3) for metric in metrics)))
+    yield ""
+    yield table(rows, header=header)
+
+
+def closing(trace: str, drawn: Mapping[str, str], record: Path | None) -> Iterator[str]:
+    """Where things are; the last line is the next command."""
+    from stlc.files import find_trace
+
+    yield ""
+    yield f"  trace      {trace}"
+    for what, path in drawn.items():
+        yield f"  {what:<10} {path}"
+    found = (
+        find_trace("trace.npz")
+        if Path("trace.npz").exists() or Path("runs/latest/trace.npz").exists()
+        else None
+    )
+    short = found is not None and found.resolve() == Path(trace).resolve()
+    yield f"  next       stlc check {record or ('trace.npz' if short else trace)}"
+
+
+def _shares(guards: Record) -> Iterator[tuple[str, ...]]:
+    for label, name in ROWS.items():
+        found = [guard["metrics"].get(name) for guard in guards.values()]
+        if any(found):
+            yield (label, *("" if metric is None else _number(metric, "", 3) for metric in found))
+
+
+def _progress(guards: Record) -> Iterator[tuple[str, ...]]:
+    """What the world tells of itself: every metric that is not one of ours."""
+    from stlc.controller.evaluate import METRICS
+
+    first = next(iter(guards.values()))
+    for name in first["metrics"]:
+        if name not in METRICS and not name.startswith("holds."):
+            unit = first["units"].get(name, "")
+            cells = (_number(guard["metrics"][name], unit, 2) for guard in guards.values())
+            yield (name.replace("_", " "), *cells)
+
+
+def _times(guards: Record) -> Iterator[tuple[str, ...]]:
+    from stlc.view.words import seconds
+
+    for label, name in (("decision, median", "median"), ("decision, 99 %", "p99")):
+        yield (label, *(seconds(guard["latency"][name]) for guard in guards.values()))
+
+
+def _number(metric: Record, unit: str, digits: int) -> str:
+    """A mean and half its interval: `0.957 ± 0.012`, `4.10 ± 0.20 m/s`."""
+    mean, high = metric["mean"], metric["high"]
+    text = f"{mean:.{digits}f}" if high is None else f"{mean:.{digits}f} ± {high - mean:.{digits}f}"
+    return f"{text} {unit}".rstrip()
+
+
+def _unsafe(unsafe: Sequence[Record], agents: int) -> str:
+    """`not driven safely: 9 of 60 agents, of which 1 can be saved (seed 2: 7)`."""
+    if not unsafe:
+        return f"all {agents} agents were driven safely"
+    lost = [each for each in unsafe if each["savable"]]
+    ending = f"{len(lost)} can be saved ({_listed(lost)})" if lost else "none can be saved"
+    return f"not driven safely: {len(unsafe)} of {agents} agents, of which {ending}"
+
+
+def _listed(agents: Sequence[Record]) -> str:
+    """`seed 2: 7, 11; seed 5: 0`, the first few."""
+    shown = agents[:MOST_LISTED]
+    seeds = dict.fromkeys(each["seed"] for each in shown)
+    parts = (
+        f"seed {seed}: " + ", ".join(str(each["agent"]) for each in shown if each["seed"] == seed)
+        for seed in seeds
+    )
+    return "; ".join(parts) + ("; …" if len(agents) > MOST_LISTED else "")
+
+
+def _acted(decisions: Mapping[str, float]) -> str:
+    """`3.1 % of decisions (T0=1 71 %, T0=2 22 %, longest safe prefix 7 %)`."""
+    total = 1.0 - decisions["policy"]
+    if total <= 0.0:
+        return "0 % of decisions"
+    kinds = {name.removeprefix("backup "): share for name, share in decisions.items() if "T0=" in name}
+    kinds |= {"polished": decisions["polished"], "longest safe prefix": decisions["safest"]}
+    parts = ", ".join(f"{name} {share / total:.0%}" for name, share in kinds.items() if share)
+    return f"{total:.1%} of decisions ({parts})"

@@ -1,0 +1,65 @@
+"""Which agents can be saved at all: a search for a plan that is safe, from each start."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from typing import TYPE_CHECKING
+
+import torch
+
+from stlc.compile.semantics import TOLERANCE
+from stlc.controller.search import THOROUGH, Searcher
+from stlc.controller.task import Task
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+PASSES = 4
+TRIES = 20_000
+"""Plans that are tried for one start in one pass, where native code judges them."""
+ENOUGH = 1e-4
+PIECES = 3
+MOST = 2048
+"""Plans in the bank, at most."""
+
+
+@torch.no_grad()
+def savable(task: Task, x0: Tensor) -> Tensor:
+    """Where some plan satisfies phi_safe, as far as a search finds one: (B, n) -> (B,) booleans.
+
+    Each pass climbs from another plan: from the middle of every control, then from plans that hold each
+    control at an end of its range or in the middle of it, thirds of the horizon long. A start without a
+    safe plan may have one that was not found; one with a plan has it, judged exactly.
+    """
+    found = torch.ones(len(x0), dtype=torch.bool)
+    if not task.compiled.safety:
+        return found
+    safety = Task(replace(task.compiled, requirements=task.compiled.safety), task.plain)
+    generator = torch.Generator().manual_seed(0)
+    searcher = Searcher(safety, generator, enough=ENOUGH)
+    bank = extremes(safety, generator)
+    middle = 0.5 * (safety.system.control_low + safety.system.control_high)
+    start = middle.expand(len(x0), safety.horizon, -1)
+    tries, found = (THOROUGH if safety.native is None else TRIES), ~found
+    for _ in range(PASSES):
+        still = torch.nonzero(~found).squeeze(1)
+        if not len(still):
+            break
+        plans = searcher.repair(x0[still].float(), start[still].clone(), bank, tries=tries).plans
+        found[still] = safety.judge(x0[still].double(), plans.double(), states=False).rho >= -TOLERANCE
+        start = bank[torch.randint(len(bank), (len(x0),), generator=generator)]
+    return found
+
+
+def extremes(task: Task, generator: torch.Generator) -> Tensor:
+    """Plans that hold each control at a low, middle or high value, piece by piece: (k, T, m)."""
+    low, high = task.system.control_low, task.system.control_high
+    levels = torch.stack((low, 0.5 * (low + high), high))
+    shape = (PIECES, len(low))
+    if 3 ** (PIECES * len(low)) <= MOST:
+        pick = torch.tensor(list(product(range(3), repeat=PIECES * len(low)))).view(-1, *shape)
+    else:
+        pick = torch.randint(3, (MOST, *shape), generator=generator)
+    pieces = levels.gather(0, pick.flatten(0, 1)).view(-1, *shape)
+    return pieces.repeat_interleave(-(-task.horizon // PIECES), 1)[:, : task.horizon]
