@@ -47,5 +47,5 @@ class Buffer:
 
     def draw(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """`n` entries with replacement: (n, dim), (n, T, m)."""
-        index = torch.randint(len(self), (n,), generator=generator, device=self.states.device)
+        index = torch.randint(len(self), (n,), generator=generator).to(self.states.device)
         return self.states[index], self.plans[index]

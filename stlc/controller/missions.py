@@ -62,7 +62,7 @@ class Missions:
         if len(states) and len(self.pool):
             judged = self._task.judge(states, plans)
             reached = self._at(judged, self._legs(len(states)))
-            place = torch.randperm(len(self.pool), generator=self._generator, device=self._device)
+            place = self._order(len(self.pool))
             place = place[: len(states)]
             self.pool[place], self.age[place] = reached[: len(place)], 0.0
 
@@ -93,7 +93,7 @@ class Missions:
         self._begin_anew(satisfied(judged.rho))
         starts = self._starts(max(int(STARTS * len(seen)), 1))
         seen = torch.cat((seen, starts))
-        return seen[torch.randperm(len(seen), generator=self._generator, device=self._device)]
+        return seen[self._order(len(seen))]
 
     def _begin_anew(self, good: Tensor) -> None:
         """New missions for those that are over or lost, and for some whose plan failed."""
@@ -105,7 +105,7 @@ class Missions:
     def _legs(self, n: int) -> Tensor:
         """How far plans are followed: up to half of the horizon, (n,) int64."""
         most = max(self._task.horizon // 2, 1)
-        return torch.randint(1, most + 1, (n,), generator=self._generator, device=self._device)
+        return torch.randint(1, most + 1, (n,), generator=self._generator).to(self._device)
 
     def _at(self, judged: Judged, steps: Tensor) -> Tensor:
         """Predicted states after so many steps, one number a row: (n, dim)."""
@@ -115,7 +115,10 @@ class Missions:
         return self._task.sample(n, generator=self._generator, device=self._device)
 
     def _rand(self, n: int) -> Tensor:
-        return torch.rand(n, generator=self._generator, device=self._device)
+        return torch.rand(n, generator=self._generator).to(self._device)
+
+    def _order(self, n: int) -> Tensor:
+        return torch.randperm(n, generator=self._generator).to(self._device)
 
 
 def mission_steps(task: Task) -> int:

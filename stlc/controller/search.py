@@ -48,17 +48,31 @@ class Repaired:
         """Where the plan satisfies the specification with a little to spare, (B,)."""
         return self.rho >= FLOAT32_SLACK
 
+    def to(self, device: torch.device) -> Repaired:
+        """The same on another device."""
+        return Repaired(self.states.to(device), self.plans.to(device), self.rho.to(device))
+
 
 class Searcher:
     """A hill climber over open-loop plans of one task."""
 
-    def __init__(self, task: Task, generator: torch.Generator, *, enough: float) -> None:
-        """Search plans of `task`; a state is left alone once its robustness reaches `enough`."""
+    def __init__(
+        self,
+        task: Task,
+        generator: torch.Generator,
+        *,
+        enough: float,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """Search plans of `task`; a state is left alone once its robustness reaches `enough`.
+
+        The generator is of the processor, and so is the native search; states and plans are on `device`.
+        """
         self.task = task
         self.generator = generator
         self.enough = enough
-        self.low = task.system.control_low
-        self.high = task.system.control_high
+        self.low = task.system.control_low.to(device)
+        self.high = task.system.control_high.to(device)
         self._aside = ThreadPoolExecutor(1, thread_name_prefix="search")
 
     def repair(self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH) -> Repaired:
@@ -70,22 +84,26 @@ class Searcher:
             bank: plans that solved other states, (k, T, m); may be empty.
             tries: plans per state at most.
         """
-        return self.begin(x0, plans, bank, tries=tries, threads=cores()).result()
+        return self.begin(x0, plans, bank, tries=tries, threads=cores()).result().to(x0.device)
 
     @torch.no_grad()
     def begin(
         self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH, threads: int | None = None
     ) -> Future[Repaired]:
-        """`repair` beside whatever else goes on; what it gives depends on arguments and generator alone."""
+        """`repair` beside whatever else goes on; what it gives depends on arguments and generator alone.
+
+        The native kernel leaves what it found on the processor.
+        """
         native = self.task.native
-        if native is not None and x0.device.type == "cpu":
+        if native is not None:
             seed = int(torch.randint(2**62, (), generator=self.generator))
-            x0, plans, bank = x0.clone(), plans.clone(), bank.clone()
+            x0, plans, bank = (part.to("cpu", copy=True) for part in (x0, plans, bank))
             effort = Effort(-(-tries // LANES), self.enough, seed, threads or idle_cores())
 
             def climb() -> Repaired:
                 best, _ = native.climb(x0, plans, bank, effort)
-                return Repaired(x0, best, self.task.judge(x0, best, states=False).rho)
+                rho = self.task.judge(x0, best, states=False).rho
+                return Repaired(x0, best, rho)
 
             return self._aside.submit(climb)
         done: Future[Repaired] = Future()
@@ -145,13 +163,13 @@ class Searcher:
         return ((time >= first) & (time < first + length)).to(self.low.dtype)
 
     def _rand(self, *shape: int) -> Tensor:
-        return torch.rand(*shape, generator=self.generator, device=self.low.device)
+        return torch.rand(*shape, generator=self.generator).to(self.low.device)
 
     def _randn(self, *shape: int) -> Tensor:
-        return torch.randn(*shape, generator=self.generator, device=self.low.device)
+        return torch.randn(*shape, generator=self.generator).to(self.low.device)
 
     def _randint(self, low: int, high: int, *shape: int) -> Tensor:
-        return torch.randint(low, high, shape, generator=self.generator, device=self.low.device)
+        return torch.randint(low, high, shape, generator=self.generator).to(self.low.device)
 
 
 def idle_cores() -> int:

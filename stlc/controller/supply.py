@@ -80,10 +80,10 @@ class Fixed:
 
     def take(self, n: int) -> Tensor:
         """The next `n` states, (n, dim), float32."""
-        size, device = self.states.shape[0], self.states.device
+        size = self.states.shape[0]
         while self.queue.shape[0] < n:
-            order = torch.randperm(size, generator=self._generator, device=device)
-            self.queue = torch.cat((self.queue, order))
+            order = torch.randperm(size, generator=self._generator)
+            self.queue = torch.cat((self.queue, order.to(self.states.device)))
         taken, self.queue = self.queue[:n], self.queue[n:]
         return self.states[taken]
 

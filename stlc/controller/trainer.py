@@ -64,7 +64,7 @@ class Trainer:
         self.device = device
         self.step = 0
         self.next_look = engine.every
-        self.generator = torch.Generator(device=device).manual_seed(engine.seed)
+        self.generator = torch.Generator().manual_seed(engine.seed)
         self.network = _network(task, engine, device)
         self.supply = self._supply()
         self.average = _network(task, engine, device)
@@ -77,7 +77,7 @@ class Trainer:
         if engine.method == "guided":
             self.margin = self._feasible_margin()
         self.objective = self._objective()
-        self.searcher = Searcher(task, self.generator, enough=MARGIN_SHARE * self.margin)
+        self.searcher = self._searcher(MARGIN_SHARE * self.margin)
         self.repairing: Future[Repaired] | None = None
         self.accuracy = 0.0
 
@@ -139,7 +139,7 @@ class Trainer:
         """
         if self.repairing is None:
             return 0, 0, None
-        found = self.repairing.result()
+        found = self.repairing.result().to(self.device)
         solved = found.solved
         self.buffer.add(found.states[solved], found.plans[solved])
         self.supply.follow(found.states[solved], found.plans[solved])
@@ -164,7 +164,7 @@ class Trainer:
         value = loss(self.task, self.objective, x0, chosen).total.mean()
         if engine.share:
             some = rows[:: engine.plans]
-            other = torch.randint(engine.plans, (len(some),), generator=self.generator, device=self.device)
+            other = torch.randint(engine.plans, (len(some),), generator=self.generator).to(self.device)
             value = (
                 value
                 + engine.share * loss(self.task, self.objective, x0[some], plans[some, other]).total.mean()
@@ -178,16 +178,15 @@ class Trainer:
         """Which plan is trained, the one that does best, (B,), and whether it satisfies the specification."""
         batch, count = plans.shape[:2]
         if count == 1 and self.engine.hard == 0:
-            return torch.zeros(batch, dtype=torch.int64, device=self.device), torch.zeros(
-                batch, dtype=torch.bool
-            )
+            first = torch.zeros(batch, dtype=torch.int64, device=self.device)
+            return first, torch.zeros_like(first, dtype=torch.bool)
         judged = self.task.judge(x0.repeat_interleave(count, 0), plans.flatten(0, 1))
         score = rank(judged.rho, self.task.cost(judged)).view(batch, count)
         return score.argmax(1), satisfied(judged.rho).view(batch, count).any(1)
 
     def _imitation(self, plans: Tensor, targets: Tensor, solved: Tensor) -> Tensor:
         """Distance of the nearest plan to the repaired one, where the state still fails."""
-        half = 0.5 * (self.task.system.control_high - self.task.system.control_low)
+        half = (0.5 * (self.task.system.control_high - self.task.system.control_low)).to(plans.device)
         distance = ((plans - targets[:, None]) / half).square().mean((2, 3)).amin(1)
         return self.engine.imitation * torch.where(solved, torch.zeros_like(distance), distance).mean()
 
@@ -195,13 +194,16 @@ class Trainer:
         """A gamma of the size that plans can reach: a share of what search reaches on the median state."""
         x0 = self.supply.take(MARGIN_STATES)
         middle = 0.5 * (self.task.system.control_low + self.task.system.control_high)
-        start = middle.expand(MARGIN_STATES, self.task.horizon, -1)
-        searcher = Searcher(self.task, self.generator, enough=math.inf)
+        start = middle.to(self.device).expand(MARGIN_STATES, self.task.horizon, -1)
+        searcher = self._searcher(math.inf)
         rho = searcher.repair(x0, start, self.buffer.bank).rho
         reached = rho[satisfied(rho)]
         if reached.numel() == 0:
             return MARGIN_RANGE[0]
         return min(max(MARGIN_SHARE * float(reached.median()), MARGIN_RANGE[0]), MARGIN_RANGE[1])
+
+    def _searcher(self, enough: float) -> Searcher:
+        return Searcher(self.task, self.generator, enough=enough, device=self.device)
 
     def _supply(self) -> Supply:
         """States that missions pass through where the specification has memory, else independent ones."""
@@ -253,7 +255,7 @@ class Trainer:
         self.margin, self.next_look = float(facts["margin"]), int(facts["next_look"])
         self.accuracy = float(facts["accuracy"])
         self.objective = self._objective()
-        self.searcher = Searcher(self.task, self.generator, enough=MARGIN_SHARE * self.margin)
+        self.searcher = self._searcher(MARGIN_SHARE * self.margin)
         if known := _below(tensors, "repairing"):
             self.repairing = Future()
             self.repairing.set_result(Repaired(**known))
