@@ -99,6 +99,10 @@ class StlcError(Exception):
         super().__init__("; ".join(f"{d.code}: {d.message}" for d in diagnostics))
         self.diagnostics = diagnostics
 
+    def __reduce__(self) -> tuple[type[StlcError], tuple[Diagnostic, ...]]:
+        """From one process to another an error goes with its findings."""
+        return type(self), self.diagnostics
+
 
 class SpecError(StlcError):
     """A specification is invalid."""
@@ -217,6 +221,7 @@ CODES: dict[str, str] = {
     "R302": "a device that is not there",
     "R401": "training diverged",
     "R402": "a policy whose plan is not a number",
+    "R403": "a process of a training that is gone",
     "U101": "a command line that cannot be understood",
     "U102": "a file that does not exist",
     # the tool itself

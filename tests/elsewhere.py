@@ -1,4 +1,4 @@
-"""A device that is not the processor, as an accelerator is: tensors of the two do not mix, and NumPy sees none of it.
+"""A device that is not the processor, as a GPU is: tensors of the two do not mix, and NumPy sees neither.
 
 Tensors on it call themselves `meta` and keep their numbers on the processor, so what is computed with them is
 exact. An operation that takes tensors of both sides is refused as on a GPU, unless one is a single number.
@@ -14,7 +14,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map_only
 
 AWAY = torch.device("meta")
-_INDEXING = {"aten.index.Tensor", "aten._index_put_impl_.default", "aten.index_put_.default", "aten.index_put.default"}
+_INDEXING = {
+    "aten.index.Tensor",
+    "aten._index_put_impl_.default",
+    "aten.index_put_.default",
+    "aten.index_put.default",
+}
 """Operations that take indices from the processor, on a GPU too."""
 
 

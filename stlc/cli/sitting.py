@@ -36,12 +36,14 @@ class Sitting:
         outcome: what training gave, once it did.
         progress: the panel.
         logbook: how a log beside `train.jsonl` is opened, if one is wanted.
+        keeps: whether this process keeps the run's folder; of several ranks the first does.
     """
 
     folder: RunDir
     outcome: Outcome | None = None
     progress: Progress = field(default_factory=Progress)
     logbook: Opener | None = None
+    keeps: bool = True
     _log: Logbook | None = None
     _asked: list[int] = field(default_factory=list)
     _before: dict[int, Any] = field(default_factory=dict)
@@ -64,8 +66,9 @@ class Sitting:
     def __enter__(self) -> Self:
         for number in (signal.SIGINT, signal.SIGTERM):
             self._before[number] = signal.signal(number, self._ask)
-        self._log = None if self.logbook is None else self.logbook(self.folder.path)
-        self.progress.start(_info(self.folder))
+        if self.keeps:
+            self._log = None if self.logbook is None else self.logbook(self.folder.path)
+            self.progress.start(_info(self.folder))
         return self
 
     def __exit__(
@@ -74,7 +77,7 @@ class Sitting:
         self.progress.stop()
         if self._log is not None:
             self._log.close()
-        if error is not None:
+        if error is not None and self.keeps:
             with suppress(StlcError):
                 self.folder.finish("interrupted" if kind is KeyboardInterrupt else "failed")
         for number, handler in self._before.items():
@@ -85,14 +88,21 @@ class Sitting:
             raise KeyboardInterrupt
         self._asked.append(number)
 
+    @property
+    def _signalled(self) -> int:
+        """The exit code of what asked to stop."""
+        return TERMINATED if signal.SIGTERM in self._asked else INTERRUPTED
+
     def conclude(self, *, pictures: bool, json: bool) -> NoReturn:
         """Pictures, then the closing screen or the JSON document; raises `typer.Exit` with the exit code."""
         outcome = self.outcome
         assert outcome is not None
+        if not self.keeps:
+            raise typer.Exit(self._signalled if outcome.interrupted else 0)
         if outcome.score is None:
             say(f"interrupted, saved: {self.folder.shown}")
-            say(f"go on with: stlc train --resume {spoken(self.folder)}")
-            code = TERMINATED if signal.SIGTERM in self._asked else INTERRUPTED
+            say(f"go on with: {started(outcome.ranks)} train --resume {spoken(self.folder)}")
+            code = self._signalled
             if json:
                 result = {"run": self.folder.shown, "seconds": outcome.seconds}
                 emit_json("train/1", ok=False, exit_code=code, result=result)
@@ -107,6 +117,11 @@ class Sitting:
         else:
             self.progress.finish(_summary(outcome, pictures=pictures), to=console())
         raise typer.Exit(code)
+
+
+def started(ranks: int) -> str:
+    """How so many processes are started that train together."""
+    return "stlc" if ranks == 1 else f"torchrun --nproc-per-node {ranks} -m stlc"
 
 
 def spoken(folder: RunDir) -> str:

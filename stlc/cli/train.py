@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from stlc.cli import train_options as o
+from stlc.cli.one_voice import one_voice
 from stlc.cli.options import JsonOption, SetOption, SystemOption, describe, parse_overrides
 from stlc.cli.ranges import parse_clock, parse_seconds, parse_seeds
 from stlc.cli.train_many import Many, train_many
@@ -76,8 +77,9 @@ def train(
             | {"--name": name, "--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch}
             | {"--set": set_, "--seeds": seeds, "--held-out": held_out}
         )
-        sitting = _resume(resume, runs=runs, steps=steps, device=device, logbook=logbook)
-        sitting.conclude(pictures=pictures, json=json)
+        with one_voice():
+            sitting = _resume(resume, runs=runs, steps=steps, device=device, logbook=logbook)
+            sitting.conclude(pictures=pictures, json=json)
     from stlc.controller.config import HELD_OUT, TrainConfig
     from stlc.controller.launch import Launch
 
@@ -95,10 +97,12 @@ def train(
         clock=parse_clock(clock),
     )
     launch = Launch(root=runs, name=name, overrides=parse_overrides(set_), command=sys.argv[1:])
-    task = _task(spec, system, launch.overrides)
+    with one_voice():
+        task = _task(spec, system, launch.overrides)
     if seeds is not None:
         train_many(Many(spec, system, config, launch, parse_seeds(seeds), jobs, log, pictures), json=json)
-    _train(task, config, launch, logbook).conclude(pictures=pictures, json=json)
+    with one_voice():
+        _train(task, config, launch, logbook).conclude(pictures=pictures, json=json)
 
 
 def _check_together(
@@ -167,24 +171,29 @@ def _train(task: Task, config: TrainConfig, launch: Launch, logbook: Opener | No
     """A new run, from its folder to its verdict."""
     from stlc.cli.sitting import Sitting
     from stlc.controller.launch import open_folder
+    from stlc.controller.ranks import joined
     from stlc.controller.train import find_device, train
+    from stlc.rundir import RunDir
 
-    find_device(config.device)
-    folder = open_folder(task, config, launch)
-    with Sitting(folder, logbook=logbook) as sitting:
-        sitting.outcome = train(task, config, folder, sitting.watch)
+    with joined(config.device) as ranks:
+        find_device(ranks.device(config.device))
+        made = str(open_folder(task, config, launch).path) if ranks.first else ""
+        folder = RunDir(Path(ranks.agree_text(made)))
+        with Sitting(folder, logbook=logbook, keeps=ranks.first) as sitting:
+            sitting.outcome = train(task, config, folder, sitting.watch, ranks=ranks)
     return sitting
 
 
 def _resume(where: str, *, runs: Path, steps: int | None, device: str, logbook: Opener | None) -> Sitting:
     """An old run, from its last checkpoint to its verdict."""
     from stlc.cli.sitting import Sitting
+    from stlc.controller.ranks import joined
     from stlc.controller.train import resume
     from stlc.rundir import RunDir
 
     folder = RunDir.open(where, runs)
-    with Sitting(folder, logbook=logbook) as sitting:
-        sitting.outcome = resume(folder, steps=steps, device=device, watch=sitting.watch)
+    with joined(device) as ranks, Sitting(folder, logbook=logbook, keeps=ranks.first) as sitting:
+        sitting.outcome = resume(folder, steps=steps, device=device, watch=sitting.watch, ranks=ranks)
     return sitting
 
 

@@ -86,6 +86,7 @@ class Engine:
         threads: of torch; sums over other numbers of them round otherwise. 0 leaves what is set.
         samples: size of a fixed training set; 0: fresh states in every step.
         clock: of budgets and of the times on record.
+        ranks: processes that train together, each with so many states a step.
     """
 
     method: Method
@@ -110,6 +111,7 @@ class Engine:
     threads: int = 0
     samples: int = 0
     clock: Clock = "wall"
+    ranks: int = 1
 
 
 def decide(task: Task, config: TrainConfig) -> Engine:
@@ -140,8 +142,9 @@ def decide(task: Task, config: TrainConfig) -> Engine:
 
 
 def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Cores that this process may use: its share, where several of this machine train together."""
+    found = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, found // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
 
 def _threads(*, searching: bool) -> int:

@@ -13,6 +13,7 @@ import time
 from typing import TYPE_CHECKING
 
 from stlc.controller.config import cores
+from stlc.controller.ranks import ALONE, Ranks
 from stlc.controller.trainer import Trainer
 
 if TYPE_CHECKING:
@@ -43,7 +44,9 @@ def clock_of(name: Clock) -> Callable[[], float]:
     return processor if name == "processor" else time.perf_counter
 
 
-def steps_within(task: Task, engine: Engine, seconds: float, device: torch.device) -> int:
+def steps_within(
+    task: Task, engine: Engine, seconds: float, device: torch.device, ranks: Ranks = ALONE
+) -> int:
     """How many steps fit into `seconds`, measured on a trainer that is thrown away.
 
     The real run starts afresh, so a run of the same seed and the same number of steps gives the same weights
@@ -51,13 +54,13 @@ def steps_within(task: Task, engine: Engine, seconds: float, device: torch.devic
     """
     now = clock_of(engine.clock)
     begun = now()
-    trial = Trainer(task, engine, steps=10_000, device=device)
+    trial = Trainer(task, engine, steps=10_000, device=device, ranks=ranks)
     built = now() - begun
     trial.look()
     _interval(trial)  # what is slow once only
     cost = min(_interval(trial) for _ in range(TIMED - 1)) / engine.every
     left = seconds * (1.0 - RESERVE) - (now() - begun) - built
-    return max(engine.every, int(left / cost))
+    return int(ranks.agree(max(engine.every, int(left / cost))))
 
 
 def _interval(trainer: Trainer) -> float:

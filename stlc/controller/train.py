@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from stlc.controller.checkpoint import load_checkpoint, save_checkpoint
+from stlc.controller.checkpoint import load_checkpoint
 from stlc.controller.config import Engine, TrainConfig, decide
-from stlc.controller.held_out import Score, save_states, score
+from stlc.controller.held_out import Score, score
+from stlc.controller.journal import Journal
 from stlc.controller.pace import OpenEnd, clock_of, steps_within
-from stlc.controller.run import Run, load_engine, load_task, save_engine, spec_hash, system_hash
+from stlc.controller.ranks import ALONE, Ranks
+from stlc.controller.run import Run, load_engine, load_task, spec_hash, system_hash
 from stlc.controller.symmetry import check_mirror
 from stlc.controller.trainer import Look, Trainer
-from stlc.diagnostics import Diagnostic, MissingError, RunError
+from stlc.diagnostics import Diagnostic, MissingError, RunError, UsageError
 from stlc.dynamics.memory import keep_freed_memory
 
 if TYPE_CHECKING:
@@ -53,18 +55,27 @@ class Outcome:
 
     Attributes:
         run: the run with its policy.
-        score: on held-out states; None where training was interrupted.
+        score: on held-out states; None where training was interrupted, and on ranks after the first.
         seconds: of training, held-out verdict included.
         interrupted: ended by `Watch.stop`.
+        ranks: that trained together.
     """
 
     run: Run
     score: Score | None
     seconds: float
     interrupted: bool
+    ranks: int = 1
 
 
-def train(task: Task, config: TrainConfig, folder: RunDir, watch: Watch | None = None) -> Outcome:
+def train(
+    task: Task,
+    config: TrainConfig,
+    folder: RunDir,
+    watch: Watch | None = None,
+    *,
+    ranks: Ranks = ALONE,
+) -> Outcome:
     """Train a policy in a new run folder that already holds its specification and system.
 
     Args:
@@ -72,31 +83,40 @@ def train(task: Task, config: TrainConfig, folder: RunDir, watch: Watch | None =
         config: what the user said.
         folder: of the run.
         watch: progress and interruption.
+        ranks: that train together; each calls this at the same time, and the first one writes.
 
     Raises:
         SystemFileError: S304, the mirror of the policy is no symmetry.
-        MissingError: R201, a checkpoint cannot be written; R302, there is no such device.
+        MissingError: R201, a checkpoint cannot be written; R302, there is no such device; R403, a rank
+            is gone.
         RunError: R401, the loss is not finite.
     """
     begun = clock_of(config.clock)()
     keep_freed_memory()
     check_mirror(task)
-    device = find_device(config.device)
-    engine = decide(task, config)
+    device = find_device(ranks.device(config.device))
+    engine = replace(decide(task, config), ranks=ranks.size)
     torch.set_num_threads(engine.threads)
-    save_engine(folder, engine)
+    journal = Journal(folder, writes=ranks.first)
+    journal.engine(engine)
     declared = task.system.decl.train
     steps = config.steps or (declared.steps if config.budget is None else None)
     budget, end = config.budget or declared.budget or DEFAULT_BUDGET, None
     if steps is None and engine.hold:
         steps, end = round(2 * engine.every / engine.hold), OpenEnd(budget, begun)
-    trainer = Trainer(task, engine, steps=steps or steps_within(task, engine, budget, device), device=device)
-    folder.update({"steps": trainer.steps, "margin": trainer.margin, "engine": asdict(engine)})
-    return _Session(folder, trainer, watch or Watch(), begun, end).finish()
+    steps = steps or steps_within(task, engine, budget, device, ranks)
+    trainer = Trainer(task, engine, steps=steps, device=device, ranks=ranks)
+    journal.note({"steps": trainer.steps, "margin": trainer.margin, "engine": asdict(engine)})
+    return _Session(journal, trainer, watch or Watch(), begun, end).finish()
 
 
 def resume(
-    folder: RunDir, *, steps: int | None = None, device: str = "cpu", watch: Watch | None = None
+    folder: RunDir,
+    *,
+    steps: int | None = None,
+    device: str = "cpu",
+    watch: Watch | None = None,
+    ranks: Ranks = ALONE,
 ) -> Outcome:
     """Go on with a run that was interrupted; the weights become those of an uninterrupted run, bit for bit.
 
@@ -105,18 +125,22 @@ def resume(
         steps: a new total of steps; None keeps the old one. Another total is another schedule.
         device: of torch.
         watch: progress and interruption.
+        ranks: that train together: as many as before.
 
     Raises:
         RunError: R101, R102, or R103 when there is nothing left to do.
+        UsageError: R104, the run was trained by another number of ranks.
     """
     keep_freed_memory()
     engine: Engine = load_engine(folder)
+    _require_as_many(engine.ranks, ranks.size)
     begun = clock_of(engine.clock)()
     task = load_task(folder)
     saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
     if engine.threads:
         torch.set_num_threads(engine.threads)
-    trainer = Trainer(task, engine, steps=int(saved.facts["steps"]), device=find_device(device))
+    place = find_device(ranks.device(device))
+    trainer = Trainer(task, engine, steps=int(saved.facts["steps"]), device=place, ranks=ranks)
     trainer.restore(saved.tensors, saved.facts)
     trainer.steps = steps or trainer.steps
     if trainer.step >= trainer.steps and folder.status == "finished":
@@ -127,10 +151,25 @@ def resume(
                 help=(f"stlc train --resume {folder.name} --steps {2 * trainer.steps} goes on",),
             )
         )
-    folder.keep_rows(lambda row: row.get("step", 0) <= trainer.step)
-    folder.update({"status": "running", "steps": trainer.steps})
+    journal = Journal(folder, writes=ranks.first)
+    journal.back_to(trainer.step)
+    journal.note({"status": "running", "steps": trainer.steps})
     before = max((row.get("seconds", 0.0) for row in folder.rows()), default=0.0)
-    return _Session(folder, trainer, watch or Watch(), begun - before).finish()
+    return _Session(journal, trainer, watch or Watch(), begun - before).finish()
+
+
+def _require_as_many(before: int, now: int) -> None:
+    """Raise UsageError (R104) where a run is not gone on with by as many ranks as it was begun by."""
+    if before != now:
+        start = f"torchrun --nproc-per-node {before} -m stlc" if before > 1 else "stlc"
+        raise UsageError(
+            Diagnostic(
+                "R104",
+                f"the run was trained by {before} process{'es' if before > 1 else ''} together, not by {now}",
+                help=(f"{start} train --resume RUN",),
+                note=("every one of them has states of its own, which the run goes on with",),
+            )
+        )
 
 
 def find_device(name: str) -> torch.device:
@@ -153,15 +192,14 @@ class _Session:
     """One sitting of training: from wherever the trainer stands to the end, or to an interruption."""
 
     def __init__(
-        self, folder: RunDir, trainer: Trainer, watch: Watch, begun: float, end: OpenEnd | None = None
+        self, journal: Journal, trainer: Trainer, watch: Watch, begun: float, end: OpenEnd | None = None
     ) -> None:
-        self.folder = folder
+        self.journal = journal
         self.trainer = trainer
         self.watch = watch
         self.begun = begun
         self.now = clock_of(trainer.engine.clock)
         self.end = end
-        self.hashes = {"spec_hash": spec_hash(folder), "system_hash": system_hash(folder)}
 
     def finish(self) -> Outcome:
         """Train to the end, judge, and close the record."""
@@ -179,37 +217,42 @@ class _Session:
             value = trainer.advance()
             if not math.isfinite(value):
                 raise self._diverged()
-            if trainer.step % SAVE_EVERY == 0 or time.perf_counter() - saved > SAVE_SECONDS:
+            due = trainer.step % SAVE_EVERY == 0 or time.perf_counter() - saved > SAVE_SECONDS
+            if trainer.ranks.any(due):
                 self._save()
                 saved = time.perf_counter()
-            if self.watch.stop() and trainer.step < trainer.steps:
+            if trainer.ranks.any(self.watch.stop()) and trainer.step < trainer.steps:
                 return self._interrupted()
         self._save()
-        return self._judged()
+        return self._judged() if trainer.ranks.first else self._ended(None)
 
     def _revise(self) -> None:
         """Where a budget is still open, say anew how many steps it is worth."""
         if self.end is not None:
             self.end.mark(self.trainer, self.now())
-            self.folder.update({"steps": self.trainer.steps})
+            self.trainer.steps = int(self.trainer.ranks.agree(self.trainer.steps))
+            self.journal.note({"steps": self.trainer.steps})
 
     def _judged(self) -> Outcome:
-        policy = self.trainer.policy
-        result = score(policy, n=self.trainer.engine.held_out)
-        save_states(self.folder.path / "eval" / "held_out.npz", self.trainer.task, result)
+        self.trainer.average.cpu()  # verdicts are float64, and the kernel's
+        result = score(self.trainer.policy, n=self.trainer.engine.held_out)
+        self.journal.held_out(self.trainer.task, result)
         seconds = self.now() - self.begun
-        self.folder.finish("finished", {**result.summary(), "seconds": seconds})
-        return Outcome(Run(self.folder, self.trainer.task, policy), result, seconds, interrupted=False)
+        self.journal.close("finished", {**result.summary(), "seconds": seconds})
+        return self._ended(result)
 
     def _interrupted(self) -> Outcome:
         self._save()
-        self.folder.finish("interrupted")
-        run = Run(self.folder, self.trainer.task, self.trainer.policy)
-        return Outcome(run, None, self.now() - self.begun, interrupted=True)
+        self.journal.close("interrupted")
+        return self._ended(None, interrupted=True)
+
+    def _ended(self, result: Score | None, *, interrupted: bool = False) -> Outcome:
+        run = Run(self.journal.folder, self.trainer.task, self.trainer.policy)
+        seconds, ranks = self.now() - self.begun, self.trainer.ranks.size
+        return Outcome(run, result, seconds, interrupted=interrupted, ranks=ranks)
 
     def _save(self) -> None:
-        facts = {**self.trainer.facts(), **self.hashes}
-        save_checkpoint(self.folder, self.trainer.tensors(), facts, step=self.trainer.step)
+        self.journal.checkpoint(self.trainer.tensors(), self.trainer.facts(), step=self.trainer.step)
 
     def _row(self, look: Look, value: float, pace: float) -> None:
         trainer = self.trainer
@@ -227,11 +270,11 @@ class _Session:
             "failing": look.failing,
             "s_per_step": pace,
         }
-        self.folder.append_row(row)
+        self.journal.row(row)
         self.watch.row(row)
 
     def _diverged(self) -> RunError:
-        self.folder.finish("failed")
+        self.journal.close("failed")
         return RunError(
             Diagnostic(
                 "R401",

@@ -20,6 +20,7 @@ from stlc.controller.buffer import Buffer
 from stlc.controller.missions import Missions
 from stlc.controller.objective import Objective, guided_objective, loss, paper_objective
 from stlc.controller.policy import Mlp, PlanNetwork, network_of
+from stlc.controller.ranks import ALONE, Ranks
 from stlc.controller.search import Repaired, Searcher
 from stlc.controller.supply import Draws, Fixed, Supply
 from stlc.controller.task import rank, satisfied
@@ -37,7 +38,7 @@ RISE = 30
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What a search round saw on fresh states.
+    """What a search round saw on fresh states, of all ranks.
 
     Attributes:
         accuracy: share whose plan satisfies the specification.
@@ -57,38 +58,45 @@ class Look:
 class Trainer:
     """Everything that changes while training. Same seed and steps: same weights on the same machine."""
 
-    def __init__(self, task: Task, engine: Engine, *, steps: int, device: torch.device) -> None:
+    def __init__(
+        self, task: Task, engine: Engine, *, steps: int, device: torch.device, ranks: Ranks = ALONE
+    ) -> None:
         self.task = task
         self.engine = engine
         self.steps = steps
         self.device = device
+        self.ranks = ranks
         self.step = 0
         self.next_look = engine.every
-        self.generator = torch.Generator().manual_seed(engine.seed)
+        self.generator = torch.Generator().manual_seed(ranks.seed(engine.seed))
         self.network = _network(task, engine, device)
         self.supply = self._supply()
         self.average = _network(task, engine, device)
         self.network.normalise(self.supply.take(4096))
+        ranks.agree_on(self.network)
         self.training = Fixed(self.supply, engine.samples, self.generator) if engine.samples else self.supply
         self.average.load_state_dict(self.network.state_dict())
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=engine.lr, fused=True)
         self.buffer = Buffer.empty(len(task.names), task.horizon, len(task.system.control_names), device)
         self.margin = paper_objective(task).margin
         if engine.method == "guided":
-            self.margin = self._feasible_margin()
+            self.margin = ranks.agree(self._feasible_margin())
         self.objective = self._objective()
         self.searcher = self._searcher(MARGIN_SHARE * self.margin)
         self.repairing: Future[Repaired] | None = None
         self.accuracy = 0.0
 
     def advance(self) -> float:
-        """One gradient step; returns its loss (not finite: training has diverged)."""
+        """One gradient step; returns its loss. Where that or its gradient is not finite, NaN, and no step."""
         for group in self.optimizer.param_groups:
             group["lr"] = self.rate
         value = self._loss()
         self.optimizer.zero_grad()
         value.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.engine.clip)
+        value = self.ranks.learn(self.network.parameters(), value.detach())
+        length = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.engine.clip)
+        if not bool(torch.isfinite(value + length)):
+            return math.nan
         self.optimizer.step()
         self.step += 1
         decay = min(self.engine.average, self.step / (self.step + 10.0))
@@ -96,7 +104,7 @@ class Trainer:
             pairs = zip(self.average.parameters(), self.network.parameters(), strict=True)
             for averaged, current in pairs:
                 averaged.lerp_(current, 1.0 - decay)
-        return float(value.detach())
+        return float(value)
 
     @property
     def rate(self) -> float:
@@ -124,12 +132,25 @@ class Trainer:
         accuracy = float(good.double().mean())
         self.next_look = self.step + self.engine.every
         if self.engine.method != "guided":
-            return Look(accuracy, shares, None, 0, 0)
+            return self._of_all(Look(accuracy, shares, None, 0, 0))
         failing, repaired, feasible = self._take_repaired()
         bad = (~good).nonzero()[:, 0][: self.engine.most]
         self.repairing = self.searcher.begin(x0[bad], plans[bad], self.buffer.bank)
         self.accuracy = accuracy
-        return Look(accuracy, shares, feasible, failing, repaired)
+        return self._of_all(Look(accuracy, shares, feasible, failing, repaired))
+
+    def _of_all(self, look: Look) -> Look:
+        """What the ranks saw together."""
+        own = (look.feasible or 0.0, look.failing, look.repaired, look.accuracy, *look.requirements)
+        feasible, failing, repaired, accuracy, *shares = self.ranks.mean(own)
+        size = self.ranks.size
+        return Look(
+            accuracy,
+            tuple(shares),
+            None if look.feasible is None else feasible,
+            round(failing * size),
+            round(repaired * size),
+        )
 
     def _take_repaired(self) -> tuple[int, int, float | None]:
         """Put what the search round before this one has found where it is learnt from.
@@ -222,12 +243,24 @@ class Trainer:
     # ------------------------------------------------------------- checkpoints
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything that a resumed run needs to go on bit for bit."""
-        found: dict[str, Tensor] = {"generator": self.generator.get_state()}
+        """Everything that a resumed run needs to go on bit for bit; on the first of several ranks, of all.
+
+        All of them have to ask at the same time.
+        """
+        found: dict[str, Tensor] = self._own()
+        for index, theirs in enumerate(self.ranks.gather(found), start=1):
+            found.update({f"rank{index}.{name}": value for name, value in theirs.items()})
         for prefix, module in (("network", self.network), ("average", self.average)):
             found.update({f"{prefix}.{name}": value for name, value in module.state_dict().items()})
         for index, state in self.optimizer.state_dict()["state"].items():
             found.update({f"adam.{index}.{name}": value for name, value in state.items()})
+        return found
+
+    def _own(self) -> dict[str, Tensor]:
+        """What every rank has for itself."""
+        found: dict[str, Tensor] = {"generator": self.generator.get_state()}
+        if not self.ranks.first:
+            found["counts"] = torch.tensor([self.accuracy, self.buffer.count], dtype=torch.float64)
         kept = len(self.buffer)
         if isinstance(self.training, Fixed):
             found.update({f"training.{name}": value for name, value in self.training.tensors().items()})
@@ -251,6 +284,7 @@ class Trainer:
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
         """Go on where `tensors` and `facts` were taken."""
+        tensors, facts = self._restored(tensors, facts)
         self.step, self.steps = int(facts["step"]), int(facts["steps"])
         self.margin, self.next_look = float(facts["margin"]), int(facts["next_look"])
         self.accuracy = float(facts["accuracy"])
@@ -275,6 +309,18 @@ class Trainer:
         if isinstance(self.training, Fixed):
             self.training.restore(_below(tensors, "training"))
         self.generator.set_state(tensors["generator"].cpu())
+
+    def _restored(
+        self, tensors: dict[str, Tensor], facts: dict[str, float | int]
+    ) -> tuple[dict[str, Tensor], dict[str, float | int]]:
+        """What this rank goes on with: its own part in the place of the first one's."""
+        if self.ranks.first:
+            return tensors, facts
+        shared = ("network.", "average.", "adam.")
+        common = {name: value for name, value in tensors.items() if name.startswith(shared)}
+        own = _below(tensors, f"rank{self.ranks.rank}")
+        accuracy, solved = own.pop("counts").tolist()
+        return common | own, {**facts, "accuracy": accuracy, "solved": int(solved)}
 
 
 def _network(task: Task, engine: Engine, device: torch.device) -> PlanNetwork:

@@ -7,9 +7,11 @@ import json
 import re
 import shlex
 import shutil
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
+from several import ENVIRONMENT, free_port
 
 from stlc.cli.app import main
 from stlc.cli.pages import FOLDER, Example, read_page
@@ -181,6 +183,10 @@ def arranged(monkeypatch):
                 monkeypatch.setattr("stlc.view.find_spec", no_package)
             case "R402":
                 monkeypatch.setattr("stlc.controller.policy.Mlp.candidates", no_number)
+            case "R403":
+                monkeypatch.setattr("stlc.controller.ranks.PATIENCE", timedelta(seconds=0.1))
+                for name, value in {**ENVIRONMENT, "RANK": 0, "MASTER_PORT": free_port()}.items():
+                    monkeypatch.setenv(name, str(value))
 
     return arrange
 
@@ -191,9 +197,10 @@ def test_a_command(code, example, arranged, capsys):
     if "wrong" in example.notes:
         arranged(code)
     for line in example.body.splitlines():
-        words = shlex.split(line.removeprefix("$ "))
-        if words[0] != "stlc":
+        words = shlex.split(line.removeprefix("$ "), comments=True)
+        if "stlc" not in words:
             continue
+        words = words[words.index("stlc") :]
         extra = ["--no-pictures"] if words[1] in ("train", "simulate") else []
         main([*words[1:], *extra])
     said = capsys.readouterr().err

@@ -1,0 +1,184 @@
+"""Training shared by several processes, as `torchrun` starts them: who is who, and what they tell each other.
+
+Every rank draws states of its own, searches on its own, and learns from the mean of all gradients, so that
+all have the same weights. What has to be one thing (steps, margin, when to save, when to stop) is agreed on,
+and the first rank alone writes the run. gloo carries what lies on processors, nccl what lies on GPUs.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import TypeVar
+
+import torch
+import torch.distributed as dist
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor, nn
+
+from stlc.diagnostics import Diagnostic, MissingError
+
+PATIENCE = timedelta(minutes=10)
+"""How long a rank waits for another; building a kernel takes a minute at most."""
+_SPREAD = 0x9E3779B97F4A7C15
+"""Between the seeds of ranks: 2^64 over the golden ratio (D. Knuth, The Art of Computer Programming 6.4)."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Ranks:
+    """One of several processes that train together; alone it has nobody to talk to.
+
+    Attributes:
+        rank: of this process, from 0.
+        size: number of processes.
+        local: rank among those of this machine.
+    """
+
+    rank: int = 0
+    size: int = 1
+    local: int = 0
+
+    @property
+    def first(self) -> bool:
+        """Whether this one prints and writes."""
+        return self.rank == 0
+
+    def seed(self, seed: int) -> int:
+        """The seed of this rank's states and searches; that of the run on the first."""
+        return (seed + self.rank * _SPREAD) % 2**63
+
+    def device(self, name: str) -> str:
+        """The device of this rank: of several GPUs each takes its own."""
+        return f"cuda:{self.local}" if name == "cuda" and self.size > 1 else name
+
+    def learn(self, weights: Iterable[nn.Parameter], value: Tensor) -> Tensor:
+        """Replace the gradients of weights by their mean over ranks; returns the mean of `value`, ()."""
+        if self.size == 1:
+            return value
+        slopes = [weight.grad for weight in weights if weight.grad is not None]
+        flat = torch.cat([value.detach().view(1), *(slope.reshape(-1) for slope in slopes)])
+        self._together(lambda: dist.all_reduce(flat))
+        mean, *parts = torch.split(flat / self.size, [1, *(slope.numel() for slope in slopes)])
+        for slope, part in zip(slopes, parts, strict=True):
+            slope.copy_(part.view_as(slope))
+        return mean.view(())
+
+    def mean(self, values: Sequence[float]) -> list[float]:
+        """The means of numbers over ranks."""
+        return [total / self.size for total in self._reduced(values, dist.ReduceOp.SUM)]
+
+    def any(self, flag: bool) -> bool:
+        """Whether some rank says so."""
+        return self._reduced([flag], dist.ReduceOp.MAX)[0] > 0.0
+
+    def agree(self, value: float) -> float:
+        """The first rank's number, for all."""
+        return self._reduced([value if self.first else 0.0], dist.ReduceOp.SUM)[0]
+
+    def agree_on(self, module: nn.Module) -> None:
+        """Give a module of every rank the first one's weights."""
+        if self.size > 1:
+            for part in module.state_dict().values():
+                self._together(lambda part=part: dist.broadcast(part, 0))  # type: ignore[misc]
+
+    def agree_text(self, text: str) -> str:
+        """The first rank's text, for all."""
+        if self.size == 1:
+            return text
+        data = torch.tensor(list(text.encode()), dtype=torch.uint8)
+        size = int(self.agree(len(data)))
+        sent = data if self.first else torch.empty(size, dtype=torch.uint8)
+        self._together(lambda: dist.broadcast(sent, 0))
+        return bytes(sent.tolist()).decode()
+
+    def gather(self, tensors: Mapping[str, Tensor]) -> list[dict[str, Tensor]]:
+        """What the ranks after the first give, in their order; on the first alone, [] elsewhere."""
+        if self.first:
+            return [self._received(rank) for rank in range(1, self.size)]
+        data = save_tensors({name: part.detach().cpu().contiguous() for name, part in tensors.items()})
+        sent = torch.frombuffer(bytearray(data), dtype=torch.uint8)
+        self._together(lambda: dist.send(torch.tensor([len(sent)]), 0))
+        self._together(lambda: dist.send(sent, 0))
+        return []
+
+    def _received(self, rank: int) -> dict[str, Tensor]:
+        size = torch.zeros(1, dtype=torch.int64)
+        self._together(lambda: dist.recv(size, rank))
+        data = torch.empty(int(size), dtype=torch.uint8)
+        self._together(lambda: dist.recv(data, rank))
+        found: dict[str, Tensor] = load_tensors(data.numpy().tobytes())
+        return found
+
+    def _reduced(self, values: Sequence[float], how: dist.ReduceOp.RedOpType) -> list[float]:
+        if self.size == 1:
+            return list(values)
+        together = torch.tensor([float(value) for value in values], dtype=torch.float64)
+        self._together(lambda: dist.all_reduce(together, how))
+        found: list[float] = together.tolist()
+        return found
+
+    def _together(self, talk: Callable[[], T]) -> T:
+        """Do what all ranks do at the same time. Raises MissingError (R403) where one is gone."""
+        try:
+            return talk()
+        except RuntimeError as error:
+            raise _lost(self, error) from error
+
+
+ALONE = Ranks()
+
+
+def expected() -> Ranks:
+    """This process among those that `torchrun` started, by the environment."""
+    rank, size, local = (int(os.environ.get(name, 0)) for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK"))
+    return Ranks(rank, size, local) if size > 1 else ALONE
+
+
+@contextmanager
+def joined(device: str) -> Iterator[Ranks]:
+    """The ranks of this training, connected while the context is open.
+
+    Args:
+        device: of torch; on `cuda` every rank of a machine takes a GPU of its own.
+
+    Raises:
+        MissingError: R403, the others cannot be reached.
+    """
+    ranks = expected()
+    if ranks.size == 1:
+        yield ranks
+        return
+    own = ranks.device(device)
+    gpu = own.startswith("cuda")
+    try:
+        if gpu:
+            torch.cuda.set_device(own)
+        dist.init_process_group("cpu:gloo,cuda:nccl" if gpu else "gloo", timeout=PATIENCE)
+    except (RuntimeError, ValueError, AssertionError) as error:
+        raise _lost(ranks, error) from error
+    try:
+        yield ranks
+    finally:
+        dist.destroy_process_group()
+
+
+def _lost(ranks: Ranks, error: Exception) -> MissingError:
+    reason = (str(error).strip() or type(error).__name__).splitlines()[0].partition(". ")[0]
+    return MissingError(
+        Diagnostic(
+            "R403",
+            f"a process of this training is gone (rank {ranks.rank} of {ranks.size} noticed)",
+            help=(
+                "see what ended it above, or in the log of its machine; memory and time limits often do",
+                f"torchrun --nproc-per-node {ranks.size} -m stlc train --resume RUN goes on from"
+                " the last checkpoint",
+            ),
+            note=(reason,),
+        )
+    )
