@@ -82,6 +82,7 @@ def simulate(
 ) -> None:
     """Deploy the policy of a run, record it, and say how it did."""
     chosen = _guard(backup, guard)
+    from stlc.cli.output import emit_json
     from stlc.cli.simulate_text import closing, screen
     from stlc.controller.drive import Setting
     from stlc.controller.run import Run
@@ -92,15 +93,12 @@ def simulate(
 
     overrides = parse_overrides(set_)
     opened = Run.open(run, root=runs, overrides=overrides)
-    test = opened.task.system.decl.test
-    which = tuple(range(seed, seed + seeds))
+    test, which = opened.task.system.decl.test, tuple(range(seed, seed + seeds))
     limit = parse_limit(time_limit)
     setting = Setting(which, agents or test.agents, steps or test.steps, test.replan, limit)
 
     def driven(name: str | None) -> Record:
-        laid = opened
-        if name is not None:
-            laid = Run.open(opened.dir.path, root=runs, overrides=overrides, scenario=name)
+        laid = opened if name is None else Run.open(opened.dir.path, overrides=overrides, scenario=name)
         found = {mode: _deploy(laid, setting, mode, record) for mode in GUARDS[chosen]}
         return _save(laid, setting, found, record)
 
@@ -110,8 +108,6 @@ def simulate(
         _print(screen(document))  # before the pictures: what was measured must not depend on them
     drawn = _draw(opened) if pictures else {}
     if json:
-        from stlc.cli.output import emit_json
-
         emit_json("simulate/1", ok=code == 0, exit_code=code, result=document | drawn)
     else:
         _print(closing(document["trace"], drawn, record))
