@@ -45,6 +45,7 @@ ROOMS = (
     {"view"},
     {"editor"},
     {"bench"},
+    {"gym"},
     {"cli", "__main__"},
     {"__init__"},
 )
@@ -57,6 +58,7 @@ HOMES = {
         "stlc.controller",
         "stlc.view",
         "stlc.bench",
+        "stlc.gym",
         "stlc.cli",
     ),
     "safetensors": ("stlc.controller",),
@@ -68,6 +70,7 @@ HOMES = {
     "pydantic": ("stlc.dynamics",),
     "matplotlib": ("stlc.view",),
     "pygls": ("stlc.editor",),
+    "gymnasium": ("stlc.gym",),
     "lsprotocol": ("stlc.editor",),
     "PIL": ("stlc.view",),
     "numpy": (
@@ -78,6 +81,7 @@ HOMES = {
         "stlc.monitor",
         "stlc.controller",
         "stlc.view",
+        "stlc.gym",
         "stlc.cli",
     ),
     "pyarrow": ("stlc.trace_parquet",),

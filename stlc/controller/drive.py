@@ -130,7 +130,7 @@ class Setting:
     limit: float | None = 0.1
 
 
-class _Worlds:
+class Worlds:
     """The worlds of all seeds, as one."""
 
     def __init__(self, task: Task, make: WorldType, setting: Setting) -> None:
@@ -252,7 +252,7 @@ def drive(
         SystemFileError: S207, a world fails; S302, it gives states that are no numbers.
         RunError: R402, a plan that is no number would have to be executed.
     """
-    worlds, pilot = _Worlds(guard.task, make, setting), _Pilot(guard, setting)
+    worlds, pilot = Worlds(guard.task, make, setting), _Pilot(guard, setting)
     x = worlds.reset()
     recorder.start(x, worlds.worlds[0])
     recorder.units = dict(worlds.worlds[0].units())

@@ -1,0 +1,93 @@
+"""The environment passes gymnasium's checker, and its rewards are robustness."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium")
+
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+
+import stlc  # noqa: E402
+import stlc.gym  # noqa: E402
+from stlc.diagnostics import UsageError  # noqa: E402
+
+ROOT = Path(__file__).parent.parent
+SPECS = ("traffic", "reach_n_avoid", "ship_safe", "ship_track", "navigation", "manipulation")
+
+
+@pytest.mark.parametrize("name", SPECS)
+@pytest.mark.filterwarnings("ignore:.*(infinity|render|Box).*:UserWarning")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_it_passes_the_checker(name: str) -> None:
+    env = stlc.gym.make(ROOT / "specs" / f"{name}.stl")
+    check_env(env, skip_render_check=True)
+
+
+def test_dense_rewards_sum_to_the_robustness_of_the_episode() -> None:
+    env = stlc.gym.make(ROOT / "specs" / "ship_safe.stl")
+    _, first = env.reset(seed=4)
+    earned, states, actions, over = 0.0, [first["state"]], [], False
+    while not over:
+        action = env.action_space.sample()
+        _, reward, over, truncated, info = env.step(action)
+        assert not truncated
+        earned += reward
+        states.append(info["state"])
+        actions.append(action)
+    assert len(actions) == env.task.horizon
+    verdict = stlc.Monitor(stlc.load(ROOT / "specs" / "ship_safe.stl")).check(
+        {name: np.array(states)[:, i] for i, name in enumerate(env.task.names)}
+    )
+    rho = float(verdict.robustness)
+    assert info["rho"] == pytest.approx(rho, abs=1e-9)
+    assert earned == pytest.approx(rho - first["rho"], abs=1e-9)
+    assert info["satisfied"] == (rho >= -1e-6)
+
+
+def test_sparse_rewards_come_last_and_seeds_repeat() -> None:
+    env = stlc.gym.make(ROOT / "specs" / "reach_n_avoid.stl", reward="sparse")
+    action = np.zeros(1, dtype=np.float32)
+    runs = []
+    for _ in range(2):
+        env.reset(seed=11)
+        steps = [env.step(action) for _ in range(env.task.horizon)]
+        runs.append(np.array([step[0] for step in steps]))
+        assert [step[1] for step in steps[:-1]] == [0.0] * (len(steps) - 1)
+        assert steps[-1][1] == steps[-1][4]["rho"] != 0.0
+        with pytest.raises(UsageError, match="over"):
+            env.step(action)
+    assert np.array_equal(*runs)
+
+
+def test_a_long_episode_goes_on_in_the_world_and_is_truncated() -> None:
+    env = stlc.gym.make(ROOT / "specs" / "ship_track.stl", steps=60)
+    env.reset(seed=0)
+    for k in range(60):
+        _, _, terminated, truncated, _ = env.step(np.zeros(2, dtype=np.float32))
+        assert not terminated
+        assert truncated == (k == 59)
+
+
+def test_it_can_begin_anywhere() -> None:
+    env = stlc.gym.make(ROOT / "specs" / "ship_track.stl")
+    state = env.task.sample(1, seed=3)[0].numpy()
+    _, info = env.reset(seed=1, options={"state": state})
+    assert info["state"] == pytest.approx(state)
+
+
+def test_what_cannot_be_made_is_said() -> None:
+    with pytest.raises(UsageError, match="dens"):
+        stlc.gym.make(ROOT / "specs" / "traffic.stl", reward="dens")  # type: ignore[arg-type]
+    with pytest.raises(UsageError):
+        stlc.gym.make(ROOT / "specs" / "nothing.stl")
+
+
+def test_the_rest_of_stlc_does_without_gymnasium() -> None:
+    code = "import sys, stlc, stlc.cli.app; sys.exit('gymnasium' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False, cwd=ROOT).returncode == 0
