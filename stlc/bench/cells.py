@@ -150,10 +150,10 @@ def inputs_of(cell: Cell) -> Inputs:
 
 
 def _system_hash(task: Task) -> str:
-    """Of the system file and of the files that it names."""
+    """Of what a policy learns from in the system file, and of the files that it names."""
     decl = task.system.decl
     named = (f"{name} {sha256(path.read_bytes())}" for name, path in sorted(function_files(decl).items()))
-    return sha256("\0".join([decl.source.text, *named]))
+    return sha256("\0".join([decl.learnt, *named]))
 
 
 def spec_path(benchmark: str) -> Path:

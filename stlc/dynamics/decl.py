@@ -18,6 +18,12 @@ from stlc.units import Unit
 
 Squash: TypeAlias = Literal["tanh", "clip", "angle"]
 
+LEARNT = (
+    *("dt", "horizon", "substeps", "integrator", "discrete", "constants", "signature", "controls"),
+    *("flow", "jumps", "clamps", "init", "objective", "policy"),
+)
+"""The fields of a system that decide what a policy learns."""
+
 
 @dataclass(frozen=True, slots=True)
 class ControlDecl:
@@ -354,6 +360,11 @@ class SystemDecl:
         changes = "".join(f"\0{key}={value}" for key, value in sorted(self.overrides.items()))
         texts = "".join(base.text for base in self.bases)
         return hashlib.sha256((self.source.text + texts + changes).encode()).hexdigest()
+
+    @property
+    def learnt(self) -> str:
+        """SHA-256 of what a policy learns from, in hexadecimal: all but names, comments, and deployment."""
+        return hashlib.sha256(repr([getattr(self, name) for name in LEARNT]).encode()).hexdigest()
 
     @property
     def worlds(self) -> tuple[WorldRef, ...]:

@@ -15,7 +15,9 @@ from stlc.compile.switch import Tanh
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.controls import raw_width, squash
 from stlc.dynamics.describe import describe
+from stlc.dynamics.schema import parse_system
 from stlc.dynamics.system import PROBED, System
+from stlc.source import Source
 
 Make = Callable[..., System]
 
@@ -176,3 +178,22 @@ def test_a_probe_of_a_long_horizon_is_short(make: Make, monkeypatch: pytest.Monk
     monkeypatch.setattr(System, "rollout", watched)
     make(text).probe(4)
     assert seen == [PROBED]
+
+
+def test_what_is_learnt_does_not_follow_comments_and_deployment() -> None:
+    path = Path(__file__).parents[2] / "examples" / "ship_track.yaml"
+    text = path.read_text()
+
+    def learnt(old: str = "", new: str = "") -> str:
+        assert old in text
+        return parse_system(Source("s.yaml", text.replace(old, new, 1) if old else text), path).learnt
+
+    assert learnt("steps: 200", "steps: 100") == learnt("dt: 0.15 s", "dt: 0.150 s") == learnt()
+    assert learnt("bins: 3", "bins: 5") == learnt("doc: Ship", "doc: A ship") == learnt()
+    changed = [("substeps: 2", "substeps: 1"), ("0.5 * rudder", "0.6 * rudder"), ("y1, r1, tau]", "y1, r1]")]
+    changed += [
+        ("randint(8, 14)", "randint(8, 15)"),
+        ("gamma: 0.5 ", "gamma: 0.4 "),
+        ("D:     4", "D:     5"),
+    ]
+    assert len({learnt(), *(learnt(*change) for change in changed)}) == len(changed) + 1
