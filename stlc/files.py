@@ -173,14 +173,14 @@ def _flush(path: Path) -> None:
 
 
 def find_system(name: str, spec_path: Path | None = None) -> Path:
-    """The system file called `name`: as given, beside the spec, in `examples`, among the installed ones.
+    """The system file called `name`: as given, beside the spec, in `systems`, in `examples`, or installed.
 
     The suffix `.yaml` may be left out. Raises UsageError (U102) with the places looked at.
     """
     folders = [Path()]
     if spec_path is not None:
         folders.append(spec_path.parent)
-    folders += [Path("examples"), LIBRARY]
+    folders += [Path("systems"), Path("examples"), LIBRARY]
     for folder in folders:
         for suffix in _SYSTEM_SUFFIXES:
             path = folder / f"{name}{suffix}"

@@ -226,12 +226,14 @@ def project(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_a_system_is_found_as_given_beside_the_spec_and_in_examples(project):
+def test_a_system_is_found_as_given_beside_the_spec_and_in_folders_of_systems(project):
     spec = Path("specs/traffic.stl")
     assert find_system("examples/car.yaml") == Path("examples/car.yaml")
     assert find_system("own", spec) == Path("specs/own.yaml")
     assert find_system("car.yaml", spec) == Path("examples/car.yaml")
     assert find_system("maze") == Path("examples/maze.yml")
+    write_atomic("systems/maze.yaml", "")
+    assert find_system("maze") == Path("systems/maze.yaml")
     assert find_system("../examples/car.yaml", spec) == Path("examples/car.yaml")
     assert find_system(str(project / "examples/car.yaml")) == project / "examples/car.yaml"
     write_atomic("car.yaml", "")
@@ -253,7 +255,9 @@ def test_a_missing_system_says_where_it_looked():
     told = finding(caught)
     assert (told.code, told.message) == ("U102", "there is no system `cra.yaml`")
     assert told.help == ("did you mean `examples/car.yaml`?",)
-    assert told.note == ("looked at: cra.yaml, specs/cra.yaml, examples/cra.yaml, installed: cra.yaml",)
+    assert told.note == (
+        "looked at: cra.yaml, specs/cra.yaml, systems/cra.yaml, examples/cra.yaml, installed: cra.yaml",
+    )
 
 
 @pytest.mark.usefixtures("project")

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from stlc.compile.modules import library_of
 from stlc.controller.config import ENGINE_VERSION, HELD_OUT, HELD_OUT_SEED, TrainConfig, decide
@@ -23,6 +23,8 @@ from stlc.provenance import sha256
 
 if TYPE_CHECKING:
     from stlc.controller.config import Clock, Method
+
+Study: TypeAlias = Literal["paper", "ablation", "family"]
 
 FORMAT = "bench-cell/1"
 BENCHMARKS = ("traffic", "reach_n_avoid", "ship_safe", "ship_track", "navigation", "manipulation")
@@ -92,6 +94,13 @@ class Cell:
         first = ("ablation", self.axis, self.value) if self.axis else (self.benchmark, self.method)
         return "-".join([*filter(None, first), self.length.name, f"seed{self.seed}"])
 
+    @property
+    def study(self) -> Study:
+        """The table that it stands in."""
+        if self.axis:
+            return "ablation"
+        return "paper" if self.benchmark in BENCHMARKS else "family"
+
     def config(self) -> TrainConfig:
         """What `stlc train` is told."""
         return TrainConfig(
@@ -160,9 +169,9 @@ def spec_path(benchmark: str) -> Path:
     """The specification of a benchmark: in `specs/`, else the installed one. Raises UsageError (U102)."""
     name = f"{benchmark}.stl"
     places = [Path("specs"), LIBRARY / "specs", LIBRARY.parent / "specs"]
-    for folder in places:
-        if (folder / name).is_file():
-            return folder / name
+    for path in (folder / part / name for folder in places for part in ("", "families")):
+        if path.is_file():
+            return path
     raise UsageError(Diagnostic("U102", f"there is no benchmark `{benchmark}`", help=BENCHMARKS))
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from stlc.bench import ablation, paper
+from stlc.bench import ablation, family, paper
 from stlc.bench.ceilings import Ceiling
 from stlc.files import write_atomic
 from stlc.view import available
@@ -16,7 +16,7 @@ PICTURE = "img/results.svg"
 
 HEAD = """# Results
 
-Written by `stlc bench paper` and `stlc bench ablation` from the files in `bench/`; each of these files says
+Written by `stlc bench paper`, `ablation` and `family` from the files in `bench/`; each of these files says
 how one number was made: its command, seed, versions, machine and commit. Accuracy is the share of held-out
 states (the same ones in every row of a benchmark, never used in training) from which the planned trajectory
 satisfies the specification: exact semantics over closed intervals, robustness of at least -1e-6 in float64.
@@ -30,6 +30,13 @@ that of the worst seed). The ceiling is the share of the same states for which s
 _ABLATION = """\
 Traffic, the plain gradient method on a fixed training set; one number at a time differs from gamma = 0.5,
 k = 500, a network of 256x3 and 50,000 samples. Beside ours: the table of the paper, which trained for hours.
+"""
+
+_FAMILY = """\
+Specifications in `specs/families/`, each that of a benchmark with one constant made a `param`. A policy is
+trained once, on values drawn evenly from the range in the title, and judged at single values; those outside
+of the range are in italics. `known feasible` is the share of the same states for which a satisfying plan is
+known, the policy's own or one that a search has found, and `share` the accuracy as a share of that.
 """
 
 
@@ -164,7 +171,33 @@ def _ablation_cells(row: ablation.Row) -> tuple[str, ...]:
     )
 
 
-# ----------------------------------------------------------------------- both
+# ----------------------------------------------------------------------- families
+
+
+def family_section(documents: Sequence[Mapping[str, Any]], rows: Sequence[family.Row]) -> str:
+    """The tables of the families, as Markdown."""
+    lines = ["## One policy for a family", "", _FAMILY.rstrip()]
+    for each, own in family.tables(rows):
+        low, high = each.sampled()
+        header = (f"`{each.parameter}`", "budget", "seeds", "accuracy", "known feasible", "share")
+        title = f"### {each.title}, trained on {low:g} to {high:g} {each.unit}"
+        cells = [_family_cells(row, each.unit) for row in own]
+        lines += ["", title[:4] + title[4].upper() + title[5:], "", *markdown(header, cells)]
+    return "\n".join([*lines, "", *provenance(documents)])
+
+
+def _family_cells(row: family.Row, unit: str) -> tuple[str, ...]:
+    low, high = row.interval
+    value = f"{row.value:g} {unit}"
+    return (
+        *(value if row.inside else f"*{value}*", row.length, ", ".join(map(str, row.seeds))),
+        f"{row.accuracy:.4f} [{low:.4f}, {high:.4f}]",
+        f"{row.feasible:.4f}",
+        "" if row.share is None else f"{row.share:.3f}",
+    )
+
+
+# ----------------------------------------------------------------------- all of them
 
 
 def provenance(documents: Iterable[Mapping[str, Any]]) -> list[str]:
@@ -184,7 +217,8 @@ def provenance(documents: Iterable[Mapping[str, Any]]) -> list[str]:
         dates = sorted({str(document["finished"])[:10] for document in group})
         when = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
         commits = ", ".join(f"`{commit}`" for commit in sorted({_commit(document) for document in group}))
-        lines += [f"- {len(group)} trainings on {key[0]}; {key[1]}; {key[2]}; {when}; commit {commits}"]
+        count = _counted(len(group), "trainings")
+        lines += [f"- {count} on {key[0]}; {key[1]}; {key[2]}; {when}; commit {commits}"]
     return lines
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 from stlc.bench.cells import (
     FORMAT,
     Cell,
     Inputs,
+    Study,
     inputs_of,
     length_of,
     pack,
@@ -26,8 +27,6 @@ from stlc.files import write_atomic
 from stlc.jsontext import dumps
 from stlc.rundir import RunDir, every_run
 from stlc.view.held_out import load_held_out
-
-Study: TypeAlias = Literal["paper", "ablation"]
 
 CURVE_POINTS = 80
 
@@ -140,7 +139,7 @@ def _collect(inputs: Inputs, run: RunDir, place: Place, *, cores: int | None = N
     solved = [] if held is None else [rho >= -TOLERANCE for rho in held.rho.tolist()]
     document = {
         "format": FORMAT,
-        "study": "ablation" if cell.axis else "paper",
+        "study": cell.study,
         "benchmark": cell.benchmark,
         "method": cell.method,
         "axis": cell.axis,

@@ -1,10 +1,11 @@
-"""`stlc bench`: the paper's benchmarks and its ablation made again, and how fast robustness is computed."""
+"""`stlc bench`: the paper's tables made again, one policy for a family, and how fast robustness is."""
 
 from __future__ import annotations
 
 import typer
 
 from stlc.cli.bench_ablation import ablation
+from stlc.cli.bench_family import family
 from stlc.cli.bench_paper import paper
 from stlc.cli.bench_robustness import robustness
 from stlc.cli.options import describe
@@ -39,6 +40,14 @@ def register(app: typer.Typer) -> None:
             note=_KEPT,
         )
     )(ablation)
+    group.command(
+        help=describe(
+            "Train one policy for all values of a parameter, and judge it inside and outside of its range.",
+            "stlc bench family",
+            "stlc bench family --only stop_time --budget 60s --seeds 0..2 --jobs 2",
+            note=_KEPT + " So is a verdict at a value of the parameter.",
+        )
+    )(family)
     group.command(
         help=describe(
             "Time the robustness of whole traces, forward and backward.",

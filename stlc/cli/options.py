@@ -19,7 +19,7 @@ SystemOption = Annotated[
         "--system",
         "-s",
         metavar="FILE",
-        help="The system: as given, beside the spec, in examples/, or an installed one.",
+        help="The system: as given, beside the spec, in systems/, in examples/, or installed.",
     ),
 ]
 RunArgument = Annotated[

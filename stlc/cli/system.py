@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from stlc.diagnostics import Diagnostic
     from stlc.dynamics.decl import SystemDecl
 
-_File = Annotated[str, typer.Argument(metavar="SYSTEM", help="As given, in examples/, or an installed one.")]
+_File = Annotated[
+    str, typer.Argument(metavar="SYSTEM", help="As given, in systems/, in examples/, or installed.")
+]
 
 
 def register(app: typer.Typer) -> None:

@@ -20,6 +20,8 @@ from stlc.grammar.printer import show
 
 WIDTH, LEFT = 110, 44
 """Columns of the whole text, and at most of what was written."""
+LONG, SHOWN = 24, 8
+"""Lines from which a formula is cut short, and lines that are left of it."""
 
 _TIED = re.compile(r" (?=[<>=!*/+-]+ )|(?<= [<>=!*/+-]) |(?<=[<>=!]=) ")
 """Blanks around the signs of comparisons and sums."""
@@ -69,11 +71,8 @@ def _beside(compiled: Compiled) -> Iterator[str]:
     left = min(max(map(len, [*written, "written"])), LEFT)
     yield f"    {'written':<{left}}  compiled"
     for (rule, kind), text in zip(_rules(compiled), written, strict=True):
-        right = [
-            line
-            for became in _became(rule, compiled)
-            for line in _wrapped(became, WIDTH - left - 6, hanging="  ")
-        ]
+        formula, *added = [_wrapped(became, WIDTH - left - 6, "  ") for became in _became(rule, compiled)]
+        right = [*_cut(formula), *(line for lines in added for line in lines)]
         rows = zip_longest(_wrapped(text, left), right, fillvalue="")
         lines = [_name(rule, kind), *(f"    {one:<{left}}  {other}".rstrip() for one, other in rows)]
         yield "\n".join(lines)
@@ -94,6 +93,13 @@ def _wrapped(text: str, width: int, hanging: str = "") -> list[str]:
     tied = _TIED.sub("\N{NO-BREAK SPACE}", text)
     lines = wrap(tied, width, subsequent_indent=hanging, break_long_words=False, break_on_hyphens=False)
     return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines]
+
+
+def _cut(lines: list[str]) -> list[str]:
+    """The beginning of a formula that fills pages, such as of what moves between samples."""
+    if len(lines) <= LONG:
+        return lines
+    return [*lines[:SHOWN], f"  … {len(lines) - SHOWN} more lines: --show ir"]
 
 
 def _name(rule: Rule, kind: str) -> str:

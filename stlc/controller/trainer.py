@@ -133,7 +133,8 @@ class Trainer:
         self.next_look = self.step + self.engine.every
         if self.engine.method != "guided":
             return self._of_all(Look(accuracy, shares, None, 0, 0))
-        failing, repaired, feasible = self._take_repaired()
+        failing, repaired, before = self._take_repaired()
+        feasible = None if before is None else max(before, accuracy)
         bad = (~good).nonzero()[:, 0][: self.engine.most]
         self.repairing = self.searcher.begin(x0[bad], plans[bad], self.buffer.bank)
         self.accuracy = accuracy
@@ -156,7 +157,8 @@ class Trainer:
         """Put what the search round before this one has found where it is learnt from.
 
         Returns:
-            How many states it worked on, how many it solved, and the share of states known to be feasible.
+            How many states it worked on, how many it solved, and the share of all states of that
+            time known to be feasible.
         """
         if self.repairing is None:
             return 0, 0, None

@@ -184,7 +184,7 @@ def _draw_places(axes: Axes, chart: Chart) -> list[PathPatch]:
             outline = filled.get_paths()[0]
             filled.remove()
             row, column = np.unravel_index(int(np.argmax(depth)), depth.shape)
-            _write(axes, place.name, (float(xs[column]), float(ys[row])))
+            _write(axes, place.title, (float(xs[column]), float(ys[row])))
         area = PathPatch(outline, fc=_tint(color, STRONG), ec=color, lw=1.2, zorder=2)
         if place.role == "avoid":
             area.set_hatch("///")
@@ -243,7 +243,7 @@ def _draw_presence(axes: Axes, chart: Chart, place: Place) -> None:
     axes.set_yticks([0, 1], ["0", "all"])
     axes.grid(visible=False)
     word = "not in" if place.role == "avoid" else "in"
-    axes.set_title(f"{word} {place.name}", color=INK, pad=3)
+    axes.set_title(f"{word} {place.title}", color=INK, pad=3)
     axes.annotate(
         labelled(place.uses),
         (1, 1),

@@ -31,6 +31,8 @@ GRID = 240
 """Points along each axis at which a place is evaluated."""
 ROOM = 0.06
 """Of the plane's size, left free around what there is to see."""
+TITLE = 26
+"""Letters of a place's name in a picture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +65,11 @@ class Place:
     name: str
     uses: tuple[Use, ...]
     monitor: Monitor
+
+    @property
+    def title(self) -> str:
+        """The name, cut where it is a text that would cover the picture."""
+        return self.name if len(self.name) <= TITLE else self.name[: TITLE - 1] + "…"
 
     @property
     def role(self) -> Role:

@@ -226,6 +226,16 @@ def test_parts_of_a_dump() -> None:
     ]
 
 
+def test_a_formula_that_fills_pages_is_cut_unless_it_is_asked_for() -> None:
+    spec = compiled("require a: always[0 s, 1 s] sweep([x, y]) not in box([0, 0], [1, 1])")
+    text = dump(spec)
+    (cut,) = [line for line in text.splitlines() if "…" in line]
+    assert cut.endswith("more lines: --show ir")
+    assert "time  always" in text
+    assert show_formula(spec.requirements[0].formula) in dump(spec, "ir")
+    assert len(text) < 2000 < len(dump(spec, "ir"))
+
+
 def test_numbers_read_like_mathematics() -> None:
     (rule,) = compiled("require a: -(x + 1 m) * 2 - y / 3 ^ 2 <= -(abs(x) - 1 m)").requirements
     assert isinstance(rule.formula, ir.Atom)

@@ -70,6 +70,14 @@ def test_a_region_that_is_reached_and_avoided_is_mixed():
     assert place("gate", text).windows == ((1.0, 3.0), (4.0, 5.0))
 
 
+def test_a_region_without_a_name_does_not_cover_the_picture():
+    text = SPEC + "require far: always ([x, y] not in box([-9, -9], [-8.5, -8.25]))\n"
+    titles = [found.title for found in plane(text).places]
+    assert titles[:3] == ["marsh", "gate", "yard"]
+    assert max(map(len, titles)) == 26
+    assert titles[-1].endswith("…")
+
+
 def test_moving_regions_are_left_out_and_no_places_are_no_plane():
     moving = SPEC.replace("circle([4 m, 0 m], 1 m)", "circle([4 m + v * 1 s, 0 m], 1 m)")
     assert "gate" not in [found.name for found in plane(moving).places]
