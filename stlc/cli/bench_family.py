@@ -11,6 +11,7 @@ import typer
 
 from stlc.cli.bench_options import (
     BudgetOption,
+    ClockOption,
     JobsOption,
     OutOption,
     PageOption,
@@ -39,6 +40,7 @@ def family(
         typer.Option("--only", metavar="NAMES", help="Some of ship_radius,stop_time; all if not given."),
     ] = None,
     budget: BudgetOption = None,
+    clock: ClockOption = "wall",
     steps: StepsOption = None,
     seeds: SeedsOption = "0",
     jobs: JobsOption = 1,
@@ -56,7 +58,7 @@ def family(
 
     names = chosen(only, [each.name for each in FAMILIES], "family")
     families = [each for each in FAMILIES if each.name in names]
-    extent = Extent(families, parse_seeds(seeds), lengths_of(budget, steps, LENGTHS), held_out)
+    extent = Extent(families, parse_seeds(seeds), lengths_of(budget, steps, LENGTHS, clock), held_out)
     place = Place(out, runs, jobs, threads)
     filling = filled(family_cells(extent), place)
     failed = [*filling.told()["failed"], *_judge_all(filling.documents, place)]
