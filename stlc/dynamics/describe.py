@@ -11,7 +11,7 @@ Row = tuple[str, ...]
 
 
 def describe(decl: SystemDecl) -> str:
-    """States, controls, flow, jumps and initial situations of a system, as lines of text."""
+    """States, controls, flow, jumps, initial situations and scenarios of a system, as lines of text."""
     head = f"{decl.name}: {decl.doc}" if decl.doc else decl.name
     substeps = f", {decl.substeps} substeps" if decl.substeps > 1 else ""
     kind = "discrete" if decl.discrete else decl.integrator
@@ -25,6 +25,7 @@ def describe(decl: SystemDecl) -> str:
         ("jumps", [(jump.name, f"when {jump.text}", _resets(jump.resets)) for jump in decl.jumps]),
         ("initial situations", _situations(decl.init.mixture)),
         ("kept where", [(text,) for text in decl.init.where_text]),
+        ("scenarios", [(scenario.name, scenario.doc) for scenario in decl.scenarios]),
     )
     return "\n".join([head, grid, *(line for title, rows in blocks for line in _table(title, rows))])
 

@@ -135,7 +135,8 @@ def test_the_hash_follows_text_and_overrides(make: Make) -> None:
 
 
 def test_the_description_is_a_table(make: Make) -> None:
-    assert describe(make(MIXED).decl).splitlines() == [
+    windy = "scenario: {calm: {override: {x: 1}}, windy: {doc: A gust., override: {x: 2}}}\n"
+    assert describe(make(MIXED + windy).decl).splitlines() == [
         "small",
         "dt = 0.1 s, T = 4 steps = 0.4 s, euler",
         "",
@@ -151,6 +152,10 @@ def test_the_description_is_a_table(make: Make) -> None:
         "",
         "initial situations",
         "  only  100 %",
+        "",
+        "scenarios",
+        "  calm",
+        "  windy  A gust.",
     ]
 
 
