@@ -27,7 +27,7 @@ static inline double bounded(double u, double low, double high, int turns) {{
 }}
 
 /* One changed plan for one control of lane j: a stretch of time gets noise, a shift or one level. */
-static void change(double (*restrict v)[LANES], int j, int kind, double low, double high, int turns,
+static void change(lane *restrict v, int j, int kind, double low, double high, int turns,
                    uint64_t *s) {{
   const double span = high - low, size = span * ldexp(0.5, -below(s, 7));
   const int from = below(s, {steps}), end = from + 1 + below(s, {steps}), to = end < {steps} ? end : {steps};
@@ -39,7 +39,7 @@ static void change(double (*restrict v)[LANES], int j, int kind, double low, dou
 }}
 
 /* A plan that solved another state, whole or from some step on; levels over quarters while there are none. */
-static void borrow(double (*restrict v)[{steps}][LANES], int j, const double *restrict bank, int64_t plans,
+static void borrow(inputs *restrict v, int j, const double *restrict bank, int64_t plans,
                    const double *restrict low, const double *restrict high, uint64_t *s) {{
   if (plans > 0) {{
     const double *from = bank + (int64_t)(uniform(s) * (double)plans) * {steps} * {controls};
@@ -66,9 +66,9 @@ int climb(int64_t first, int64_t last, const double *x0, double *plans, double *
   enum {{ N = {states}, M = {controls}, T = {steps}, R = {rules} }};
   const double *low = bounds, *high = bounds + M, *turns = bounds + 2 * M;
   lanes *x = malloc(sizeof(lanes) * N);
-  double (*v)[T][LANES] = malloc(sizeof(double) * M * T * LANES);
+  inputs *v = malloc(sizeof(double) * M * T * LANES);
   double *room = malloc(sizeof(double) * {room} * LANES);
-  double (*out)[LANES] = malloc(sizeof(double) * (R + 1) * LANES);
+  lane *out = malloc(sizeof(double) * (R + 1) * LANES);
   if (!x || !v || !room || !out) {{ free(x); free(v); free(room); free(out); return 1; }}
   for (int64_t row = first; row < last; ++row) {{
     uint64_t s = seed ^ (uint64_t)row * 0xD1B54A32D192ED03ull;
@@ -84,7 +84,7 @@ int climb(int64_t first, int64_t last, const double *x0, double *plans, double *
           if (only < 0 || only == i) change(v[i], j, kind, low[i], high[i], turns[i] > 0.0, &s);
       }}
       double bad[LANES] = {{0}};
-      roll(x, (const double (*)[T][LANES])v, bad);
+      roll(x, (const inputs *)v, bad);
       check(x, room, bad, out);
       int which = -1;
       for (int j = 0; j < LANES; ++j) {{

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import reduce
-from typing import assert_never
+from typing import TypeAlias, assert_never
 
 from stlc.compile import ir
 
@@ -50,25 +50,20 @@ class Untranslatable(Exception):  # noqa: N818 - not an error: another back end 
     """The IR holds something that has no C form, such as a function that the system provides."""
 
 
+Leaf: TypeAlias = ir.Col | ir.At | ir.Held | ir.Extern
+
+
 class NumberWriter:
     """Writes numbers as C statements; equal numbers get one register.
 
     Args:
-        column: C expression of an environment entry.
-        at: the same at another sample; None where there is only one.
-        call: C expression of a component of a function's result that stands somewhere already, else None.
+        place: C expression of where a column, a frozen value or a function's result stands already; None for
+            a function that is to be written out.
     """
 
-    def __init__(
-        self,
-        column: Callable[[str], str],
-        at: Callable[[ir.At], str] | None = None,
-        call: Callable[[ir.Extern], str | None] | None = None,
-    ) -> None:
+    def __init__(self, place: Callable[[Leaf], str | None]) -> None:
         self.lines: list[str] = []
-        self._column = column
-        self._at = at
-        self._call = call
+        self._place = place
         self._known: dict[ir.Num, str] = {}
         self._texts: dict[str, str] = {}
         self._calls: dict[tuple[str, ...], list[str]] = {}
@@ -101,25 +96,26 @@ class NumberWriter:
         match num:
             case ir.Lit(value):
                 return literal(value)
-            case ir.Col(name):
-                return self._register(self._column(name))
             case ir.Op(name, args):
                 return self._op(name, [self.number(arg) for arg in args])
             case ir.Ind(cond):
                 return self._indicator(cond)
             case ir.Where(cond, yes, no):
                 return self._choice(cond, self.number(yes), self.number(no))
-            case ir.Extern(name, args, output, ir.Body() as body):
-                stored = None if self._call is None else self._call(num)
-                if stored is not None:
-                    return self._register(stored)
-                return self._inlined(name, body, [self.number(arg) for arg in args])[output]
-            case ir.At() if self._at is not None:
-                return self._register(self._at(num))
-            case ir.Extern(name) | ir.At(name) | ir.Held(name):
-                raise Untranslatable(name)
+            case ir.Col() | ir.At() | ir.Held() | ir.Extern():
+                place = self._place(num)
+                return self._written_out(num) if place is None else self._load(place)
             case _:
                 assert_never(num)
+
+    def _load(self, place: str) -> str:
+        return self._register(place)
+
+    def _written_out(self, num: Leaf) -> str:
+        if not isinstance(num, ir.Extern) or not isinstance(num.function, ir.Body):
+            raise Untranslatable(f"`{num.name}`")
+        args = [self.number(arg) for arg in num.args]
+        return self._inlined(num.name, num.function, args)[num.output]
 
     def _indicator(self, cond: ir.Formula) -> str:
         return self._register(f"(double){self.truth(cond)}")
@@ -141,7 +137,7 @@ class NumberWriter:
 
     def _inside(self) -> NumberWriter:
         """A writer with names of its own into the same registers."""
-        inner = NumberWriter(self._column, self._at)
+        inner = NumberWriter(self._place)
         inner.lines, inner._texts = self.lines, self._texts
         return inner
 
@@ -176,7 +172,7 @@ class NumberWriter:
 def literal(value: float) -> str:
     """A double as C reads it back, bit for bit."""
     if math.isnan(value):
-        raise Untranslatable("nan")
+        return "NAN"
     if math.isinf(value):
         return "INFINITY" if value > 0 else "(-INFINITY)"
     return f"({value.hex()})"

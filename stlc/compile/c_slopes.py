@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from functools import reduce
 
 from stlc.compile import ir
-from stlc.compile.c_numbers import NumberWriter
+from stlc.compile.c_numbers import Leaf, NumberWriter
 
 Slope = tuple[str, str]
 """A register, and the derivative by it."""
@@ -52,15 +52,12 @@ class SlopeWriter(NumberWriter):
     """Writes numbers, and remembers how each register changes with those before it.
 
     Args:
-        column: C expression of an environment entry.
-        at: C expression of an entry at another sample.
+        place: C expression of where a leaf stands.
         soft: whether conditions have a slope; where not, only the branch that is taken counts.
     """
 
-    def __init__(
-        self, column: Callable[[str], str], at: Callable[[ir.At], str] | None = None, *, soft: bool
-    ) -> None:
-        super().__init__(column, at)
+    def __init__(self, place: Callable[[Leaf], str | None], *, soft: bool) -> None:
+        super().__init__(place)
         self._soft = soft
         self._slopes: dict[str, tuple[Slope, ...]] = {}
         self._inputs: dict[str, str] = {}
@@ -72,7 +69,7 @@ class SlopeWriter(NumberWriter):
             seeds: register -> C expression of the derivative of the outcome by it.
 
         Returns:
-            The statements, and what they give: place where the derivative by a column is gathered (that by
+            The statements, and what they give: place where the derivative by a leaf is gathered (that by
             `x[…]` in `gx[…]`) -> register.
         """
         registers = list(self._texts.values())
@@ -94,16 +91,13 @@ class SlopeWriter(NumberWriter):
             case _:
                 return "0.0"
 
-    def _number(self, num: ir.Num) -> str:
-        register = super()._number(num)
-        if isinstance(num, ir.Col):
-            self._inputs[register] = self._column(num.name)
-        elif isinstance(num, ir.At) and self._at is not None:
-            self._inputs[register] = self._at(num)
+    def _load(self, place: str) -> str:
+        register = super()._load(place)
+        self._inputs[register] = place
         return register
 
     def _inside(self) -> SlopeWriter:
-        inner = SlopeWriter(self._column, self._at, soft=self._soft)
+        inner = SlopeWriter(self._place, soft=self._soft)
         inner.lines, inner._texts = self.lines, self._texts
         inner._slopes, inner._inputs = self._slopes, self._inputs
         return inner

@@ -10,8 +10,11 @@ from dataclasses import dataclass
 
 from stlc.compile import ir
 from stlc.compile.c_climb import CLIMB
-from stlc.compile.c_formulas import FormulaWriter
-from stlc.compile.c_numbers import NumberWriter
+from stlc.compile.c_formulas import Forward
+from stlc.compile.c_numbers import Leaf, NumberWriter
+from stlc.compile.c_parts import Frame, declared, in_parts
+from stlc.compile.c_plan import plan_of
+from stlc.compile.c_steps import Plan
 
 LANES = 16
 
@@ -31,6 +34,12 @@ VECTOR(sin) VECTOR(cos) VECTOR(exp) VECTOR(log)
 #define LANE for (int j = 0; j < LANES; ++j)
 #define MIN(a, b) ((b) < (a) ? (b) : (a)) /* a where it is NaN */
 #define MAX(a, b) ((b) > (a) ? (b) : (a))
+#if defined(__GNUC__)
+#define APART __attribute__((noinline))
+#else
+#define APART
+#endif
+#define LATER(a, b) ((a) > (b) ? (a) : (b))
 #define NAN_IN(a) ((double)((a) != (a)))
 
 static inline double floored_mod(double a, double b) {{
@@ -67,19 +76,18 @@ def emit(motion: Motion, formulas: Sequence[ir.Formula]) -> str:
     Raises:
         Untranslatable: the IR holds something that has no C form.
     """
-    checks = FormulaWriter(motion.steps + 1, state_column(motion))
-    values = [checks.value(formula) for formula in formulas]
+    plan = plan_of(formulas, motion.steps + 1)
     states, rules, steps = len(motion.states), len(formulas), motion.steps
     return "\n".join(
         [
             HEAD,
-            *passes(motion, checks, values),
+            *passes(motion, plan),
             (_DRIVER + CLIMB).format(
                 states=states,
                 controls=len(motion.controls),
                 steps=steps,
                 rules=rules,
-                room=max(checks.size, 1),
+                room=max(plan.size, 1),
             ),
         ]
     )
@@ -90,34 +98,53 @@ def state_column(motion: Motion) -> Callable[[str, str], str]:
     return lambda name, k: f"x[{motion.states.index(name)}][{k}][j]"
 
 
-def passes(motion: Motion, checks: FormulaWriter, values: Sequence[str]) -> list[str]:
+def passes(motion: Motion, plan: Plan) -> list[str]:
     """The two passes forward: `roll` fills the states, `check` gives the robustness of each requirement."""
+    forward = Forward(plan, state_column(motion))
+    blocks = [forward.lines([step]) for step in plan.steps]
+    blocks.append([f"LANE out[{i}][j] = {root['0']};" for i, root in enumerate(plan.roots)])
     return [
+        "typedef double lane[LANES];",
         f"typedef double lanes[{motion.steps + 1}][LANES];",
-        f"static void roll(lanes *restrict x, const double (*restrict u)[{motion.steps}][LANES],",
-        "                 double *restrict bad) {",
+        f"typedef double inputs[{motion.steps}][LANES];",
+        "static void roll(lanes *restrict x, const inputs *restrict u, double *restrict bad) {",
         f"  for (int k = 0; k < {motion.steps}; ++k) LANE {{",
         *(f"    {line}" for line in _step(motion)),
         "  }",
         "}",
-        "static void check(const lanes *restrict x, double *restrict room, double *restrict bad,",
-        "                  double (*restrict out)[LANES]) {",
-        *(f"  {line}" for line in checks.lines),
-        *(f"  LANE out[{i}][j] = {value}[0][j];" for i, value in enumerate(values)),
-        "}",
+        *in_parts(CHECK, blocks, declared(plan)),
     ]
+
+
+CHECK = Frame(
+    "check",
+    (
+        "const lanes *restrict x",
+        "double *restrict room",
+        "double *restrict bad",
+        "lane *restrict out",
+    ),
+)
+
+
+def place_in_step(motion: Motion) -> Callable[[Leaf], str | None]:
+    """Where states and inputs stand in a step, of lane `j`."""
+    index = {name: i for i, name in enumerate(motion.states)}
+
+    def place(leaf: Leaf) -> str | None:
+        if not isinstance(leaf, ir.Col):
+            return None
+        if leaf.name in index:
+            return f"x[{index[leaf.name]}][k][j]"
+        return f"u[{motion.controls.index(leaf.name)}][k][j]"
+
+    return place
 
 
 def _step(motion: Motion) -> list[str]:
     """The body of a step: sample k to sample k + 1 of one lane."""
     index = {name: i for i, name in enumerate(motion.states)}
-
-    def column(name: str) -> str:
-        if name in index:
-            return f"x[{index[name]}][k][j]"
-        return f"u[{motion.controls.index(name)}][k][j]"
-
-    writer = NumberWriter(column)
+    writer = NumberWriter(place_in_step(motion))
     for name, num in motion.lets:
         writer.assign(name, writer.number(num))
     after = {name: writer.number(num) for name, num in motion.next.items()}
@@ -135,9 +162,9 @@ int judge(int64_t batch, int64_t first, int64_t last, const double *x0, const do
           double *columns) {{
   enum {{ N = {states}, M = {controls}, T = {steps}, R = {rules} }};
   lanes *x = malloc(sizeof(lanes) * N);
-  double (*v)[T][LANES] = malloc(sizeof(double) * M * T * LANES);
+  inputs *v = malloc(sizeof(double) * M * T * LANES);
   double *room = malloc(sizeof(double) * {room} * LANES);
-  double (*out)[LANES] = malloc(sizeof(double) * (R + 1) * LANES);
+  lane *out = malloc(sizeof(double) * (R + 1) * LANES);
   if (!x || !v || !room || !out) {{ free(x); free(v); free(room); free(out); return 1; }}
   for (int64_t at = first; at < last; at += LANES) {{
     const int here = last - at < LANES ? (int)(last - at) : LANES;
@@ -147,7 +174,7 @@ int judge(int64_t batch, int64_t first, int64_t last, const double *x0, const do
       for (int k = 0; k < T; ++k) for (int i = 0; i < M; ++i) v[i][k][j] = u[(row * T + k) * M + i];
     }}
     double bad[LANES] = {{0}};
-    roll(x, (const double (*)[T][LANES])v, bad);
+    roll(x, (const inputs *)v, bad);
     check(x, room, bad, out);
     for (int j = 0; j < here; ++j) for (int i = 0; i < R; ++i)
       rho[(at + j) * R + i] = bad[j] > 0.0 ? NAN : out[i][j];

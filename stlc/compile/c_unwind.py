@@ -1,0 +1,131 @@
+"""The steps of a plan as C, backwards: the gradient by the values of a buffer, taken to what they came from.
+
+`gb7` holds the gradient by the buffer `b7`, and `gx` that by the columns. Of equal minima and maxima the
+first gets it. What stands in a `freeze` is computed anew, and only for the instants that matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import assert_never
+
+from stlc.compile.c_formulas import Forward, Sight, columns, components
+from stlc.compile.c_slopes import SlopeWriter
+from stlc.compile.c_steps import (
+    Called,
+    Extremum,
+    Fill,
+    Frozen,
+    Joined,
+    Margin,
+    Meeting,
+    Moved,
+    Plan,
+    Repeated,
+    Step,
+)
+from stlc.compile.c_windows import windowed_back
+from stlc.compile.ir import Num
+
+
+@dataclass(frozen=True, slots=True)
+class Backward:
+    """Writes steps backwards.
+
+    Attributes:
+        plan: that they belong to.
+        column: C expression of a state at a sample.
+    """
+
+    plan: Plan
+    column: Callable[[str, str], str]
+
+    def lines(self, steps: Sequence[Step]) -> list[str]:
+        """Statements that take the gradient back through all steps."""
+        return [line for step in reversed(steps) for line in self._step(step)]
+
+    def _step(self, step: Step) -> list[str]:
+        match step:
+            case Fill():
+                return []
+            case Margin():
+                return [] if step.atom.guard else self._margin(step)
+            case Joined():
+                return _joined(step)
+            case Extremum() | Meeting() | Moved():
+                return windowed_back(step, self.plan.samples - 1)
+            case Repeated(out, run, body):
+                return [f"{run.loop()} LANE g{body['0']} += g{out['k']};"]
+            case Called():
+                return self._called(step)
+            case Frozen():
+                return self._frozen(step)
+            case _:
+                assert_never(step)
+
+    def _margin(self, step: Margin) -> list[str]:
+        sign = "" if step.atom.sign > 0 else "-"
+        sight = Sight(self.plan, self.column, step.held)
+        inner = _pulled(step.atom.num, f"{sign}g{step.out['k']}", sight)
+        return [sight.head(step.run), *inner, "}"]
+
+    def _called(self, step: Called) -> list[str]:
+        writer = SlopeWriter(columns(self.column), soft=False)
+        seeds: dict[str, str] = {}
+        for out, part in zip(step.outs, components(step), strict=True):
+            register, own = writer.number(part), f"g{out['k']}"
+            seeds[register] = f"{seeds[register]} + {own}" if register in seeds else own
+        lines, gathered = writer.backward(seeds)
+        adds = [f"{place} += {value};" for place, value in gathered.items()]
+        return [f"{step.run.loop()} LANE {{", *writer.lines, *lines, *adds, "}"]
+
+    def _frozen(self, step: Frozen) -> list[str]:
+        index, seed = step.index, f"g{step.out[step.index]}"
+        blank = [f"memset(g{buffer.name}, 0, sizeof(double) * {buffer.rows} * LANES);" for buffer in step.own]
+        bound = []
+        for buffer, num in step.bindings:
+            sight = Sight(self.plan, self.column, step.held)
+            inner = _pulled(num, f"g{buffer['0']}", sight)
+            bound += [f"{{ const int k = {index}; {sight.heads()}", *inner, "}"]
+        return [
+            f"for (int {index} = {step.run.first.text}; {index} <= {step.run.last.text}; ++{index}) {{",
+            f"int matters = 0; LANE matters |= {seed} != 0.0;",
+            "if (!matters) continue;",
+            *Forward(self.plan, self.column).inside(step),
+            *blank,
+            f"LANE g{step.body[index]} += {seed};",
+            *self.lines(step.steps),
+            *bound,
+            "}",
+        ]
+
+
+def _pulled(num: Num, seed: str, sight: Sight) -> list[str]:
+    """Gradient by a number at sample `k`, taken to its leaves.
+
+    Two leaves may be the same sample: added apart from the loop that computes, which becomes vector code so.
+    """
+    writer = SlopeWriter(sight, soft=False)
+    lines, gathered = writer.backward({writer.number(num): seed})
+    shares = [f"h{i}" for i in range(len(gathered))]
+    return [
+        *(f"double {share}[LANES];" for share in shares),
+        "LANE {",
+        *writer.lines,
+        *lines,
+        *(f"{share}[j] = {value};" for share, value in zip(shares, gathered.values(), strict=True)),
+        "}",
+        *(f"LANE {place} += {share}[j];" for share, place in zip(shares, gathered, strict=True)),
+    ]
+
+
+def _joined(step: Joined) -> list[str]:
+    out = step.out["k"]
+    lines = [f"{step.run.loop()} LANE {{", f"double left = g{out};"]
+    for item in step.items:
+        lines += [
+            f"{{ const int hit = {item['k']} == {out};",
+            f"g{item['k']} += hit ? left : 0.0; left = hit ? 0.0 : left; }}",
+        ]
+    return [*lines, "}"]
