@@ -91,3 +91,11 @@ def test_what_cannot_be_made_is_said() -> None:
 def test_the_rest_of_stlc_does_without_gymnasium() -> None:
     code = "import sys, stlc, stlc.cli.app; sys.exit('gymnasium' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, cwd=ROOT).returncode == 0
+
+
+@pytest.mark.filterwarnings("ignore:.*(infinity|render|Box).*:UserWarning")
+def test_the_page_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (ROOT / "docs" / "gym.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(ROOT)
+    exec(compile(text.split("```python\n")[1].split("```")[0], "gym.md", "exec"), {})
+    assert "in_river" in capsys.readouterr().out
