@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias, assert_never, final
+from typing import Any, TypeAlias, assert_never, final
+
+import numpy as np
 
 from stlc.compile import ir
 from stlc.compile.ops import Array
@@ -48,7 +50,10 @@ class Machine:
 
     @property
     def unknown(self) -> float:
-        """What stands for what nobody knows yet."""
+        """What stands for what nobody knows yet; a number each where two traces are its two ends."""
+        if self.extent.end == "both":
+            both: Any = np.array([-math.inf, math.inf])
+            return both  # type: ignore[no-any-return]
         return math.inf if self.extent.end == "upper" else -math.inf
 
     def atom(self, node: ir.Atom, run: Run, inside: Run) -> Kernel:

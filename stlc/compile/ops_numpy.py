@@ -125,9 +125,10 @@ class NumpyOps:
         return reduce(np.minimum if pick == "min" else np.maximum, items)
 
     def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact extrema of sliding windows, for rows that are long enough."""
+        """Exact extrema of sliding windows; None for narrow rows of which the last windows are cut."""
         if x.ndim != 2 or x.shape[1] < _WIDE:
-            return None
+            whole = window.rows >= window.count + window.width - 1
+            return _doubling(x, np.minimum if pick == "min" else np.maximum, window) if whole else None
         return sliding.extrema(x, sliding.Asked(pick, window, NUMPY))
 
     def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array | None:
@@ -191,6 +192,17 @@ class NumpyOps:
         """Numerical exceptions give inf and NaN."""
         context: Any = np.errstate(all="ignore")
         return context  # type: ignore[no-any-return]
+
+
+def _doubling(x: Array, pair: np.ufunc, window: Sliding) -> Array:
+    """Pieces of 1, 2, 4, … rows are put together."""
+    size, width = 1, window.width
+    while 2 * size <= width:
+        x = pair(x[:-size], x[size:])
+        size *= 2
+    rest = width - size
+    x = pair(x[:-rest], x[rest:]) if rest else x
+    return x[: window.count]
 
 
 NUMPY: Ops = cast("Ops", NumpyOps())

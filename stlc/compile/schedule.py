@@ -17,12 +17,13 @@ from stlc.compile.ops import Array
 from stlc.compile.samples import Reach, farthest, reach_of
 from stlc.compile.tails import tail
 
-End: TypeAlias = Literal["strict", "truncate", "lower", "upper"]
+End: TypeAlias = Literal["strict", "truncate", "lower", "upper", "both"]
 """What stands beyond the last sample.
 
 `strict`: nothing, and whoever asks is told. `truncate`: nothing, windows are cut. `lower` and `upper`: the
 trace may go on, and unknown predicates are -inf or +inf there; windows to the end of the trace end at the
-last known sample all the same.
+last known sample all the same. `both` (NumPy, without `freeze`): two traces, of which the first is taken at
+its least and the second at its greatest.
 """
 
 _FAR = 256
@@ -49,7 +50,7 @@ class Extent:
     @property
     def open(self) -> bool:
         """Whether instants beyond the last sample exist, with unknown predicates."""
-        return self.end in ("lower", "upper")
+        return self.end in ("lower", "upper", "both")
 
     @property
     def length(self) -> int:

@@ -26,6 +26,7 @@ from stlc.monitor.values import by_truth
 
 Floats: TypeAlias = NDArray[np.float64]
 End: TypeAlias = Literal["lower", "upper", "truncate"]
+Beyond: TypeAlias = Literal["lower", "upper", "truncate", "both"]
 
 NOTHING = ""
 """A column for formulas that read none."""
@@ -46,7 +47,7 @@ class Reader:
         going_on: the trace does not end with the last row.
     """
 
-    def __init__(self, formulas: Sequence[ir.Formula], end: End, *, going_on: bool = False) -> None:
+    def __init__(self, formulas: Sequence[ir.Formula], end: Beyond, *, going_on: bool = False) -> None:
         self.formulas = tuple(formulas)
         self.end = end
         self._stop = FAR if going_on else None
@@ -169,7 +170,7 @@ class Side:
         count = samples + self._pads[stream.name] - start
         parts = self.values(reader, start, count)
         last = self.rows[stream.name][start - 1 - self.base] if start else None
-        self._put(stream.name, start, _continued(stream.op, parts, last))
+        self._put(stream.name, start, continued(stream.op, parts, last))
         lags = [samples - self._settled[name] for name in read_by(stream)]
         self._settled[stream.name] = max(samples - max(lags, default=0) - stream.ahead, start)
 
@@ -179,7 +180,7 @@ class Side:
         self.rows[name] = values if kept is None else np.concatenate([kept[: start - self.base], values])
 
 
-def _continued(op: Latch, parts: Sequence[Floats], last: Floats | None) -> Floats:
+def continued(op: Latch, parts: Sequence[Floats], last: Floats | None) -> Floats:
     """The values of a past operator, given its operands and the value before them."""
     match op:
         case "once":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias, final
@@ -17,16 +18,16 @@ from stlc.monitor.instants import check_length, starts_of
 from stlc.monitor.judgement import Status, unknown_requirement
 from stlc.monitor.needs import Need, needs_of
 from stlc.monitor.signals import arrange
-from stlc.monitor.tally import Tally
-from stlc.monitor.tracking import Tracker, tracker_of
+from stlc.monitor.tally import Flags, Judged, Tally
+from stlc.monitor.tracking import Tracker, Trackers
 from stlc.trace import Trace
 
 Floats: TypeAlias = NDArray[np.float64]
 Sample: TypeAlias = Mapping[str, Any]
 """Signal -> number; a vector is a list of them."""
 
-_UNKNOWN, _HOLDS, _FAILS = 0, 1, 2
-_OF_STATUS = {"inconclusive": _UNKNOWN, "satisfied": _HOLDS, "violated": _FAILS}
+
+_BEYOND_FLOATS = 1 << 1023
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +81,7 @@ class Watched:
     truths: Tracker | None
     tolerance: float
     tally: Tally = field(default_factory=Tally)
-    decided: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, dtype=np.int8))
+    decided: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
         """Take new samples in."""
@@ -95,22 +96,21 @@ class Watched:
         """Whether it was judged once and for all."""
         return not self.everywhere and self.tally.instants > 0
 
-    def judged(self, start: int, stop: int) -> tuple[Bounds, NDArray[np.int8]]:
+    def judged(self, start: int, stop: int) -> Judged:
         """Bounds and verdicts at instants while the trace goes on."""
-        bounds = self.values.live(start, stop)
-        return bounds, self._verdicts(bounds, None if self.truths is None else self.truths.live(start, stop))
+        truths = None if self.truths is None else self.truths.live(start, stop)
+        return self._judged(self.values.live(start, stop), truths)
 
-    def ended(self, starts: range) -> tuple[Bounds, NDArray[np.int8]]:
+    def ended(self, starts: range) -> Judged:
         """The same where the trace is over."""
-        bounds = self.values.ended(starts)
-        return bounds, self._verdicts(bounds, None if self.truths is None else self.truths.ended(starts))
+        truths = None if self.truths is None else self.truths.ended(starts)
+        return self._judged(self.values.ended(starts), truths)
 
-    def _verdicts(self, bounds: Bounds, truths: Bounds | None) -> NDArray[np.int8]:
+    def _judged(self, bounds: Bounds, truths: Bounds | None) -> Judged:
+        low, high = bounds
         if truths is None:
-            holds, fails = bounds.low >= -self.tolerance, bounds.high < -self.tolerance
-        else:
-            holds, fails = truths.low > 0, truths.high < 0
-        return np.where(fails, _FAILS, np.where(holds, _HOLDS, _UNKNOWN)).astype(np.int8)
+            return Judged(low, high, low >= -self.tolerance, high < -self.tolerance)
+        return Judged(low, high, truths.low > 0, truths.high < 0)
 
     def drop(self) -> int:
         """Forget what has been counted; the first sample that is still needed."""
@@ -135,6 +135,7 @@ class Online:
         self._needs = needs_of(compiled, [*rules, *compiled.assumptions])
         self._first = 0
         self._signals: dict[str, Floats] = {}
+        self._trackers = Trackers(compiled.grid.horizon)
         self._watched = [self._watch(rule) for rule in rules]
         self._scope = [self._watch(rule, once=True) for rule in compiled.assumptions]
 
@@ -147,7 +148,7 @@ class Online:
             raise UsageError(Diagnostic("U101", message, help=("judge it once, without `--at all`",)))
         ending: Literal["open", "truncate"] = "truncate" if self.how.end == "truncate" else "open"
         trackers = [
-            tracker_of(rule, horizon, Asked(ending, truth), everywhere=everywhere)
+            self._trackers.of(rule, Asked(ending, truth), everywhere=everywhere)
             for truth in ((False, True) if self.how.tolerance == 0 else (False,))
         ]
         return Watched(
@@ -162,13 +163,19 @@ class Online:
         Raises:
             TraceError: E601, a signal is missing; E604, one is not finite; E605, one is not a single number.
         """
-        self.grow({need.column.name: np.full((1, 1), _number(sample, need)) for need in self._needs})
-        found = [self._decisions(watched) for watched in self._watched if not watched.over]
-        for watched in self._scope:
+        values = [_number(sample, need) for need in self._needs]
+        for need, value in zip(self._needs, values, strict=True):
+            if not math.isfinite(value):
+                raise self._not_finite(need, value, self.samples)
+        rows = np.array(values).reshape(-1, 1, 1)
+        self._take({need.column.name: row for need, row in zip(self._needs, rows, strict=True)}, 1)
+        found: list[Decision] = []
+        for watched in self._watched:
             if not watched.over:
-                self._decisions(watched)
+                self._decide(watched, found)
+        self._count_scope()
         self._trim()
-        return tuple(decision for some in found for decision in some)
+        return tuple(found)
 
     def feed(self, signals: Mapping[str, Any] | Trace) -> None:
         """Take many samples in at once, arrays (time,) by name or a piece of a trace.
@@ -179,27 +186,29 @@ class Online:
             TraceError: as `push`.
         """
         laid = arrange(signals, self._needs, plain=True)
-        self.grow({name: np.asarray(values).reshape(laid.samples, 1) for name, values in laid.env.items()})
+        columns = {name: np.asarray(values).reshape(laid.samples, 1) for name, values in laid.env.items()}
+        for need in self._needs:
+            values = columns[need.column.name][:, 0]
+            if not (finite := np.isfinite(values)).all():
+                first = int(np.argmin(finite))
+                raise self._not_finite(need, float(values[first]), self.samples + first)
+        self._take(columns, laid.samples)
         for watched in self._watched:
             if not watched.over:
-                self._count(watched, *self._settled(watched))
-        for watched in self._scope:
-            if not watched.over:
-                self._count(watched, *self._settled(watched))
+                self._count(watched, self._settled(watched))
+        self._count_scope()
         self._trim()
 
-    def grow(self, columns: Mapping[str, Floats]) -> None:
+    def _not_finite(self, need: Need, value: float, sample: int) -> TraceError:
+        message = f"`{need.column.name}` is {value} at sample {sample}"
+        return TraceError(Diagnostic("E604", message, note=(f"needed by: {', '.join(need.by)}",)))
+
+    def _take(self, columns: dict[str, Floats], count: int) -> None:
         """Append columns (time, 1) and bring every requirement up to date."""
-        count = len(next(iter(columns.values()))) if columns else 1
-        bad = [(i, need) for need in self._needs if (i := _not_finite(columns[need.column.name])) is not None]
-        if bad:
-            i, need = bad[0]
-            value = columns[need.column.name][i, 0]
-            message = f"`{need.column.name}` is {value} at sample {self.samples + i}"
-            raise TraceError(Diagnostic("E604", message, note=(f"needed by: {', '.join(need.by)}",)))
         columns = columns or {"": np.zeros((count, 1))}
-        kept = self._signals
-        self._signals = {n: np.concatenate([kept[n], x]) if n in kept else x for n, x in columns.items()}
+        if self.kept:
+            columns = {name: np.concatenate([self._signals[name], x]) for name, x in columns.items()}
+        self._signals = columns
         self.samples += count
         for watched in (*self._watched, *self._scope):
             watched.grow(self._signals, self._first, self.samples)
@@ -218,30 +227,24 @@ class Online:
         start = watched.tally.instants
         return (start, self.samples) if watched.everywhere else (start, 1)
 
-    def _decisions(self, watched: Watched) -> list[Decision]:
-        """What the last sample has decided."""
+    def _decide(self, watched: Watched, found: list[Decision]) -> None:
+        """Add what the last sample has decided. What was decided once stays so."""
         start, stop = self._pending(watched)
-        bounds, verdicts = watched.judged(start, stop)
-        before = np.zeros(len(verdicts), dtype=np.int8)
-        before[: len(watched.decided)] = watched.decided[: len(before)]
-        now = np.flatnonzero((before == _UNKNOWN) & (verdicts != _UNKNOWN))
-        watched.decided = np.where(before == _UNKNOWN, verdicts, before)
-        found = [
-            Decision(
-                watched.rule.name,
-                start + int(i),
-                self.time(start + int(i)),
-                "satisfied" if verdicts[i] == _HOLDS else "violated",
-                float(bounds.low[i]),
-                float(bounds.high[i]),
-                self.samples - 1,
-            )
-            for i in now
-        ]
-        self._count(watched, bounds, verdicts)
-        return found
+        judged = watched.judged(start, stop)
+        known = judged.holds | judged.fails
+        if np.count_nonzero(known) > np.count_nonzero(watched.decided):
+            new = known.copy()
+            new[: len(watched.decided)] &= ~watched.decided
+            found += [self._decision(watched.rule, judged, start, i) for i in np.flatnonzero(new).tolist()]
+        count = self._count(watched, judged)
+        watched.decided = known[count:]
 
-    def _settled(self, watched: Watched) -> tuple[Bounds, NDArray[np.int8]]:
+    def _decision(self, rule: Rule, judged: Judged, start: int, i: int) -> Decision:
+        status: Status = "violated" if judged.fails[i] else "satisfied"
+        low, high = float(judged.low[i]), float(judged.high[i])
+        return Decision(rule.name, start + i, self.time(start + i), status, low, high, self.samples - 1)
+
+    def _settled(self, watched: Watched) -> Judged:
         start, stop = self._pending(watched)
         return watched.judged(start, min(stop, self._countable(watched)))
 
@@ -252,10 +255,16 @@ class Online:
         window = self.compiled.grid.horizon if watched.rule.windowed else watched.rule.reach
         return min(watched.values.settled, max(self.samples - (window or 0), 0))
 
-    def _count(self, watched: Watched, bounds: Bounds, verdicts: NDArray[np.int8]) -> None:
-        count = min(max(self._countable(watched) - watched.tally.instants, 0), len(verdicts))
-        watched.tally.add(bounds.low[:count], bounds.high[:count], verdicts[:count])
-        watched.decided = watched.decided[count:]
+    def _count(self, watched: Watched, judged: Judged) -> int:
+        """Count what is settled of instants that are not counted yet: how many."""
+        count = min(max(self._countable(watched) - watched.tally.instants, 0), len(judged.low))
+        watched.tally.add(judged, count)
+        return count
+
+    def _count_scope(self) -> None:
+        for watched in self._scope:
+            if not watched.over:
+                self._count(watched, self._settled(watched))
 
     def time(self, sample: int) -> float:
         """Time of a sample in seconds; its number where no time step is known."""
@@ -295,17 +304,17 @@ class Online:
         if watched.over:
             return watched.tally
         start, stop = self._pending(watched)
-        return watched.tally.with_more(*watched.judged(start, min(stop, self.samples)))
+        return watched.tally.with_more(watched.judged(start, min(stop, self.samples)))
 
     @property
     def in_scope(self) -> bool | None:
         """Whether the assumptions hold at the first sample: yes, no, or not known yet."""
         if not self.samples:
             return None if self._scope else True
-        verdicts = [_OF_STATUS[self._standing(watched).status] for watched in self._scope]
-        if _FAILS in verdicts:
+        found = {self._standing(watched).status for watched in self._scope}
+        if "violated" in found:
             return False
-        return True if all(v == _HOLDS for v in verdicts) else None
+        return True if found <= {"satisfied"} else None
 
     def finish(self) -> dict[str, Tally]:
         """The trace is over: what `Monitor.check` says of it, requirement by requirement.
@@ -324,9 +333,7 @@ class Online:
                 finding = check_length(watched.rule, self.samples, starts, self.compiled.grid)
                 refused += [] if finding is None else [finding]
             rest = range(min(watched.tally.instants, starts.stop), starts.stop)
-            found[watched.rule.name] = (
-                watched.tally.with_more(*watched.ended(rest)) if rest else watched.tally
-            )
+            found[watched.rule.name] = watched.tally.with_more(watched.ended(rest)) if rest else watched.tally
         if refused:
             raise TraceError(*refused)
         return found
@@ -338,16 +345,13 @@ class Online:
         raise unknown_requirement(name, list(self.requirements))
 
 
-def _not_finite(values: Floats) -> int | None:
-    finite = np.isfinite(values[:, 0])
-    return None if finite.all() else int(np.argmin(finite))
-
-
 def _number(sample: Sample, need: Need) -> float:
     """The value of a signal in a sample; `q[0]` is also a component of `q`."""
     value = sample.get(need.column.name)
-    if isinstance(value, (int, float)) and not isinstance(value, complex):
-        return float(value)
+    if isinstance(value, float):
+        return value
+    if isinstance(value, int):
+        return float(value) if abs(value) < _BEYOND_FLOATS else math.inf
     names = (need.column.name, need.column.name.partition("[")[0])
     given = {name: [sample[name]] for name in names if name in sample}
     laid = arrange(given or {name: [0.0] for name in sample}, [need], plain=True)

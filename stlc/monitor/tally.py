@@ -4,16 +4,31 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.monitor.asked import Bounds
 from stlc.monitor.judgement import Status
 
 Floats = NDArray[np.float64]
-Verdicts = NDArray[np.int8]
-"""0 not known, 1 satisfied, 2 violated."""
+Flags = NDArray[np.bool_]
+
+
+class Judged(NamedTuple):
+    """Bounds and verdicts at consecutive instants, each (instants,).
+
+    Attributes:
+        low: least robustness over all continuations.
+        high: greatest robustness.
+        holds: satisfied, whatever follows.
+        fails: violated, whatever follows.
+    """
+
+    low: Floats
+    high: Floats
+    holds: Flags
+    fails: Flags
 
 
 @dataclass(slots=True)
@@ -38,20 +53,29 @@ class Tally:
     low_at: int = 0
     high_at: int = 0
 
-    def add(self, low: Floats, high: Floats, verdicts: Verdicts) -> None:
-        """Count the next instants."""
-        if not len(verdicts):
-            return
-        self.low, self.low_at = _least(low, self.low, self.low_at, self.instants)
-        self.high, self.high_at = _least(high, self.high, self.high_at, self.instants)
-        self.holds += int((verdicts == 1).sum())
-        self.fails += int((verdicts == 2).sum())
-        self.instants += len(verdicts)
+    def add(self, judged: Judged, count: int) -> None:
+        """Count the first `count` of the next instants."""
+        if count == 1:
+            self._add_one(float(judged.low[0]), float(judged.high[0]))
+            self.holds += bool(judged.holds[0])
+            self.fails += bool(judged.fails[0])
+        elif count > 1:
+            self.low, self.low_at = _least(judged.low[:count], self.low, self.low_at, self.instants)
+            self.high, self.high_at = _least(judged.high[:count], self.high, self.high_at, self.instants)
+            self.holds += int(np.count_nonzero(judged.holds[:count]))
+            self.fails += int(np.count_nonzero(judged.fails[:count]))
+        self.instants += count
 
-    def with_more(self, bounds: Bounds, verdicts: Verdicts) -> Tally:
+    def _add_one(self, low: float, high: float) -> None:
+        if low < self.low or not self.instants:
+            self.low, self.low_at = low, self.instants
+        if high < self.high or not self.instants:
+            self.high, self.high_at = high, self.instants
+
+    def with_more(self, judged: Judged) -> Tally:
         """The same with more instants, itself unchanged."""
         more = replace(self)
-        more.add(bounds.low, bounds.high, verdicts)
+        more.add(judged, len(judged.low))
         return more
 
     @property

@@ -9,6 +9,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from stlc.compile import ir
+from stlc.compile.horizon import reach
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.pipeline import Rule
 from stlc.monitor.asked import (
@@ -27,6 +28,7 @@ from stlc.monitor.endings import lengthened, with_seen
 from stlc.monitor.everywhere import Everywhere
 from stlc.monitor.frontier import Frontier, skeleton
 from stlc.monitor.instants import rule_bounds, window_of
+from stlc.monitor.pairs import Pairs, fits
 from stlc.monitor.streams import EndlessError, endless, looks_on, plan
 from stlc.monitor.values import Record, by_truth, window_bounds
 from stlc.monitor.windowed import Windowed
@@ -55,30 +57,44 @@ class Tracker(Protocol):
         """Forget instants before `start`; the number of the first sample that is still needed."""
 
 
-def tracker_of(rule: Rule, horizon: int | None, asked: Asked, *, everywhere: bool) -> Tracker:
-    """The tracker of a requirement that needs the least memory.
+@dataclass(slots=True)
+class Trackers:
+    """Makes the trackers of requirements; what is counted at the same time shares its columns.
 
-    Args:
-        rule: the requirement.
+    Attributes:
         horizon: what `T` means, in steps.
-        asked: how its values are taken.
-        everywhere: it is judged at every instant, and not only at the first one.
     """
-    window = window_of(rule, horizon)
-    try:
-        plans = _plans(rule.formula, asked.ending, window)
-        planned = plans["truncate"]
-        if window is not None:
-            if planned.lag or not everywhere:
-                raise EndlessError
-            return Windowed(plans, asked, window)
-        if endless(planned.formula):
-            if everywhere:
-                raise EndlessError
-            return FromTheStart(plans, asked)
-        return Everywhere(plans, asked)
-    except EndlessError:
-        return Whole(rule, horizon, asked.ending, asked.truth)
+
+    horizon: int | None
+    _pairs: dict[tuple[bool, bool, int], Pairs] = field(default_factory=dict)
+
+    def of(self, rule: Rule, asked: Asked, *, everywhere: bool) -> Tracker:
+        """The tracker of a requirement that needs the least memory.
+
+        Args:
+            rule: the requirement.
+            asked: how its values are taken.
+            everywhere: it is judged at every instant, and not only at the first one.
+        """
+        window = window_of(rule, self.horizon)
+        try:
+            plans = _plans(rule.formula, asked.ending, window)
+            if window is not None:
+                if plans["truncate"].lag or not everywhere:
+                    raise EndlessError
+                return Windowed(plans, asked, window)
+            if endless(plans["truncate"].formula):
+                if everywhere:
+                    raise EndlessError
+                return FromTheStart(plans, asked)
+            if asked.ending == "truncate" or not fits(plans):
+                return Everywhere(plans, asked)
+            counted = (self.horizon if rule.windowed else rule.reach) if everywhere else 0
+            later = max(counted or 0, reach(rule.formula).future)
+            pairs = self._pairs.setdefault((everywhere, asked.truth, later), Pairs(asked.truth))
+            return pairs.add(rule.formula)
+        except EndlessError:
+            return Whole(rule, self.horizon, asked.ending, asked.truth)
 
 
 def _plans(formula: ir.Formula, ending: Ending, window: int | None) -> Plans:

@@ -81,6 +81,16 @@ def test_bounds_over_all_continuations(formula: typed.Formula, env: Env) -> None
 
 
 @settings(max_examples=100)
+@given(formulas(), traces(high=8, batch=1))
+def test_both_bounds_at_once(formula: typed.Formula, env: Env) -> None:
+    node = lowered(formula)
+    twice = {name: np.repeat(column, 2, axis=1) for name, column in env.items()}
+    low, high = (robustness_signal(node, env, ops=NUMPY, end=end) for end in ("lower", "upper"))
+    both = robustness_signal(node, twice, ops=NUMPY, end="both")
+    np.testing.assert_array_equal(both, np.concatenate([low, high], axis=1))
+
+
+@settings(max_examples=100)
 @given(formulas(), traces(low=2, high=6), st.integers(0, 2**32 - 1), st.integers(1, 12))
 def test_bounds_hold_for_every_continuation(formula: typed.Formula, env: Env, seed: int, more: int) -> None:
     """A longer trace stays within the bounds of its prefix, `end` apart, which then is another sample."""

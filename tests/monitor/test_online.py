@@ -27,7 +27,8 @@ from stlc.monitor.columns import FAR
 from stlc.monitor.endings import lengthened, may_end, with_seen
 from stlc.monitor.everywhere import Everywhere
 from stlc.monitor.online import How
-from stlc.monitor.tracking import FromTheStart, Whole, tracker_of
+from stlc.monitor.pairs import Paired
+from stlc.monitor.tracking import FromTheStart, Trackers, Whole
 from stlc.monitor.values import Record, bounds
 from stlc.monitor.verdict import Monitor
 from stlc.monitor.windowed import Windowed
@@ -83,7 +84,7 @@ def test_a_stream_gives_what_the_whole_trace_gives(written, trace, ending, steps
     rule = a_rule(formula)
     everywhere = not rule.uses_end
     samples = len(trace["x"])
-    tracker = tracker_of(rule, None, Asked(ending), everywhere=everywhere)
+    tracker = Trackers(None).of(rule, Asked(ending), everywhere=everywhere)
     kept, first, now, done = {name: x[:0] for name, x in trace.items()}, 0, 0, 0
     for step in steps:
         more = {name: x[now : now + step] for name, x in trace.items()}
@@ -119,7 +120,7 @@ def test_frozen_values_and_other_samples_give_what_the_whole_trace_gives(written
     rule = a_rule(formula)
     everywhere = not rule.uses_end
     samples = len(trace["x"])
-    tracker = tracker_of(rule, None, Asked(ending), everywhere=everywhere)
+    tracker = Trackers(None).of(rule, Asked(ending), everywhere=everywhere)
     for now in range(1, samples + 1):
         known = {name: x[:now] for name, x in trace.items()}
         tracker.grow(known, 0, now)
@@ -358,8 +359,10 @@ def test_which_memory_a_requirement_needs() -> None:
     assert {kinds[n] for n in ("always", "response", "infinitely_often", "until", "late_until")} == {
         FromTheStart
     }
-    assert {kinds[n] for n in ("windowed", "whole_past", "since", "state")} == {Everywhere, FromTheStart}
-    assert {kinds[n] for n in kinds if "window_to_end" in n or "beyond" in n} == {Everywhere, Windowed}
+    assert {kinds[n] for n in ("windowed", "whole_past", "since", "state")} == {Paired, FromTheStart}
+    assert {kinds[n] for n in kinds if "window_to_end" in n or "beyond" in n} == {Paired, Windowed}
+    (watched,) = monitor_of("windowed").online(How(end="truncate"))._watched
+    assert type(watched.values) is Everywhere
 
 
 def test_open_starts_and_standing() -> None:
