@@ -38,12 +38,12 @@ def outcome_in_chunks(path: Path, work: Work) -> Outcome:
     head = Recording(str(path), (), meta=first.meta)
     source, note = specification(head, question.spec)
     monitor = given or monitor_of(source, question, first.meta.spec_library)
-    how = How("all" if question.at else None, question.end, question.tolerance, first.t0)
+    how = How("all" if question.at else None, question.end, question.tolerance, first.t0, reasons=True)
     online = monitor.online(how, require=question.require, like=first)
     online.feed(first)
     for piece in read:
         online.feed(piece)
-    told = Told(str(path), source, first.dt, online.samples)
+    told = Told(str(path), source, first.dt, online.samples, work.color)
     return outcome_of_tallies(online, told, (note,) if note else (), time.perf_counter() - begun)
 
 

@@ -63,7 +63,7 @@ def _requirement(judged: Judgement, result: Checked) -> dict[str, Any]:
         "starts": judged.instants,
         "satisfied_share": judged.share,
         "violated_traces": judged.statuses.count("violated"),
-        "cause": None if cause is None else _cause(cause),
+        "cause": None if cause is None else cause_entry(cause),
     }
 
 
@@ -77,7 +77,8 @@ def _mean(values: NDArray[np.float64]) -> float | None:
         return float((values / values.size).sum()) if values.size else None
 
 
-def _cause(cause: Cause) -> dict[str, Any]:
+def cause_entry(cause: Cause) -> dict[str, Any]:
+    """Why a requirement is violated."""
     first = cause.readings[0] if cause.readings else None
     return {
         "signal": None if first is None else first.signal,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from stlc.cli.judge import Question, monitor_of, usage
 from stlc.cli.outcome import WORDS, Outcome
-from stlc.cli.output import emit
+from stlc.cli.output import emit, wants_color
 from stlc.cli.tallies import Told, outcome_of_tallies
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.files import read_source
@@ -63,7 +63,7 @@ def outcome_of_stream(question: Question, *, talk: bool) -> Outcome:
             for decision in decisions:
                 _tell(decision, online)
     step = online.compiled.grid.dt
-    told = Told(NAME, source, float(step or 0), online.samples)
+    told = Told(NAME, source, float(step or 0), online.samples, wants_color(sys.stdout))
     return outcome_of_tallies(online, told, (), time.perf_counter() - begun)
 
 
@@ -78,7 +78,7 @@ def _online(monitor: Monitor, question: Question, first: Sample, dt: float | Non
 
     start = first.get("t", 0.0)
     t0 = float(start) if isinstance(start, (int, float)) else 0.0
-    how = How("all" if question.at else None, question.end, question.tolerance, t0)
+    how = How("all" if question.at else None, question.end, question.tolerance, t0, reasons=True)
     return monitor.online(how, require=question.require, dt=dt)
 
 

@@ -8,13 +8,16 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from stlc.cli.check_json import cause_entry
 from stlc.cli.check_text import percent, signed
 from stlc.cli.outcome import WORDS, Outcome, Row
 from stlc.cli.output import table
+from stlc.cli.render import render_place
 from stlc.compile.semantics import TOLERANCE
 from stlc.source import Source
 
 if TYPE_CHECKING:
+    from stlc.monitor.explain import Cause
     from stlc.monitor.judgement import Status
     from stlc.monitor.online import Online
     from stlc.monitor.tally import Tally
@@ -29,27 +32,35 @@ class Told:
         source: text of the specification.
         dt: time step in seconds.
         samples: how many there were.
+        color: reasons are printed in colours.
     """
 
     name: str
     source: Source
     dt: float
     samples: int
+    color: bool = False
 
 
 def outcome_of_tallies(online: Online, told: Told, said: tuple[str, ...], seconds: float) -> Outcome:
     """The outcome of a stream that is over. Raises TraceError as `Online.finish`."""
     tallies = online.finish()
     status = status_of(online, tallies)
-    rows = tuple(_row(name, tally, online) for name, tally in tallies.items())
+    causes = {
+        name: cause
+        for name, tally in tallies.items()
+        if tally.status == "violated" and (cause := online.cause(name)) is not None
+    }
+    rows = tuple(_row(name, tally, online, causes.get(name)) for name, tally in tallies.items())
     counts = [tally.instants for tally in tallies.values()]
     most = max(tallies.values(), key=lambda tally: tally.instants)
     return Outcome(
         name=told.name,
         status=status,
         rows=rows,
-        text="\n".join(_text(told, rows, tallies, status)),
-        entry=_entry(told, online, tallies, status),
+        text="\n".join([*_text(told, rows, tallies, causes), "", WORDS[status].lower()]),
+        entry=_entry(told, online, tallies, status)
+        | {"requirements": _requirements(online, tallies, causes)},
         traces=0 if status == "out of scope" else 1,
         holds=min(tally.share for tally in tallies.values()) if counts else 0.0,
         fails=max(tally.fails / max(tally.instants, 1) for tally in tallies.values()) if most else 0.0,
@@ -74,8 +85,11 @@ def robustness_text(tally: Tally) -> str:
     return "boundary" if abs(tally.robustness) <= TOLERANCE else signed(tally.robustness)
 
 
-def _row(name: str, tally: Tally, online: Online) -> Row:
+def _row(name: str, tally: Tally, online: Online, cause: Cause | None) -> Row:
     where = f"from t = {online.time(tally.worst):.10g} s" if tally.instants > 1 else ""
+    if cause is not None:
+        where = f"t = {cause.time:.10g} s"
+        return Row(name, tally.status, robustness_text(tally), where, cause.because)
     if tally.status == "satisfied":
         return Row(name, tally.status, robustness_text(tally), where)
     if tally.status == "violated":
@@ -85,7 +99,9 @@ def _row(name: str, tally: Tally, online: Online) -> Row:
     return Row(name, tally.status, robustness_text(tally), where, why)
 
 
-def _text(told: Told, rows: tuple[Row, ...], tallies: Mapping[str, Tally], status: Status) -> Iterator[str]:
+def _text(
+    told: Told, rows: tuple[Row, ...], tallies: Mapping[str, Tally], causes: Mapping[str, Cause]
+) -> Iterator[str]:
     yield f"{told.source.name} on {told.name}    1 trace x {told.samples} samples, dt {told.dt:g} s"
     yield ""
     head = ("requirement", "verdict", "robustness", "starts", "where")
@@ -93,8 +109,15 @@ def _text(told: Told, rows: tuple[Row, ...], tallies: Mapping[str, Tally], statu
         (row.name, WORDS[row.status], row.robustness, _share(tallies[row.name]), row.where) for row in rows
     ]
     yield table(lines, header=head)
-    yield ""
-    yield WORDS[status].lower()
+    for name, cause in causes.items():
+        yield ""
+        yield _violation(name, tallies[name], cause, color=told.color)
+
+
+def _violation(name: str, tally: Tally, cause: Cause, *, color: bool) -> str:
+    count = f", at {tally.fails:,} of {tally.instants:,} starts" if tally.instants > 1 else ""
+    place = render_place(cause.place, cause.labels, [("because", cause.because)], color=color)
+    return f"{name} is violated{count}.\n{place}".rstrip("\n")
 
 
 def _share(tally: Tally) -> str:
@@ -118,11 +141,16 @@ def _entry(told: Told, online: Online, tallies: Mapping[str, Tally], status: Sta
         "robustness": math.nan if any(map(math.isnan, known)) else min(known),
         "satisfied_traces": int(status == "satisfied"),
         "satisfied_share": min(tally.share for tally in tallies.values()),
-        "requirements": [_requirement(name, tally, online) for name, tally in tallies.items()],
     }
 
 
-def _requirement(name: str, tally: Tally, online: Online) -> dict[str, Any]:
+def _requirements(
+    online: Online, tallies: Mapping[str, Tally], causes: Mapping[str, Cause]
+) -> list[dict[str, Any]]:
+    return [_requirement(name, tally, online, causes.get(name)) for name, tally in tallies.items()]
+
+
+def _requirement(name: str, tally: Tally, online: Online, cause: Cause | None) -> dict[str, Any]:
     rule = next(rule for rule in online.compiled.requirements if rule.name == name)
     time = online.time(tally.worst)
     return {
@@ -135,10 +163,10 @@ def _requirement(name: str, tally: Tally, online: Online) -> dict[str, Any]:
             "mean": tally.robustness,
             "low": tally.low,
             "high": tally.high,
-            "argmin": {"trace": 0, "start": time, "time": time},
+            "argmin": {"trace": 0, "start": time, "time": time if cause is None else cause.time},
         },
         "starts": tally.instants,
         "satisfied_share": tally.share,
         "violated_traces": int(tally.status == "violated"),
-        "cause": None,
+        "cause": None if cause is None else cause_entry(cause),
     }

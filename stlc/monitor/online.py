@@ -14,9 +14,11 @@ from stlc.compile.pipeline import Compiled, Rule
 from stlc.compile.semantics import TOLERANCE
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.monitor.asked import Asked, Bounds
+from stlc.monitor.explain import Cause
 from stlc.monitor.instants import check_length, starts_of
 from stlc.monitor.judgement import Status, unknown_requirement
 from stlc.monitor.needs import Need, needs_of
+from stlc.monitor.recall import Recall
 from stlc.monitor.signals import arrange
 from stlc.monitor.tally import Flags, Judged, Tally
 from stlc.monitor.tracking import Tracker, Trackers
@@ -62,12 +64,14 @@ class How:
         end: where the stream is too short at its end: bounds, a refusal, or cut windows.
         tolerance: a robustness of at least minus this is satisfied; 0 makes strictness count.
         t0: time of the first sample in seconds.
+        reasons: keep the samples that `Online.cause` takes.
     """
 
     at: Literal["all"] | None = None
     end: Literal["open", "strict", "truncate"] = "open"
     tolerance: float = TOLERANCE
     t0: float = 0.0
+    reasons: bool = False
 
 
 @final
@@ -138,6 +142,7 @@ class Online:
         self._trackers = Trackers(compiled.grid.horizon)
         self._watched = [self._watch(rule) for rule in rules]
         self._scope = [self._watch(rule, once=True) for rule in compiled.assumptions]
+        self._recall = Recall(compiled, rules, self.how.t0) if self.how.reasons else None
 
     def _watch(self, rule: Rule, *, once: bool = False) -> Watched:
         horizon = self.compiled.grid.horizon
@@ -196,6 +201,8 @@ class Online:
         for watched in self._watched:
             if not watched.over:
                 self._count(watched, self._settled(watched))
+            if self._recall is not None and not (watched.over or watched.everywhere):
+                self._recall_last(watched, watched.judged(0, 1))
         self._count_scope()
         self._trim()
 
@@ -206,6 +213,8 @@ class Online:
     def _take(self, columns: dict[str, Floats], count: int) -> None:
         """Append columns (time, 1) and bring every requirement up to date."""
         columns = columns or {"": np.zeros((count, 1))}
+        if self._recall is not None:
+            self._recall.take(columns, count)
         if self.kept:
             columns = {name: np.concatenate([self._signals[name], x]) for name, x in columns.items()}
         self._signals = columns
@@ -236,6 +245,8 @@ class Online:
             new = known.copy()
             new[: len(watched.decided)] &= ~watched.decided
             found += [self._decision(watched.rule, judged, start, i) for i in np.flatnonzero(new).tolist()]
+        if not watched.everywhere:
+            self._recall_last(watched, judged)
         count = self._count(watched, judged)
         watched.decided = known[count:]
 
@@ -243,6 +254,10 @@ class Online:
         status: Status = "violated" if judged.fails[i] else "satisfied"
         low, high = float(judged.low[i]), float(judged.high[i])
         return Decision(rule.name, start + i, self.time(start + i), status, low, high, self.samples - 1)
+
+    def _recall_last(self, watched: Watched, judged: Judged) -> None:
+        if self._recall is not None and judged.fails[0]:
+            self._recall.note_last(watched.rule, float(judged.high[0]))
 
     def _settled(self, watched: Watched) -> Judged:
         start, stop = self._pending(watched)
@@ -258,7 +273,11 @@ class Online:
     def _count(self, watched: Watched, judged: Judged) -> int:
         """Count what is settled of instants that are not counted yet: how many."""
         count = min(max(self._countable(watched) - watched.tally.instants, 0), len(judged.low))
-        watched.tally.add(judged, count)
+        tally = watched.tally
+        known = tally.high_at if tally.fails else None
+        tally.add(judged, count)
+        if self._recall is not None and tally.fails and tally.high_at != known:
+            self._recall.note(watched.rule, tally.high_at)
         return count
 
     def _count_scope(self) -> None:
@@ -337,6 +356,15 @@ class Online:
         if refused:
             raise TraceError(*refused)
         return found
+
+    def cause(self, name: str) -> Cause | None:
+        """Why a requirement is violated at its worst start so far, as `explain` says it of a recording.
+
+        Of what runs to the end of the stream only that is explained that has to hold always. None without
+        `reasons`, and where more samples say it than may be kept.
+        """
+        rule = self._find(name).rule
+        return None if self._recall is None else self._recall.cause(rule)
 
     def _find(self, name: str) -> Watched:
         for watched in self._watched:

@@ -191,6 +191,8 @@ def test_pieces_give_what_the_whole_gives(
             )
             assert one["robustness"]["min"] == other["robustness"]["min"]
             assert one["satisfied_share"] == other["satisfied_share"]
+            assert one["robustness"]["argmin"]["trace"] == other["robustness"]["argmin"]["trace"]
+            assert one["cause"] == other["cause"]
 
 
 def test_pieces_that_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
@@ -242,6 +244,7 @@ def test_a_stream(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.Monkey
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "t = 0.3 s  window  satisfied  +5.500"
     assert "t = 3 s  low  VIOLATED  [-inf, -1.000]" in lines
+    assert "  = because: `a < top * 1 m` is false where a = 3 m, at t = 3 s" in lines
     assert lines[-1] == "violated"
     assert stream(monkeypatch, form(a_trace()), "-q") == 0
     assert capsys.readouterr() == ("", "")
@@ -257,6 +260,10 @@ def test_a_stream_gives_what_the_trace_gives(
     for one, other in zip(found["requirements"], whole["requirements"], strict=True):
         assert (one["name"], one["verdict"]) == (other["name"], other["verdict"])
         assert one["robustness"]["min"] == other["robustness"]["min"]
+        assert one["cause"] == other["cause"]
+    assert (
+        found["requirements"][0]["cause"]["because"] == "`a < top * 1 m` is false where a = 3 m, at t = 3 s"
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,87 @@
+"""Why a stream violates a requirement: what `explain` says of the whole recording."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stlc.monitor.explain import Cause, explain
+from stlc.monitor.online import How, Online
+from stlc.monitor.verdict import Monitor
+
+REQUIREMENTS = {
+    "state": "a > 1",
+    "window": "always[0, T] (a > 0.5 -> eventually[0 s, 0.3 s] b > 0.5)",
+    "to_the_end_of_the_window": "always[0, T] (a > 1 or eventually[0, end] b > 1)",
+    "past": "always[0, T] (once[0 s, 0.4 s] a > 1 or b > 0)",
+    "once": "eventually[0 s, 0.8 s] a > 2",
+    "lasting": "always a > -1",
+    "later": "always[0.5 s, inf] b > -1",
+    "response": "always (a > 1.5 -> eventually[0 s, 0.4 s] b > 1)",
+    "lasting_past": "always (a < 1.5 or historically[0 s, 0.5 s] b > -1)",
+}
+UNEXPLAINED = {
+    "whole_past": "always (historically a > -1)",
+    "never_met": "eventually a > 5",
+    "nested": "always eventually a > 5",
+}
+SAMPLES = 120
+
+
+def monitor_of(written: str) -> Monitor:
+    return Monitor(f"signal a\nsignal b\nrequire r: {written}\n", dt=0.1, horizon=0.6)
+
+
+def fed(online: Online, whole: dict[str, np.ndarray], step: int) -> Cause | None:
+    for k in range(0, SAMPLES, step):
+        piece = {name: values[k : k + step] for name, values in whole.items()}
+        if step == 1:
+            online.push({name: values[0] for name, values in piece.items()})
+        else:
+            online.feed(piece)
+    assert online.finish()["r"].status == "violated"
+    return online.cause("r")
+
+
+@pytest.mark.parametrize("name", REQUIREMENTS)
+@pytest.mark.parametrize("step", [1, 17])
+def test_a_stream_is_explained_as_the_recording(name: str, step: int) -> None:
+    monitor, compared = monitor_of(REQUIREMENTS[name]), 0
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        whole = {signal: rng.normal(size=SAMPLES) for signal in ("a", "b")}
+        verdict = monitor.check(whole)
+        wanted = explain(verdict, "r")
+        if wanted is None:
+            continue
+        found = fed(monitor.online(How(reasons=True)), whole, step)
+        assert found is not None
+        assert (found.sample, found.start) == (wanted.sample, wanted.start)
+        assert found.because == wanted.because
+        assert found.time == pytest.approx(wanted.time)
+        assert [label.text for label in found.labels] == [label.text for label in wanted.labels]
+        assert found.readings == wanted.readings
+        compared += 1
+    assert compared
+
+
+@pytest.mark.parametrize("name", UNEXPLAINED)
+def test_what_more_samples_say_than_are_kept(name: str) -> None:
+    whole = {signal: np.random.default_rng(0).normal(size=SAMPLES) for signal in ("a", "b")}
+    assert fed(monitor_of(UNEXPLAINED[name]).online(How(reasons=True)), whole, 1) is None
+
+
+def test_reasons_are_asked_for() -> None:
+    whole = {signal: np.random.default_rng(0).normal(size=SAMPLES) for signal in ("a", "b")}
+    online = monitor_of(REQUIREMENTS["lasting"]).online()
+    assert fed(online, whole, 1) is None
+
+
+def test_few_samples_are_kept() -> None:
+    online = monitor_of(REQUIREMENTS["response"]).online(How(reasons=True))
+    for k in range(2_000):
+        online.push({"a": float(k % 7), "b": -k / 1000})
+    recall = online._recall
+    assert recall is not None
+    assert len(recall._pieces) < 20
+    assert sum(len(excerpt.env["a"]) for excerpt in recall._excerpts.values()) < 20
