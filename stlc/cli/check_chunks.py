@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stlc.cli.judge import laid_reading, monitor_of, specification, usage
+from stlc.cli.judge import instant_of, laid_reading, monitor_of, specification, usage
 from stlc.cli.outcome import Outcome
 from stlc.cli.tallies import Told, outcome_of_tallies
 from stlc.files import read_source
@@ -38,7 +38,8 @@ def outcome_in_chunks(path: Path, work: Work) -> Outcome:
     head = Recording(str(path), (), meta=first.meta)
     source, note = specification(head, question.spec)
     monitor = given or monitor_of(source, question, first.meta.spec_library)
-    how = How("all" if question.at else None, question.end, question.tolerance, first.t0, reasons=True)
+    at = instant_of(question.at, str(path), first.dt, first.t0, None)
+    how = How(at, question.end, question.tolerance, first.t0, reasons=True)
     online = monitor.online(how, require=question.require, like=first)
     online.feed(first)
     for piece in read:
@@ -54,7 +55,6 @@ def _require_pieces(path: Path, work: Work) -> None:
         "--resample": question.resample is not None,
         "--out": work.out is not None,
         "--semantics": question.semantics != "exact",
-        f"--at {question.at}": question.at not in (None, "all"),
     }
     advice = "leave out --chunk" if work.chunk else "cut out what is of interest"
     for option, asked in whole.items():

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, BinaryIO
 
-from stlc.cli.judge import Question, monitor_of, usage
+from stlc.cli.judge import Question, instant_of, monitor_of, usage
 from stlc.cli.outcome import WORDS, Outcome
 from stlc.cli.output import emit, wants_color
 from stlc.cli.tallies import Told, outcome_of_tallies
@@ -41,7 +41,6 @@ def outcome_of_stream(question: Question, *, talk: bool) -> Outcome:
         raise usage("which specification?", "stlc check SPEC -")
     whole = {
         "--resample": question.resample is not None,
-        "--at": question.at not in (None, "all"),
         "--semantics": question.semantics != "exact",
     }
     for option, given in whole.items():
@@ -78,7 +77,9 @@ def _online(monitor: Monitor, question: Question, first: Sample, dt: float | Non
 
     start = first.get("t", 0.0)
     t0 = float(start) if isinstance(start, (int, float)) else 0.0
-    how = How("all" if question.at else None, question.end, question.tolerance, t0, reasons=True)
+    known = monitor.online(How(), require=question.require, dt=dt).compiled.grid.dt
+    at = instant_of(question.at, f"the {NAME}", float(known or 0), t0, None)
+    how = How(at, question.end, question.tolerance, t0, reasons=True)
     return monitor.online(how, require=question.require, dt=dt)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 from collections.abc import Iterable, Mapping
@@ -202,6 +203,15 @@ def _monitor(
 
 def instant(text: str | None, trace: Trace) -> At:
     """A sample of `trace`; "all" and None as they are. Raises UsageError (U101)."""
+    return instant_of(text, trace.name, trace.dt, trace.t0, trace.samples)
+
+
+def instant_of(text: str | None, name: str, dt: float, t0: float, samples: int | None) -> At:
+    """The same of a trace that runs from `t0` on; None: nobody knows how long.
+
+    Raises:
+        UsageError: U101, it is no instant, or the trace has no sample then.
+    """
     if text is None or text == "all":
         return "all" if text else None
     match = _AT.fullmatch(text.strip())
@@ -212,14 +222,15 @@ def instant(text: str | None, trace: Trace) -> At:
         if not match["number"].isdigit():
             raise usage(f"`--at {text}` is not a whole number of samples", help_)
         return int(match["number"])
-    steps = (_seconds("--at", text, help_) - trace.t0) / trace.dt
-    sample = round(steps)
-    if abs(steps - sample) > 0.01 or not 0 <= sample < trace.samples:
-        first, last = trace.t0, trace.t0 + (trace.samples - 1) * trace.dt
+    if not dt:
         raise usage(
-            f"`{trace.name}` has no sample at {text}",
-            f"it runs from {first:g} s to {last:g} s every {trace.dt:g} s",
+            f"`--at {text}` is a time, and `{name}` has no time step", "a number counts samples: --at 46"
         )
+    steps = (_seconds("--at", text, help_) - t0) / dt
+    sample = round(steps) if math.isfinite(steps) else -1
+    if abs(steps - sample) > 0.01 or sample < 0 or (samples is not None and sample >= samples):
+        last = "" if samples is None else f" to {t0 + (samples - 1) * dt:g} s"
+        raise usage(f"`{name}` has no sample at {text}", f"it runs from {t0:g} s{last} every {dt:g} s")
     return sample
 
 

@@ -27,10 +27,12 @@ class Asked:
     Attributes:
         ending: what becomes of windows that the end of the trace cuts.
         truth: predicates are true or false (+inf or -inf), without any tolerance.
+        begin: the first sample that is judged.
     """
 
     ending: Ending = "open"
     truth: bool = False
+    begin: int = 0
 
 
 class Bounds(NamedTuple):

@@ -171,11 +171,12 @@ def _neutral(origin: Moved) -> float:
 
 @dataclass(slots=True)
 class Frontier:
-    """The value of a formula at the first sample, at one end of what is possible.
+    """The value of a formula at its first sample, at one end of what is possible.
 
     Attributes:
         bones: the formula.
         side: the columns.
+        begin: the sample at which the formula is judged.
         at: number of the first sample that is not yet in the polynomial.
         coefficients: (subsets of the operators, traces): the value where those operators are worth +inf from
             there on and the others -inf; None at first.
@@ -183,6 +184,7 @@ class Frontier:
 
     bones: Skeleton
     side: Side
+    begin: int = 0
     at: int = 0
     coefficients: Floats | None = None
     _parts: dict[int, tuple[list[str], Reader]] = field(default_factory=dict, init=False)
@@ -227,7 +229,7 @@ class Frontier:
     def ended(self, formula: ir.Formula, samples: int) -> Floats:
         """The value where the last sample is the end of the trace."""
         if self.coefficients is None:
-            return self._plain(formula, 0, samples)
+            return self._plain(formula, self.begin, samples)
         origins = self.bones.origins.values()
         rests = [self._plain(origin.formula, self.at + origin.steps, samples) for origin in origins]
         return self._at(np.stack(rests))

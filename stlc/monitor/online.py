@@ -15,7 +15,7 @@ from stlc.compile.semantics import TOLERANCE
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.monitor.asked import Asked, Bounds
 from stlc.monitor.explain import Cause
-from stlc.monitor.instants import check_length, starts_of
+from stlc.monitor.instants import At, check_length, starts_of
 from stlc.monitor.judgement import Status, unknown_requirement
 from stlc.monitor.needs import Need, needs_of
 from stlc.monitor.recall import Recall
@@ -60,14 +60,14 @@ class How:
     """How a stream of samples is judged.
 
     Attributes:
-        at: "all" judges every requirement at every sample; None as each asks for.
+        at: "all" judges every requirement at every sample, a number at that one; None as each asks for.
         end: where the stream is too short at its end: bounds, a refusal, or cut windows.
         tolerance: a robustness of at least minus this is satisfied; 0 makes strictness count.
         t0: time of the first sample in seconds.
         reasons: keep the samples that `Online.cause` takes.
     """
 
-    at: Literal["all"] | None = None
+    at: At = None
     end: Literal["open", "strict", "truncate"] = "open"
     tolerance: float = TOLERANCE
     t0: float = 0.0
@@ -118,10 +118,8 @@ class Watched:
 
     def drop(self) -> int:
         """Forget what has been counted; the first sample that is still needed."""
-        needed = [self.values.drop(self.tally.instants)]
-        if self.truths is not None:
-            needed.append(self.truths.drop(self.tally.instants))
-        return min(needed)
+        trackers = [self.values] if self.truths is None else [self.values, self.truths]
+        return min(tracker.drop(min(self.tally.next, tracker.settled)) for tracker in trackers)
 
 
 class Online:
@@ -146,19 +144,20 @@ class Online:
 
     def _watch(self, rule: Rule, *, once: bool = False) -> Watched:
         horizon = self.compiled.grid.horizon
-        always = self.how.at == "all" and not rule.absolute
-        everywhere = not once and (always or (rule.windowed and horizon is not None and not rule.absolute))
+        begin = self.how.at if isinstance(self.how.at, int) and not once else 0
+        once = once or rule.absolute or isinstance(self.how.at, int)
+        everywhere = not once and (self.how.at == "all" or (rule.windowed and horizon is not None))
         if everywhere and not rule.windowed and rule.uses_end:
             message = f"`{rule.name}` runs to the end: at every start it would stay open until then"
             raise UsageError(Diagnostic("U101", message, help=("judge it once, without `--at all`",)))
         ending: Literal["open", "truncate"] = "truncate" if self.how.end == "truncate" else "open"
         trackers = [
-            self._trackers.of(rule, Asked(ending, truth), everywhere=everywhere)
+            self._trackers.of(rule, Asked(ending, truth, begin), everywhere=everywhere)
             for truth in ((False, True) if self.how.tolerance == 0 else (False,))
         ]
-        return Watched(
-            rule, everywhere, trackers[0], trackers[1] if trackers[1:] else None, self.how.tolerance
-        )
+        truths = trackers[1] if trackers[1:] else None
+        tally = Tally(low_at=begin, high_at=begin, first=begin)
+        return Watched(rule, everywhere, trackers[0], truths, self.how.tolerance, tally)
 
     # ------------------------------------------------------------------------ samples
 
@@ -202,7 +201,7 @@ class Online:
             if not watched.over:
                 self._count(watched, self._settled(watched))
             if self._recall is not None and not (watched.over or watched.everywhere):
-                self._recall_last(watched, watched.judged(0, 1))
+                self._recall_last(watched, watched.judged(*self._pending(watched)))
         self._count_scope()
         self._trim()
 
@@ -233,8 +232,8 @@ class Online:
 
     def _pending(self, watched: Watched) -> tuple[int, int]:
         """The instants that are not counted yet."""
-        start = watched.tally.instants
-        return (start, self.samples) if watched.everywhere else (start, 1)
+        start, first = watched.tally.next, watched.tally.first
+        return (start, self.samples if watched.everywhere else max(min(first + 1, self.samples), first))
 
     def _decide(self, watched: Watched, found: list[Decision]) -> None:
         """Add what the last sample has decided. What was decided once stays so."""
@@ -256,8 +255,8 @@ class Online:
         return Decision(rule.name, start + i, self.time(start + i), status, low, high, self.samples - 1)
 
     def _recall_last(self, watched: Watched, judged: Judged) -> None:
-        if self._recall is not None and judged.fails[0]:
-            self._recall.note_last(watched.rule, float(judged.high[0]))
+        if self._recall is not None and judged.fails.any():
+            self._recall.note_last(watched.rule, watched.tally.first, float(judged.high[0]))
 
     def _settled(self, watched: Watched) -> Judged:
         start, stop = self._pending(watched)
@@ -272,7 +271,7 @@ class Online:
 
     def _count(self, watched: Watched, judged: Judged) -> int:
         """Count what is settled of instants that are not counted yet: how many."""
-        count = min(max(self._countable(watched) - watched.tally.instants, 0), len(judged.low))
+        count = min(max(self._countable(watched) - watched.tally.next, 0), len(judged.low))
         tally = watched.tally
         known = tally.high_at if tally.fails else None
         tally.add(judged, count)
@@ -351,7 +350,7 @@ class Online:
             if self.how.end == "strict":
                 finding = check_length(watched.rule, self.samples, starts, self.compiled.grid)
                 refused += [] if finding is None else [finding]
-            rest = range(min(watched.tally.instants, starts.stop), starts.stop)
+            rest = range(min(watched.tally.next, starts.stop), starts.stop)
             found[watched.rule.name] = watched.tally.with_more(watched.ended(rest)) if rest else watched.tally
         if refused:
             raise TraceError(*refused)

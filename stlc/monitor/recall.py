@@ -31,13 +31,15 @@ class Excerpt:
 
     Attributes:
         first: number of the first sample.
-        start: number of the sample at which the requirement is violated.
+        start: number of the sample from which on the excerpt says why the requirement is violated.
         env: columns (samples, 1).
+        begin: the sample at which it was judged, where that is an earlier one.
     """
 
     first: int
     start: int
     env: Mapping[str, Floats]
+    begin: int | None = None
 
 
 @dataclass(slots=True)
@@ -83,15 +85,15 @@ class Recall:
         if first >= self._pieces[0][0]:
             self._excerpts[rule.name] = Excerpt(first, start, self._cut(first, start + ahead + 1))
 
-    def note_last(self, rule: Rule, high: float) -> None:
+    def note_last(self, rule: Rule, begin: int, high: float) -> None:
         """The same for what has to hold to the end of the stream, where it fails by more than ever before."""
         known = self._worst.get(rule.name, math.inf)
         if rule.name not in self._reads or high >= known or not endless_always(rule):
             return
         first = self._pieces[0][0]
-        start = first + self._reads[rule.name][0] if first else 0
+        start = max(first + self._reads[rule.name][0] if first else 0, begin)
         self._worst[rule.name] = high
-        self._excerpts[rule.name] = Excerpt(first, start, self._cut(first, self.samples))
+        self._excerpts[rule.name] = Excerpt(first, start, self._cut(first, self.samples), begin)
 
     def cause(self, rule: Rule) -> Cause | None:
         """Why a requirement is violated; None where the samples that say it were not kept."""
@@ -114,7 +116,8 @@ class Recall:
         cause = explain(Verdict((judgement,), Prepared(self.compiled, (rule,), signals, record)), rule.name)
         if cause is None:
             return None
-        begun, sample = 0 if endless_always(rule) else found.start, found.first + cause.sample
+        sample = found.first + cause.sample
+        begun = found.start if found.begin is None else found.begin
         time = float(sample) if step is None else self.t0 + sample * step
         return replace(cause, start=begun, sample=sample, time=time)
 

@@ -43,6 +43,7 @@ class Tally:
         high: greatest robustness, the least over the instants.
         low_at: instant of `low`.
         high_at: instant of `high`.
+        first: the first of them.
     """
 
     instants: int = 0
@@ -52,6 +53,7 @@ class Tally:
     high: float = math.inf
     low_at: int = 0
     high_at: int = 0
+    first: int = 0
 
     def add(self, judged: Judged, count: int) -> None:
         """Count the first `count` of the next instants."""
@@ -60,17 +62,22 @@ class Tally:
             self.holds += bool(judged.holds[0])
             self.fails += bool(judged.fails[0])
         elif count > 1:
-            self.low, self.low_at = _least(judged.low[:count], self.low, self.low_at, self.instants)
-            self.high, self.high_at = _least(judged.high[:count], self.high, self.high_at, self.instants)
+            self.low, self.low_at = _least(judged.low[:count], self.low, self.low_at, self.next)
+            self.high, self.high_at = _least(judged.high[:count], self.high, self.high_at, self.next)
             self.holds += int(np.count_nonzero(judged.holds[:count]))
             self.fails += int(np.count_nonzero(judged.fails[:count]))
         self.instants += count
 
     def _add_one(self, low: float, high: float) -> None:
-        if low < self.low or not self.instants:
-            self.low, self.low_at = low, self.instants
-        if high < self.high or not self.instants:
-            self.high, self.high_at = high, self.instants
+        if low < self.low:
+            self.low, self.low_at = low, self.next
+        if high < self.high:
+            self.high, self.high_at = high, self.next
+
+    @property
+    def next(self) -> int:
+        """The instant that comes after those."""
+        return self.first + self.instants
 
     def with_more(self, judged: Judged) -> Tally:
         """The same with more instants, itself unchanged."""
@@ -106,4 +113,4 @@ class Tally:
 def _least(values: Floats, known: float, at: int, offset: int) -> tuple[float, int]:
     i = int(np.argmin(values))
     least = float(values[i])
-    return (least, offset + i) if least < known or not offset else (known, at)
+    return (least, offset + i) if least < known else (known, at)

@@ -66,7 +66,7 @@ class Trackers:
     """
 
     horizon: int | None
-    _pairs: dict[tuple[bool, bool, int], Pairs] = field(default_factory=dict)
+    _pairs: dict[tuple[bool, bool, int, int], Pairs] = field(default_factory=dict)
 
     def of(self, rule: Rule, asked: Asked, *, everywhere: bool) -> Tracker:
         """The tracker of a requirement that needs the least memory.
@@ -91,7 +91,7 @@ class Trackers:
                 return Everywhere(plans, asked)
             counted = (self.horizon if rule.windowed else rule.reach) if everywhere else 0
             later = max(counted or 0, reach(rule.formula).future)
-            pairs = self._pairs.setdefault((everywhere, asked.truth, later), Pairs(asked.truth))
+            pairs = self._pairs.setdefault((everywhere, asked.truth, asked.begin, later), Pairs(asked.truth))
             return pairs.add(rule.formula)
         except EndlessError:
             return Whole(rule, self.horizon, asked.ending, asked.truth)
@@ -119,7 +119,8 @@ class FromTheStart:
         self._back = max(each.back for each in bones.values())
         beyond = max(bones[end].reach + bones[end].unsure(planned) for end, planned in self.plans.items())
         sides = sides_of(self.plans, beyond, self.asked)
-        self._fronts = [Frontier(bones[side.end], side) for side in sides]
+        begin = self.asked.begin
+        self._fronts = [Frontier(bones[side.end], side, begin, begin) for side in sides]
 
     @property
     def settled(self) -> int:
@@ -148,9 +149,9 @@ class FromTheStart:
         return Bounds(found[0][: len(starts)], found[1][: len(starts)])
 
     def drop(self, start: int) -> int:  # noqa: ARG002 - only the first instant is judged
-        """Forget what the frontier has passed."""
+        """Forget what the frontier has passed, and before it is reached what nobody reads any more."""
         for front in self._fronts:
-            front.side.drop(front.at - self._back)
+            front.side.drop(min(front.at, self.samples - self._lag) - self._back)
         return first_needed(self.plans["truncate"], self.samples)
 
 

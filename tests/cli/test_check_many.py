@@ -165,7 +165,9 @@ def test_resampling_and_units_and_the_name_of_the_clock(capsys: pytest.CaptureFi
 
 @pytest.mark.parametrize("suffix", [".npz", ".csv", ".parquet"])
 @pytest.mark.parametrize("end", ["open", "truncate"])
-@pytest.mark.parametrize("at", [(), ("--at", "all", "--require", "window", "--require", "soon")])
+@pytest.mark.parametrize(
+    "at", [(), ("--at", "all", "--require", "window", "--require", "soon"), ("--at", "2.5s"), ("--at", "31")]
+)
 @pytest.mark.parametrize("peak", [1.0, 3.0])
 def test_pieces_give_what_the_whole_gives(
     capsys: pytest.CaptureFixture[str], suffix: str, end: str, at: Sequence[str], peak: float
@@ -197,7 +199,7 @@ def test_pieces_give_what_the_whole_gives(
 
 def test_pieces_that_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     (name,) = files(a_trace())
-    for option in (("--resample", "1s"), ("--at", "3"), ("--out", "x.npz")):
+    for option in (("--resample", "1s"), ("--out", "x.npz"), ("--semantics", "agm")):
         assert check("s.stl", name, "--chunk", "9", *option) == 2
         assert "help: leave out --chunk" in capsys.readouterr().err
     several = Trace(a_trace().signature, 0.1, {n: np.repeat(x, 3, axis=0) for n, x in a_trace().data.items()})
@@ -297,9 +299,36 @@ def test_streams_that_are_refused(
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("at", ["31", "3.1s", "2.9s"])
+def test_a_stream_at_one_of_its_samples(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, at: str
+) -> None:
+    text = as_csv(a_trace(peak=3))
+    whole = document(capsys, "s.stl", "stream.csv", "--at", at)["result"]
+    stream(monkeypatch, text, "--json", "--at", at)
+    found = json.loads(capsys.readouterr().out)["result"]
+    assert found["requirements"] == whole["requirements"]
+
+
+@pytest.mark.parametrize(
+    ("at", "words"),
+    [
+        ("60", "there is no sample 60: the trace has 60"),
+        ("9s", "there is no sample 90: the trace has 60"),
+        ("2.55s", "has no sample at 2.55s"),
+        ("noon", "`--at noon` is not an instant"),
+    ],
+)
+def test_instants_that_a_stream_does_not_have(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, at: str, words: str
+) -> None:
+    assert stream(monkeypatch, as_csv(a_trace()), "--at", at) == 2
+    assert words in capsys.readouterr().err
+
+
 def test_options_that_need_the_whole_trace(monkeypatch: pytest.MonkeyPatch) -> None:
     assert stream(monkeypatch, "", "--resample", "1s") == 2
-    assert stream(monkeypatch, "", "--at", "3") == 2
+    assert stream(monkeypatch, "", "--semantics", "agm") == 2
     assert check("-") == 2
     assert check("s.stl", "-", "other.npz") == 2
 
