@@ -28,6 +28,7 @@ def register(app: typer.Typer) -> None:
             "stlc explain precedence",
             "stlc explain specs/traffic.stl",
             "stlc explain trace.npz --require give_way",
+            "stlc explain latest --guarantee",
             note="A code's page has a wrong and a right example; without an argument all codes are listed. "
             "`precedence` tells how operators bind. A specification is told in English, requirement "
             "by requirement. Of a trace each violated requirement is traced back to the sub-formula, "
@@ -39,7 +40,7 @@ def register(app: typer.Typer) -> None:
 def explain(
     what: Annotated[
         str | None,
-        typer.Argument(metavar="CODE|SPEC|TRACE", help="A code, precedence, a .stl file or a trace."),
+        typer.Argument(metavar="CODE|SPEC|TRACE|RUN", help="A code, precedence, .stl file, trace or run."),
     ] = None,
     require: RequireOption = None,
     at: Annotated[
@@ -52,11 +53,19 @@ def explain(
     map_: given.Names = None,
     resample: given.Resample = None,
     set_: SetOption = None,
+    guarantee: Annotated[
+        bool,
+        typer.Option("--guarantee", help="Of a run: how likely its backup meets a plan that works."),
+    ] = False,
     runs: Annotated[Path, typer.Option(help="Folder of all runs.")] = Path("runs"),
     as_json: JsonOption = False,
 ) -> None:
     """Say what `what` means."""
-    if what is None:
+    if guarantee:
+        from stlc.cli.explain_guarantee import explain_guarantee
+
+        explain_guarantee(what or "latest", runs, parse_overrides(set_), as_json=as_json)
+    elif what is None:
         _list_codes(as_json=as_json)
     elif _CODE.fullmatch(what):
         _page(_code(what.upper()), as_json=as_json)
