@@ -82,6 +82,8 @@ def check(
     )
     talk = not (quiet or json)
     if _STREAM in traces:
+        if out is not None:
+            raise usage("`--out` needs the whole trace, and the standard input is judged line by line")
         outcomes = [_stream(traces, question, talk=talk)]
     else:
         color, paths = wants_color(sys.stdout), out_paths(out, traces)

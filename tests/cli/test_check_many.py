@@ -328,6 +328,7 @@ def test_instants_that_a_stream_does_not_have(
 
 def test_options_that_need_the_whole_trace(monkeypatch: pytest.MonkeyPatch) -> None:
     assert stream(monkeypatch, "", "--resample", "1s") == 2
+    assert stream(monkeypatch, "", "--out", "x.npz") == 2
     assert stream(monkeypatch, "", "--semantics", "agm") == 2
     assert check("-") == 2
     assert check("s.stl", "-", "other.npz") == 2
