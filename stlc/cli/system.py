@@ -79,7 +79,8 @@ def check(
         return
     show_diagnostics(warnings)
     moved = f", {_DRAWN} starts driven {steps} steps" if steps else ""
-    emit(f"{decl.path} is valid: {len(decl.signature)} states, {len(decl.controls)} controls{moved}")
+    size = f"{_counted(len(decl.signature), 'state')}, {_counted(len(decl.controls), 'control')}"
+    emit(f"{decl.path} is valid: {size}{moved}")
 
 
 def list_(as_json: JsonOption = False) -> None:
@@ -95,6 +96,10 @@ def list_(as_json: JsonOption = False) -> None:
 
 
 _DRAWN = 256
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def _load(name: str, overrides: dict[str, str]) -> SystemDecl:

@@ -20,9 +20,12 @@ def sentence(item: ast.Require | ast.Assume) -> str:
     return f"{text[0].upper()}{text[1:]}." if begins else f"{text}."
 
 
+_NAMED = ast.Def | ast.Region | ast.Const
+
+
 def definitions_of(item: ast.Require | ast.Assume, spec: ast.Spec) -> list[tuple[str, str]]:
-    """The definitions that a requirement uses, those that they use too, each with what it means."""
-    known = {entry.name: entry for entry in spec.items if isinstance(entry, ast.Def | ast.Region)}
+    """The names that a requirement uses, those that they use too, each with what it means."""
+    known = {entry.name: entry for entry in spec.items if isinstance(entry, _NAMED)}
     found: dict[str, str] = {}
     queue = [item.formula]
     while queue:
@@ -34,9 +37,11 @@ def definitions_of(item: ast.Require | ast.Assume, spec: ast.Spec) -> list[tuple
     return list(found.items())
 
 
-def _meaning(entry: ast.Def | ast.Region) -> str:
+def _meaning(entry: ast.Def | ast.Region | ast.Const) -> str:
     if isinstance(entry, ast.Region):
         return show_expr(entry.value)
+    if isinstance(entry, ast.Const):
+        return show_expr(entry.value) + (f" [{entry.unit}]" if entry.unit else "")
     text = say(entry.value) if _is_formula(entry.value) else show_expr(entry.value)
     names = ", ".join(formal.name for formal in entry.formals)
     return f"of {names}: {text}" if names else text

@@ -46,7 +46,11 @@ def test_a_sentence(formula, english):
 
 
 def test_definitions_are_followed():
-    spec = parse(Source("text", "def a = b > 1\ndef b = x + 1\nrequire r: a"))
+    spec = parse(
+        Source(
+            "text", "const c [m] = 2\nconst d = 3 s\ndef a = b > 1\ndef b = x + c\nrequire r: always[0, d] a"
+        )
+    )
     item = spec.items[-1]
     assert isinstance(item, ast.Require)
-    assert definitions_of(item, spec) == [("a", "b > 1"), ("b", "x + 1")]
+    assert definitions_of(item, spec) == [("d", "3 s"), ("a", "b > 1"), ("b", "x + c"), ("c", "2 [m]")]
