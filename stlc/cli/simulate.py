@@ -110,9 +110,14 @@ def simulate(
     if json:
         emit_json("simulate/1", ok=code == 0, exit_code=code, result=document | drawn)
     else:
-        _print(closing(document["trace"], drawn, record))
+        _print(closing(document["trace"], drawn, record, _needed_system(opened)))
     if code:
         raise typer.Exit(code)
+
+
+def _needed_system(run: Run) -> str | None:
+    """The system file that a trace cannot be judged without: functions are not in traces."""
+    return f"{run.dir.shown}/system.yaml" if run.task.system.decl.functions else None
 
 
 def _accuracy(document: Record, guard: Mode) -> float:

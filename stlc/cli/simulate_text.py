@@ -66,8 +66,8 @@ def compared(document: Record) -> Iterator[str]:
     yield table(rows, header=header)
 
 
-def closing(trace: str, drawn: Mapping[str, str], record: Path | None) -> Iterator[str]:
-    """Where things are; the last line is the next command."""
+def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: str | None) -> Iterator[str]:
+    """Where things are; the last line is the next command, with the system where judging needs it."""
     from stlc.files import find_trace
 
     yield ""
@@ -80,7 +80,8 @@ def closing(trace: str, drawn: Mapping[str, str], record: Path | None) -> Iterat
         else None
     )
     short = found is not None and found.resolve() == Path(trace).resolve()
-    yield f"  next       stlc check {record or ('trace.npz' if short else trace)}"
+    needed = "" if system is None else f" --system {system}"
+    yield f"  next       stlc check {record or ('trace.npz' if short else trace)}{needed}"
 
 
 def _shares(guards: Record) -> Iterator[tuple[str, ...]]:

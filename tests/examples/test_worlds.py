@@ -30,6 +30,9 @@ WORLDS = {
     "ship_safe": "ship_safe",
     "ship_track": "ship_track",
     "ship_track shifted": "ship_track",
+    "reach_n_avoid": "maze",
+    "navigation": "rover",
+    "manipulation": "panda",
 }
 FREE = [name for name in WORLDS if name != "traffic"]  # agents that do not meet each other
 
@@ -106,13 +109,16 @@ def test_an_episode_ends_with_a_trace_that_check_reads(
     task: Task, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("stlc.controller.evaluate.LATENCY_SECONDS", 0.05)
+    everybody = "stlc.controller.executed.savable"
+    monkeypatch.setattr(everybody, lambda _, x0: torch.ones(len(x0), dtype=torch.bool))
     setting = Setting((0, 1), 2, task.horizon + 4, task.system.decl.test.replan)
     found = deploy(task, Wild(task), setting, "none")  # type: ignore[arg-type]
     assert {"plan_accuracy", "executed", "executed_safe", "savable"} <= set(found.metrics)
     assert set(found.metrics) - set(METRICS) >= set(found.recording.progress[0])
     folder = open_folder(task, TrainConfig(steps=1), Launch(root=tmp_path / "runs", name="wild"))
     save_trace_of(Run(folder, task, Wild(task)), found.recording, setting)  # type: ignore[arg-type]
-    assert main(["check", str(folder.path / "trace.npz")]) in (0, 1)
+    system = ["--system", str(folder.path / "system.yaml")] if task.system.decl.functions else []
+    assert main(["check", str(folder.path / "trace.npz"), *system]) in (0, 1)
     assert "4 traces" in capsys.readouterr().out
 
 

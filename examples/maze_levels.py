@@ -1,0 +1,148 @@
+"""The shaft of Meng & Fan (2023): a ball that rises through 200 levels of obstacles and goals.
+
+The truth beside the model of `maze.yaml`. Each ball has a shaft of its own and moves as the model's own step
+says: it rises at a constant speed and steers sideways. A level is an obstacle with a gap on each side and
+perhaps a goal in one of the gaps; level i has its upper edge at height 2.5 i. Metres, seconds.
+
+* Levels are drawn as the next one in training is: width 2 to 4 m, anywhere in the shaft of 5 m, slivers of
+  less than .1 m closed; a goal in the left gap, in the right one, or none, where it fits.
+* The obstacle of the first level begins .1 m outside of the left wall, so its goal can only be on the right.
+* A ball starts at the left wall, at rest, 2.5 m below the first level. It knows the next level and the one
+  after; when it is above the upper edge of a level the next one takes its place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from stlc.controller.streams import Streams
+
+LEVELS = 200
+EDGE = -0.1  # left edge of the first obstacle
+NONE = -1.0  # this level has no goal
+ROUNDING = 1e-9  # heights are sums of steps
+BELOW, ABOVE = 3.0, 6.0  # m of the shaft that a picture shows around the ball
+BLOCK, GOAL, SHAFT = "#8a8f98", "#2f9e57", "#f1f3f5"
+DECIDED = ("#2563a8", "#e08a00", "#c0267e", "#2e9e5b")  # policy, backup, safest, polished
+
+
+class MazeLevels:
+    """The world of `maze.yaml`; see the module's text. Implements `stlc.controller.world.World`."""
+
+    def __init__(self, system: Any, agents: int, generator: torch.Generator) -> None:
+        self.system, self.agents, self.generator = system, agents, generator
+        self.at = {name: index for index, name in enumerate(system.names)}
+        constants = ("width", "h", "d", "r")
+        self.width, self.h, self.d, self.r = (float(system.decl.constants[name][0]) for name in constants)
+
+    def reset(self) -> torch.Tensor:
+        """Fresh shafts, and a ball at the beginning of each."""
+        self.streams = Streams.of(self.generator, self.agents)
+        columns = [self.at[name] for name in ("x1", "l1", "g1")]
+        self.levels = self.streams.states(self.system, LEVELS)[..., columns]  # (agents, levels, 3)
+        for own, generator in zip(self.levels, self.streams.own, strict=True):
+            own[0] = self._first(own[0], generator)
+        self.passed = torch.zeros(self.agents, dtype=torch.int64)
+        self.inside = torch.zeros(self.agents, dtype=torch.bool)
+        self.hits, self.reached = torch.zeros(2, self.agents, dtype=torch.int64)
+        self.near = torch.zeros(self.agents, dtype=torch.bool)
+        x = torch.zeros(self.agents, len(self.at), dtype=torch.float64)
+        x[:, self.at["dy"]] = -self.d
+        self.met, self.state = torch.zeros(self.agents, dtype=torch.int64), self._facing(x)
+        return self.state
+
+    def advance(self, x: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """Move every ball as the model says for one step; (agents, n), (agents, m) -> (agents, n)."""
+        moved, dy = self.system.step(x, action), self.at["dy"]
+        self._look(moved)
+        above = moved[:, dy] > ROUNDING
+        moved[:, dy] -= self.d * above
+        self._count(above)
+        self.passed = (self.passed + above).clamp(max=LEVELS - 2)
+        self.state = self._facing(moved)
+        return self.state
+
+    def progress(self) -> Mapping[str, float]:
+        """Means over the balls: levels passed, obstacles touched on the way, goals met and reached."""
+        each = {
+            "levels_passed": self.passed,
+            "obstacles_touched": self.hits,
+            "goals_met": self.met,
+            "goals_reached": self.reached,
+        }
+        return {name: float(values.double().mean()) for name, values in each.items()}
+
+    def units(self) -> Mapping[str, str]:
+        """Counts have none."""
+        return {}
+
+    def snapshot(self) -> Mapping[str, np.ndarray]:
+        """Balls (agents, 2) as x and height; levels (agents, levels, 3); what all levels are like (4,)."""
+        height = self.state[:, self.at["dy"]] + self.d * (self.passed + 1)
+        return {
+            "balls": torch.stack((self.state[:, self.at["x"]], height), 1).numpy(),
+            "levels": self.levels.numpy(),
+            "shape": np.array([self.width, self.h, self.d, self.r]),
+        }
+
+    @staticmethod
+    def draw(axes: Any, scene: Mapping[str, np.ndarray], index: int) -> None:
+        """One frame: the shafts side by side around their balls, coloured by who decided."""
+        from matplotlib.patches import Circle, Rectangle
+
+        balls, levels = scene["balls"][index], scene["levels"][index]
+        width, high, apart, radius = scene["shape"][index]
+        decided = scene["decision"][index] if "decision" in scene else np.zeros(len(balls), dtype=int)
+        for shaft, ((x, height), own) in enumerate(zip(balls, levels, strict=True)):
+            left = shaft * (width + 1.0)
+            axes.add_patch(Rectangle((left, -BELOW), width, BELOW + ABOVE, color=SHAFT, lw=0))
+            for level, (edge, length, goal) in enumerate(own):
+                top = (level + 1) * apart - height
+                if high - BELOW < top < ABOVE:
+                    start, end = max(edge, 0.0), min(edge + length, width)
+                    corner = (left + start, top - high)
+                    axes.add_patch(Rectangle(corner, end - start, high, color=BLOCK, lw=0))
+                    if goal > 0:
+                        place = (left + goal, top - high / 2)
+                        axes.add_patch(Circle(place, radius, fill=False, color=GOAL, lw=1.5))
+            axes.add_patch(Circle((left + x, 0.0), 0.18, color=DECIDED[int(decided[shaft])], lw=0, zorder=3))
+        axes.set(xlim=(-0.5, len(balls) * (width + 1.0) - 0.5), ylim=(-BELOW, ABOVE), aspect="equal")
+        axes.set_axis_off()
+
+    def _first(self, level: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """The first level: its obstacle leaves a gap on the right alone, with a goal or none."""
+        edge, length = EDGE, float(level[1])
+        coin, share = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
+        end = edge + length
+        goal = end + (self.width - end) * (0.3 + 0.4 * share)
+        fits = coin < 0.5 and self.width - goal >= self.r and goal - end >= self.r
+        return torch.tensor([edge, length, goal if fits else NONE], dtype=torch.float64)
+
+    def _facing(self, states: torch.Tensor) -> torch.Tensor:
+        """States that see the next two levels."""
+        rows, states = torch.arange(self.agents), states.clone()
+        for offset in (0, 1):
+            level = self.levels[rows, self.passed + offset]
+            for column, name in enumerate("xlg"):
+                states[:, self.at[f"{name}{offset}"]] = level[:, column]
+        return states
+
+    def _look(self, states: torch.Tensor) -> None:
+        """Who is inside of the next obstacle, or at its goal, before levels are counted on."""
+        x, dy = states[:, self.at["x"]], states[:, self.at["dy"]]
+        edge, length, goal = self.levels[torch.arange(self.agents), self.passed].unbind(1)
+        beside = (x - edge) * (x - edge - length) > 0
+        self.inside |= (dy > -self.h + ROUNDING) & (dy < -ROUNDING) & ~beside
+        self.near |= (goal > 0) & ((x - goal) ** 2 + (dy + self.h / 2) ** 2 < self.r**2)
+
+    def _count(self, above: torch.Tensor) -> None:
+        """Enter what happened on the levels that were passed."""
+        goal = self.levels[torch.arange(self.agents), self.passed, 2]
+        self.hits += above & self.inside
+        self.met += above & (goal > 0)
+        self.reached += above & self.near
+        self.inside, self.near = self.inside & ~above, self.near & ~above

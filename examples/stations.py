@@ -1,0 +1,194 @@
+"""The map of Meng & Fan (2023): rovers between destinations and five charging stations.
+
+The truth beside the model of `rover.yaml`. All rovers of a seed share the stations and do not meet each
+other; each has a list of destinations of its own and moves as the model's own step says. Metres, seconds.
+
+* The stations are those five of 100 that training draws which lie farthest apart, of 1000 sets.
+* A rover that is not at its station chooses among the five whenever it plans. It charges at the one it chose.
+* A destination is reached within .8 m of it. One step later the next one takes its place, so a recorded trace
+  has the sample in which it was reached.
+* The time to stay at a station is renewed as soon as the rover is away from it.
+* A rover whose battery is empty goes on; the share of time with charge is reported.
+
+A rover starts where training lets it, and so that its battery would last to a station on a straight way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from stlc.controller.streams import Streams
+
+STATES = 100  # of the stations and of each rover that are drawn as in training
+SETS, STATIONS = 1000, 5
+POINTS = 101  # of a way that are looked at
+ROUNDING = 1e-6
+DECIDED = ("#2563a8", "#e08a00", "#c0267e", "#2e9e5b")  # policy, backup, safest, polished
+WALL, GROUND, CHARGE, GOAL = "#8a8f98", "#f1f3f5", "#e9c46a", "#2f9e57"
+
+
+class Stations:
+    """The world of `rover.yaml`; see the module's text.
+
+    Implements `stlc.controller.world.World` and `Choosing`.
+    """
+
+    def __init__(self, system: Any, agents: int, generator: torch.Generator) -> None:
+        self.system, self.agents, self.generator = system, agents, generator
+        self.at = {name: index for index, name in enumerate(system.names)}
+        constants = ("size", "w", "vmax", "r_near", "c")
+        numbers = (float(system.decl.constants[name][0]) for name in constants)
+        self.size, self.side, self.fastest, self.near, self.stay = numbers
+        w, half = self.side, self.size / 2
+        self.walls = torch.tensor(  # left, bottom, right, top
+            [
+                (0.0, 0.0, w, w),
+                (half - w / 2, self.size - w, half + w / 2, self.size),
+                (self.size - w, 0.0, self.size, w),
+                (half - w / 4, half - w / 4, half + w / 4, half + w / 4),
+            ],
+            dtype=torch.float64,
+        )
+
+    def reset(self) -> torch.Tensor:
+        """New stations, and every rover at a start of its own."""
+        streams = Streams.of(self.generator, self.agents)
+        shared = self.system.sample(STATES, generator=streams.shared, dtype=torch.float64)
+        self.places = farthest(shared[:, [self.at["xc"], self.at["yc"]]], streams.shared)
+        drawn = streams.states(self.system, STATES)
+        self.state = torch.stack([own[self._first(own)] for own in drawn])
+        self.list = drawn[..., [self.at["xd"], self.at["yd"]]]
+        self.number = torch.zeros(self.agents, dtype=torch.int64)
+        self.arrived = torch.zeros(self.agents, dtype=torch.int64)
+        self.steps, self.charged, self.way = 0, 0.0, 0.0
+        self.crashed = torch.zeros(self.agents, dtype=torch.bool)
+        self.mine = torch.cdist(self._place(self.state), self.places).argmin(1)
+        self.state = self._told(self.state)
+        self.state[:, self.at["tau_s"]] = self.stay
+        return self.state
+
+    def options(self) -> torch.Tensor:
+        """The states with every station in the place of the chosen one, (agents, 5, n); that one first.
+
+        A rover at its station stays with it.
+        """
+        order = torch.stack([(self.mine + turn) % STATIONS for turn in range(STATIONS)], 1)
+        order = torch.where(self._at_station(self.state)[:, None], self.mine[:, None], order)
+        options = self.state[:, None].repeat(1, STATIONS, 1)
+        options[..., [self.at["xc"], self.at["yc"]]] = self.places[order]
+        return options
+
+    def choose(self, pick: torch.Tensor) -> torch.Tensor:
+        """Every rover takes an option, (agents,); returns the states (agents, n)."""
+        free = ~self._at_station(self.state)
+        self.mine = torch.where(free, (self.mine + pick) % STATIONS, self.mine)
+        self.state = self._told(self.state)
+        return self.state
+
+    def advance(self, x: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """Move every rover as the model says for one step; (agents, n), (agents, m) -> (agents, n)."""
+        self.state = x
+        there = torch.linalg.norm(self._place(x) - self._destination(), dim=1) <= self.near
+        moved = self.system.step(x, action)
+        self.arrived += there
+        self.number = (self.number + there) % STATES
+        self._note(self._place(x), moved)
+        moved = self._told(moved)
+        moved[:, self.at["tau_s"]] = torch.where(
+            self._at_station(moved), moved[:, self.at["tau_s"]], torch.full_like(moved[:, 0], self.stay)
+        )
+        self.state = moved
+        return moved
+
+    def progress(self) -> Mapping[str, float]:
+        """Means of destinations reached and of the way; share of time with charge; rovers that crashed."""
+        return {
+            "destinations_reached": float(self.arrived.double().mean()),
+            "distance": self.way / self.agents,
+            "share_with_charge": self.charged / max(self.steps * self.agents, 1),
+            "rovers_crashed": float(self.crashed.sum()),
+        }
+
+    def units(self) -> Mapping[str, str]:
+        """Of entries of `progress`."""
+        return {"distance": "m"}
+
+    def snapshot(self) -> Mapping[str, np.ndarray]:
+        """Rovers, destinations (agents, 2), stations (5, 2), walls (4, 4), size and radius (2,)."""
+        return {
+            "rovers": self._place(self.state).numpy(),
+            "destinations": self.state[:, [self.at["xd"], self.at["yd"]]].numpy(),
+            "battery": self.state[:, self.at["tau_b"]].numpy(),
+            "stations": self.places.numpy(),
+            "walls": self.walls.numpy(),
+            "shape": np.array([self.size, self.near]),
+        }
+
+    @staticmethod
+    def draw(axes: Any, scene: Mapping[str, np.ndarray], index: int) -> None:
+        """One frame: the map, and the rovers with a line to where they go, coloured by who decided."""
+        from matplotlib.patches import Circle, Rectangle
+
+        size, near = scene["shape"][index]
+        axes.add_patch(Rectangle((0, 0), size, size, color=GROUND, lw=0))
+        for left, bottom, right, top in scene["walls"][index]:
+            axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, color=WALL, lw=0))
+        for place in scene["stations"][index]:
+            axes.add_patch(Circle(place, near, color=CHARGE, lw=0, alpha=0.7))
+        rovers = scene["rovers"][index]
+        decided = scene["decision"][index] if "decision" in scene else np.zeros(len(rovers), dtype=int)
+        for at, goal, left, source in zip(
+            rovers, scene["destinations"][index], scene["battery"][index], decided, strict=True
+        ):
+            color = DECIDED[int(source)]
+            axes.add_patch(Circle(goal, near, fill=False, color=GOAL, lw=1.2))
+            axes.plot(*np.transpose((at, goal)), color=color, lw=0.6, alpha=0.5)
+            axes.add_patch(Circle(at, 0.16, color=color, lw=0, zorder=3))
+            axes.text(at[0] + 0.2, at[1] + 0.2, f"{left:.1f}", size=7, color="#4a4f57", zorder=4)
+        axes.set(xlim=(-0.3, size + 0.3), ylim=(-0.3, size + 0.3), aspect="equal")
+        axes.set_axis_off()
+
+    def _first(self, states: torch.Tensor) -> int:
+        """The first of the drawn states (k, n) whose battery lasts to a station on a straight way."""
+        apart = torch.cdist(self._place(states), self.places).amin(1) - self.near
+        lasts = torch.nonzero(apart <= self.fastest * states[:, self.at["tau_b"]])
+        return int(lasts[0]) if len(lasts) else int(states[:, self.at["tau_b"]].argmax())
+
+    def _told(self, states: torch.Tensor) -> torch.Tensor:
+        """States that see their destination and their station."""
+        states = states.clone()
+        states[:, [self.at["xd"], self.at["yd"]]] = self._destination()
+        states[:, [self.at["xc"], self.at["yc"]]] = self.places[self.mine]
+        return states
+
+    def _destination(self) -> torch.Tensor:
+        return self.list[torch.arange(self.agents), self.number]
+
+    def _place(self, states: torch.Tensor) -> torch.Tensor:
+        return states[:, [self.at["x"], self.at["y"]]]
+
+    def _at_station(self, states: torch.Tensor) -> torch.Tensor:
+        """Whether rovers are at the station that they chose, (agents,); on the circle is at it."""
+        return torch.linalg.norm(self._place(states) - self.places[self.mine], dim=1) <= self.near + ROUNDING
+
+    def _note(self, start: torch.Tensor, moved: torch.Tensor) -> None:
+        """Enter a step from `start` (agents, 2): its way, what it ran into, and the charge that is left."""
+        end, self.steps = self._place(moved), self.steps + 1
+        self.way += float(torch.linalg.norm(end - start, dim=1).sum())
+        self.charged += float((moved[:, self.at["tau_b"]] >= -ROUNDING).sum())
+        share = torch.linspace(0.0, 1.0, POINTS, dtype=torch.float64)[:, None, None]
+        points = (start + share * (end - start))[:, :, None]  # (points, agents, 1, 2)
+        inside = ((points > self.walls[:, :2]) & (points < self.walls[:, 2:])).all(3).any(2)
+        outside = ((end < 0.0) | (end > self.size)).any(1)
+        self.crashed |= inside.any(0) | outside
+
+
+def farthest(places: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    """Of `SETS` random fives of places (k, 2) the one with the largest mean distance between two: (5, 2)."""
+    picks = torch.randint(len(places), (SETS, STATIONS), generator=generator)
+    apart = torch.cdist(places[picks], places[picks]).sum((1, 2))
+    return places[picks[apart.argmax()]]
