@@ -222,6 +222,7 @@ CODES: dict[str, str] = {
     "R401": "training diverged",
     "R402": "a policy whose plan is not a number",
     "R403": "a process of a training that is gone",
+    "R404": "requirements that no plan satisfies",
     "U101": "a command line that cannot be understood",
     "U102": "a file that does not exist",
     # the tool itself

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import paper
 import pytest
 import torch
 from paper import Array
+
+from stlc.dynamics.system import System
+
+ROOT = Path(__file__).parents[1]
 
 DT, NEAR = 0.2, 0.8
 BOXES = ((0.0, 0.0, 3.0), (3.5, 7.0, 3.0), (7.0, 0.0, 3.0), (4.25, 4.25, 1.5))  # corner and side
@@ -197,3 +202,18 @@ def test_starts_on_the_grid_are_there_and_count_as_near() -> None:
 )  # fmt: skip
 def test_another_distribution_is_noticed(old: str, new: str) -> None:
     assert paper.unlike(ROVER, ROVER.task(system=((old, new),)))
+
+
+def test_the_performance_term_is_the_papers() -> None:
+    system = System.load(ROOT / "examples" / "rover.yaml")
+    x0 = system.sample(400, seed=3, dtype=torch.float64)
+    u = torch.rand(400, 10, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    columns = system.rollout_columns(x0, u)
+    far = {
+        end: torch.hypot(columns["x"] - columns[f"x{end}"], columns["y"] - columns[f"y{end}"]).mean(0)
+        for end in "cd"
+    }
+    low = x0[:, system.names.index("tau_b")] <= 2.0
+    wanted = 0.01 * torch.where(low, far["c"], far["d"])
+    assert 0.2 < float(low.double().mean()) < 0.8
+    assert torch.allclose(system.performance(columns, torch.ones(400)), wanted, atol=1e-6)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, Self
 import typer
 
 from stlc.cli.errors import INTERRUPTED, TERMINATED
-from stlc.cli.output import console, emit_json, say
+from stlc.cli.output import console, emit_json, say, show_diagnostics
 from stlc.cli.progress import Progress, RunInfo, Summary
 from stlc.controller.train import Outcome, Watch
 from stlc.diagnostics import StlcError
@@ -109,13 +109,15 @@ class Sitting:
             raise typer.Exit(code)
         if pictures:
             draw_report(self.folder)
+        why = () if outcome.why is None else (outcome.why,)
         found = outcome.score.feasible > 0.0
         code = 0 if found else 1
         if json:
             result = {"run": self.folder.shown, "seconds": outcome.seconds, **outcome.score.summary()}
-            emit_json("train/1", ok=found, exit_code=code, result=result)
+            emit_json("train/1", ok=found, exit_code=code, diagnostics=why, result=result)
         else:
             self.progress.finish(_summary(outcome, pictures=pictures), to=console())
+            show_diagnostics(why)
         raise typer.Exit(code)
 
 

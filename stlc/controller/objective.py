@@ -104,13 +104,24 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Loss:
     return Loss(total=total, stl=hinge, cost=cost.detach(), satisfied=good)
 
 
-def _rolled(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-    """Robustness (B,) and states (T+1, B) by name, differentiable: natively where that means the same."""
+def native_rolled(
+    task: Task, objective: Objective, x0: Tensor, u: Tensor
+) -> tuple[Tensor, Mapping[str, Tensor]] | None:
+    """Robustness per requirement (B, R) and states (T+1, B) by name, differentiable, from emitted C.
+
+    None where that is not what the objective means, or where torch has to do the work.
+    """
     switch = objective.switch
     if objective.smoothing is None and isinstance(switch, StraightThrough) and x0.device.type == "cpu":
         native = task.gradient
-        if native is not None:
-            each, columns = native(x0, u, slope=switch.slope)
-            return task.graph.overall(each), columns
-    columns = task.system.rollout_columns(x0, u, switch)
+        return None if native is None else native(x0, u, slope=switch.slope)
+    return None
+
+
+def _rolled(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
+    """Robustness (B,) and states (T+1, B) by name, differentiable: natively where that means the same."""
+    native = native_rolled(task, objective, x0, u)
+    if native is not None:
+        return task.graph.overall(native[0]), native[1]
+    columns = task.system.rollout_columns(x0, u, objective.switch)
     return task.graph.columns(columns, ops=TORCH, smoothing=objective.smoothing), columns

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from stlc.controller.autopsy import Step, autopsy
 from stlc.controller.checkpoint import load_checkpoint
 from stlc.controller.config import Engine, TrainConfig, decide
+from stlc.controller.conflict import conflict
 from stlc.controller.held_out import Score, score
 from stlc.controller.journal import Journal
 from stlc.controller.pace import OpenEnd, clock_of, steps_within
@@ -18,7 +20,7 @@ from stlc.controller.ranks import ALONE, Ranks
 from stlc.controller.run import Run, load_engine, load_task, spec_hash, system_hash
 from stlc.controller.symmetry import check_mirror
 from stlc.controller.trainer import Look, Trainer
-from stlc.diagnostics import Diagnostic, MissingError, RunError, UsageError
+from stlc.diagnostics import Diagnostic, MissingError, RunError, StlcError, UsageError
 from stlc.dynamics.memory import keep_freed_memory
 
 if TYPE_CHECKING:
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
     from stlc.rundir import RunDir
 
 DEFAULT_BUDGET = 60.0
+BARREN_LOOKS, BARREN_SHARE = 5, 0.1
+"""After so many looks, and this share of the steps, a search that never found a plan is given up."""
 SAVE_EVERY = 500
 """Steps between checkpoints at most."""
 SAVE_SECONDS = 10.0
@@ -59,6 +63,7 @@ class Outcome:
         seconds: of training, held-out verdict included.
         interrupted: ended by `Watch.stop`.
         ranks: that trained together.
+        why: why no plan satisfies the specification, where none was found for any start.
     """
 
     run: Run
@@ -66,6 +71,7 @@ class Outcome:
     seconds: float
     interrupted: bool
     ranks: int = 1
+    why: Diagnostic | None = None
 
 
 def train(
@@ -86,13 +92,16 @@ def train(
         ranks: that train together; each calls this at the same time, and the first one writes.
 
     Raises:
-        SystemFileError: S304, the mirror of the policy is no symmetry.
+        SystemFileError: S301, hardly any initial state is possible; S304, the mirror of the policy is no
+            symmetry.
         MissingError: R201, a checkpoint cannot be written; R302, there is no such device; R403, a rank
             is gone.
-        RunError: R401, the loss is not finite.
+        RunError: R401, the loss or its gradient is not finite.
+        SystemFileError: S302, states are not.
     """
     begun = clock_of(config.clock)()
     keep_freed_memory()
+    task.system.initial.require_many()
     check_mirror(task)
     device = find_device(ranks.device(config.device))
     engine = replace(decide(task, config), ranks=ranks.size)
@@ -200,6 +209,7 @@ class _Session:
         self.begun = begun
         self.now = clock_of(trainer.engine.clock)
         self.end = end
+        self.barren = not trainer.ranks.any(trainer.buffer.count > 0)
 
     def finish(self) -> Outcome:
         """Train to the end, judge, and close the record."""
@@ -213,10 +223,13 @@ class _Session:
             if trainer.step >= trainer.next_look:
                 self._revise()
                 pace = (self.now() - sat_down) / max(1, trainer.step - first)
-                self._row(trainer.look(), value, pace)
+                look = trainer.look()
+                self._row(look, value, pace)
+                if self._hopeless(look):
+                    break
             value = trainer.advance()
             if not math.isfinite(value):
-                raise self._diverged()
+                raise self._broken()
             due = trainer.step % SAVE_EVERY == 0 or time.perf_counter() - saved > SAVE_SECONDS
             if trainer.ranks.any(due):
                 self._save()
@@ -224,7 +237,14 @@ class _Session:
             if trainer.ranks.any(self.watch.stop()) and trainer.step < trainer.steps:
                 return self._interrupted()
         self._save()
-        return self._judged() if trainer.ranks.first else self._ended(None)
+        return self._judged() if trainer.ranks.first else self._ended()
+
+    def _hopeless(self, look: Look) -> bool:
+        """Whether neither the policy nor the search has ever satisfied the specification for any state."""
+        trainer = self.trainer
+        self.barren = self.barren and look.accuracy == 0.0 and look.repaired == 0
+        enough = max(BARREN_LOOKS * trainer.engine.every, BARREN_SHARE * trainer.steps)
+        return self.barren and trainer.engine.method == "guided" and trainer.step >= enough
 
     def _revise(self) -> None:
         """Where a budget is still open, say anew how many steps it is worth."""
@@ -238,18 +258,20 @@ class _Session:
         result = score(self.trainer.policy, n=self.trainer.engine.held_out)
         self.journal.held_out(self.trainer.task, result)
         seconds = self.now() - self.begun
-        self.journal.close("finished", {**result.summary(), "seconds": seconds})
-        return self._ended(result)
+        why = conflict(self.trainer.task) if result.feasible == 0.0 else None
+        found = {"seconds": seconds} if why is None else {"seconds": seconds, "why": why.message}
+        self.journal.close("finished", {**result.summary(), **found})
+        return replace(self._ended(), score=result, why=why)
 
     def _interrupted(self) -> Outcome:
         self._save()
         self.journal.close("interrupted")
-        return self._ended(None, interrupted=True)
+        return self._ended(interrupted=True)
 
-    def _ended(self, result: Score | None, *, interrupted: bool = False) -> Outcome:
+    def _ended(self, *, interrupted: bool = False) -> Outcome:
         run = Run(self.journal.folder, self.trainer.task, self.trainer.policy)
         seconds, ranks = self.now() - self.begun, self.trainer.ranks.size
-        return Outcome(run, result, seconds, interrupted=interrupted, ranks=ranks)
+        return Outcome(run, None, seconds, interrupted=interrupted, ranks=ranks)
 
     def _save(self) -> None:
         self.journal.checkpoint(self.trainer.tensors(), self.trainer.facts(), step=self.trainer.step)
@@ -273,13 +295,18 @@ class _Session:
         self.journal.row(row)
         self.watch.row(row)
 
-    def _diverged(self) -> RunError:
+    def _broken(self) -> StlcError:
+        """What broke a step, of whichever rank. The weights are those before it: they are kept if good."""
+        trainer = self.trainer
+        theirs = [part["x0"].to(trainer.device) for part in trainer.ranks.gather({"x0": trainer.learnt})]
+        x0 = torch.cat((trainer.learnt, *theirs))
+        step = Step.of(trainer.network, trainer.objective, x0, trainer.step, trainer.task)
+        good = not trainer.ranks.any(not bool(torch.isfinite(step.u).all()))
+        if good:
+            self._save()
         self.journal.close("failed")
-        return RunError(
-            Diagnostic(
-                "R401",
-                f"training diverged: the loss is not finite at step {self.trainer.step}",
-                help=("try a smaller --lr; `stlc compile` shows the dynamics that are rolled out",),
-                note=("the last checkpoint of the run is kept",),
-            )
+        error = autopsy(step)
+        kept = (
+            "the run keeps the weights before that step" if good else "the last checkpoint of the run is kept"
         )
+        return type(error)(*(finding.with_note(kept) for finding in error.diagnostics))

@@ -85,6 +85,7 @@ class Trainer:
         self.searcher = self._searcher(MARGIN_SHARE * self.margin)
         self.repairing: Future[Repaired] | None = None
         self.accuracy = 0.0
+        self.learnt = torch.empty(0, len(task.names), device=device)
 
     def advance(self) -> float:
         """One gradient step; returns its loss. Where that or its gradient is not finite, NaN, and no step."""
@@ -180,6 +181,7 @@ class Trainer:
         if hard:
             states, targets = self.buffer.draw(hard, self.generator)
             x0 = torch.cat((fresh, states))
+        self.learnt = x0
         plans: Tensor = self.network(x0)
         winner, good = self._winner(x0, plans)
         rows = torch.arange(len(x0), device=self.device)

@@ -122,6 +122,10 @@ class InitDecl:
     span: Span | None = field(default=None, compare=False, repr=False)
 
 
+START = "_start"
+"""Behind the name of a state: its value at the start of the plan, in performance terms."""
+
+
 @dataclass(frozen=True, slots=True)
 class Term:
     """A performance term of the objective: `weight` times the mean of `value` over time and batch."""

@@ -17,7 +17,8 @@ from stlc.dynamics.points import points_of
 MAX_ROUNDS = 500
 MAX_BATCH = 1 << 20
 FEW = 0.01
-"""Acceptance rate below which W601 speaks up."""
+"""Acceptance rate below which W601 speaks up, and nothing is trained."""
+RATED = 10_000
 
 _HARD = Hard()
 Table = dict[str, Tensor]
@@ -125,11 +126,23 @@ class InitialStates:
 
     def holds(self, states: Tensor) -> Tensor:
         """Where (n, dim) states meet every condition of `where`, (n,) booleans."""
+        return self._each_holds(states).all(0)
+
+    def _each_holds(self, states: Tensor) -> Tensor:
+        """Where each condition of `where` holds, (conditions, n) booleans."""
         if self._where is None:
-            return torch.ones(len(states), dtype=torch.bool, device=states.device)
+            return torch.ones(0, len(states), dtype=torch.bool, device=states.device)
         env = dict(zip(self.names, states.unbind(1), strict=True))
         marks = self._where(env, TORCH, _HARD)
-        return torch.stack([mark.expand(len(states)) > 0.5 for mark in marks.values()]).all(0)
+        return torch.stack([mark.expand(len(states)) > 0.5 for mark in marks.values()])
+
+    def require_many(self, n: int = 256, *, seed: int = 0) -> None:
+        """Raise SystemFileError (S301) where less than one proposed state in a hundred is kept."""
+        before = self.drawn, self.kept
+        self.sample(n, torch.Generator().manual_seed(seed))
+        drawn, kept = self.drawn - before[0], self.kept - before[1]
+        if kept < FEW * drawn:
+            raise self._rejected(drawn, kept)
 
     def _rejected(self, drawn: int, kept: int) -> SystemFileError:
         return SystemFileError(
@@ -139,8 +152,16 @@ class InitialStates:
                 self.decl.span,
                 label="too narrow, or it contradicts `mixture`",
                 help=("draw the states closer to what `where` asks for",),
+                note=self._rates(),
             )
         )
+
+    def _rates(self) -> tuple[str, ...]:
+        """How often each condition holds, the rarest first."""
+        proposed = self._propose(RATED, torch.Generator().manual_seed(0))
+        rates = self._each_holds(proposed).double().mean(1).tolist()
+        told = sorted(zip(rates, self.decl.where_text, strict=True))
+        return tuple(f"`{text}` holds for {rate:.2%} of what is drawn" for rate, text in told)
 
     def warnings(self) -> tuple[Diagnostic, ...]:
         """W601 where few of the states drawn so far were kept."""

@@ -84,6 +84,11 @@ class Names:
         exact = tuple(column for column in self.columns if column.name == name)
         return exact or tuple(column for column in self.columns if base_name(column.name) == name)
 
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states; a vector has one."""
+        return tuple(dict.fromkeys(base_name(column.name) for column in self.columns))
+
     def vector(self, name: str) -> bool:
         """Whether a state of that name is a vector."""
         return all(column.name != name for column in self.columns)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from stlc.compile import ir
-from stlc.compile.scope import Known
-from stlc.compile.values import Number
-from stlc.dynamics.decl import BackupDecl, ObjectiveDecl, PolicyDecl, Term, TrainDecl
+from stlc.compile.scope import Entry, Known
+from stlc.compile.values import Number, Vector
+from stlc.dynamics.decl import START, BackupDecl, ObjectiveDecl, PolicyDecl, Term, TrainDecl
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import component_texts
 from stlc.dynamics.schema_mirror import read_mirror
@@ -29,11 +31,14 @@ OUTCOME = {
 
 
 def read_objective(node: Node | None, reader: Reader, names: Names) -> ObjectiveDecl:
-    """The section `objective`; terms may read `sat`, `rho`, `k` and `t`."""
+    """The section `objective`; terms read `sat`, `rho`, `k`, `t`, and `x_start`, where a state `x` began."""
     found = reader.fields(node, "`objective`", OBJECTIVE_KEYS)
     default = ObjectiveDecl()
     entries = {name: Known(Number(ir.Col(name), flexible=True), about) for name, about in OUTCOME.items()}
     entries["t"] = Known(Number(ir.Col("t"), SECOND), "seconds since the start of the plan")
+    entries |= {
+        f"{name}{START}": _first(names.entries[name]) for name in names.states if name in names.entries
+    }
     here = names.expressions(reader).extended({n: e for n, e in entries.items() if n not in names.entries})
     gamma = reader.number(found.get("gamma"), "`gamma`")
     smoothing = reader.number(found.get("smoothing"), "`smoothing`", low=1e-9)
@@ -44,6 +49,23 @@ def read_objective(node: Node | None, reader: Reader, names: Names) -> Objective
         default.stl_weight if weight is None else weight,
         tuple(term for item in reader.items(found.get("terms"), "`terms`") for term in _term(item, here)),
     )
+
+
+def _first(state: Entry) -> Known:
+    """The value of a state at the start of the plan."""
+    assert isinstance(state, Known)
+    about = "its value at the start of the plan"
+    match state.value:
+        case Number(num=ir.Col(name)) as number:
+            return Known(replace(number, num=ir.Col(name + START)), about)
+        case Vector(items) as vector:
+            parts = tuple(
+                replace(item, num=ir.Col(item.num.name + START))
+                for item in items
+                if isinstance(item.num, ir.Col)
+            )
+            return Known(replace(vector, items=parts), about)
+    raise TypeError(f"not a state: {state}")
 
 
 def _term(node: Node, here: Expressions) -> tuple[Term, ...]:

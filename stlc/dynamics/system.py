@@ -19,7 +19,7 @@ from stlc.compile.timers import Timer
 from stlc.compile.typed import Parameter
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.algebra import add, multiply, names_in
-from stlc.dynamics.decl import Assign, ControlDecl, SystemDecl
+from stlc.dynamics.decl import START, Assign, ControlDecl, SystemDecl
 from stlc.dynamics.describe import describe
 from stlc.dynamics.draws import Drawing, Rows
 from stlc.dynamics.functions import load_functions
@@ -322,9 +322,16 @@ class System:
             return torch.zeros_like(sat)
         like = next(iter(columns.values()))
         k = torch.arange(len(like), dtype=like.dtype, device=like.device)[:, None]
-        env = {"k": k, "t": k * self.dt, "sat": sat, "rho": rho, **columns}
+        first = {name + START: columns[name][0] for name in self._named_first}
+        env = {"k": k, "t": k * self.dt, "sat": sat, "rho": rho, **first, **columns}
         cost: Tensor = program(env, TORCH, switch)["cost"]
         return cost.expand(len(like), len(sat)).mean(0)
+
+    @cached_property
+    def _named_first(self) -> tuple[str, ...]:
+        """The states whose value at the start of the plan a term reads."""
+        read = {name for term in self.decl.objective.terms for name in names_in(term.value)}
+        return tuple(name for name in self.names if name + START in read)
 
     @cached_property
     def _terms(self) -> tuple[Program | None, Program | None]:

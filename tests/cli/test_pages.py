@@ -183,6 +183,9 @@ def arranged(monkeypatch):
                 monkeypatch.setattr("stlc.view.find_spec", no_package)
             case "R402":
                 monkeypatch.setattr("stlc.controller.policy.Mlp.candidates", no_number)
+            case "R404":
+                path = Path("specs/cart.stl")
+                path.write_text(path.read_text().replace("abs(x) < 0.1 m", "x > 100 m"))
             case "R403":
                 monkeypatch.setattr("stlc.controller.ranks.PATIENCE", timedelta(seconds=0.1))
                 for name, value in {**ENVIRONMENT, "RANK": 0, "MASTER_PORT": free_port()}.items():

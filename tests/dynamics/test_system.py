@@ -88,6 +88,24 @@ def test_terms_are_weighted_means_over_time(make: Make) -> None:
         system.performance(columns, torch.tensor([1.0, 0.0]))
 
 
+BEGUN = """\
+time: {dt: 1 s, horizon: 2 steps}
+state: {p: {size: 2, unit: m}, tau: {unit: s}}
+control: {u: {unit: m/s, range: [-9, 9]}}
+flow: {p: "[u, 0]", tau: -1}
+init: {mixture: [{draw: {p: "[0, 0]", tau: 0}}]}
+objective: {terms: [{expr: "if tau_start > 0 s then norm(p - p_start) else p[1]"}]}
+"""
+
+
+def test_a_term_may_read_where_a_state_began(make: Make) -> None:
+    system = make(BEGUN)
+    x0 = torch.tensor([[5.0, 7.0, 1.0], [5.0, 7.0, -1.0]])
+    columns = system.rollout_columns(x0, torch.full((2, 2, 1), 3.0))
+    cost = system.performance(columns, torch.ones(2))
+    assert cost.tolist() == pytest.approx([3.0, 7.0])  # 0, 3 and 6 m from where it began, though tau runs out
+
+
 def test_performance_has_a_gradient_but_the_verdict_has_none(car: System) -> None:
     x0 = car.sample(64, seed=0)
     u = torch.zeros(64, 25, 1, requires_grad=True)
