@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,17 @@ def test_at_the_value_of_the_benchmark_a_family_is_the_benchmark(
     u = own.system.control_low + share * (own.system.control_high - own.system.control_low)
     here, there = same.judge(x0, u).requirements, own.judge(x0, u).requirements
     torch.testing.assert_close(here, there, rtol=0, atol=1e-12)
+
+
+def test_what_is_published_is_complete() -> None:
+    published, kept = load_schema("bench/1"), read_json(ROOT / "bench" / FILE)
+    assert misfits(kept, {"$defs": published["$defs"], **published["$defs"]["family"]}) == []
+    values = {family.name: [str(value) for value in family.values] for family in FAMILIES}
+    page = (ROOT / "docs/results.md").read_text(encoding="utf-8")
+    for training in kept["trainings"].values():
+        assert list(training["values"]) == values[training["family"]]
+        for value in training["values"]:
+            assert re.search(rf"^\| \*?{float(value):g} {training['unit']}\*? \|", page, re.MULTILINE)
 
 
 def test_cells_of_families_are_none_of_the_paper() -> None:
