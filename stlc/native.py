@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stlc.diagnostics import MissingError
 from stlc.files import atomic_path
 
 if TYPE_CHECKING:
@@ -233,7 +234,7 @@ def build(text: str) -> Path | None:
                 _compile(using, source, beside)
             finally:
                 source.unlink(missing_ok=True)
-    except (OSError, subprocess.SubprocessError):
+    except (OSError, subprocess.SubprocessError, MissingError):
         return None
     return path
 

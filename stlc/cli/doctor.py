@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from stlc.cli.output import emit, emit_json, say, table
 State = Literal["ok", "missing", "off"]
 MISSING = 5
 
+_SLOWER = "torch does its work, about ten times slower"
 _NEEDED = ("torch", "numpy", "lark", "pydantic", "pyyaml", "safetensors", "typer", "rich")
 
 
@@ -137,10 +137,21 @@ def _tools() -> Iterator[Finding]:
     writable = folder is not None and os.access(_existing(folder), os.W_OK)
     advice = str(folder) if writable else "no place for it; starting takes 0.1 s longer"
     yield Finding("cache", "ok" if writable else "off", advice)
-    compiler = next((found for name in ("cc", "gcc", "clang") if (found := shutil.which(name))), None)
-    yield Finding("compiler", "ok" if compiler else "off", compiler or "no C compiler; nothing needs one yet")
+    yield _compiler()
     installed = _completion()
     yield Finding("completion", "ok" if installed else "off", installed or "stlc --install-completion")
+
+
+def _compiler() -> Finding:
+    """Whether plans are judged and searched for as C, or by torch."""
+    from stlc.native import build, compiler
+
+    found = compiler()
+    if found is None:
+        return Finding("compiler", "off", f"no C compiler (cc, gcc, clang, $CC); {_SLOWER}")
+    if build("int works(void) { return 1; }\n") is None:
+        return Finding("compiler", "off", f"{found} fails to build a library; {_SLOWER}")
+    return Finding("compiler", "ok", f"{found}; training, search and backup run as C")
 
 
 def _existing(folder: Path) -> Path:

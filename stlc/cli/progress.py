@@ -146,6 +146,8 @@ class Progress:
     def chosen(self, engine: Mapping[str, Any]) -> None:
         """Say what the engine chose by itself."""
         self._print(f"  engine          {engine_text(engine)}")
+        if "by_torch" in engine:
+            self._print(f"  computed by     {native_text(engine['by_torch'])}")
 
     def update(self, row: Mapping[str, Any]) -> None:
         """Take in a row of `train.jsonl`, or a part of one."""
@@ -289,6 +291,17 @@ def engine_text(engine: Mapping[str, Any]) -> str:
             f"margin {engine['margin']:.3g}",
         ]
     )
+
+
+def native_text(by_torch: Mapping[str, str]) -> str:
+    """Which parts of training run as emitted C, and why the others do not."""
+    native = [part for part, reason in by_torch.items() if not reason]
+    reasons = dict.fromkeys(reason for reason in by_torch.values() if reason)
+    lines = [f"{', '.join(native)}: C"] if native else []
+    for why in reasons:
+        parts = ", ".join(part for part, reason in by_torch.items() if reason == why)
+        lines.append(f"{parts}: torch ({why})")
+    return " · ".join(lines)
 
 
 def final_screen(summary: Summary, spark: str = "") -> list[str]:

@@ -113,7 +113,7 @@ class NumberWriter:
 
     def _written_out(self, num: Leaf) -> str:
         if not isinstance(num, ir.Extern) or not isinstance(num.function, ir.Body):
-            raise Untranslatable(f"`{num.name}`")
+            raise Untranslatable(f"the function `{num.name}`")
         args = [self.number(arg) for arg in num.args]
         return self._inlined(num.name, num.function, args)[num.output]
 

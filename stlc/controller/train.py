@@ -15,6 +15,7 @@ from stlc.controller.config import Engine, TrainConfig, decide
 from stlc.controller.conflict import conflict
 from stlc.controller.held_out import Score, score
 from stlc.controller.journal import Journal
+from stlc.controller.natives import by_torch
 from stlc.controller.pace import OpenEnd, clock_of, steps_within
 from stlc.controller.ranks import ALONE, Ranks
 from stlc.controller.run import Run, load_engine, load_task, spec_hash, system_hash
@@ -215,7 +216,10 @@ class _Session:
         """Train to the end, judge, and close the record."""
         trainer = self.trainer
         sat_down, first = self.now(), trainer.step
-        self.watch.begun({**asdict(trainer.engine), "margin": trainer.margin, "steps": trainer.steps})
+        torch_does = by_torch(trainer.task, trainer.engine, trainer.device.type)
+        self.journal.note({"by_torch": dict(torch_does)})
+        chosen = {**asdict(trainer.engine), "margin": trainer.margin, "steps": trainer.steps}
+        self.watch.begun({**chosen, "by_torch": torch_does})
         saved = time.perf_counter()
         self._revise()
         value = math.nan

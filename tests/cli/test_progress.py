@@ -17,6 +17,7 @@ from stlc.cli.progress import (
     clock_text,
     engine_text,
     final_screen,
+    native_text,
     sparkline,
 )
 
@@ -240,6 +241,16 @@ def test_what_the_engine_chose_is_said():
     )
     fixed = {**chosen, "method": "gradient", "plans": 1, "hard": 0, "samples": 50000, "margin": 0.5}
     assert "1 plan of a network 64x64 · 256 states a step of 50,000 ·" in engine_text(fixed)
+
+
+def test_which_parts_run_as_c_is_said():
+    progress, stream, _ = piped()
+    progress.start(INFO)
+    chosen = {"method": "guided", "hidden": [8], "plans": 1, "batch": 9, "hard": 0, "lr": 1.0, "margin": 0.1}
+    progress.chosen({**chosen, "by_torch": {"verdicts": "", "search": "", "gradient": ""}})
+    assert stream.getvalue().splitlines()[2] == "  computed by     verdicts, search, gradient: C"
+    assert native_text({"verdicts": "", "gradient": "why"}) == "verdicts: C · gradient: torch (why)"
+    assert native_text({"verdicts": "why", "gradient": "why"}) == "verdicts, gradient: torch (why)"
 
 
 def test_the_closing_screen_says_what_remains_and_where_it_is_drawn():

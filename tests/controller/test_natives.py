@@ -1,0 +1,75 @@
+"""Which part runs as C, and why another does not; what cannot be C gives the same results in torch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from stlc import native
+from stlc.controller.config import TrainConfig, decide
+from stlc.controller.natives import by_torch
+from stlc.controller.objective import guided_objective, loss
+from stlc.controller.task import Task
+from stlc.dynamics.system import System
+from stlc.grammar.parser import parse
+from stlc.source import Source
+
+pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
+ARM = Path(__file__).parents[1] / "data" / "arm.yaml"
+SPEC = """
+{extern}
+signal a, b [rad]
+{body}
+def tip = hand([a, b])
+require clear: always[0, T] norm(tip - [1 m, 1 m]) > 0.5 m
+require seen: once[0, 0.3 s] a > 0.1 rad
+"""
+OUTSIDE = "extern fn hand(q: real[2]) -> real[2] [m]"
+INSIDE = "def hand(q) = [q[0] * 2 m - q[0]^3 / 6 * 1 m, q[1] * 2 m - q[1]^3 / 6 * 1 m]"
+
+
+def _task(extern: str, body: str) -> Task:
+    return Task.of(parse(Source("arm.stl", SPEC.format(extern=extern, body=body))), System.load(ARM))
+
+
+def test_a_function_in_python_leaves_the_work_to_torch_with_the_same_results() -> None:
+    outside, inside = _task(OUTSIDE, ""), _task("", INSIDE)
+    engine = decide(outside, TrainConfig())
+    why = "the function `hand` has no C form"
+    assert by_torch(outside, engine, "cpu") == dict.fromkeys(("verdicts", "search", "gradient"), why)
+    assert not any(by_torch(inside, engine, "cpu").values())
+    x0 = outside.sample(50, seed=1, dtype=torch.float64)
+    results = []
+    for task in (outside, inside):
+        u = torch.linspace(-1, 1, 500, dtype=torch.float64).view(50, 5, 2).sin().requires_grad_()
+        judged = task.judge(x0, u.detach())
+        value = loss(task, guided_objective(0.1, slope=5.0, performance_weight=0.3), x0, u).total
+        results.append((judged.requirements, *torch.autograd.grad(value.sum(), u)))
+    for found, expected in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_the_paper_s_objective_a_device_and_a_missing_compiler(
+    car_task: Task, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine = decide(car_task, TrainConfig())
+    assert by_torch(car_task, engine, "cpu") == {"verdicts": "", "search": "", "gradient": ""}
+    smooth = by_torch(car_task, replace(engine, method="gradient"), "cpu")
+    assert smooth == {"verdicts": "", "gradient": "the paper's objective is smooth"}
+    assert set(by_torch(car_task, engine, "cuda").values()) == {"the device is cuda"}
+    fresh = Task(car_task.compiled, System(car_task.system.decl))
+    monkeypatch.setattr(native, "compiler", lambda: None)
+    monkeypatch.setattr("stlc.controller.natives.compiler", lambda: None)
+    assert set(by_torch(fresh, engine, "cpu").values()) == {"there is no C compiler"}
+    monkeypatch.undo()
+    fresh = Task(car_task.compiled, System(car_task.system.decl))
+    monkeypatch.setattr("stlc.native._compile", _fails)
+    monkeypatch.setenv("XDG_CACHE_HOME", "/nowhere")
+    assert set(by_torch(fresh, engine, "cpu").values()) == {"the C compiler fails"}
+
+
+def _fails(*_: object) -> None:
+    raise OSError
