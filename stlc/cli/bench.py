@@ -8,6 +8,7 @@ from stlc.cli.bench_ablation import ablation
 from stlc.cli.bench_family import family
 from stlc.cli.bench_paper import paper
 from stlc.cli.bench_robustness import robustness
+from stlc.cli.bench_step import step
 from stlc.cli.options import describe
 
 _KEPT = (
@@ -57,4 +58,12 @@ def register(app: typer.Typer) -> None:
             "its backward); `plain torch` is how many times longer plain torch takes.",
         )
     )(robustness)
+    group.command(
+        help=describe(
+            "Time the parts of a training step, and rollouts with verdicts and gradients.",
+            "stlc bench step",
+            "stlc bench step --only traffic --page docs/benchmarks.md",
+            note="Milliseconds of processor time on one thread; the search beside it runs on another core.",
+        )
+    )(step)
     app.add_typer(group)
