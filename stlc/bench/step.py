@@ -187,15 +187,23 @@ def speed(name: str, task: Task, *, seconds: float) -> Speed:
         each, _ = task.gradient(some, plan, slope=slope)
         torch.autograd.grad(task.graph.overall(each).sum(), plan)
 
-    todo: list[Callable[[], object]] = [in_torch, lambda: task.judge(x0, u, states=False)]
+    double = x0.double().numpy(), u.double().numpy()
+
+    def verdict() -> None:
+        if task.native is None:
+            task.judge(x0, u, states=False)
+        else:
+            task.native.kernel.judge(*double)
+
+    todo: list[Callable[[], object]] = [in_torch, verdict]
     if task.gradient is not None:
         todo.append(as_c)
-    torch_time, verdict, *native = (median(times) for times in interleaved(todo, seconds))
+    torch_time, judging, *native = (median(times) for times in interleaved(todo, seconds))
     return Speed(
         name,
         task.horizon,
         native[0] * 1e3 if native else None,
         torch_time * 1e3,
         REPORTED.get(name),
-        VERDICTS / verdict,
+        VERDICTS / judging,
     )

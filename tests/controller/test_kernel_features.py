@@ -78,7 +78,8 @@ def gradients_agree(task: Task, seed: int) -> None:
     x0, u = _tried(task, seed)
     generator = torch.Generator().manual_seed(seed)
     assert task.gradient is not None
-    by_each = torch.rand(ROWS, len(task.rules), generator=generator, dtype=torch.float64)
+    still = _stands_still(task.system.rollout_columns(x0, u, Hard()))
+    by_each = torch.rand(ROWS, len(task.rules), generator=generator, dtype=torch.float64) * ~still[:, None]
     by_states = torch.rand(len(task.names), ROWS, generator=generator, dtype=torch.float64)
 
     def gradient(each: torch.Tensor, states: dict[str, torch.Tensor], plan: torch.Tensor) -> torch.Tensor:
@@ -94,6 +95,12 @@ def gradients_agree(task: Task, seed: int) -> None:
     states = task.system.rollout_columns(x0, plan, StraightThrough(SLOPE))
     expected = gradient(task.graph.per_requirement_columns(states, ops=TORCH), states, plan)
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
+
+
+def _stands_still(states: dict[str, torch.Tensor]) -> torch.Tensor:
+    """Rows in which a clamped state repeats itself: a minimum over time is a tie there."""
+    pairs = [states[name][1:] == states[name][:-1] for name in ("x", "q[0]", "q[1]")]
+    return torch.stack(pairs).any(0).any(0)
 
 
 def test_values_of_random_systems_and_specifications() -> None:
@@ -114,5 +121,5 @@ def test_values_of_many_systems_and_specifications() -> None:
 
 @pytest.mark.slow
 def test_gradients_of_many_systems_and_specifications() -> None:
-    for seed, task in enumerate(_tasks(60, 12, smooth=True)):
+    for seed, task in enumerate(_tasks(40, 12, smooth=True)):
         gradients_agree(task, seed)
