@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from stlc.compile.modules import library_of
-from stlc.controller.config import ENGINE_VERSION, HELD_OUT, HELD_OUT_SEED, TrainConfig, decide
+from stlc.controller.config import ENGINE_VERSION, HELD_OUT, HELD_OUT_SEED, Engine, TrainConfig, decide
 from stlc.controller.task import Task
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.functions import function_files
@@ -126,8 +126,13 @@ class Inputs:
         return sha256(dumps(self.values))[:10]
 
     def made(self, document: Mapping[str, Any]) -> bool:
-        """Whether the result `document` came of these inputs."""
-        return all(document.get(key) == value for key, value in self.values.items())
+        """Whether the result `document` came of these inputs.
+
+        A number that engines did not have when it was made stood at what is its default now.
+        """
+        known = {field.name: field.default for field in fields(Engine) if field.default is not MISSING}
+        then = {**document, "engine": {**known, **document.get("engine", {})}}
+        return all(then.get(key) == value for key, value in self.values.items())
 
 
 def inputs_of(cell: Cell) -> Inputs:

@@ -128,6 +128,11 @@ def test_a_finished_run_is_collected_and_then_kept(tmp_path: Path, monkeypatch: 
     assert 0.0 <= document["training_accuracy"] <= 1.0
     assert valid_results(place.out, "ablation") == [document]
     assert valid_results(place.out, "paper") == []
+    older = {key: value for key, value in document["engine"].items() if key != "clock"}
+    place.file(cell).write_text(json.dumps({**document, "engine": older}))
+    assert len(valid_results(place.out, "ablation")) == 1
+    place.file(cell).write_text(json.dumps({**document, "engine": {**older, "slope": 7.0}}))
+    assert valid_results(place.out, "ablation") == []
     stale = {**document, "engine_version": -1}
     place.file(cell).write_text(json.dumps(stale))
     assert valid_results(place.out) == []
