@@ -256,15 +256,31 @@ class _Look:
     def _to_the_end(self) -> bool:
         return self.forward and self.window.hi is None
 
+    @property
+    def _endless(self) -> bool:
+        """Whether the window may take samples for ever."""
+        return self._to_the_end and self.record.growing and self.every is (self.record.end == "lower")
+
+    def _steady(self, instants: Instants) -> Instants:
+        """Where no window reaches back to a sample any more, all instants are alike.
+
+        The record is finite and has to be cut somewhere; what looks beyond the cut must not decide.
+        """
+        far = self.record.length + self.record.ahead // 2
+        rest = self.record.everywhere >> far << far
+        return instants | rest if instants >> far & 1 else instants & ~rest
+
     @cached_property
     def _visible(self) -> Instants:
         """A window to the end takes the samples there are; while a trace grows it may take more."""
-        if self._to_the_end and self.record.growing and self.every is (self.record.end == "lower"):
+        if self._endless:
             return self.record.everywhere
         return (1 << self.record.length) - 1 if self._to_the_end else self.record.everywhere
 
     def at(self, instants: Instants, k: int) -> Instants:
         """Who finds himself in the set k steps away; where there is nothing to see, `every` is content."""
+        if self._endless:
+            instants = self._steady(instants)
         if self.forward:
             seen, seeing = (instants & self._visible) >> k, self._visible >> k
         else:

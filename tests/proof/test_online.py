@@ -56,7 +56,11 @@ def test_samples_one_by_one(numbers: range) -> None:
 
 
 @pytest.mark.parametrize(
-    "seed", [pytest.param(600000003709, id="what the past tells beyond the end of a planning window")]
+    "seed",
+    [
+        pytest.param(600000003709, id="what the past tells beyond the end of a planning window"),
+        pytest.param(694993044804, id="what the past tells for ever"),
+    ],
 )
 def test_a_case_that_was_wrong_once(seed: int) -> None:
     found = drawn(seed)
