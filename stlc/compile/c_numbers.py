@@ -40,10 +40,10 @@ BINARY = {
     "mod": "floored_mod({0}, {1})",
     "pow": "pow({0}, {1})",
     "atan2": "atan2({0}, {1})",
-    "min": "MIN({0}, {1})",
-    "max": "MAX({0}, {1})",
+    "min": "LEAST({0}, {1})",
+    "max": "MOST({0}, {1})",
 }
-CLIP = "MIN(MAX({0}, {1}), {2})"
+CLIP = "LEAST(MOST({0}, {1}), {2})"
 
 
 class Untranslatable(Exception):  # noqa: N818 - not an error: another back end takes over

@@ -7,6 +7,7 @@ import pytest
 from emitted import OPERATIONS, STEPS, follower, values_agree
 from formula_strategies import NAMES
 
+from stlc import native
 from stlc.compile import ir
 from stlc.compile.c_numbers import Untranslatable
 from stlc.compile.emit_c import emit
@@ -35,3 +36,12 @@ def test_what_has_no_c_form_is_said() -> None:
     for rule in (ir.Atom(ir.Extern("f", (ir.Col("x"),))), ir.Atom(ir.At("x", 15)), before, *late):
         with pytest.raises(Untranslatable):
             emit(follower(), [rule])
+
+
+def test_nan_is_not_lost_in_minima_and_maxima(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(native, "FLAGS", (*native.FLAGS, "-O0"))
+    root, one = ir.Op("sqrt", (ir.Col("x"),)), ir.Lit(1.0)
+    nums = [ir.Op("min", (one, root)), ir.Op("max", (one, root)), ir.Op("clip", (one, root, ir.Lit(2.0)))]
+    trace = np.random.default_rng(3).normal(0, 2, (STEPS + 1, 64, 3))
+    for num in nums:
+        values_agree([ir.Atom(num)], trace)
