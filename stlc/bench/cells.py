@@ -131,7 +131,8 @@ class Inputs:
         A number that engines did not have when it was made stood at what is its default now.
         """
         known = {field.name: field.default for field in fields(Engine) if field.default is not MISSING}
-        then = {**document, "engine": {**known, **document.get("engine", {})}}
+        engine = document.get("engine")
+        then = {**document, "engine": {**known, **engine} if isinstance(engine, dict) else None}
         return all(then.get(key) == value for key, value in self.values.items())
 
 
