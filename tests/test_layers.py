@@ -88,6 +88,7 @@ HOMES = {
     "h5py": ("stlc.trace_mat",),
     "mcap": ("stlc.trace_mcap",),
     "tensorboardX": ("stlc.controller.logbook",),
+    "ray": ("stlc.controller.cluster",),
     "mcap_ros2": ("stlc.trace_mcap",),
     "pickle": (),
     "marshal": (),

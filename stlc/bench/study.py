@@ -21,7 +21,8 @@ from stlc.bench.cells import (
 )
 from stlc.bench.fixed_set import training_accuracy
 from stlc.compile.semantics import TOLERANCE
-from stlc.controller.sweep import Errand, side_by_side
+from stlc.controller.inputs import input_files
+from stlc.controller.sweep import Errand, Returned, side_by_side
 from stlc.diagnostics import StlcError
 from stlc.files import write_atomic
 from stlc.jsontext import dumps
@@ -40,12 +41,14 @@ class Place:
         runs: folder of the runs behind them.
         jobs: processes at a time.
         threads: of torch in each.
+        cluster: address of a cluster that trains instead of this machine.
     """
 
     out: Path = Path("bench")
     runs: Path = Path("runs/bench")
     jobs: int = 1
     threads: int = 1
+    cluster: str | None = None
 
     def file(self, cell: Cell) -> Path:
         """The result of a cell."""
@@ -92,12 +95,12 @@ def fill(
         if run is not None and run.status == "finished":
             yield Filled(inputs.cell, _collect(inputs, run, place))
         else:
-            errands.append(Errand(inputs.cell.name, _arguments(inputs, place, run)))
-    for back in side_by_side(errands, jobs=place.jobs, begun=lambda errand: begun(errand.name)):
+            errands.append(_errand(inputs, place, run))
+    for back in _sent(errands, place, begun):
         inputs = wanted[back.errand.name]
         run = newest_run(inputs, place)
         if back.code not in (0, 1) or run is None or run.status != "finished":
-            yield Filled(inputs.cell, {}, why=f"exit code {back.code}\n{back.said}".strip())
+            yield Filled(inputs.cell, {}, why=f"exit code {back.code}\n{back.why}".strip())
             continue
         yield Filled(inputs.cell, _collect(inputs, run, place, cores=back.cores))
 
@@ -116,6 +119,26 @@ def newest_run(inputs: Inputs, place: Place) -> RunDir | None:
         return None if runs[-1].status == "failed" else runs[-1]
     except StlcError:
         return None
+
+
+def _sent(errands: Sequence[Errand], place: Place, begun: Callable[[str], None]) -> Iterator[Returned]:
+    """Errands run where the place says."""
+    if place.cluster is None or not errands:
+        yield from side_by_side(errands, jobs=place.jobs, begun=lambda errand: begun(errand.name))
+        return
+    from stlc.controller.cluster import Cluster, on_cluster
+
+    cluster = Cluster(place.cluster, place.threads)
+    yield from on_cluster(errands, cluster, begun=lambda errand: begun(errand.name))
+
+
+def _errand(inputs: Inputs, place: Place, run: RunDir | None) -> Errand:
+    """A training, with what another machine needs for it."""
+    arguments, runs = _arguments(inputs, place, run), runs_of(inputs, place)
+    if place.cluster is None:
+        return Errand(inputs.cell.name, arguments)
+    read = input_files(spec_path(inputs.cell.benchmark), overrides=inputs.cell.overrides)
+    return Errand(inputs.cell.name, arguments, read if run is None else (run.path,), runs)
 
 
 def _arguments(inputs: Inputs, place: Place, run: RunDir | None) -> tuple[str, ...]:

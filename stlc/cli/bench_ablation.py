@@ -11,6 +11,7 @@ import typer
 from stlc.cli.bench_options import (
     BudgetOption,
     ClockOption,
+    ClusterOption,
     HeldOutOption,
     JobsOption,
     OutOption,
@@ -43,6 +44,7 @@ def ablation(
     steps: StepsOption = None,
     seeds: SeedsOption = "0..2",
     jobs: JobsOption = 1,
+    cluster: ClusterOption = None,
     threads: ThreadsOption = 1,
     held_out: HeldOutOption = 5000,
     out: OutOption = Path("bench"),
@@ -57,7 +59,7 @@ def ablation(
 
     axes = chosen(only, [axis.name for axis in AXES], "table")
     extent = Extent(axes, parse_seeds(seeds), lengths_of(budget, steps, LENGTHS, clock), held_out)
-    filling = filled(ablation_cells(extent), Place(out, runs, jobs, threads))
+    filling = filled(ablation_cells(extent), Place(out, runs, jobs, threads, cluster))
     documents = valid_results(out, "ablation")
     write_section(page, "ablation", ablation_section(documents))
     rows = [row for row in ablation_rows(filling.documents) if row.axis in axes]

@@ -12,6 +12,7 @@ import typer
 from stlc.cli.bench_options import (
     BudgetOption,
     ClockOption,
+    ClusterOption,
     JobsOption,
     OutOption,
     PageOption,
@@ -44,6 +45,7 @@ def family(
     steps: StepsOption = None,
     seeds: SeedsOption = "0",
     jobs: JobsOption = 1,
+    cluster: ClusterOption = None,
     threads: ThreadsOption = 1,
     held_out: Annotated[int, typer.Option("--held-out", min=1, help="States at each value.")] = 2000,
     out: OutOption = Path("bench"),
@@ -59,7 +61,7 @@ def family(
     names = chosen(only, [each.name for each in FAMILIES], "family")
     families = [each for each in FAMILIES if each.name in names]
     extent = Extent(families, parse_seeds(seeds), lengths_of(budget, steps, LENGTHS, clock), held_out)
-    place = Place(out, runs, jobs, threads)
+    place = Place(out, runs, jobs, threads, cluster)
     filling = filled(family_cells(extent), place)
     failed = [*filling.told()["failed"], *_judge_all(filling.documents, place)]
     documents = valid_results(out, "family")

@@ -37,6 +37,14 @@ SeedsOption = Annotated[str, typer.Option("--seeds", metavar="SEEDS", help="Such
 JobsOption = Annotated[
     int, typer.Option("--jobs", "-j", min=1, help="Trainings side by side, a share of the cores each.")
 ]
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        metavar="auto|local|HOST:PORT",
+        help="Train on a Ray cluster instead, as many at a time as it has cores for.",
+    ),
+]
 ThreadsOption = Annotated[int, typer.Option("--threads", min=1, help="Threads of torch in each training.")]
 HeldOutOption = Annotated[int, typer.Option("--held-out", min=1, help="Held-out states of the verdicts.")]
 OutOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the results.")]
@@ -116,7 +124,9 @@ def filled(cells: Sequence[Cell], place: Place) -> Filling:
         found[each.cell.name] = dict(each.document)
         kept += each.kept
         accuracy, seconds = float(each.document["accuracy"]), float(each.document["seconds"])
-        told = "  kept" if each.kept else _left(cells, (*found, *(name for name, _ in failed)), place.jobs)
+        done = (*found, *(name for name, _ in failed))
+        left = "" if place.cluster is not None else _left(cells, done, place.jobs)
+        told = "  kept" if each.kept else left
         say(f"{counted}  accuracy {accuracy:.4f}  {seconds:.0f} s{told}")
     documents = tuple(found[cell.name] for cell in cells if cell.name in found)
     return Filling(documents, len(documents) - kept, kept, tuple(failed))

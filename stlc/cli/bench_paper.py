@@ -12,6 +12,7 @@ import typer
 from stlc.cli.bench_options import (
     BudgetOption,
     ClockOption,
+    ClusterOption,
     HeldOutOption,
     JobsOption,
     OutOption,
@@ -54,6 +55,7 @@ def paper(
         typer.Option("--passes", min=0, help="Searches for the ceiling, 20,000 plans a state each."),
     ] = 10,
     jobs: JobsOption = 1,
+    cluster: ClusterOption = None,
     threads: ThreadsOption = 1,
     held_out: HeldOutOption = 5000,
     out: OutOption = Path("bench"),
@@ -73,7 +75,7 @@ def paper(
         lengths_of(budget, steps, LENGTHS, clock),
         held_out,
     )
-    place = Place(out, runs, jobs, threads)
+    place = Place(out, runs, jobs, threads, cluster)
     filling = filled(paper_cells(extent), place)
     search(extent, place, passes)
     documents, ceilings = write_page(place, page)

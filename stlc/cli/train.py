@@ -18,7 +18,7 @@ from stlc.cli.train_many import Many, train_many
 from stlc.diagnostics import Diagnostic, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from stlc.cli.sitting import Sitting
     from stlc.controller.config import Method, TrainConfig
@@ -38,13 +38,14 @@ def register(app: typer.Typer) -> None:
             "stlc train specs/traffic.stl --system car.yaml --budget 60s",
             "stlc train --resume latest",
             "stlc train specs/traffic.stl --seeds 0..2 --jobs 2",
+            "stlc train specs/traffic.stl specs/ship_safe.stl --seeds 0..2 --cluster auto",
             note="The run's folder holds everything that repeats it. Ctrl-C saves a checkpoint and stops.",
         ),
     )(train)
 
 
 def train(
-    spec: o.SpecArgument = None,
+    spec: o.SpecsArgument = None,
     system: SystemOption = None,
     budget: o.BudgetOption = None,
     clock: o.ClockOption = "wall",
@@ -52,6 +53,7 @@ def train(
     seed: o.SeedOption = None,
     seeds: o.SeedsOption = None,
     jobs: o.JobsOption = 1,
+    cluster: o.ClusterOption = None,
     method: o.MethodOption = None,
     resume: o.ResumeOption = None,
     name: o.NameOption = None,
@@ -69,13 +71,17 @@ def train(
 ) -> None:
     """Learn a policy, or go on with a run that was interrupted."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads of torch must not spin
-    _check_together(seed=seed, seeds=seeds, jobs=jobs, budget=budget, steps=steps)
+    specs = tuple(dict.fromkeys(spec or ()))
+    _check_together(seed=seed, seeds=seeds, budget=budget, steps=steps)
+    if resume is None:
+        _check_many(specs, seeds=seeds, system=system, jobs=jobs, cluster=cluster)
     logbook = _logbook(log)
     if resume is not None:
         _refuse_on_resume(
-            {"SPEC": spec, "--system": system, "--budget": budget, "--seed": seed, "--method": method}
+            {"SPEC": spec or None, "--system": system, "--budget": budget, "--seed": seed, "--method": method}
             | {"--name": name, "--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch}
-            | {"--set": set_, "--seeds": seeds, "--held-out": held_out}
+            | {"--set": set_, "--seeds": seeds, "--held-out": held_out, "--cluster": cluster}
+            | {"--jobs": None if jobs == 1 else jobs}
         )
         with one_voice():
             sitting = _resume(resume, runs=runs, steps=steps, device=device, logbook=logbook)
@@ -97,23 +103,37 @@ def train(
         clock=parse_clock(clock),
     )
     launch = Launch(root=runs, name=name, overrides=parse_overrides(set_), command=sys.argv[1:])
+    if len(specs) > 1 or seeds is not None or cluster is not None:
+        drawn = parse_seeds(seeds) if seeds is not None else (seed,)
+        if len(specs) < 2:  # what is wrong with the only one is said once
+            with one_voice():
+                _task(specs, system, launch.overrides)
+        many = Many(specs, system, config, launch, drawn, jobs, cluster, log, pictures)
+        train_many(many, json=json)
     with one_voice():
-        task = _task(spec, system, launch.overrides)
-    if seeds is not None:
-        train_many(Many(spec, system, config, launch, parse_seeds(seeds), jobs, log, pictures), json=json)
-    with one_voice():
+        task = _task(specs, system, launch.overrides)
         _train(task, config, launch, logbook).conclude(pictures=pictures, json=json)
 
 
-def _check_together(
-    *, seed: int | None, seeds: str | None, jobs: int, budget: str | None, steps: int | None
-) -> None:
-    """Options that exclude each other, or mean nothing alone."""
+def _check_together(*, seed: int | None, seeds: str | None, budget: str | None, steps: int | None) -> None:
+    """Options that exclude each other."""
     if budget is not None and steps is not None:
         raise UsageError(Diagnostic("U101", "`--budget` and `--steps` contradict each other"))
     if seeds is not None and seed is not None:
         raise UsageError(Diagnostic("U101", "`--seed` and `--seeds` contradict each other"))
-    if seeds is None and jobs > 1:
+
+
+def _check_many(
+    specs: Sequence[Path], *, seeds: str | None, system: str | None, jobs: int, cluster: str | None
+) -> None:
+    """Options that mean nothing for one run, or for several, or where a cluster divides the work."""
+    if len(specs) > 1 and system is not None:
+        help_ = ('a line `system "FILE"` in every specification',)
+        raise UsageError(Diagnostic("U101", "`--system` is for one specification", help=help_))
+    if cluster is not None and jobs > 1:
+        help_ = ("a cluster runs as many as it has cores for; --threads says how many a run has",)
+        raise UsageError(Diagnostic("U101", "`--jobs` and `--cluster` contradict each other", help=help_))
+    if len(specs) < 2 and seeds is None and jobs > 1:
         help_ = ("stlc train SPEC --seeds 0..2 --jobs 2",)
         raise UsageError(Diagnostic("U101", "`--jobs` needs several runs", help=help_))
 
@@ -143,7 +163,7 @@ def _rate(value: float) -> float:
     return value
 
 
-def _task(path: Path | None, system: str | None, overrides: Mapping[str, str]) -> Task:
+def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str]) -> Task:
     """Read, compile, and say which system file was taken."""
     from stlc.cli.output import say, show_diagnostics
     from stlc.controller.task import Task
@@ -151,9 +171,10 @@ def _task(path: Path | None, system: str | None, overrides: Mapping[str, str]) -
     from stlc.files import find_system, read_source
     from stlc.grammar.parser import parse
 
-    if path is None:
+    if not specs:
         example = "stlc train specs/traffic.stl --system car.yaml"
         raise UsageError(Diagnostic("U101", "which specification is to be trained for?", help=(example,)))
+    (path,) = specs
     spec = parse(read_source(path))
     wanted = system or spec.system
     if wanted is None:

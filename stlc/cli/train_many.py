@@ -1,8 +1,8 @@
-"""Training for several seeds: one run each, in a process of its own, and a table of all."""
+"""Training for several specifications and seeds: a run each, in a process of its own, and a table of all."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -23,37 +23,64 @@ ENDED = 70
 
 
 @dataclass(frozen=True, slots=True)
-class Many:
-    """Runs that differ in their seeds alone.
+class Part:
+    """One run of many.
 
     Attributes:
         spec: the specification's file.
-        system: as given, or None.
+        seed: None for that of the system file.
+    """
+
+    spec: Path
+    seed: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Many:
+    """Runs that differ in their specifications and seeds alone.
+
+    Attributes:
+        specs: the specifications' files.
+        system: as given, or None; only of one specification.
         config: what the runs have in common.
         launch: where, and under which name.
-        seeds: one a run.
+        seeds: one a run of each specification; None for that of its system file.
         jobs: processes at a time.
+        cluster: address of a cluster that trains instead of this machine.
         log: of `--log`.
         pictures: whether reports are drawn.
     """
 
-    spec: Path | None
+    specs: Sequence[Path]
     system: str | None
     config: TrainConfig
     launch: Launch
-    seeds: Sequence[int]
+    seeds: Sequence[int | None]
     jobs: int
+    cluster: str | None
     log: str | None
     pictures: bool
 
-    def errand(self, seed: int) -> Errand:
+    @property
+    def parts(self) -> list[Part]:
+        """The runs, in order."""
+        return [Part(spec, seed) for spec in self.specs for seed in self.seeds]
+
+    def name(self, part: Part) -> str:
+        """By which a run is told from the others."""
+        words = [] if len(self.specs) == 1 and part.seed is not None else [str(part.spec)]
+        return " ".join(words + ([] if part.seed is None else [f"seed {part.seed}"]))
+
+    def errand(self, part: Part) -> Errand:
         """The command line of one run."""
         from stlc.controller.sweep import Errand
 
         config, launch = self.config, self.launch
-        threads = config.threads or (1 if self.jobs > 1 else None)
-        name = None if launch.name is None else f"{launch.name}-seed{seed}"
+        threads = config.threads or (1 if self.jobs > 1 or self.cluster is not None else None)
+        seeded = "" if part.seed is None else f"-seed{part.seed}"
+        name = None if launch.name is None else f"{launch.name}{seeded}"
         options: Mapping[str, object] = {
+            "--seed": part.seed,
             "--system": self.system,
             "--budget": None if config.budget is None else f"{config.budget!r}s",
             "--clock": config.clock,
@@ -72,56 +99,78 @@ class Many:
         given = [word for key, value in options.items() if value is not None for word in (key, str(value))]
         changed = [word for key, value in launch.overrides.items() for word in ("--set", f"{key}={value}")]
         drawn = () if self.pictures else ("--no-pictures",)
-        return Errand(f"seed {seed}", (str(self.spec), "--seed", str(seed), *given, *changed, *drawn))
+        arguments = (str(part.spec), *given, *changed, *drawn)
+        if self.cluster is None:
+            return Errand(self.name(part), arguments)
+        from stlc.controller.inputs import input_files
+
+        read = input_files(part.spec, self.system, launch.overrides)
+        return Errand(self.name(part), arguments, read, launch.root)
 
 
 def train_many(many: Many, *, json: bool) -> NoReturn:
     """Train all, and print a table or the JSON document; raises `typer.Exit` with the exit code."""
-    from stlc.controller.sweep import side_by_side
-
-    errands = [many.errand(seed) for seed in many.seeds]
-    seeds = dict(zip((errand.name for errand in errands), many.seeds, strict=True))
-    found: dict[int, Returned] = {}
+    found: dict[str, Returned] = {}
+    sent = "begins" if many.cluster is None else "is sent"
     try:
-        for back in side_by_side(errands, jobs=many.jobs, begun=lambda errand: say(f"{errand.name} begins")):
-            found[seeds[back.errand.name]] = back
+        for back in _backs(many, lambda errand: say(f"{errand.name} {sent}")):
+            found[back.errand.name] = back
             say(_line(back))
     except (KeyboardInterrupt, SystemExit):
         say(f"interrupted; runs that were going are saved: stlc runs list --runs {many.launch.root}")
         raise
-    ordered = [found[seed] for seed in many.seeds]
-    code = max((back.code if back.code >= 0 else ENDED) for back in ordered)
+    ordered = {part: found[many.name(part)] for part in many.parts}
+    code = max((back.code if back.code >= 0 else ENDED) for back in ordered.values())
     if json:
-        result = {"runs": [_entry(seed, found[seed]) for seed in many.seeds]}
+        result = {"runs": [_entry(part, back) for part, back in ordered.items()]}
         emit_json("train/1", ok=code == 0, exit_code=code, result=result)
     else:
-        emit(
-            table(
-                [*(_cells(seed, found[seed]) for seed in many.seeds), *_mean(ordered)],
-                header=HEADER,
-                indent="",
-            )
-        )
+        emit(_table(many, ordered))
     raise typer.Exit(code)
+
+
+def _backs(many: Many, begun: Callable[[Errand], None]) -> Iterator[Returned]:
+    """The runs as they end: of processes here, or of a cluster."""
+    errands = [many.errand(part) for part in many.parts]
+    if many.cluster is None:
+        from stlc.controller.sweep import side_by_side
+
+        return side_by_side(errands, jobs=many.jobs, begun=begun)
+    from stlc.controller.cluster import Cluster, on_cluster
+
+    config = many.config
+    cluster = Cluster(many.cluster, config.threads or 1, gpus=int(config.device != "cpu"))
+    return on_cluster(errands, cluster, begun=begun)
+
+
+def _table(many: Many, ordered: Mapping[Part, Returned]) -> str:
+    """A line for every run, and one for the mean of each specification's."""
+    rows: list[tuple[str, ...]] = []
+    several = len(many.specs) > 1
+    for spec in many.specs:
+        own = {part: back for part, back in ordered.items() if part.spec == spec}
+        lines = [*(_cells(part, back) for part, back in own.items()), *_mean(list(own.values()))]
+        rows += [(str(spec), *line) if several else line for line in lines]
+    return table(rows, header=("specification", *HEADER) if several else HEADER, indent="")
 
 
 def _line(back: Returned) -> str:
     """What is said as a run ends."""
     accuracy = back.result.get("accuracy")
     if accuracy is None:
-        return f"{back.errand.name} broke off with exit code {back.code}\n{back.said}".rstrip()
+        return f"{back.errand.name} broke off with exit code {back.code}\n{back.why}".rstrip()
     return f"{back.errand.name} done: accuracy {accuracy:.4f}  {back.result['run']}"
 
 
-def _cells(seed: int, back: Returned) -> tuple[str, ...]:
-    result = back.result
+def _cells(part: Part, back: Returned) -> tuple[str, ...]:
+    result, seed = back.result, "" if part.seed is None else str(part.seed)
     if result.get("accuracy") is None:
-        return (str(seed), "", f"exit code {back.code}")
+        return (seed, "", f"exit code {back.code}")
     low, high = result["interval"]
     shares = result["requirements"]
     worst = min(shares, key=shares.__getitem__)
     return (
-        *(str(seed), f"{result['accuracy']:.4f}", f"[{low:.4f}, {high:.4f}]", f"{result['feasible']:.4f}"),
+        *(seed, f"{result['accuracy']:.4f}", f"[{low:.4f}, {high:.4f}]", f"{result['feasible']:.4f}"),
         *(_share(result), f"{worst} {shares[worst]:.4f}", f"{result['seconds']:.0f} s", result["run"]),
     )
 
@@ -142,5 +191,7 @@ def _mean(backs: Sequence[Returned]) -> list[tuple[str, ...]]:
     return [("mean", f"{mean['accuracy']:.4f}", spread, f"{feasible:.4f}", _share(mean))]
 
 
-def _entry(seed: int, back: Returned) -> dict[str, Any]:
-    return {"seed": seed, "exit_code": back.code, **back.result}
+def _entry(part: Part, back: Returned) -> dict[str, Any]:
+    seed = {} if part.seed is None else {"seed": part.seed}
+    why = {"why": back.why} if back.result.get("accuracy") is None else {}
+    return {"spec": str(part.spec), **seed, "exit_code": back.code, **why, **back.result}

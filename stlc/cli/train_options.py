@@ -9,7 +9,10 @@ import typer
 
 from stlc.cli.completion import run_names
 
-SpecArgument = Annotated[Path | None, typer.Argument(metavar="SPEC", help="The specification, a .stl file.")]
+SpecsArgument = Annotated[
+    list[Path] | None,
+    typer.Argument(metavar="SPEC", help="The specification, a .stl file; of several, each is trained for."),
+]
 BudgetOption = Annotated[
     str | None, typer.Option(metavar="TIME", help="Time to train, such as 60s or 5min; becomes steps.")
 ]
@@ -28,7 +31,15 @@ SeedsOption = Annotated[
     str | None,
     typer.Option(metavar="SEEDS", help="Several runs, such as 0..2 or 0,3, in processes of their own."),
 ]
-JobsOption = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Runs of --seeds side by side.")]
+JobsOption = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Runs side by side.")]
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        metavar="auto|local|HOST:PORT",
+        help="Train on a Ray cluster, as many as it has cores for.",
+    ),
+]
 MethodOption = Annotated[
     str | None,
     typer.Option(

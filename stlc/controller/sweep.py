@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
@@ -26,10 +27,14 @@ class Errand:
     Attributes:
         name: by which it is told from the others.
         arguments: of `stlc train`, without `--json`.
+        inputs: files and folders that it reads, for machines that do not see them.
+        runs: the folder of its runs, for the same machines.
     """
 
     name: str
     arguments: tuple[str, ...]
+    inputs: tuple[Path, ...] = ()
+    runs: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +59,13 @@ class Returned:
     def result(self) -> dict[str, Any]:
         """What the document says of the run; empty without one."""
         return (self.document or {}).get("result") or {}
+
+    @property
+    def why(self) -> str:
+        """Why it broke off: what is in the document, else what the process said last."""
+        findings = (self.document or {}).get("diagnostics") or []
+        lines = [f"{each['severity']}[{each['code']}]: {each['message']}" for each in findings]
+        return "\n".join(lines) or self.said
 
 
 def side_by_side(
@@ -110,26 +122,15 @@ class _Crew:
         finally:
             self.shares.put(share)
         tail = "\n".join(said.splitlines()[-TAIL:])
-        return Returned(errand, process.returncode, _document(out), tail, len(share))
+        return Returned(errand, process.returncode, document_of(out), tail, len(share))
 
     def _start(self, errand: Errand, share: frozenset[int]) -> subprocess.Popen[str] | None:
         """The process, on its share of the cores; None once everything is to stop."""
         with self.lock:
             if self.stopped:
                 return None
-            process = subprocess.Popen(
-                [sys.executable, "-m", "stlc", "train", *errand.arguments, "--json"],
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-                encoding="utf-8",
-                env={**os.environ, "PYTHONIOENCODING": "utf-8"},
-                start_new_session=True,  # Ctrl-C reaches it through `stop` alone, once
-            )
+            process = start(errand.arguments, share if self.jobs > 1 else None)
             self.live.add(process)
-        if self.jobs > 1 and hasattr(os, "sched_setaffinity"):
-            with suppress(OSError):
-                os.sched_setaffinity(process.pid, share)
         return process
 
     def stop(self) -> None:
@@ -149,6 +150,32 @@ class _Crew:
             raise
 
 
+def start(
+    arguments: Sequence[str], share: frozenset[int] | None = None, folder: Path | None = None
+) -> subprocess.Popen[str]:
+    """A process that trains.
+
+    Args:
+        arguments: of `stlc train`.
+        share: cores that it keeps to; all if None.
+        folder: where it works; here if None.
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-m", "stlc", "train", *arguments, "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        encoding="utf-8",
+        env={**os.environ, "PYTHONIOENCODING": "utf-8"},
+        cwd=folder,
+        start_new_session=True,  # Ctrl-C reaches it through who started it alone, once
+    )
+    if share and hasattr(os, "sched_setaffinity"):
+        with suppress(OSError):
+            os.sched_setaffinity(process.pid, share)
+    return process
+
+
 def core_shares(jobs: int) -> list[frozenset[int]]:
     """The cores of this process in `jobs` shares of one size; with more jobs than cores, all in each."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
@@ -159,7 +186,7 @@ def core_shares(jobs: int) -> list[frozenset[int]]:
     return [frozenset(cores[edges[i] : edges[i + 1]]) for i in range(jobs)]
 
 
-def _document(text: str) -> dict[str, Any] | None:
+def document_of(text: str) -> dict[str, Any] | None:
     """The JSON document that a process printed, if it did."""
     with suppress(ValueError):
         found = json.loads(text)

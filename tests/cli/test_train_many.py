@@ -67,6 +67,57 @@ def test_the_table_has_a_line_for_each_and_the_mean_of_those_that_ended_well(
     assert f"seed 1 broke off with exit code {ended}\nerror[R401]: training diverged" in told.err
 
 
+def test_every_specification_is_trained_for_and_one_that_fails_stops_no_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = tmp_path / "broken.stl"
+    broken.write_text("require a: always[0, ")
+    words = ["train", str(broken), SPEC, "--jobs", "2", "--steps", "2", *QUICK]
+    code = main([*words, "--seed", "3", "--runs", str(tmp_path / "runs"), "--json"])
+    document = json.loads(capsys.readouterr().out)
+    assert misfits(document, load_schema("train/1")) == []
+    bad, good = document["result"]["runs"]
+    assert code == document["exit_code"] == bad["exit_code"] == 3
+    assert bad["why"].startswith("error[E")
+    assert (bad["spec"], good["spec"], good["seed"]) == (str(broken), SPEC, 3)
+    (run,) = every_run(tmp_path / "runs")
+    assert (run.shown, run.record()["seed"], run.status) == (good["run"], 3, "finished")
+
+
+def test_the_table_of_several_specifications_has_a_mean_for_each(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def pretended(errands, *, jobs, begun):
+        assert (len({errand.name for errand in errands}), jobs) == (6, 1)
+        for errand in errands:
+            begun(errand)
+            yield returned(errand, int(errand.arguments[errand.arguments.index("--seed") + 1]), 3)
+
+    monkeypatch.setattr("stlc.controller.sweep.side_by_side", pretended)
+    assert main(["train", "a.stl", "b.stl", "a.stl", "--seeds", "0..2", "--steps", "2"]) == 3
+    header, *lines = capsys.readouterr().out.splitlines()
+    assert header.split()[:2] == ["specification", "seed"]
+    firsts = [tuple(line.split()[:2]) for line in lines]
+    assert firsts == [(name, row) for name in ("a.stl", "b.stl") for row in ("0", "1", "2", "mean")]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        [SPEC.replace("traffic", "ship_safe"), "--system", "car.yaml"],
+        ["--jobs", "2", "--cluster", "local"],
+        ["--resume", "latest", "--cluster", "local"],
+    ],
+)
+def test_options_that_mean_nothing_for_many(
+    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["train", SPEC] if "--resume" not in options else ["train"]
+    assert main([*words, *options, "--runs", str(tmp_path / "runs")]) == 2
+    assert "--" in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()
+
+
 @pytest.mark.parametrize(
     "options",
     [["--seeds", "0..2", "--seed", "1"], ["--jobs", "2"], ["--seeds", "2..1"], ["--seeds", "0", "--lr", "0"]],
