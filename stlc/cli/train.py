@@ -6,7 +6,7 @@ import math
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import typer
 
@@ -73,15 +73,13 @@ def train(
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads of torch must not spin
     specs = tuple(dict.fromkeys(spec or ()))
     _check_together(seed=seed, seeds=seeds, budget=budget, steps=steps)
-    if resume is None:
-        _check_many(specs, seeds=seeds, system=system, jobs=jobs, cluster=cluster)
+    _check_many(specs, seeds=seeds, system=system, jobs=jobs, cluster=cluster)
     logbook = _logbook(log)
     if resume is not None:
         _refuse_on_resume(
             {"SPEC": spec or None, "--system": system, "--budget": budget, "--seed": seed, "--method": method}
             | {"--name": name, "--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch}
             | {"--set": set_, "--seeds": seeds, "--held-out": held_out, "--cluster": cluster}
-            | {"--jobs": None if jobs == 1 else jobs}
         )
         with one_voice():
             sitting = _resume(resume, runs=runs, steps=steps, device=device, logbook=logbook)
@@ -105,11 +103,7 @@ def train(
     launch = Launch(root=runs, name=name, overrides=parse_overrides(set_), command=sys.argv[1:])
     if len(specs) > 1 or seeds is not None or cluster is not None:
         drawn = parse_seeds(seeds) if seeds is not None else (seed,)
-        if len(specs) < 2:  # what is wrong with the only one is said once
-            with one_voice():
-                _task(specs, system, launch.overrides)
-        many = Many(specs, system, config, launch, drawn, jobs, cluster, log, pictures)
-        train_many(many, json=json)
+        _train_many(Many(specs, system, config, launch, drawn, jobs, cluster, log, pictures), json=json)
     with one_voice():
         task = _task(specs, system, launch.overrides)
         _train(task, config, launch, logbook).conclude(pictures=pictures, json=json)
@@ -186,6 +180,14 @@ def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str
     task = Task.of(spec, loaded, overrides=overrides)
     show_diagnostics(task.compiled.warnings)
     return task
+
+
+def _train_many(many: Many, *, json: bool) -> NoReturn:
+    """Several runs; what is wrong with an only specification is said once, before any begins."""
+    if len(many.specs) < 2:
+        with one_voice():
+            _task(many.specs, many.system, many.launch.overrides)
+    train_many(many, json=json)
 
 
 def _train(task: Task, config: TrainConfig, launch: Launch, logbook: Opener | None) -> Sitting:

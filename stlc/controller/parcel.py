@@ -11,6 +11,7 @@ import os
 import secrets
 import signal
 import socket
+import subprocess
 import tarfile
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -167,12 +168,19 @@ def _ran(arguments: Sequence[str], folder: Path, share: frozenset[int]) -> Deliv
     """Train in a process of its own; one that is called off may save."""
     process = start(arguments, share, folder)
     try:
-        out, said = process.communicate()
+        out, said = _awaited(process)
     except KeyboardInterrupt:
         process.send_signal(signal.SIGINT)
         out, said = process.communicate()
     tail = "\n".join(said.splitlines()[-TAIL:])
     return Delivery(process.returncode, out, tail, len(share))
+
+
+def _awaited(process: subprocess.Popen[str]) -> tuple[str, str]:
+    """What a process says, awaited in short steps: Ray's interrupt is not seen within a long one."""
+    while True:
+        with suppress(subprocess.TimeoutExpired):
+            return process.communicate(timeout=0.5)
 
 
 @contextmanager
