@@ -81,11 +81,8 @@ def train(
             | {"--name": name, "--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch}
             | {"--set": set_, "--seeds": seeds, "--held-out": held_out, "--cluster": cluster}
         )
-        with one_voice():
-            sitting = _resume(resume, runs=runs, steps=steps, device=device, logbook=logbook)
-            sitting.conclude(pictures=pictures, json=json)
+        _go_on(resume, runs=runs, steps=steps, device=device, logbook=logbook, pictures=pictures, json=json)
     from stlc.controller.config import HELD_OUT, TrainConfig
-    from stlc.controller.launch import Launch
 
     config = TrainConfig(
         method=_method(method) if method is not None else None,
@@ -100,7 +97,7 @@ def train(
         held_out=held_out or HELD_OUT,
         clock=parse_clock(clock),
     )
-    launch = Launch(root=runs, name=name, overrides=parse_overrides(set_), command=sys.argv[1:])
+    launch = _launch(runs, name, set_)
     if len(specs) > 1 or seeds is not None or cluster is not None:
         drawn = parse_seeds(seeds) if seeds is not None else (seed,)
         _train_many(Many(specs, system, config, launch, drawn, jobs, cluster, log, pictures), json=json)
@@ -180,6 +177,29 @@ def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str
     task = Task.of(spec, loaded, overrides=overrides)
     show_diagnostics(task.compiled.warnings)
     return task
+
+
+def _launch(runs: Path, name: str | None, changes: Sequence[str] | None) -> Launch:
+    """Where a run is made, and what `--set` changes in it."""
+    from stlc.controller.launch import Launch
+
+    return Launch(root=runs, name=name, overrides=parse_overrides(changes), command=sys.argv[1:])
+
+
+def _go_on(
+    where: str,
+    *,
+    runs: Path,
+    steps: int | None,
+    device: str,
+    logbook: Opener | None,
+    pictures: bool,
+    json: bool,
+) -> NoReturn:
+    """Resume a run and conclude it."""
+    with one_voice():
+        sitting = _resume(where, runs=runs, steps=steps, device=device, logbook=logbook)
+        sitting.conclude(pictures=pictures, json=json)
 
 
 def _train_many(many: Many, *, json: bool) -> NoReturn:

@@ -110,7 +110,8 @@ def _received(ray: Any, done: Any, errand: Errand, parcel: Parcel) -> Returned:
 
 def _call_back(ray: Any, going: dict[Any, tuple[Errand, Parcel]]) -> None:
     """Ask every errand to save and stop, and bring back what it saved."""
-    for each in going:
+    for each, (_, parcel) in going.items():
+        parcel.close()
         with suppress(Exception):
             ray.cancel(each, force=False)
     ended, _ = ray.wait(list(going), num_returns=len(going), timeout=_PATIENCE) if going else ([], [])

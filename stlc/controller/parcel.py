@@ -140,7 +140,7 @@ def carry(parcel: Parcel) -> Delivery:
         return Delivery(_OTHER_VERSION, "", said, 0)
     with claimed(parcel.cores) as share:
         if parcel.shared:
-            return _ran(parcel.arguments, Path(parcel.folder), share)
+            return _ran(parcel.arguments, Path(parcel.folder), share, Path(parcel.probe))
         with tempfile.TemporaryDirectory(prefix="stlc-") as temporary:
             return _ran_in_mirror(parcel, Path(temporary).resolve(), share)
 
@@ -164,11 +164,13 @@ def _ran_in_mirror(parcel: Parcel, root: Path, share: frozenset[int]) -> Deliver
     return Delivery(back.code, back.out, back.said, back.cores, f"/{run.relative_to(root)}", files)
 
 
-def _ran(arguments: Sequence[str], folder: Path, share: frozenset[int]) -> Delivery:
-    """Train in a process of its own; one that is called off may save."""
+def _ran(
+    arguments: Sequence[str], folder: Path, share: frozenset[int], probe: Path | None = None
+) -> Delivery:
+    """Train in a process of its own; one that is called off, or whose probe is gone, may save."""
     process = start(arguments, share, folder)
     try:
-        out, said = _awaited(process)
+        out, said = _awaited(process, probe)
     except KeyboardInterrupt:
         process.send_signal(signal.SIGINT)
         out, said = process.communicate()
@@ -176,11 +178,13 @@ def _ran(arguments: Sequence[str], folder: Path, share: frozenset[int]) -> Deliv
     return Delivery(process.returncode, out, tail, len(share))
 
 
-def _awaited(process: subprocess.Popen[str]) -> tuple[str, str]:
-    """What a process says, awaited in short steps: Ray's interrupt is not seen within a long one."""
+def _awaited(process: subprocess.Popen[str], probe: Path | None) -> tuple[str, str]:
+    """What a process says, awaited in short steps: an interrupt by Ray is not seen within a long one."""
     while True:
         with suppress(subprocess.TimeoutExpired):
             return process.communicate(timeout=0.5)
+        if probe is not None and not probe.exists():
+            raise KeyboardInterrupt
 
 
 @contextmanager
