@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import os
 import secrets
-import signal
 import socket
 import subprocess
 import tarfile
@@ -172,7 +171,7 @@ def _ran(
     try:
         out, said = _awaited(process, probe)
     except KeyboardInterrupt:
-        process.send_signal(signal.SIGINT)
+        process.terminate()  # workers of Ray ignore SIGINT, and so would the process
         out, said = process.communicate()
     tail = "\n".join(said.splitlines()[-TAIL:])
     return Delivery(process.returncode, out, tail, len(share))
