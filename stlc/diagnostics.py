@@ -215,6 +215,7 @@ CODES: dict[str, str] = {
     "R102": "a checkpoint of another specification or system",
     "R103": "a run that is already finished",
     "R104": "options that cannot change on resume",
+    "R105": "an exported controller that does not do what its run does",
     "R201": "no room on the disk, or a file that cannot be written",
     "R202": "not enough memory",
     "R301": "a package that is not installed",

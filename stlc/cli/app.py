@@ -23,6 +23,7 @@ from stlc.cli import (
     compile,
     doctor,
     explain,
+    export,
     fmt,
     init,
     lint,
@@ -56,7 +57,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": list(HELP_NAMES)},
 )
-_DAILY = (train, simulate, check, explain, plot, report, runs)
+_DAILY = (train, simulate, check, explain, plot, report, runs, export)
 _WRITING = (init, new, lint, fmt, parse, compile, system)
 _OTHER = (lsp, schema, doctor, bench)
 for group in (*_DAILY, *_WRITING, *_OTHER):

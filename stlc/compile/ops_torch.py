@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Hashable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from functools import lru_cache
+from functools import lru_cache, reduce
 from itertools import pairwise
 from typing import Any, cast, final
 
@@ -245,11 +245,13 @@ class TorchOps:
 
     def join(self, items: Sequence[Tensor], pick: Pick) -> Tensor:
         """Exact extremum of one or more arrays; one of several equal operands may get all of the gradient."""
+        if torch.compiler.is_exporting():  # it must not depend on the batch
+            return reduce(torch.minimum if pick == "min" else torch.maximum, items)
         return choice(items, pick)
 
     def extrema(self, x: Tensor, pick: Pick, window: Sliding) -> Tensor | None:
         """Exact extrema of sliding windows; one of several equal operands may get all of the gradient."""
-        if x.ndim != 2:
+        if x.ndim != 2 or torch.compiler.is_exporting():
             return None
         if is_small(x, window):
             return small_extrema(x, pick, window)
@@ -264,7 +266,7 @@ class TorchOps:
 
     def until(self, left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Tensor | None:
         """Exact `until` and `release`; one of several equal operands may get all of the gradient."""
-        if left.ndim != 2 or left.is_cuda:
+        if left.ndim != 2 or left.is_cuda or torch.compiler.is_exporting():
             return None
         if is_small(left, window):
             return small_until(left, right, pick, window)
@@ -322,6 +324,9 @@ class TorchOps:
         """`x` with `value` in the rows that are not kept."""
         if keep.all():
             return x
+        if torch.compiler.is_exporting():
+            mask = torch.from_numpy(keep).view(-1, *(1,) * (x.ndim - 1))
+            return torch.where(mask, x, value)
         out: Tensor = _Kept.apply(x, keep, value)  # type: ignore[no-untyped-call]
         return out
 

@@ -50,13 +50,14 @@ class Promises:
     """The promises of a mission.
 
     Attributes:
+        clock: column of the mission clock; empty where there is none.
         items: requirements that are one promise each; those inside other formulas are left alone.
     """
 
     def __init__(self, compiled: Compiled, gamma: float) -> None:
         """`gamma` is what should be spared."""
         self._gamma = gamma
-        self._clock = next((timer.name for timer in compiled.timers if timer.kind == "clock"), "")
+        self.clock = next((timer.name for timer in compiled.timers if timer.kind == "clock"), "")
         statuses = {timer.name for timer in compiled.timers if timer.kind == "status"}
         found = [
             _promise(rule.name, rule.typed.formula, compiled.grid)
@@ -71,7 +72,7 @@ class Promises:
         Args:
             columns: predicted states, name -> (time, batch); differentiable in them.
         """
-        clock = columns[self._clock]
+        clock = columns[self.clock]
         lack = torch.zeros_like(clock[0])
         for promise, margin in zip(self.items, self._margins(columns, len(clock)), strict=True):
             counts = (clock >= promise.first) & (clock <= promise.last)
@@ -86,7 +87,7 @@ class Promises:
         Args:
             columns: predicted states, name -> (time, batch).
         """
-        found = torch.zeros_like(columns[self._clock][0], dtype=torch.bool)
+        found = torch.zeros_like(columns[self.clock][0], dtype=torch.bool)
         for margin in self._margins(columns, 2):
             now, soon = margin.expand(2, -1)
             found |= (now >= 0.0) & (now < self._gamma) & (soon > now)

@@ -85,6 +85,14 @@ class _Accumulated(torch.autograd.Function):
         return rows[0], below[1:]
 
 
+def _accumulated(start: Tensor, increments: Tensor) -> Tensor:
+    """`_Accumulated`, as one operation while a program is recorded for export."""
+    if torch.compiler.is_exporting():
+        return torch.cat((start[None], increments)).cumsum(0)
+    column: Tensor = _Accumulated.apply(start, increments)  # type: ignore[no-untyped-call]
+    return column
+
+
 class _StageRunner:
     """A stage, its programs compiled."""
 
@@ -104,8 +112,7 @@ class _StageRunner:
             film.enter(state, torch.cat((start[None], film.full(film.now[source]))))
         for state, source in self.stage.sums.items():
             increments = film.full(film.now[source])
-            column: Tensor = _Accumulated.apply(film.states[state], increments)  # type: ignore[no-untyped-call]
-            film.enter(state, column)
+            film.enter(state, _accumulated(film.states[state], increments))
         if self.blocks:
             self._loop(film)
 

@@ -188,7 +188,11 @@ class System:
 
     def rollout_columns(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Columns:
         """The same as (T+1, B) columns by name; columns that never change are expanded views."""
-        if x0.shape[1:] != (len(self.names),) or u.shape[2:] != (len(self.controls),) or len(x0) != len(u):
+        if (
+            x0.shape[1:] != (len(self.names),)
+            or u.shape[2:] != (len(self.controls),)
+            or x0.shape[0] != u.shape[0]
+        ):
             raise ValueError(
                 f"{self.name} takes x0 (B, {len(self.names)}) and u (B, T, {len(self.controls)}),"
                 f" not {tuple(x0.shape)} and {tuple(u.shape)}"
@@ -325,7 +329,7 @@ class System:
         first = {name + START: columns[name][0] for name in self._named_first}
         env = {"k": k, "t": k * self.dt, "sat": sat, "rho": rho, **first, **columns}
         cost: Tensor = program(env, TORCH, switch)["cost"]
-        return cost.expand(len(like), len(sat)).mean(0)
+        return cost.expand(len(like), sat.shape[0]).mean(0)
 
     @cached_property
     def _named_first(self) -> tuple[str, ...]:
@@ -335,7 +339,13 @@ class System:
 
     @cached_property
     def _terms(self) -> tuple[Program | None, Program | None]:
-        """The sum of the terms over states, and of those that read a control."""
+        """`objective` as programs."""
+        states, controlled = (None if total is None else Program({"cost": total}) for total in self.objective)
+        return states, controlled
+
+    @cached_property
+    def objective(self) -> tuple[ir.Num | None, ir.Num | None]:
+        """The weighed sum of the performance terms over states, and of those that read a control."""
         sums: list[ir.Num | None] = [None, None]
         for term in self.decl.objective.terms:
             if term.weight:
@@ -343,8 +353,7 @@ class System:
                 value = multiply(ir.Lit(term.weight), term.value)
                 before = sums[kind]
                 sums[kind] = value if before is None else add(before, value)
-        states, controlled = (None if total is None else Program({"cost": total}) for total in sums)
-        return states, controlled
+        return sums[0], sums[1]
 
     # -------------------------------------------------------------------- health
 

@@ -1,0 +1,128 @@
+"""A controller as one C header: policy, model, monitor and the paper's backup policy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib.resources import files
+from string import Template
+from typing import TYPE_CHECKING
+
+from stlc.compile.c_formulas import Forward
+from stlc.compile.c_numbers import literal
+from stlc.compile.c_parts import declared, in_parts
+from stlc.compile.c_plan import plan_of
+from stlc.compile.emit_c import CHECK, HEAD, passes, state_column
+from stlc.controller.backup import Grid
+from stlc.controller.kernel import motion_of
+from stlc.controller.prefix import BEYOND, anchored, open_ended
+from stlc.dynamics.controls import raw_width
+from stlc.export import c_numbers, c_weights
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from stlc.compile.c_steps import Plan
+    from stlc.compile.emit_c import Motion
+    from stlc.compile.pipeline import Rule
+    from stlc.controller.policy import PlanNetwork
+    from stlc.controller.task import Task
+
+
+def header(task: Task, network: PlanNetwork) -> str:
+    """The text of `stlc_controller.h`, which includes `stlc_weights.h`.
+
+    Raises:
+        Untranslatable: the task holds something that has no C form.
+    """
+    motion = motion_of(task)
+    judged = plan_of([rule.formula for rule in task.rules], task.horizon + 1)
+    falling = plan_of([open_ended(anchored(rule.formula)) for rule in task.compiled.safety], task.horizon + 1)
+    parts = _numbers(task, network) | {
+        "HEAD": HEAD,
+        "PASSES": "\n".join([*passes(motion, judged), *_falling(motion, falling)]),
+        "ROOM": max(judged.size, falling.size, 1),
+    }
+    return _template("controller.h.txt").substitute({name: str(value) for name, value in parts.items()})
+
+
+def main_of(task: Task) -> str:
+    """An example program: states from standard input, decisions to standard output."""
+    return _template("main.c.txt").substitute({"SYSTEM": task.system.name})
+
+
+def makefile() -> str:
+    """How the example is built."""
+    return _template("Makefile.txt").substitute()
+
+
+def _template(name: str) -> Template:
+    return _Template(files("stlc.export").joinpath("templates", name).read_text(encoding="utf-8"))
+
+
+class _Template(Template):
+    delimiter = "@"
+
+
+def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
+    """Sizes, constants and straight-line code."""
+    grid, mirror = Grid.of(task), network.mirror
+    most = max((grid.count(length) for length in grid.lengths), default=0)
+    controls = task.system.controls
+    return {
+        "NAME": task.system.name,
+        "SPEC": task.compiled.name,
+        "STATES": len(task.names),
+        "NAMES": ", ".join(f'"{name}"' for name in task.names),
+        "INPUTS": ", ".join(f'"{control.name}"' for control in controls),
+        "CONTROLS": len(controls),
+        "STEPS": task.horizon,
+        "DT": literal(task.dt),
+        "RULES": len(task.rules),
+        "RULE_NAMES": ", ".join(f'"{rule.name}"' for rule in task.rules),
+        "SAFETY": len(task.compiled.safety),
+        "PLANS": network.plans,
+        "RAW": raw_width(controls),
+        "OBSERVED": task.system.observed_count,
+        "WIDEST": c_weights.widest(network),
+        "CHOICES": most + 1,
+        "LENGTHS": ", ".join(map(str, grid.lengths)) or "0",
+        "LENGTH_COUNT": len(grid.lengths),
+        "LEVEL_COUNTS": ", ".join(str(len(values)) for values in grid.values),
+        "MOST_LEVELS": max(map(len, grid.values)),
+        "LEVELS": ", ".join("{" + ", ".join(map(literal, values)) + "}" for values in grid.values),
+        "REST": ", ".join(literal(min(max(0.0, each.low), each.high)) for each in controls),
+        "MIRRORED": int(mirror is not None),
+        "SIDE": 0 if mirror is None else mirror.side,
+        "OBSERVE": _block(c_numbers.observed(task)),
+        "IMAGE_STATE": "" if mirror is None else _block(c_numbers.image_of_state(mirror, task)),
+        "IMAGE_ACTION": "" if mirror is None else _block(c_numbers.image_of_action(task)),
+        "SQUASH": _block(c_numbers.squashed(task)),
+        "FORWARD": _block(c_weights.forward(network)),
+        "COST": _block(c_numbers.cost(task)),
+        "OVERALL": _block(_overall(task.rules, task.rules)),
+        "SAFE": _block(_overall(task.compiled.safety, task.rules)),
+    }
+
+
+def _block(lines: Sequence[str]) -> str:
+    return "\n".join(f"  {line}" for line in lines)
+
+
+def _overall(rules: Sequence[Rule], among: Sequence[Rule]) -> list[str]:
+    """Statements that lower `least` to the weighed robustness of some requirements."""
+    names = [rule.name for rule in among]
+    return [
+        f"least = MIN(least, each[{names.index(rule.name)}] * {literal(rule.weight / rule.scale)});"
+        for rule in rules
+    ]
+
+
+def _falling(motion: Motion, plan: Plan) -> list[str]:
+    """`fall`: the least robustness of phi_safe on a prefix; row STATES is positive beyond its end."""
+    column = state_column(motion)
+    forward = Forward(
+        plan, lambda name, k: f"x[{len(motion.states)}][{k}][j]" if name == BEYOND else column(name, k)
+    )
+    blocks = [forward.lines([step]) for step in plan.steps]
+    blocks.append([f"LANE out[{i}][j] = {root['0']};" for i, root in enumerate(plan.roots)])
+    return in_parts(replace(CHECK, name="fall"), blocks, declared(plan))

@@ -1,0 +1,138 @@
+"""What was exported against the run that it came from, on random states."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+import torch
+from torch import Tensor
+
+from stlc import native
+from stlc.controller.task import rank
+from stlc.diagnostics import Diagnostic, RunError
+from stlc.export.programs import unmoved
+
+if TYPE_CHECKING:
+    from stlc.controller.policy import Mlp
+    from stlc.controller.task import Task
+
+PLAN = 1e-4
+"""How far a control may be from the original's, in parts of its range: the network is float32."""
+RHO = 1e-6
+"""How far a verdict may be from the exact monitor's on the same plan."""
+BUILT = ("-std=c99", "-O1", "-fno-math-errno")
+
+Answer: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor]
+"""plan (B, T, m), rho and safe (B,), requirements (B, R)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """How well an export agrees with its run.
+
+    Attributes:
+        states: random states that were tried.
+        plan: largest distance of a control, in parts of its range, where the same plan was chosen.
+        rho: largest distance of a robustness from the exact monitor's.
+        ties: states in which another plan of the same rank was chosen.
+    """
+
+    states: int
+    plan: float
+    rho: float
+    ties: int
+
+
+def agreement(policy: Mlp, decide: Callable[[Tensor], Answer], *, states: int, seed: int = 7) -> Agreement:
+    """Ask both in random states.
+
+    Args:
+        policy: the original.
+        decide: the export, of states (B, n) float64.
+        states: how many.
+        seed: of the states.
+
+    Raises:
+        RunError: R105, they disagree.
+    """
+    with torch.no_grad():
+        return _compared(policy, decide, policy.task.sample(states, seed=seed, dtype=torch.float64))
+
+
+def _compared(policy: Mlp, decide: Callable[[Tensor], Answer], x: Tensor) -> Agreement:
+    """`agreement` in given states."""
+    task = policy.task
+    plan, judged = policy.plan_judged(x)
+    mine, rho, safe, each = decide(x)
+    width = (task.system.control_high - task.system.control_low).double()
+    far = ((mine - plan).abs() / width).amax((1, 2))
+    again = task.judge(x, mine)
+    score = [rank(one.rho, task.cost(one), one.safe) for one in (judged, again)]
+    same = far <= PLAN
+    ties = ~same & ((score[0] - score[1]).abs() <= PLAN)
+    off = max(_distance(rho, again.rho), _distance(safe, again.safe), _distance(each, again.requirements))
+    found = Agreement(len(x), float(far[same].amax()) if bool(same.any()) else 0.0, off, int(ties.sum()))
+    if not bool((same | ties).all()) or not off <= RHO:
+        worst = float(far.nan_to_num(torch.inf).amax())
+        raise RunError(
+            Diagnostic(
+                "R105",
+                "the exported controller does not do what the run does",
+                note=(f"plans differ by up to {worst:.2g} of a range, robustness by up to {off:.2g}",),
+                help=("nothing was written; please report this with the specification and the system",),
+            )
+        )
+    return found
+
+
+def _distance(a: Tensor, b: Tensor) -> float:
+    """The largest distance; equal infinities are 0 apart."""
+    return float(torch.where(a == b, torch.zeros_like(a), (a - b).abs()).nan_to_num(torch.inf).amax())
+
+
+def by_torch(path: Path) -> Callable[[Tensor], Answer]:
+    """The program in a file."""
+    with unmoved():
+        module = torch.export.load(path).module()
+
+    def decide(x: Tensor) -> Answer:
+        plan, rho, safe, each = module(x)
+        return plan, rho, safe, each
+
+    return decide
+
+
+def by_c(folder: Path, task: Task, built: Path) -> Callable[[Tensor], Answer] | None:
+    """The example program of a folder, compiled to `built`; None without a compiler.
+
+    Raises:
+        RunError: R105, it cannot be compiled.
+    """
+    using = native.compiler()
+    if using is None:
+        return None
+    command = [using, *BUILT, "-o", str(built), str(folder / "main.c"), "-lm"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    if done.returncode:
+        raise RunError(
+            Diagnostic("R105", "the exported C does not compile", note=tuple(done.stderr.splitlines()[:5]))
+        )
+    rules, shape = len(task.rules), (task.horizon, len(task.system.controls))
+
+    def decide(x: Tensor) -> Answer:
+        table = torch.tensor(answers([str(built), "policy"], x.tolist()), dtype=torch.float64)
+        plan = table[:, 4 + rules :].view(-1, *shape)
+        return plan, table[:, 2], table[:, 3], table[:, 4 : 4 + rules]
+
+    return decide
+
+
+def answers(command: Sequence[str], states: Sequence[Sequence[float]]) -> list[list[float]]:
+    """What the example program prints for states: source, t0, rho, safe, requirements, plan."""
+    asked = "\n".join(" ".join(map(repr, state)) for state in states)
+    done = subprocess.run(command, input=asked, check=True, capture_output=True, text=True)
+    return [[float(word) for word in line.split()] for line in done.stdout.splitlines()]

@@ -1,0 +1,151 @@
+"""What is taken away decides as the run does, and nothing that does not is handed out."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+import torch
+from documents import misfits
+
+from stlc import native
+from stlc.cli.app import main
+from stlc.cli.schema import load_schema
+from stlc.controller.config import TrainConfig
+from stlc.controller.deploy import Guard
+from stlc.controller.launch import Launch, open_folder
+from stlc.controller.policy import Mlp, PlanNetwork
+from stlc.controller.run import Run
+from stlc.controller.task import Task
+from stlc.diagnostics import RunError, UsageError
+from stlc.dynamics.system import System
+from stlc.export.programs import unmoved
+from stlc.export.verify import BUILT, agreement, answers
+from stlc.export.write import export, target_of
+from stlc.files import read_source
+from stlc.grammar.parser import parse
+from stlc.rundir import RunDir
+
+ROOT = Path(__file__).parents[2]
+compiled = pytest.mark.skipif(native.compiler() is None, reason="needs a C compiler")
+
+
+def run_of(spec: str, system: str, folder: Path) -> Run:
+    """A run with a small network that has learnt nothing."""
+    task = Task.of(
+        parse(read_source(ROOT / "specs" / f"{spec}.stl")), System.load(ROOT / "examples" / f"{system}.yaml")
+    )
+    with torch.random.fork_rng():
+        torch.manual_seed(3)
+        network = PlanNetwork(task, hidden=(16, 16), plans=3).eval()
+    network.normalise(task.sample(200, seed=1))
+    return Run(RunDir.create(folder, spec, "test"), task, Mlp(task, network))
+
+
+def build(folder: Path) -> Path:
+    using = native.compiler()
+    assert using is not None
+    target = folder / "controller"
+    command = [
+        using,
+        *BUILT,
+        "-Wall",
+        "-Werror",
+        "-Wno-unused",
+        "-o",
+        str(target),
+        str(folder / "main.c"),
+        "-lm",
+    ]
+    subprocess.run(command, check=True)
+    return target
+
+
+@compiled
+@pytest.mark.parametrize(("spec", "system"), [("traffic", "car"), ("ship_safe", "ship_safe")])
+def test_the_c_controller_decides_as_the_guard(spec: str, system: str, tmp_path: Path) -> None:
+    run = run_of(spec, system, tmp_path)
+    done = export(run, "c", tmp_path / "out")
+    assert done.files == ("Makefile", "main.c", "stlc_controller.h", "stlc_weights.h")
+    assert done.agreement is not None
+    assert done.agreement.rho <= 1e-9
+    x = run.task.sample(6, seed=5, dtype=torch.float64)
+    wanted = Guard(run.task, run.policy, "paper").decide(x)
+    assert bool((wanted.source > 0).any()), "no state asks for the backup policy"
+    got = torch.tensor(answers([str(build(done.folder))], x.tolist()), dtype=torch.float64)
+    rules = len(run.task.rules)
+    assert got[:, 0].tolist() == wanted.source.tolist()
+    assert got[:, 1].tolist() == wanted.t0.tolist()
+    torch.testing.assert_close(got[:, 2], wanted.rho, rtol=0.0, atol=1e-4)
+    torch.testing.assert_close(got[:, 4 + rules :].view_as(wanted.plan), wanted.plan, rtol=0.0, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_the_torch_program_needs_nothing_of_stlc(tmp_path: Path) -> None:
+    run = run_of("traffic", "car", tmp_path)
+    done = export(run, "torch", tmp_path / "out")
+    assert done.files == ("controller.json", "decide.pt2")
+    with unmoved():
+        module = torch.export.load(done.folder / "decide.pt2").module()
+    for count in (1, 70):
+        x = run.task.sample(count, seed=9, dtype=torch.float64)
+        plan, judged = run.policy.plan_judged(x)
+        mine, rho, _, each = module(x)
+        torch.testing.assert_close(mine, plan, rtol=0.0, atol=1e-5)
+        torch.testing.assert_close(rho, judged.rho, rtol=0.0, atol=1e-5)
+        torch.testing.assert_close(each, judged.requirements, rtol=0.0, atol=1e-5)
+
+
+def test_what_disagrees_is_not_handed_out(tmp_path: Path) -> None:
+    run = run_of("traffic", "car", tmp_path)
+
+    def proud(x: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        plan, judged = run.policy.plan_judged(x)
+        return plan, judged.rho + 1e-3, judged.safe, judged.requirements
+
+    with pytest.raises(RunError, match="does not do what the run does"):
+        agreement(run.policy, proud, states=8)  # type: ignore[arg-type]
+
+
+def test_an_unknown_target_is_a_usage_error() -> None:
+    with pytest.raises(UsageError, match="rust"):
+        target_of("rust")
+
+
+@compiled
+def test_the_page_compiles(tmp_path: Path) -> None:
+    run = run_of("traffic", "car", tmp_path)
+    out = export(run, "c", tmp_path / "out").folder
+    text = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
+    (out / "main.c").write_text(text.split("```c\n")[1].split("```")[0], encoding="utf-8")
+    done = subprocess.run([str(build(out))], check=True, capture_output=True, text=True)
+    assert len(done.stdout.split()) == 3
+
+
+@pytest.mark.parametrize(("arguments", "code"), [(["--to", "rust"], 2), (["--to", "c"], 3)])
+def test_bad_input_gives_a_diagnostic(
+    arguments: list[str],
+    code: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    task = run_of("traffic", "car", tmp_path / "other").task
+    made = open_folder(task, TrainConfig(steps=1), Launch(root=tmp_path / "runs", name="test"))
+    assert main(["export", str(made.path), *arguments]) == code
+    assert "error[" in capsys.readouterr().err
+    assert not (made.path / "export").exists()
+
+
+def test_the_command_writes_beside_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = run_of("traffic", "car", tmp_path / "runs")
+    monkeypatch.setattr(Run, "open", lambda *_, **__: run)
+    assert main(["export", "--to", "c", "--json", "-o", str(tmp_path / "out")]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert misfits(document, load_schema("export/1")) == []
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == document["result"]["files"]
