@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from stlc.compile import ir
 from stlc.compile.c_numbers import Leaf, NumberWriter, Untranslatable, literal
 from stlc.controller.task import KEPT, PULL, SHORT, Task
+from stlc.dynamics.decl import START
 
 if TYPE_CHECKING:
     from stlc.controller.promises import Promise
@@ -79,6 +80,7 @@ def _columns(places: Mapping[str, str]) -> Callable[[Leaf], str | None]:
 def cost(task: Task) -> list[str]:
     """Statements that add what a plan costs to `cost`, of lane `j` with robustness `rho`."""
     at = {name: f"x[{i}][k][j]" for i, name in enumerate(task.names)}
+    at |= {name + START: f"x[{i}][0][j]" for i, name in enumerate(task.names)}
     at |= {"k": "(double)k", "t": f"(k * {literal(task.dt)})", "sat": "1.0", "rho": "rho"}
     inputs = {name: f"u[{i}][k][j]" for i, name in enumerate(task.system.control_names)}
     states, controlled = task.system.objective

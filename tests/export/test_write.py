@@ -98,6 +98,24 @@ def test_the_torch_program_needs_nothing_of_stlc(tmp_path: Path) -> None:
         torch.testing.assert_close(each, judged.requirements, rtol=0.0, atol=1e-5)
 
 
+@compiled
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("spec", "system"),
+    [
+        ("reach_n_avoid", "maze"),
+        ("ship_track", "ship_track"),
+        ("navigation", "rover"),
+        ("manipulation", "panda"),
+        ("patrol", "unicycle"),
+    ],
+)
+def test_every_benchmark_has_a_c_controller(spec: str, system: str, tmp_path: Path) -> None:
+    done = export(run_of(spec, system, tmp_path), "c", tmp_path / "out")
+    assert done.agreement is not None
+    assert done.agreement.ties <= 1
+
+
 def test_what_disagrees_is_not_handed_out(tmp_path: Path) -> None:
     run = run_of("traffic", "car", tmp_path)
 
