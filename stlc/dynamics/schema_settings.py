@@ -7,6 +7,7 @@ from dataclasses import replace
 from stlc.compile import ir
 from stlc.compile.scope import Entry, Known
 from stlc.compile.values import Number, Vector
+from stlc.dynamics.algebra import names_in, substitute
 from stlc.dynamics.decl import START, BackupDecl, ObjectiveDecl, PolicyDecl, Term, TrainDecl
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import component_texts
@@ -52,20 +53,21 @@ def read_objective(node: Node | None, reader: Reader, names: Names) -> Objective
 
 
 def _first(state: Entry) -> Known:
-    """The value of a state at the start of the plan."""
+    """The value of a state at the start of the plan, whatever it is made of: a column may be converted."""
     assert isinstance(state, Known)
     about = "its value at the start of the plan"
     match state.value:
-        case Number(num=ir.Col(name)) as number:
-            return Known(replace(number, num=ir.Col(name + START)), about)
+        case Number() as number:
+            return Known(_began(number), about)
         case Vector(items) as vector:
-            parts = tuple(
-                replace(item, num=ir.Col(item.num.name + START))
-                for item in items
-                if isinstance(item.num, ir.Col)
-            )
-            return Known(replace(vector, items=parts), about)
-    raise TypeError(f"not a state: {state}")
+            return Known(replace(vector, items=tuple(map(_began, items))), about)
+        case _:
+            return state
+
+
+def _began(number: Number) -> Number:
+    table = {name: ir.Col(name + START) for name in names_in(number.num)}
+    return replace(number, num=substitute(number.num, table))
 
 
 def _term(node: Node, here: Expressions) -> tuple[Term, ...]:
