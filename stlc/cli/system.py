@@ -31,7 +31,7 @@ def register(app: typer.Typer) -> None:
     group.callback()(only_help)
     group.command(
         help=describe(
-            "Show states, controls, flow, jumps, initial situations and scenarios.",
+            "Show what a system file declares, from states to scenarios.",
             "stlc system show car.yaml",
         )
     )(show)
