@@ -13,6 +13,9 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map_only
 
+from stlc.compile import ops_torch
+from stlc.dynamics import controls
+
 AWAY = torch.device("meta")
 _INDEXING = {
     "aten.index.Tensor",
@@ -54,6 +57,7 @@ class Elsewhere(TorchDispatchMode):
     """While it is open, tensors that are made on the device `AWAY` have numbers."""
 
     def __enter__(self) -> Elsewhere:
+        _forget_constants()
         self._numbers = _Numbers()
         self._numbers.__enter__()
         return super().__enter__()
@@ -61,9 +65,16 @@ class Elsewhere(TorchDispatchMode):
     def __exit__(self, *raised: Any) -> None:
         super().__exit__(*raised)
         self._numbers.__exit__(*raised)
+        _forget_constants()
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         return carried_out(function, args, kwargs or {})
+
+
+def _forget_constants() -> None:
+    """Those of a device are kept by its name, and tensors of the true `meta` have no numbers."""
+    ops_torch._constant.cache_clear()
+    controls._affine.cache_clear()
 
 
 class _Numbers(TorchFunctionMode):
