@@ -15,7 +15,7 @@ def register(app: typer.Typer) -> None:
     """Add the command to the program."""
     app.command(
         help=describe(
-            "Export a trained controller, with the model and the monitor inside.",
+            "Export a trained controller, monitor included.",
             "stlc export latest --to c",
             "stlc export latest --to torch -o controller",
             note="`torch` is a torch.export program: states in, plans and their robustness out. `c` is one "

@@ -36,6 +36,7 @@ from stlc.version import __version__
 COMMANDS = (
     *("train", "simulate", "check", "explain", "plot", "report", "runs"),
     *("init", "new", "lint", "fmt", "parse", "compile", "system", "lsp", "schema", "doctor", "bench"),
+    "export",
 )
 HEAVY = {"torch", "numpy", "matplotlib", "lark", "yaml", "rich"}
 
