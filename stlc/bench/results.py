@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 from stlc.bench import ablation, family, paper
@@ -13,6 +14,7 @@ from stlc.view import available
 from stlc.view.benchmarks import Curve, Panel, draw_benchmarks
 
 PICTURE = "img/results.svg"
+WIDTH = 120
 
 HEAD = """# Results
 
@@ -218,7 +220,8 @@ def provenance(documents: Iterable[Mapping[str, Any]]) -> list[str]:
         when = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
         commits = ", ".join(f"`{commit}`" for commit in sorted({_commit(document) for document in group}))
         count = _counted(len(group), "trainings")
-        lines += [f"- {count} on {key[0]}; {key[1]}; {key[2]}; {when}; commit {commits}"]
+        line = f"- {count} on {key[0]}; {key[1]}; {key[2]}; {when}; commit {commits}"
+        lines += wrap(line, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
     return lines
 
 
