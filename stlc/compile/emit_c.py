@@ -40,8 +40,8 @@ VECTOR(sin) VECTOR(cos) VECTOR(exp) VECTOR(log)
 #define APART
 #endif
 #define LATER(a, b) ((a) > (b) ? (a) : (b))
-#define LEAST(a, b) (((a) != (a)) | ((a) < (b)) ? (a) : (b)) /* NaN where either is */
-#define MOST(a, b) (((a) != (a)) | ((a) > (b)) ? (a) : (b))
+#define LEAST(a, b) (MIN(a, b) + ((b) != (b) ? (b) : 0.0)) /* NaN where either is; loops vectorise */
+#define MOST(a, b) (MAX(a, b) + ((b) != (b) ? (b) : 0.0))
 #define NAN_IN(a) ((double)((a) != (a)))
 
 static inline double floored_mod(double a, double b) {{

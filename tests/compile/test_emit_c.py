@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import platform
+import subprocess
+from pathlib import Path
+
 import numpy as np
 import pytest
 from emitted import OPERATIONS, STEPS, follower, values_agree
@@ -45,3 +49,19 @@ def test_nan_is_not_lost_in_minima_and_maxima(monkeypatch: pytest.MonkeyPatch) -
     trace = np.random.default_rng(3).normal(0, 2, (STEPS + 1, 64, 3))
     for num in nums:
         values_agree([ir.Atom(num)], trace)
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "aarch64"), reason="vector units are of these")
+def test_loops_of_minima_and_maxima_vectorise(tmp_path: Path) -> None:
+    version = subprocess.run([compiler() or "cc", "--version"], check=False, capture_output=True, text=True)
+    if "Free Software Foundation" not in version.stdout:
+        pytest.skip("the report of what was vectorised is that of GCC")
+    x, y, z = (ir.Col(name) for name in NAMES)
+    deep = ir.Op("max", (ir.Op("min", (x, y)), ir.Op("min", (y, ir.Op("clip", (z, x, y))))))
+    source = tmp_path / "kernel.c"
+    source.write_text(emit(follower(), [ir.Atom(deep)]))
+    line = next(at for at, text in enumerate(source.read_text().splitlines(), 1) if "= LEAST(" in text)
+    flags = (*native.FLAGS, "-O3", "-fopt-info-vec-optimized", "-o", str(tmp_path / "kernel.so"))
+    command = [compiler() or "cc", *flags, str(source), "-lm"]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert f"kernel.c:{line}:" in done.stderr
