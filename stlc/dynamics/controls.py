@@ -9,7 +9,7 @@ from torch import Tensor
 
 from stlc.dynamics.decl import ControlDecl
 
-_EPS = 1e-6
+EPS = 1e-6
 """Keeps the gradient of an angle finite where both components are 0."""
 
 
@@ -45,7 +45,7 @@ def _units(raw: Tensor, controls: tuple[ControlDecl, ...]) -> list[Tensor]:
             case "clip":
                 out.append(torch.clamp(first, -1.0, 1.0))
             case "angle":
-                out.append(torch.atan2(next(columns), first + _EPS) / torch.pi)
+                out.append(torch.atan2(next(columns), first + EPS) / torch.pi)
     return out
 
 

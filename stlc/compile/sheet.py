@@ -1,0 +1,245 @@
+"""A graph that is written down while it is computed: symbolic arrays and the ONNX nodes between them.
+
+A `Value` looks like an array to the evaluators: it has a shape, can be cut along time, and takes arithmetic.
+Every operation becomes a node of its sheet, equal ones once. `stlc.export.onnx_file` makes files of sheets;
+nothing here needs a library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import reduce
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Kind: TypeAlias = Literal["float64", "float32", "int64", "bool"]
+Attribute: TypeAlias = int | tuple[int, ...]
+
+BATCH = 1 << 40
+"""The length of an axis that is known only when the graph is run; of several on a sheet only equal ones meet."""
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """One operation of ONNX: names of what goes in and comes out."""
+
+    op: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    attributes: tuple[tuple[str, Attribute], ...]
+
+
+@dataclass(slots=True)
+class Sheet:
+    """A graph.
+
+    Attributes:
+        nodes: in order.
+        constants: name -> array.
+        inputs: what is given when the graph is run.
+    """
+
+    nodes: list[Node] = field(default_factory=list)
+    constants: dict[str, NDArray[Any]] = field(default_factory=dict)
+    inputs: list[Value] = field(default_factory=list)
+    _known: dict[tuple[object, ...], tuple[Value, ...]] = field(default_factory=dict)
+
+    def input(self, name: str, shape: tuple[int, ...], kind: Kind = "float64") -> Value:
+        """Something that is given."""
+        self.inputs.append(Value(self, name, shape, kind))
+        return self.inputs[-1]
+
+    def constant(self, value: object, kind: Kind = "float64") -> Value:
+        """A constant of any shape; equal ones are one."""
+        array = np.asarray(value, dtype=kind)
+        key = ("constant", kind, array.shape, array.tobytes())
+        if key not in self._known:
+            name = f"c{len(self.constants)}"
+            self.constants[name] = array
+            self._known[key] = (Value(self, name, array.shape, kind),)
+        return self._known[key][0]
+
+    def emit(
+        self,
+        op: str,
+        inputs: Sequence[Value],
+        shapes: Sequence[tuple[int, ...]],
+        kind: Kind,
+        attributes: Mapping[str, Attribute] | None = None,
+    ) -> tuple[Value, ...]:
+        """The outputs of a node, one a shape."""
+        facts = tuple(sorted((attributes or {}).items()))
+        names = tuple(value.name for value in inputs)
+        key = (op, names, facts, len(shapes))
+        if key not in self._known:
+            made = tuple(
+                Value(self, f"v{len(self.nodes)}.{place}", shape, kind) for place, shape in enumerate(shapes)
+            )
+            self.nodes.append(Node(op, names, tuple(value.name for value in made), facts))
+            self._known[key] = made
+        return self._known[key]
+
+    def needed(self, outputs: Sequence[Value]) -> list[Node]:
+        """The nodes that outputs depend on, in order."""
+        wanted, kept = {value.name for value in outputs}, []
+        for node in reversed(self.nodes):
+            if wanted & set(node.outputs):
+                wanted |= set(node.inputs)
+                kept.append(node)
+        return kept[::-1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Value:
+    """A symbolic array.
+
+    Attributes:
+        sheet: that it stands on.
+        name: its name there.
+        shape: `BATCH` where a length is not known.
+        kind: of its numbers.
+    """
+
+    sheet: Sheet
+    name: str
+    shape: tuple[int, ...]
+    kind: Kind
+
+    # ----------------------------------------------------------------- arithmetic
+
+    def __add__(self, other: Value | float) -> Value:
+        return self.apply("Add", other)
+
+    def __radd__(self, other: float) -> Value:
+        return self.beside(other).apply("Add", self)
+
+    def __sub__(self, other: Value | float) -> Value:
+        return self.apply("Sub", other)
+
+    def __rsub__(self, other: float) -> Value:
+        return self.beside(other).apply("Sub", self)
+
+    def __mul__(self, other: Value | float) -> Value:
+        return self.apply("Mul", other)
+
+    def __rmul__(self, other: float) -> Value:
+        return self.beside(other).apply("Mul", self)
+
+    def __truediv__(self, other: Value | float) -> Value:
+        return self.apply("Div", other)
+
+    def __rtruediv__(self, other: float) -> Value:
+        return self.beside(other).apply("Div", self)
+
+    def __neg__(self) -> Value:
+        return self.apply("Neg")
+
+    def beside(self, other: Value | float) -> Value:
+        """A number as a constant of the same kind; a value as it is."""
+        return other if isinstance(other, Value) else self.sheet.constant(other, self.kind)
+
+    def apply(self, op: str, *others: Value | float, kind: Kind | None = None) -> Value:
+        """An operation element by element; shapes broadcast as in NumPy."""
+        parts = [self.beside(other) for other in others]
+        (out,) = self.sheet.emit(op, (self, *parts), [self.broadcast(*parts)], kind or self.kind)
+        return out
+
+    def broadcast(self, *others: Value) -> tuple[int, ...]:
+        """The shape that these have together."""
+        return reduce(_broadcast, (other.shape for other in others), self.shape)
+
+    def cast(self, kind: Kind) -> Value:
+        """The same numbers as another kind."""
+        if kind == self.kind:
+            return self
+        code = {"float32": 1, "int64": 7, "bool": 9, "float64": 11}[kind]
+        (out,) = self.sheet.emit("Cast", (self,), [self.shape], kind, {"to": code})
+        return out
+
+    # --------------------------------------------------------------------- shapes
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    @property
+    def ndim(self) -> int:
+        """How many axes there are."""
+        return len(self.shape)
+
+    def __getitem__(self, rows: slice | int) -> Value:
+        """Rows along axis 0; one row alone has an axis less."""
+        if isinstance(rows, int):
+            index = self.sheet.constant(rows % self.shape[0], "int64")
+            (out,) = self.sheet.emit("Gather", (self, index), [self.shape[1:]], self.kind, {"axis": 0})
+            return out
+        first, stop, step = rows.indices(self.shape[0])
+        count = len(range(first, stop, step))
+        if count == self.shape[0] and step == 1:
+            return self
+        ends = stop if stop >= 0 else -self.shape[0] - 1
+        numbers = [self.sheet.constant([number], "int64") for number in (first, ends, 0, step)]
+        (out,) = self.sheet.emit("Slice", (self, *numbers), [(count, *self.shape[1:])], self.kind)
+        return out
+
+    def rows(self) -> tuple[Value, ...]:
+        """Every row along axis 0, with the axis kept."""
+        count = self.shape[0]
+        if count == 1:
+            return (self,)
+        sizes = self.sheet.constant([1] * count, "int64")
+        shapes = [(1, *self.shape[1:])] * count
+        return self.sheet.emit("Split", (self, sizes), shapes, self.kind, {"axis": 0})
+
+    def reshaped(self, *shape: int) -> Value:
+        """The same numbers in another shape, in which at most one length is `BATCH`."""
+        wanted = self.sheet.constant([-1 if length == BATCH else length for length in shape], "int64")
+        (out,) = self.sheet.emit("Reshape", (self, wanted), [shape], self.kind)
+        return out
+
+    def transposed(self, *order: int) -> Value:
+        """The axes in another order."""
+        shape = tuple(self.shape[axis] for axis in order)
+        (out,) = self.sheet.emit("Transpose", (self,), [shape], self.kind, {"perm": order})
+        return out
+
+    @property
+    def T(self) -> Value:  # noqa: N802 - as arrays call it
+        """Two axes exchanged."""
+        return self.transposed(1, 0)
+
+    def spread(self, *shape: int, like: Value | None = None) -> Value:
+        """Repeated along axes of length 1 to a shape, whose `BATCH` is that of the last axis of `like`."""
+        if self.shape == shape:
+            return self
+        parts = [self.sheet.constant([1 if length == BATCH else length], "int64") for length in shape]
+        if like is not None and like.shape[-1] == BATCH and BATCH in shape:
+            parts[shape.index(BATCH)] = like.count()
+        wanted = joined(parts)
+        (out,) = self.sheet.emit("Expand", (self, wanted), [shape], self.kind)
+        return out
+
+    def count(self) -> Value:
+        """The length of the last axis, (1,) int64."""
+        (out,) = self.sheet.emit("Shape", (self,), [(1,)], "int64", {"start": self.ndim - 1})
+        return out
+
+
+def joined(parts: Sequence[Value]) -> Value:
+    """One behind the other along axis 0; the other axes agree."""
+    if len(parts) == 1:
+        return parts[0]
+    first = parts[0]
+    shape = (sum(part.shape[0] for part in parts), *first.shape[1:])
+    (out,) = first.sheet.emit("Concat", parts, [shape], first.kind, {"axis": 0})
+    return out
+
+
+def _broadcast(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[int, ...]:
+    length = max(len(a), len(b))
+    left, right = (1,) * (length - len(a)) + a, (1,) * (length - len(b)) + b
+    for one, other in zip(left, right, strict=True):
+        assert one == other or 1 in (one, other), f"{a} and {b}"
+    return tuple(other if one == 1 else one for one, other in zip(left, right, strict=True))

@@ -1,0 +1,98 @@
+"""A model as a graph: the steps of a plan, one after the other, and together where nothing feeds back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from stlc.compile import ir
+from stlc.compile.arith import Program
+from stlc.compile.ops_onnx import ONNX
+from stlc.compile.sheet import Value
+from stlc.compile.unrolled import Columns, require_numbers
+from stlc.dynamics.schedule import Stage, schedule
+from stlc.dynamics.step import Step
+
+
+def rolled(step: Step, start: Mapping[str, Value], controls: Mapping[str, Value]) -> Columns:
+    """The states under a plan, exact switching.
+
+    Args:
+        step: one step of the system.
+        start: states, (1, batch) each.
+        controls: (steps, batch) each.
+
+    Returns:
+        The states, (steps + 1, batch) each.
+
+    Raises:
+        Untranslatable: the step calls a function of Python.
+    """
+    require_numbers([*(num for _, num in step.lets), *step.next.values()])
+    steps = len(next(iter(controls.values())))
+    film = _Film(start, controls, step.next.keys(), steps)
+    for stage in schedule(step):
+        film.run(stage)
+    still = {name: value.spread(steps + 1, value.shape[1]) for name, value in start.items()}
+    return still | film.states
+
+
+class _Film:
+    """What is known so far: the states that move, and numbers at all steps or, in one row, at each."""
+
+    def __init__(
+        self, start: Mapping[str, Value], controls: Mapping[str, Value], moving: Iterable[str], steps: int
+    ) -> None:
+        self.start, self.steps = start, steps
+        self.states: Columns = {}
+        moving = frozenset(moving)
+        self.now: Columns = {name: value for name, value in start.items() if name not in moving}
+        self.now |= controls
+
+    def run(self, stage: Stage) -> None:
+        """A stage whose inputs are known."""
+        if stage.early:
+            self.now.update(Program(stage.early)(self.now, ONNX))
+        for state, source in stage.follows.items():
+            self._enter(state, ONNX.cat([self.start[state], self._full(source)]))
+        for state, source in stage.sums.items():
+            parts = ONNX.cat([self.start[state], self._full(source)])
+            axis = parts.sheet.constant(0, "int64")
+            (total,) = parts.sheet.emit("CumSum", (parts, axis), [parts.shape], parts.kind)
+            self._enter(state, total)
+        if stage.blocks:
+            self._loop(stage)
+
+    def _enter(self, name: str, column: Value) -> None:
+        self.states[name] = column
+        self.now[name] = column[:-1]
+
+    def _full(self, name: str) -> Value:
+        value = self.now[name]
+        return value.spread(self.steps, value.shape[1])
+
+    def _loop(self, stage: Stage) -> None:
+        """Step what feeds back into itself."""
+        rows = {name: value.rows() for name, value in self.now.items()}
+        blocks = [Program(block) for block in stage.blocks]
+        states = {name: self.start[name] for name in stage.stepped}
+        history: dict[str, list[Value]] = {name: [] for name in (*stage.stepped.values(), *stage.lets)}
+        for step in range(self.steps):
+            env = {name: row[min(step, len(row) - 1)] for name, row in rows.items()} | states
+            for block in blocks:
+                env.update(block(env, ONNX))
+            for name, values in history.items():
+                values.append(env[name])
+            states = {name: env[source] for name, source in stage.stepped.items()}
+        for state, source in stage.stepped.items():
+            self._enter(state, ONNX.cat([self.start[state], *history[source]]))
+        self.now.update((name, ONNX.cat(history[name])) for name in stage.lets)
+
+
+def assigned(numbers: Mapping[str, ir.Num], columns: Mapping[str, Value]) -> Columns:
+    """Numbers that follow from columns, which broadcast against them.
+
+    Raises:
+        Untranslatable: one calls a function of Python.
+    """
+    require_numbers(list(numbers.values()))
+    return Program(dict(numbers))(columns, ONNX) if numbers else {}
