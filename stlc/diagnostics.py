@@ -216,6 +216,8 @@ CODES: dict[str, str] = {
     "R103": "a run that is already finished",
     "R104": "options that cannot change on resume",
     "R105": "an exported controller that does not do what its run does",
+    "R106": "an exported controller whose files are missing, damaged or mixed",
+    "R107": "a state that an exported controller cannot decide in",
     "R201": "no room on the disk, or a file that cannot be written",
     "R202": "not enough memory",
     "R301": "a package that is not installed",

@@ -17,17 +17,19 @@ def register(app: typer.Typer) -> None:
         help=describe(
             "Export a trained controller, monitor included.",
             "stlc export latest --to c",
-            "stlc export latest --to torch -o controller",
+            "stlc export latest --to onnx -o controller",
+            "stlc export latest --to torch",
             note="`torch` is a torch.export program: states in, plans and their robustness out. `c` is one "
             "C99 header that needs nothing but libm, with the backup policy inside, and an example program. "
-            "What is written has been checked against the run on random states.",
+            "`onnx` are graphs for onnxruntime, which `stlc.runtime` drives without torch, the backup policy "
+            "included. What is written has been checked against the run on random states.",
         )
     )(export)
 
 
 def export(
     run: RunArgument = "latest",
-    to: Annotated[str, typer.Option("--to", metavar="TARGET", help="What to write: torch or c.")] = "torch",
+    to: Annotated[str, typer.Option("--to", metavar="TARGET", help="torch, c or onnx.")] = "torch",
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", "--out", metavar="DIR", help="By default in the run's folder."),
@@ -47,8 +49,10 @@ def export(
     found = done.agreement
     if as_json:
         checked = None if found is None else {"states": found.states, "plan": found.plan, "rho": found.rho}
+        taken = done.latency
+        latency = None if taken is None else {"median_ms": taken.median, "p99_ms": taken.p99}
         result = {"run": opened.dir.shown, "target": target, "folder": str(shown), "files": list(done.files)}
-        emit_json("export/1", ok=True, exit_code=0, result={**result, "checked": checked})
+        emit_json("export/1", ok=True, exit_code=0, result={**result, "checked": checked, "latency": latency})
         return
     if found is None:
         say("not checked: there is no C compiler")
@@ -56,6 +60,11 @@ def export(
         say(
             f"checked in {found.states} random states: plans within {found.plan:.1e} of a range, "
             f"robustness within {found.rho:.1e}"
+        )
+    if done.latency is not None:
+        say(
+            f"decides in {done.latency.median:.2f} ms, 99 % within {done.latency.p99:.2f} ms: "
+            "one agent, one thread, stlc.runtime"
         )
     for name in done.files:
         emit(str(shown / name))

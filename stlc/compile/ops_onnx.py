@@ -14,7 +14,7 @@ from typing import TypeAlias, cast, final
 
 from stlc.compile.extremum import Pick, Sliding
 from stlc.compile.ops import Ops
-from stlc.compile.sheet import BATCH, Value, joined
+from stlc.compile.sheet import BATCH, Kind, Value, joined
 
 Number: TypeAlias = Value | float
 
@@ -174,10 +174,8 @@ class OnnxOps:
 
     def where(self, mask: Value, yes: Number, no: Number) -> Value:
         """`yes` where `mask`, else `no`."""
-        kind = next((each.kind for each in (yes, no) if isinstance(each, Value)), "float64")
-        parts = [
-            each if isinstance(each, Value) else mask.sheet.constant(each, kind) for each in (yes, no)
-        ]
+        kind: Kind = next((each.kind for each in (yes, no) if isinstance(each, Value)), "float64")
+        parts = [each if isinstance(each, Value) else mask.sheet.constant(each, kind) for each in (yes, no)]
         return mask.apply("Where", *parts, kind=kind)
 
     def infinite(self, mask: Value, like: Value) -> Value:  # noqa: ARG002
@@ -186,6 +184,8 @@ class OnnxOps:
 
     def clamp(self, x: Value, low: float | None, high: float | None) -> Value:
         """`x` cut to [low, high]."""
+        if low is not None and high is not None:
+            return x.apply("Clip", low, high)
         x = x if low is None else x.apply("Max", low)
         return x if high is None else x.apply("Min", high)
 

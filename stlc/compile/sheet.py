@@ -19,7 +19,7 @@ Kind: TypeAlias = Literal["float64", "float32", "int64", "bool"]
 Attribute: TypeAlias = int | tuple[int, ...]
 
 BATCH = 1 << 40
-"""The length of an axis that is known only when the graph is run; of several on a sheet only equal ones meet."""
+"""The length of an axis that is known only when the graph is run; only equal ones meet in an operation."""
 
 
 @dataclass(frozen=True, slots=True)

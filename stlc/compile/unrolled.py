@@ -22,9 +22,7 @@ from stlc.compile.sheet import Value
 Columns = dict[str, Value]
 
 
-def written(
-    formulas: Sequence[ir.Formula], columns: Mapping[str, Value], *, count: int = 1
-) -> list[Value]:
+def written(formulas: Sequence[ir.Formula], columns: Mapping[str, Value], *, count: int = 1) -> list[Value]:
     """Exact robustness at the first samples.
 
     Args:

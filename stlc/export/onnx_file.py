@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from stlc.compile.sheet import BATCH, Value
 from stlc.diagnostics import Diagnostic, MissingError
 from stlc.version import __version__
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
     from onnx import NodeProto, TensorProto, ValueInfoProto
 
     from stlc.compile.sheet import Node
@@ -42,9 +43,7 @@ def model_of(name: str, outputs: Mapping[str, Value], facts: Mapping[str, str]) 
     sheet = next(iter(outputs.values())).sheet
     nodes = sheet.needed(tuple(outputs.values()))
     read = {each for node in nodes for each in node.inputs} | {each.name for each in outputs.values()}
-    renamed = [
-        helper.make_node("Identity", [value.name], [shown]) for shown, value in outputs.items()
-    ]
+    renamed = [helper.make_node("Identity", [value.name], [shown]) for shown, value in outputs.items()]
     graph = helper.make_graph(
         [*map(_node, nodes), *renamed],
         name,
@@ -68,10 +67,12 @@ def model_of(name: str, outputs: Mapping[str, Value], facts: Mapping[str, str]) 
 def _node(node: Node) -> NodeProto:
     from onnx import helper
 
-    return helper.make_node(node.op, list(node.inputs), list(node.outputs), **dict(node.attributes))
+    made = helper.make_node(node.op, list(node.inputs), list(node.outputs))
+    made.attribute.extend(helper.make_attribute(key, value) for key, value in node.attributes)
+    return made
 
 
-def _constant(name: str, array: object) -> TensorProto:
+def _constant(name: str, array: NDArray[Any]) -> TensorProto:
     from onnx import numpy_helper
 
     return numpy_helper.from_array(array, name)

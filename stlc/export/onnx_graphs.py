@@ -87,7 +87,7 @@ def judging(task: Task) -> dict[str, Value]:
 
 
 def falling(task: Task) -> dict[str, Value]:
-    """`state` and `plan` as in `judging` -> `falls` (batch, T + 1), the robustness of phi_safe on every prefix.
+    """`state` and `plan` as in `judging` -> `falls` (batch, T + 1): phi_safe's robustness on every prefix.
 
     Raises:
         Untranslatable: the task holds something that has no form as a graph.
@@ -101,5 +101,3 @@ def _asked(task: Task) -> tuple[Mapping[str, Value], Value]:
     state = sheet.input("state", (BATCH, len(task.names)))
     plans = sheet.input("plan", (BATCH, task.horizon, len(task.system.controls)))
     return columns_of(state, task.names), plans
-
-

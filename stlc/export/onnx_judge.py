@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import TYPE_CHECKING
 
-from stlc.compile.ops_onnx import ONNX
+from stlc.compile.ops_onnx import ONNX_OPS as ONNX
 from stlc.compile.semantics import TOLERANCE
 from stlc.compile.sheet import BATCH, Value, joined
 from stlc.compile.unrolled import written
@@ -79,22 +80,23 @@ def judged(task: Task, start: Columns, plans: Value) -> Verdicts:
 def _overall(rules: Sequence[Rule], each: Columns, like: Value) -> Value:
     """The weighed minimum, (1, batch); +inf without rules."""
     if not rules:
-        return ONNX.full((1, 1), math.inf, like).spread(1, BATCH, like=like)
-    weighed = [each[rule.name] * (rule.weight / rule.scale) for rule in rules]
+        return like.sheet.constant([[math.inf]]).spread(1, BATCH, like=like)
+    weighed = [
+        each[rule.name] if rule.weight == rule.scale else each[rule.name] * (rule.weight / rule.scale)
+        for rule in rules
+    ]
     least: Value = ONNX.join(weighed, "min")
     return least
 
 
 def _broken(task: Task, plans: Value, states: Columns, margins: Sequence[Value]) -> Value:
     """Where a plan holds what is no finite number, or something that follows from it is NaN, (1, batch)."""
-    sheet = plans.sheet
     nothing = _reduced("ReduceSum", plans * 0.0, (1, 2)).reshaped(1, BATCH)
     moving = [states[name] for name in task.system.exact_step.next]
     like = next(iter(states.values()))
     wide = [column.spread(column.shape[0], BATCH, like=like) for column in (*moving, *margins)]
     together = joined([nothing, *wide])
     lost = together.apply("IsNaN", kind="bool").cast("float32")
-    assert lost.sheet is sheet
     return _reduced("ReduceMax", lost, (0,)).apply("Greater", 0.5, kind="bool")
 
 
@@ -129,7 +131,7 @@ def _cost(task: Task, states: Columns, controls: Columns, rho: Value) -> Value:
     env |= {name + START: column[:1] for name, column in states.items()}
     over_states, over_controls = system.objective
     before = {name: column[:rows] for name, column in (env | dict(states)).items()}
-    parts = [ONNX.full((1, 1), 0.0, rho)]
+    parts = [rho.sheet.constant([[0.0]])]
     if over_states is not None:
         parts.append(_mean(over_states, env | dict(states), rows + 1))
     if over_controls is not None:
@@ -140,10 +142,7 @@ def _cost(task: Task, states: Columns, controls: Columns, rho: Value) -> Value:
         parts.append(_mean(task.compiled.pull, states, rows + 1) * PULL)
     if task.compiled.timers:
         parts.append(_lacking(task, rho) * SHORT)
-    total = parts[0]
-    for part in parts[1:]:
-        total = total + part
-    return total.spread(1, BATCH, like=rho)
+    return reduce(ONNX.add, parts).spread(1, BATCH, like=rho)
 
 
 def _mean(number: ir.Num, env: Columns, rows: int) -> Value:
@@ -169,10 +168,7 @@ def _short(task: Task, states: Columns) -> Value:
         best = ONNX.amax(ONNX.where(counts, margin, -math.inf))
         still_open = ONNX.gt(HELD, ONNX.abs(states[promise.status][:1]))
         lacks.append(ONNX.where(still_open, _lacking(task, best), 0.0))
-    total: Value = lacks[0]
-    for lack in lacks[1:]:
-        total = total + lack
-    return total
+    return reduce(ONNX.add, lacks)
 
 
 def deepened(task: Task, states: Columns) -> Value:
@@ -183,10 +179,7 @@ def deepened(task: Task, states: Columns) -> Value:
         now, next_ = margin.spread(2, margin.shape[1])[:1], margin.spread(2, margin.shape[1])[1:]
         held = ONNX.both(ONNX.ge(now, 0.0), ONNX.gt(gamma, now))
         found.append(ONNX.both(held, ONNX.gt(next_, now)))
-    total: Value = found[0]
-    for one in found[1:]:
-        total = ONNX.either(total, one)
-    return total
+    return reduce(ONNX.either, found)
 
 
 # ------------------------------------------------------------------------ prefixes
@@ -203,7 +196,9 @@ def falls(task: Task, start: Columns, plans: Value) -> Value:
     prefixes = [[[1.0 if k > end else -1.0] for end in range(rows)] for k in range(rows)]
     beyond = like.sheet.constant(prefixes).spread(rows, rows, BATCH, like=like)
     columns = {
-        name: column.spread(rows, BATCH, like=like).reshaped(rows, 1, BATCH).spread(rows, rows, BATCH, like=like)
+        name: column.spread(rows, BATCH, like=like)
+        .reshaped(rows, 1, BATCH)
+        .spread(rows, rows, BATCH, like=like)
         for name, column in states.items()
     }
     columns[BEYOND] = beyond

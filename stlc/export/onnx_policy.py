@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from torch import nn
 
 from stlc.compile import ir
-from stlc.compile.ops_onnx import ONNX
+from stlc.compile.ops_onnx import ONNX_OPS as ONNX
 from stlc.compile.sheet import BATCH, Value, joined
 from stlc.dynamics.controls import EPS, raw_width
 from stlc.export.onnx_rollout import assigned

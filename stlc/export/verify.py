@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from stlc import native
+from stlc.controller.prefix import prefix_robustness
 from stlc.controller.task import rank
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.export.programs import unmoved
@@ -19,6 +20,7 @@ from stlc.export.programs import unmoved
 if TYPE_CHECKING:
     from stlc.controller.policy import Mlp
     from stlc.controller.task import Task
+    from stlc.runtime.graphs import Graphs
 
 PLAN = 1e-4
 """How far a control may be from the original's, in parts of its range: the network is float32."""
@@ -78,15 +80,18 @@ def _compared(policy: Mlp, decide: Callable[[Tensor], Answer], x: Tensor) -> Agr
     found = Agreement(len(x), float(far[same].amax()) if bool(same.any()) else 0.0, off, int(ties.sum()))
     if not bool((same | ties).all()) or not off <= RHO:
         worst = float(far.nan_to_num(torch.inf).amax())
-        raise RunError(
-            Diagnostic(
-                "R105",
-                "the exported controller does not do what the run does",
-                note=(f"plans differ by up to {worst:.2g} of a range, robustness by up to {off:.2g}",),
-                help=("nothing was written; please report this with the specification and the system",),
-            )
-        )
+        message = f"plans differ by up to {worst:.2g} of a range, robustness by up to {off:.2g}"
+        raise RunError(_disagreement(message))
     return found
+
+
+def _disagreement(how: str) -> Diagnostic:
+    return Diagnostic(
+        "R105",
+        "the exported controller does not do what the run does",
+        note=(how,),
+        help=("nothing was written; please report this with the specification and the system",),
+    )
 
 
 def _distance(a: Tensor, b: Tensor) -> float:
@@ -104,6 +109,47 @@ def by_torch(path: Path) -> Callable[[Tensor], Answer]:
         return plan, rho, safe, each
 
     return decide
+
+
+def by_onnx(graphs: Graphs) -> Callable[[Tensor], Answer]:
+    """The graphs of a folder, as the runtime runs them."""
+
+    def decide(x: Tensor) -> Answer:
+        judged, _ = graphs.decided(x.numpy())
+        plan, rho, safe, each = map(torch.from_numpy, (judged.plan, judged.rho, judged.safe, judged.each))
+        return plan, rho, safe, each
+
+    return decide
+
+
+def same_verdicts(task: Task, graphs: Graphs, *, states: int, seed: int = 7) -> float:
+    """The largest distance between the verdicts of both on random plans: robustness, cost, states, prefixes.
+
+    Raises:
+        RunError: R105, they disagree.
+    """
+    x = task.sample(states, seed=seed, dtype=torch.float64)
+    low, high = task.system.control_low.double(), task.system.control_high.double()
+    shape = (states, task.horizon, len(low))
+    drawn = torch.rand(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    plans = low + (high - low) * drawn
+    wanted = task.judge(x, plans)
+    mine, said = graphs.judged(x.numpy(), plans.numpy())
+    columns = torch.stack([wanted.columns[name].t() for name in task.names], 2)
+    formulas = [rule.formula for rule in task.compiled.safety]
+    falls = prefix_robustness(formulas, wanted.columns).t()
+    pairs = [
+        (mine.rho, wanted.rho),
+        (mine.safe, wanted.safe),
+        (mine.each, wanted.requirements),
+        (mine.cost, task.cost(wanted)),
+        (said["states"], columns),
+        (graphs.falls(x.numpy(), plans.numpy()), falls),
+    ]
+    off = max(_distance(torch.from_numpy(a), b) for a, b in pairs)
+    if not off <= RHO:
+        raise RunError(_disagreement(f"verdicts on given plans differ by up to {off:.2g}"))
+    return off
 
 
 def by_c(folder: Path, task: Task, built: Path) -> Callable[[Tensor], Answer] | None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
@@ -12,15 +13,18 @@ import torch
 from stlc.compile.c_numbers import Untranslatable
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.export import c_weights, emit
+from stlc.export.onnx_write import Latency, timed, write_onnx
 from stlc.export.programs import recorded
-from stlc.export.verify import Agreement, agreement, by_c, by_torch
+from stlc.export.verify import Agreement, agreement, by_c, by_onnx, by_torch, same_verdicts
 from stlc.files import write_atomic
 from stlc.jsontext import dumps
+from stlc.runtime.facts import read_facts
+from stlc.runtime.graphs import Graphs
 
 if TYPE_CHECKING:
     from stlc.controller.run import Run
 
-Target: TypeAlias = Literal["torch", "c"]
+Target: TypeAlias = Literal["torch", "c", "onnx"]
 TARGETS: tuple[Target, ...] = get_args(Target)
 STATES = 64
 """Random states that an export is checked in."""
@@ -34,11 +38,13 @@ class Exported:
         folder: where.
         files: names in it.
         agreement: with the run; None where there is no compiler to check with.
+        latency: of a decision in the Python runtime, where it was measured.
     """
 
     folder: Path
     files: tuple[str, ...]
     agreement: Agreement | None
+    latency: Latency | None = None
 
 
 def target_of(word: str) -> Target:
@@ -61,30 +67,41 @@ def export(run: Run, target: Target, folder: Path) -> Exported:
 
     Raises:
         RunError: R105, the export does not do what the run does; nothing is written.
+        MissingError: R301, the target needs packages that are not installed.
         UsageError: U101, the task has no form for the target.
     """
     with tempfile.TemporaryDirectory() as name:
         beside = Path(name)
-        found = _torch(run, beside) if target == "torch" else _c(run, beside)
+        found, latency = _WRITERS[target](run, beside)
         files = tuple(sorted(path.name for path in beside.iterdir() if path.name != BUILT))
         folder.mkdir(parents=True, exist_ok=True)
         for each in files:
             write_atomic(folder / each, (beside / each).read_bytes())
-    return Exported(folder, files, found)
+    return Exported(folder, files, found, latency)
 
 
 BUILT = "checked"
+Checked: TypeAlias = tuple[Agreement | None, Latency | None]
 
 
-def _torch(run: Run, folder: Path) -> Agreement:
+def _torch(run: Run, folder: Path) -> Checked:
     """`decide.pt2`, and `controller.json` that says what goes in and comes out."""
     path = folder / "decide.pt2"
     torch.export.save(recorded(run.task, run.policy.network), path)
     (folder / "controller.json").write_text(dumps(_facts(run)) + "\n", encoding="utf-8")
-    return agreement(run.policy, by_torch(path), states=STATES)
+    return agreement(run.policy, by_torch(path), states=STATES), None
 
 
-def _c(run: Run, folder: Path) -> Agreement | None:
+def _onnx(run: Run, folder: Path) -> Checked:
+    """The graphs of `stlc.export.onnx_graphs`, and `controller.json`."""
+    write_onnx(run, folder)
+    graphs = Graphs(read_facts(folder))
+    found = agreement(run.policy, by_onnx(graphs), states=STATES)
+    off = same_verdicts(run.task, graphs, states=STATES // 4)
+    return replace(found, rho=max(found.rho, off)), timed(run.task, folder)
+
+
+def _c(run: Run, folder: Path) -> Checked:
     """A header, its weights, an example program and its Makefile."""
     try:
         text = emit.header(run.task, run.policy.network)
@@ -100,7 +117,10 @@ def _c(run: Run, folder: Path) -> Agreement | None:
     for name, content in texts.items():
         (folder / name).write_text(content, encoding="utf-8")
     decide = by_c(folder, run.task, folder / BUILT)
-    return None if decide is None else agreement(run.policy, decide, states=STATES)
+    return None if decide is None else agreement(run.policy, decide, states=STATES), None
+
+
+_WRITERS: Mapping[Target, Callable[[Run, Path], Checked]] = {"torch": _torch, "c": _c, "onnx": _onnx}
 
 
 def _facts(run: Run) -> dict[str, object]:

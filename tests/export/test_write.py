@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from documents import misfits
+from exported import run_of
 
 from stlc import native
 from stlc.cli.app import main
@@ -16,32 +17,14 @@ from stlc.cli.schema import load_schema
 from stlc.controller.config import TrainConfig
 from stlc.controller.deploy import Guard
 from stlc.controller.launch import Launch, open_folder
-from stlc.controller.policy import Mlp, PlanNetwork
 from stlc.controller.run import Run
-from stlc.controller.task import Task
 from stlc.diagnostics import RunError, UsageError
-from stlc.dynamics.system import System
 from stlc.export.programs import unmoved
 from stlc.export.verify import BUILT, agreement, answers
 from stlc.export.write import export, target_of
-from stlc.files import read_source
-from stlc.grammar.parser import parse
-from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[2]
 compiled = pytest.mark.skipif(native.compiler() is None, reason="needs a C compiler")
-
-
-def run_of(spec: str, system: str, folder: Path) -> Run:
-    """A run with a small network that has learnt nothing."""
-    task = Task.of(
-        parse(read_source(ROOT / "specs" / f"{spec}.stl")), System.load(ROOT / "examples" / f"{system}.yaml")
-    )
-    with torch.random.fork_rng():
-        torch.manual_seed(3)
-        network = PlanNetwork(task, hidden=(16, 16), plans=3).eval()
-    network.normalise(task.sample(200, seed=1))
-    return Run(RunDir.create(folder, spec, "test"), task, Mlp(task, network))
 
 
 def build(folder: Path) -> Path:
@@ -163,7 +146,11 @@ def test_the_command_writes_beside_the_run(
 ) -> None:
     run = run_of("traffic", "car", tmp_path / "runs")
     monkeypatch.setattr(Run, "open", lambda *_, **__: run)
-    assert main(["export", "--to", "c", "--json", "-o", str(tmp_path / "out")]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert misfits(document, load_schema("export/1")) == []
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == document["result"]["files"]
+    for target in ("c", "onnx"):
+        assert main(["export", "--to", target, "--json", "-o", str(tmp_path / target)]) == 0
+        document = json.loads(capsys.readouterr().out)
+        assert misfits(document, load_schema("export/1")) == []
+        assert sorted(path.name for path in (tmp_path / target).iterdir()) == document["result"]["files"]
+        assert (document["result"]["latency"] is not None) == (target == "onnx")
+    assert main(["export", "--to", "onnx", "-o", str(tmp_path / "again")]) == 0
+    assert "decides in" in capsys.readouterr().err

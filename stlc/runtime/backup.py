@@ -1,0 +1,102 @@
+"""The paper's backup policy over the graphs of a controller, as `stlc.controller.backup` is over torch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.semantics import TOLERANCE
+from stlc.runtime.facts import Quantity
+from stlc.runtime.graphs import Graphs, Judged, Numbers, joined
+
+POLICY, BACKUP, SAFEST = range(3)
+"""Who decided: the policy, the backup policy, or the longest safe prefix."""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """One plan for a state: `source` says by which rule, `t0` after how many actions of the grid."""
+
+    judged: Judged
+    source: int
+    t0: int
+
+
+def search(graphs: Graphs, x: Numbers, plan: Numbers) -> Found:
+    """A better plan for a state whose own one was found wanting.
+
+    T0 grows until a plan satisfies phi, or else phi_safe; where none does the longest safe prefix decides.
+
+    Args:
+        graphs: of the controller.
+        x: (n,).
+        plan: (T, m), what the policy would do; entries that are not finite are replaced.
+
+    Returns:
+        The plan, in one row.
+    """
+    own, grid = finite(plan, graphs.facts.controls), graphs.facts.grid
+    candidates = None
+    for length in grid.lengths:
+        candidates = _candidates(graphs, x, own, length)
+        good = candidates.rho >= -TOLERANCE
+        eligible = good if good.any() else candidates.safe >= -TOLERANCE
+        if eligible.any():
+            pick = best(eligible, (candidates.rho, -candidates.cost))
+            return Found(candidates.of([pick]), BACKUP, length)
+    if candidates is None:
+        nothing = np.full(1, -np.inf)
+        each = np.full((1, len(graphs.facts.requirements)), -np.inf)
+        return Found(Judged(own[None], nothing, nothing, -nothing, each), SAFEST, 0)
+    return Found(candidates.of([_safest(graphs, x, candidates)]), SAFEST, grid.lengths[-1])
+
+
+def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> Judged:
+    """All plans of one T0; the first begins as the policy's own plan does."""
+    grid = graphs.facts.grid
+    actions = np.array(list(product(*grid.values)))
+    index = np.indices((len(actions),) * length).reshape(length, -1).T
+    heads = np.concatenate((own[None, :length], actions[index]))
+    parts = []
+    for first in range(0, len(heads), grid.batch):
+        some = heads[first : first + grid.batch]
+        starts = np.repeat(x[None], len(some), 0)
+        plans = np.repeat(own[None], len(some), 0)
+        plans[:, :length] = some
+        reached = graphs.judged(starts, plans)[1]["states"][:, length]
+        tail = finite(graphs.decided(reached)[0].plan, graphs.facts.controls)
+        plans[:, length:] = tail[:, : own.shape[0] - length]
+        parts.append(graphs.judged(starts, plans)[0])
+    return joined(parts)
+
+
+def _safest(graphs: Graphs, x: Numbers, candidates: Judged) -> int:
+    """The plan with the longest safe prefix; of several the most robust, the latest to fail."""
+    size = max(graphs.facts.grid.batch // graphs.facts.horizon, 1)
+    falls = np.concatenate(
+        [
+            graphs.falls(np.repeat(x[None], len(plans), 0), plans)
+            for plans in (candidates.plan[at : at + size] for at in range(0, len(candidates.plan), size))
+        ]
+    )
+    samples = (falls >= -TOLERANCE).sum(1)
+    depth = np.minimum(falls, 0.0).mean(1)
+    return best(samples == samples.max(), (candidates.rho, depth, -candidates.cost))
+
+
+def best(allowed: NDArray[np.bool_], keys: Sequence[Numbers]) -> int:
+    """The first allowed choice that is best by the keys in order."""
+    for key in keys:
+        value = np.where(allowed & ~np.isnan(key), key, -np.inf)
+        allowed = allowed & (value >= value.max() - TOLERANCE)
+    return int(allowed.argmax())
+
+
+def finite(plans: Numbers, controls: Sequence[Quantity]) -> Numbers:
+    """Plans (…, m) with every entry that is no number replaced by the control's value nearest to 0."""
+    rest = [min(max(0.0, each.low or 0.0), each.high or 0.0) for each in controls]
+    return np.where(np.isfinite(plans), plans, rest)

@@ -1,0 +1,261 @@
+"""One decision after the other, as `stlc simulate` takes them, without torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stlc.compile.semantics import TOLERANCE
+from stlc.diagnostics import Diagnostic, RunError, UsageError
+from stlc.runtime.backup import POLICY, search
+from stlc.runtime.facts import Facts, read_facts
+from stlc.runtime.graphs import Graphs, Judged, Numbers
+
+Guard: TypeAlias = Literal["none", "paper"]
+RULES = ("policy", "backup", "safest")
+KEPT = "kept"
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What to do now, and why: of one agent, or of a batch with an axis of agents in front.
+
+    Attributes:
+        control: (m,), physical units.
+        rule: "policy", "kept" (a plan that was begun is gone on with), "backup" or "safest".
+        plan: (T, m) that the control begins.
+        rho: robustness of the plan; satisfied from -1e-6 on.
+        safe: the same of the safety requirements alone.
+        robustness: the same of each requirement, by name.
+        source: who made the plan: `rule`, but for a kept one who made it when it was new.
+        t0: length of the backup's prefix; 0 for the policy's own plan.
+        policy_rho: robustness of what the policy planned; -inf where that is no number.
+    """
+
+    control: Numbers
+    rule: str | NDArray[np.str_]
+    plan: Numbers
+    rho: float | Numbers
+    safe: float | Numbers
+    robustness: Mapping[str, float | Numbers]
+    source: str | NDArray[np.str_]
+    t0: int | NDArray[np.int64]
+    policy_rho: float | Numbers
+
+
+@dataclass(slots=True)
+class _Followed:
+    """The plans that are followed: verdicts, who made them, and which of them were begun before."""
+
+    judged: Judged
+    source: NDArray[np.int64]
+    t0: NDArray[np.int64]
+    kept: NDArray[np.bool_]
+
+
+class Controller:
+    """Policy, model, monitor and backup policy of a run, exported with `stlc export RUN --to onnx`.
+
+    It remembers the plans that it began, and the states that the specification adds: `reset` forgets them.
+
+    Attributes:
+        facts: names, units, ranges, hashes.
+        guard: "paper" calls the paper's backup policy where a plan is found violated; "none" only says so.
+    """
+
+    def __init__(
+        self,
+        facts: Facts,
+        guard: Guard = "none",
+        *,
+        parameters: Mapping[str, float] | None = None,
+        threads: int = 1,
+    ) -> None:
+        if guard not in get_args(Guard):
+            raise UsageError(Diagnostic("U101", f"there is no guard `{guard}`", help=("none or paper",)))
+        self.facts = facts
+        self.guard = guard
+        self._graphs = Graphs(facts, threads=threads)
+        self._parameters = dict(parameters or {})
+        self._begun: _Followed | None = None
+        self._added: Numbers | None = None
+
+    @classmethod
+    def load(
+        cls,
+        where: Path | str,
+        guard: Guard = "none",
+        *,
+        parameters: Mapping[str, float] | None = None,
+        threads: int = 1,
+    ) -> Controller:
+        """A controller from its folder, or a file in it.
+
+        Args:
+            where: what `stlc export RUN --to onnx` wrote.
+            guard: "paper" or "none".
+            parameters: values of the specification's parameters, where states come without them.
+            threads: that one decision may use.
+
+        Raises:
+            UsageError: U102, there is nothing; U101, there is no such guard.
+            RunError: R106, something is missing, damaged, or of another export.
+            MissingError: R301, `onnxruntime` is not installed.
+        """
+        return cls(read_facts(where), guard, parameters=parameters, threads=threads)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the columns of a state; those that the specification adds are last and may be left out."""
+        return tuple(each.name for each in self.facts.states)
+
+    @property
+    def controls(self) -> tuple[str, ...]:
+        """Names of the controls."""
+        return tuple(each.name for each in self.facts.controls)
+
+    def reset(self) -> None:
+        """Forget the plans that were begun, and begin the mission anew."""
+        self._begun = self._added = None
+
+    def decide(self, state: ArrayLike | Mapping[str, ArrayLike], *, elapsed: int = 1) -> Decision:
+        """Decide.
+
+        Args:
+            state: (n,), or (agents, n) for a batch, or columns by name; SI units. Ranges of states are
+                nominal: beyond them the monitor judges as anywhere.
+            elapsed: steps since the decision before.
+
+        Returns:
+            The decision. A plan that was begun and still satisfies the specification is gone on with where
+            the new one is no better.
+
+        Raises:
+            RunError: R107, the state does not fit or is no number; R402, without a guard, the policy's plan
+                is no number.
+        """
+        x, single = self._read(state, elapsed)
+        if self._begun is not None and len(self._begun.source) != len(x):
+            raise _misfit(f"{len(x)} agents where {len(self._begun.source)} were", "`reset` begins anew")
+        fresh, said = self._graphs.decided(x)
+        policy_rho = fresh.rho.copy()
+        followed = self._followed(x, fresh, elapsed)
+        if self.guard == "paper":
+            for row in np.flatnonzero(~(followed.judged.rho >= -TOLERANCE)):
+                self._search(followed, x[row], fresh.plan[row], int(row))
+        if not np.isfinite(followed.judged.plan[:, 0]).all():
+            raise RunError(Diagnostic("R402", "the policy's plan is not a number"))
+        self._begun = followed
+        self._added = said.get("added")
+        return self._decision(followed, policy_rho, single=single)
+
+    # ---------------------------------------------------------------------- states
+
+    def _read(self, state: ArrayLike | Mapping[str, ArrayLike], elapsed: int) -> tuple[Numbers, bool]:
+        """(agents, n), and whether it is one agent."""
+        if isinstance(state, Mapping):
+            state = np.stack(np.broadcast_arrays(*self._named(state)), -1)
+        given = np.asarray(state, dtype=np.float64)
+        single, x = given.ndim == 1, np.atleast_2d(given)
+        known = len(self.facts.states) - len(self.facts.added)
+        if x.ndim != 2 or x.shape[1] not in (known, len(self.facts.states)):
+            raise _misfit(f"a state of shape {given.shape}", f"the columns are {', '.join(self.states)}")
+        if x.shape[1] == known and self.facts.added:
+            x = np.concatenate((x, self._remembered(len(x), elapsed)), 1)
+        if not np.isfinite(x).all():
+            names = [
+                name for name, column in zip(self.states, x.T, strict=True) if not np.isfinite(column).all()
+            ]
+            raise _misfit(f"{', '.join(names)} is not a finite number", "hold the last control, or stop")
+        return np.ascontiguousarray(x), single
+
+    def _named(self, state: Mapping[str, ArrayLike]) -> list[ArrayLike]:
+        added = {each.name for each in self.facts.added}
+        names = [name for name in self.states if name not in added or name in state]
+        wrong = (set(names) ^ set(state)) or (added - set(names) if added & set(state) else set())
+        if wrong:
+            raise _misfit(f"states by name: {', '.join(sorted(wrong))}", f"they are {', '.join(self.states)}")
+        return [state[name] for name in names]
+
+    def _remembered(self, agents: int, elapsed: int) -> Numbers:
+        """What the specification adds to states: as the model said, or as at the start of a mission."""
+        if self._added is not None:
+            if elapsed != 1 or len(self._added) != agents:
+                raise _misfit("timers follow from every step", "give them as the last columns of the state")
+            return self._added
+        row = []
+        for each in self.facts.added:
+            value = self._parameters.get(each.name, each.initial)
+            if value is None:
+                raise _misfit(
+                    f"the parameter `{each.name}` has no value", "give it to `load`, or in the state"
+                )
+            row.append(float(value))
+        return np.tile(np.array(row), (agents, 1))
+
+    # ------------------------------------------------------------------------ plans
+
+    def _followed(self, x: Numbers, fresh: Judged, elapsed: int) -> _Followed:
+        """The policy's plans, or what is left of those that were begun."""
+        zero, none = np.zeros(len(x), dtype=np.int64), np.zeros(len(x), dtype=bool)
+        new = _Followed(fresh, zero + POLICY, zero, none)
+        if self._begun is None:
+            return new
+        before = self._begun
+        rest, said = self._graphs.judged(x, _later(before.judged.plan, elapsed))
+        better = rest.rank >= fresh.rank
+        if self.facts.promises:
+            better = better | said["deepened"].astype(bool)
+        keep = better & (rest.rho >= -TOLERANCE)
+        rows = keep.reshape(-1, 1)
+        judged = Judged(
+            np.where(rows[..., None], rest.plan, fresh.plan),
+            np.where(keep, rest.rho, fresh.rho),
+            np.where(keep, rest.safe, fresh.safe),
+            np.where(keep, rest.cost, fresh.cost),
+            np.where(rows, rest.each, fresh.each),
+        )
+        return _Followed(judged, np.where(keep, before.source, POLICY), np.where(keep, before.t0, 0), keep)
+
+    def _search(self, followed: _Followed, x: Numbers, plan: Numbers, row: int) -> None:
+        """Ask the backup policy for one agent."""
+        found = search(self._graphs, x, plan)
+        for name in ("plan", "rho", "safe", "cost", "each"):
+            getattr(followed.judged, name)[row] = getattr(found.judged, name)[0]
+        followed.source[row], followed.t0[row], followed.kept[row] = found.source, found.t0, False
+
+    def _decision(self, followed: _Followed, policy_rho: Numbers, *, single: bool) -> Decision:
+        judged = followed.judged
+        source = np.array(RULES)[followed.source]
+        rule = np.where(followed.kept, KEPT, source)
+        each = dict(zip(self.facts.requirements, judged.each.T, strict=True))
+        if not single:
+            control = judged.plan[:, 0].copy()
+            plan, t0 = judged.plan.copy(), followed.t0.copy()
+            return Decision(control, rule, plan, judged.rho, judged.safe, each, source, t0, policy_rho)
+        return Decision(
+            judged.plan[0, 0].copy(),
+            str(rule[0]),
+            judged.plan[0].copy(),
+            float(judged.rho[0]),
+            float(judged.safe[0]),
+            {name: float(value[0]) for name, value in each.items()},
+            str(source[0]),
+            int(followed.t0[0]),
+            float(policy_rho[0]),
+        )
+
+
+def _later(plans: Numbers, steps: int) -> Numbers:
+    """What is left of plans after so many steps; their last actions are held on."""
+    last = plans.shape[1] - 1
+    return np.ascontiguousarray(plans[:, np.minimum(np.arange(last + 1) + steps, last)])
+
+
+def _misfit(message: str, advice: str) -> RunError:
+    return RunError(Diagnostic("R107", f"no decision: {message}", help=(advice,)))

@@ -1,0 +1,131 @@
+"""What an exported controller says of itself: `controller.json`."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from stlc.diagnostics import Diagnostic, RunError, UsageError
+
+FACTS = "controller.json"
+FORMAT = "stlc-controller/1"
+DECIDE, JUDGE, FALL = "decide.onnx", "judge.onnx", "fall.onnx"
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A state or a control.
+
+    Attributes:
+        name: as in the system file.
+        unit: of its numbers; empty where they have none.
+        low: lower end of its range; None where it has none. Those of states are nominal.
+        high: upper end.
+        added: "parameter" or "timer" where the specification adds this state, else empty.
+        initial: of a timer, at the start of a mission.
+    """
+
+    name: str
+    unit: str
+    low: float | None
+    high: float | None
+    added: str = ""
+    initial: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """What the backup policy tries: `values` a control, prefixes of each of `lengths`, `batch` at a time."""
+
+    values: tuple[tuple[float, ...], ...]
+    lengths: tuple[int, ...]
+    batch: int
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What a controller is.
+
+    Attributes:
+        spec: name and hash of the specification.
+        system: the same of the system.
+        states: in order, what the specification adds last.
+        controls: in order.
+        requirements: names, in order.
+        dt: seconds of a step.
+        horizon: steps of a plan.
+        grid: of the backup policy.
+        graphs: name of a file -> its bytes.
+        promises: the mission keeps promises, and plans are gone on with for their sake.
+    """
+
+    spec: Mapping[str, str]
+    system: Mapping[str, str]
+    states: tuple[Quantity, ...]
+    controls: tuple[Quantity, ...]
+    requirements: tuple[str, ...]
+    dt: float
+    horizon: int
+    grid: Grid
+    graphs: Mapping[str, bytes]
+    promises: bool
+
+    @property
+    def added(self) -> tuple[Quantity, ...]:
+        """The states that the specification adds."""
+        return tuple(each for each in self.states if each.added)
+
+
+def read_facts(where: Path | str) -> Facts:
+    """Read a controller.
+
+    Args:
+        where: its folder, or a file in it.
+
+    Raises:
+        UsageError: U102, there is nothing.
+        RunError: R106, something is missing, damaged, or of another export.
+    """
+    path = Path(where)
+    if not path.exists():
+        raise UsageError(Diagnostic("U102", f"there is no controller `{path}`"))
+    folder = path if path.is_dir() else path.parent
+    try:
+        return _facts(json.loads((folder / FACTS).read_text(encoding="utf-8")), folder)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        finding = Diagnostic(
+            "R106",
+            f"`{folder}` holds no whole controller",
+            note=(f"{type(error).__name__}: {error}",),
+            help=("take all files of one `stlc export RUN --to onnx`",),
+        )
+        raise RunError(finding) from error
+
+
+def _facts(read: Mapping[str, Any], folder: Path) -> Facts:
+    if read["format"] != FORMAT:
+        raise ValueError(f"its format is {read['format']}, not {FORMAT}")
+    grid = read["backup"]
+    return Facts(
+        read["spec"],
+        read["system"],
+        tuple(Quantity(**each) for each in read["states"]),
+        tuple(Quantity(**each) for each in read["controls"]),
+        tuple(read["requirements"]),
+        float(read["dt"]),
+        int(read["horizon"]),
+        Grid(tuple(map(tuple, grid["values"])), tuple(grid["lengths"]), int(grid["batch"])),
+        {name: _whole(folder / name, digest) for name, digest in read["files"].items()},
+        bool(read["promises"]),
+    )
+
+
+def _whole(path: Path, digest: str) -> bytes:
+    data = path.read_bytes()
+    if hashlib.sha256(data).hexdigest() != digest:
+        raise ValueError(f"{path.name} is damaged, or of another export")
+    return data

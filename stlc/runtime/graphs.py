@@ -1,0 +1,123 @@
+"""The graphs of a controller, run by onnxruntime."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.semantics import TOLERANCE
+from stlc.diagnostics import Diagnostic, MissingError
+from stlc.runtime.facts import DECIDE, FALL, JUDGE, Facts
+
+Numbers: TypeAlias = NDArray[np.float64]
+
+TIE = 1e-4
+"""What cost may weigh where robustness does not differ, as in training."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Plans and what became of them, a row each.
+
+    Attributes:
+        plan: (rows, T, m), physical units.
+        rho: robustness of the specification, (rows,); -inf where a plan is no number.
+        safe: the same of the safety requirements alone; +inf where there are none.
+        cost: performance terms.
+        each: (rows, R), robustness per requirement.
+    """
+
+    plan: Numbers
+    rho: Numbers
+    safe: Numbers
+    cost: Numbers
+    each: Numbers
+
+    @property
+    def rank(self) -> Numbers:
+        """Larger is better: the cheapest that satisfies, else the most robust, safe ones first."""
+        with np.errstate(all="ignore"):
+            cheap = np.nan_to_num(1.0 / (1.0 + np.maximum(self.cost, 0.0)))
+            poor = np.where(np.isfinite(self.rho), self.rho / (1.0 + np.abs(self.rho)), -1.0) + TIE * cheap
+        poor = np.where(self.safe >= -TOLERANCE, poor, poor - 2.0)
+        return np.where((self.rho >= -TOLERANCE) & ~np.isnan(self.cost), 1.0 + cheap, poor)
+
+    def of(self, rows: Any) -> Judged:
+        """Some rows: indices or a mask."""
+        return Judged(*(getattr(self, each.name)[rows] for each in fields(self)))
+
+
+def joined(parts: list[Judged]) -> Judged:
+    """The rows of all parts."""
+    return Judged(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Judged)))
+
+
+class Graphs:
+    """What the files of a controller compute; states (rows, n) and plans (rows, T, m) are float64.
+
+    Args:
+        facts: of the controller.
+        threads: that one call may use.
+
+    Raises:
+        MissingError: R301, `onnxruntime` is not installed.
+    """
+
+    def __init__(self, facts: Facts, *, threads: int = 1) -> None:
+        self.facts = facts
+        self.threads = threads
+        self._decide = self._session(DECIDE)
+
+    def decided(self, x: Numbers) -> tuple[Judged, Mapping[str, Numbers]]:
+        """The best of the policy's plans, and all that the graph says besides."""
+        found = _run(self._decide, {"state": x})
+        return _judged(found["plan"], found), found
+
+    def judged(self, x: Numbers, plans: Numbers) -> tuple[Judged, Mapping[str, Numbers]]:
+        """Plans from states; `states` (rows, T + 1, n) is among what is said besides."""
+        found = _run(self._judge, {"state": x, "plan": plans})
+        return _judged(plans, found), found
+
+    def falls(self, x: Numbers, plans: Numbers) -> Numbers:
+        """The least robustness of phi_safe on every prefix, (rows, T + 1); +inf without such requirements."""
+        if self._fall is None:
+            return np.full((len(x), self.facts.horizon + 1), np.inf)
+        return _run(self._fall, {"state": x, "plan": plans})["falls"]
+
+    @cached_property
+    def _judge(self) -> Any:
+        return self._session(JUDGE)
+
+    @cached_property
+    def _fall(self) -> Any:
+        return self._session(FALL) if FALL in self.facts.graphs else None
+
+    def _session(self, name: str) -> Any:
+        try:
+            import onnxruntime
+        except ImportError:
+            message = "this needs the package `onnxruntime`, which is not installed"
+            raise MissingError(Diagnostic("R301", message, help=("pip install onnxruntime",))) from None
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = self.threads
+        options.inter_op_num_threads = 1
+        options.graph_optimization_level = (
+            onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+        )  # nothing is left
+        options.log_severity_level = 3
+        graph = self.facts.graphs[name]
+        return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+
+
+def _run(session: Any, feeds: Mapping[str, Numbers]) -> dict[str, Numbers]:
+    names = [each.name for each in session.get_outputs()]
+    return dict(zip(names, session.run(names, dict(feeds)), strict=True))
+
+
+def _judged(plan: Numbers, found: Mapping[str, Numbers]) -> Judged:
+    return Judged(plan, found["rho"], found["safe"], found["cost"], found["requirements"])

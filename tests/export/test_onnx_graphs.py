@@ -1,0 +1,102 @@
+"""The graphs say what the task says, about promises, mirrors, angles and everything that steps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from exported import CART, exported, mission, untrained
+from sheets import computed
+
+from stlc.compile import ir
+from stlc.compile.sheet import BATCH, Sheet
+from stlc.dynamics.step import Step
+from stlc.export.onnx_graphs import deciding, judging
+from stlc.export.onnx_rollout import rolled
+from stlc.export.verify import same_verdicts
+from stlc.runtime.facts import read_facts
+from stlc.runtime.graphs import Graphs
+
+
+def test_promises_deepen_as_the_task_says() -> None:
+    run, folder = mission()
+    x = run.task.sample(80, seed=1, dtype=torch.float64)
+    x[:, 0] = torch.linspace(-1.0, 1.0, 80)
+    x[:, 1] = torch.linspace(0.6, -0.6, 80).roll(20)
+    plans = torch.zeros(80, run.task.horizon, 1, dtype=torch.float64)
+    wanted = run.task.promises.deepened(run.task.judge(x, plans).columns)
+    graphs = Graphs(read_facts(folder))
+    _, said = graphs.judged(x.numpy(), plans.numpy())
+    assert said["deepened"].tolist() == wanted.tolist()
+    assert set(wanted.tolist()) == {True, False}
+    assert same_verdicts(run.task, graphs, states=30) <= 1e-9
+
+
+def test_what_a_mission_adds_moves_as_in_the_model() -> None:
+    run, folder = mission()
+    x = run.task.sample(20, seed=2, dtype=torch.float64)
+    for _ in range(8):
+        x = run.task.system.step(x, torch.full((20, 1), 3.0, dtype=torch.float64))
+    _, said = Graphs(read_facts(folder)).decided(x.numpy())
+    np.testing.assert_array_equal(said["added"], run.task.system.added_later(x))
+
+
+def test_mirrors_and_angles_are_those_of_the_network(tmp_path: Path) -> None:
+    system = CART.replace("{x: v, v: u}", "{x: v, v: 3 m/s^2 * sin(u / 1 m/s^2)}").replace(
+        "range: [-8, 8]", "range: [-3, 4], squash: angle"
+    )
+    system += "policy: {observe: [x + 0.1 m, v * 2], mirror: {x: -x, v: -v, u: -u}}\n"
+    spec = "spec cart\nsignal x [m]\nrequire near: always[0, T] abs(x) < 1 m\n"
+    (tmp_path / "cart.yaml").write_text(system)
+    (tmp_path / "near.stl").write_text(spec)
+    run = untrained(tmp_path / "near.stl", tmp_path / "cart.yaml", tmp_path / "runs")
+    x = run.task.sample(60, seed=3, dtype=torch.float64)
+    assert set((x[:, 0] < 0).tolist()) == {True, False}
+    wanted, judged = run.policy.plan_judged(x)
+    found = computed(deciding(run.task, run.policy.network), {"state": x.numpy()})
+    np.testing.assert_allclose(found["plan"], wanted, rtol=0.0, atol=2e-6)
+    np.testing.assert_allclose(found["rho"], judged.rho, rtol=0.0, atol=1e-6)
+    np.testing.assert_array_equal(found["safe"], np.full(60, np.inf))
+    assert "added" not in found
+
+
+def test_every_stage_of_a_step_is_rolled() -> None:
+    x, y, z, u = (ir.Col(name) for name in ("x", "y", "z", "u"))
+    feeds = ir.Op("add", (ir.Op("mul", (y, z)), u))
+    step = Step(
+        (("gain", ir.Op("sin", (u,))), ("fed", feeds)),
+        {
+            "x": ir.Op("add", (x, ir.Col("gain"))),
+            "y": ir.Op("sub", (ir.Col("fed"), ir.Op("mul", (z, ir.Lit(0.5))))),
+            "z": ir.Op("mul", (y, ir.Lit(0.25))),
+            "w": ir.Op("mul", (x, x)),
+            "c": ir.Lit(4.0),
+        },
+    )
+    sheet = Sheet()
+    names = ("x", "y", "z", "w", "c", "s")
+    start = {name: sheet.input(name, (1, BATCH)) for name in names}
+    controls = {"u": sheet.input("u", (5, BATCH))}
+    rng = np.random.default_rng(4)
+    given = {name: rng.normal(size=(1, 9)) for name in names} | {"u": rng.normal(size=(5, 9))}
+    moved = rolled(step, start, controls)
+    found = computed({f"{name}*": value for name, value in moved.items()}, given)
+    now = {name: given[name][0] for name in names}
+    for k in range(6):
+        for name in names:
+            np.testing.assert_allclose(found[f"{name}*"][k], now[name], rtol=1e-12, atol=1e-12, err_msg=name)
+        if k < 5:
+            a, b, c, drive = now["x"], now["y"], now["z"], given["u"][k]
+            later = {"x": a + np.sin(drive), "y": b * c + drive - 0.5 * c, "z": 0.25 * b, "w": a * a}
+            now = {**now, **later, "c": np.full(9, 4.0)}
+
+
+def test_a_graph_takes_any_number_of_agents() -> None:
+    run, _ = exported("traffic", "car")
+    outputs = judging(run.task)
+    for count in (1, 2, 33):
+        x = run.task.sample(count, seed=5, dtype=torch.float64)
+        plans = torch.ones(count, run.task.horizon, 1, dtype=torch.float64)
+        found = computed(outputs, {"state": x.numpy(), "plan": plans.numpy()})
+        np.testing.assert_allclose(found["rho"], run.task.judge(x, plans).rho, rtol=0.0, atol=1e-12)

@@ -1,0 +1,208 @@
+"""The runtime decides as the torch controller does, without torch."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from exported import ROOT, exported, mission, run_of
+
+from stlc.controller.deploy import SOURCES, Guard
+from stlc.controller.run import Run
+from stlc.diagnostics import RunError, UsageError
+from stlc.export.write import export
+from stlc.runtime import Controller
+
+FEW = [("traffic", "car"), ("ship_safe", "ship_safe")]
+MANY = [
+    ("reach_n_avoid", "maze"),
+    ("ship_track", "ship_track"),
+    ("navigation", "rover"),
+    ("manipulation", "panda"),
+    ("patrol", "unicycle"),
+]
+
+
+def driven(run: Run, folder: Path, mode: str, *, agents: int, steps: int) -> set[str]:
+    """Both controllers through the same states; the rules that decided."""
+    mine, theirs = Controller.load(folder, mode), Guard(run.task, run.policy, mode)  # type: ignore[arg-type]
+    x, begun, rules = run.task.sample(agents, seed=5, dtype=torch.float64), None, set()
+    high = float(run.task.system.control_high.abs().max())
+    for _ in range(steps):
+        found, wanted = mine.decide(x.numpy()), theirs.decide(x, begun)
+        assert found.source.tolist() == [SOURCES[source] for source in wanted.source]
+        assert found.t0.tolist() == wanted.t0.tolist()
+        np.testing.assert_allclose(found.control, wanted.action, rtol=0.0, atol=1e-6 * high)
+        np.testing.assert_allclose(found.plan, wanted.plan, rtol=0.0, atol=1e-6 * high)
+        np.testing.assert_allclose(found.rho, wanted.rho, rtol=0.0, atol=1e-4)
+        np.testing.assert_allclose(found.policy_rho, wanted.policy_rho, rtol=0.0, atol=1e-4)
+        assert (np.asarray(found.safe) >= -1e-6).tolist() == wanted.safe.tolist()
+        again = run.task.judge(x, torch.from_numpy(found.plan)).requirements
+        np.testing.assert_allclose(np.stack(list(found.robustness.values()), 1), again, rtol=0.0, atol=1e-9)
+        rules |= set(found.rule)
+        x, begun = run.task.system.step(x, wanted.action), wanted.later(1)
+    return rules
+
+
+@pytest.mark.parametrize(("spec", "system"), FEW)
+def test_every_decision_is_that_of_the_guard(spec: str, system: str) -> None:
+    run, folder = exported(spec, system)
+    assert driven(run, folder, "none", agents=6, steps=8) == {"policy", "kept"}
+    rules = driven(run, folder, "paper", agents=4, steps=5)
+    assert rules >= {"policy", "kept", "backup"}
+    assert spec != "ship_safe" or "safest" in rules
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("spec", "system"), MANY)
+def test_every_benchmark_decides_as_the_guard(spec: str, system: str, tmp_path: Path) -> None:
+    run = run_of(spec, system, tmp_path / "runs")
+    folder = export(run, "onnx", tmp_path / "out").folder
+    driven(run, folder, "none", agents=12, steps=12)
+    few = spec in ("manipulation", "patrol")  # thousands of prefixes
+    assert "backup" in driven(run, folder, "paper", agents=2 if few else 4, steps=2 if few else 6)
+
+
+def test_promises_are_gone_on_with_as_the_guard_does() -> None:
+    run, folder = mission()
+    assert run.task.promises.items
+    assert "kept" in driven(run, folder, "none", agents=30, steps=15)
+
+
+def test_one_agent_a_batch_and_names_are_one_question() -> None:
+    run, folder = exported("traffic", "car")
+    x = run.task.sample(3, seed=4, dtype=torch.float64).numpy()
+    batch = Controller.load(folder).decide(x)
+    for row, state in enumerate(x):
+        alone = Controller.load(folder / "decide.onnx").decide(state)
+        named = Controller.load(folder).decide(dict(zip(run.task.names, state, strict=True)))
+        assert alone.rule == named.rule == batch.rule[row] == "policy"
+        for each in (alone, named):
+            np.testing.assert_allclose(each.plan, batch.plan[row], rtol=0.0, atol=1e-6)
+            np.testing.assert_array_equal(each.control, each.plan[0])
+            assert each.rho == pytest.approx(np.asarray(batch.rho)[row], abs=1e-6)
+        assert set(alone.robustness) == {rule.name for rule in run.task.rules}
+
+
+def test_a_mission_keeps_its_clock() -> None:
+    run, folder = mission()
+    x = run.task.sample(2, seed=6, dtype=torch.float64)
+    x[:, 2] = 0.25
+    short, whole = Controller.load(folder, parameters={"far": 0.25}), Controller.load(folder)
+    assert short.states[2:] == ("far", *(timer.name for timer in run.task.system.timers))
+    begun = whole.decide(x.numpy()).plan
+    np.testing.assert_array_equal(short.decide(x[:, :2].numpy()).plan, begun)
+    first = x[:, :2].numpy()
+    for _ in range(3):
+        x = run.task.system.step(x, torch.from_numpy(whole.decide(x.numpy()).control))
+        whole.reset()
+        whole.decide(x.numpy())
+        short.decide(x[:, :2].numpy())
+    again = short.decide(x[:, :2].numpy()).robustness
+    assert set(again) == {"there", "back", "slow"}
+    with pytest.raises(RunError, match=r"R107.*timers follow from every step"):
+        short.decide(first, elapsed=2)
+    short.reset()
+    np.testing.assert_array_equal(short.decide(first).plan, begun)
+    with pytest.raises(RunError, match=r"R107.*`far` has no value"):
+        Controller.load(folder).decide(first)
+
+
+def test_a_plan_is_gone_on_with_after_several_steps() -> None:
+    run, folder = mission()
+    controller, guard = Controller.load(folder), Guard(run.task, run.policy, "none")
+    x = run.task.sample(60, seed=1, dtype=torch.float64)
+    controller.decide(x.numpy())
+    begun = guard.decide(x)
+    for ahead in range(2):
+        x = run.task.system.step(x, begun.later(ahead).action)
+    found, wanted = controller.decide(x.numpy(), elapsed=2), guard.decide(x, begun.later(2))
+    np.testing.assert_allclose(found.plan, wanted.plan, rtol=0.0, atol=1e-5)
+    assert "kept" in found.rule
+
+
+@pytest.mark.parametrize(
+    ("state", "why"),
+    [
+        (np.zeros(3), "shape"),
+        (np.zeros((2, 2, 7)), "shape"),
+        (np.array([np.nan, 0, 0, 0, 0, 0, 0]), "x is not a finite number"),
+        (np.array([[0.0] * 7, [0, np.inf, 0, 0, 0, 0, 0]]), "v is not a finite number"),
+        ({"x": 0.0}, "tau"),
+        ({**dict.fromkeys(("x", "v", "sign", "tau", "dx", "v_lead", "yielding"), 0.0), "y": 1.0}, "y"),
+    ],
+)
+def test_a_state_that_does_not_fit_is_told(state: object, why: str) -> None:
+    with pytest.raises(RunError, match=f"R107.*{why}"):
+        Controller.load(exported("traffic", "car")[1]).decide(state)  # type: ignore[arg-type]
+
+
+def test_another_number_of_agents_is_told() -> None:
+    run, folder = exported("traffic", "car")
+    controller = Controller.load(folder)
+    x = run.task.sample(3, seed=4, dtype=torch.float64).numpy()
+    controller.decide(x)
+    with pytest.raises(RunError, match=r"R107.*2 agents where 3 were"):
+        controller.decide(x[:2])
+    controller.reset()
+    controller.decide(x[:2])
+
+
+def test_beyond_the_range_of_states_the_guard_acts() -> None:
+    run, folder = exported("ship_safe", "ship_safe")
+    x = run.task.sample(1, seed=4, dtype=torch.float64)
+    x[0, 1] = 40.0  # far outside of the river
+    found = Controller.load(folder, "paper").decide(x[0].numpy())
+    wanted = Guard(run.task, run.policy, "paper").decide(x)
+    assert found.source == SOURCES[int(wanted.source[0])] != "policy"
+    np.testing.assert_allclose(found.plan, wanted.plan[0], rtol=0.0, atol=1e-5)
+
+
+def test_a_policy_that_is_no_number_is_stopped_or_guarded() -> None:
+    run, folder = exported("traffic", "car")
+    x = run.task.sample(1, seed=4, dtype=torch.float64)
+    x[0, 0] = 1e300  # the network is float32, so this becomes infinite there
+    with pytest.raises(RunError, match="R402"):
+        Controller.load(folder).decide(x[0].numpy())
+    found = Controller.load(folder, "paper").decide(x[0].numpy())
+    assert found.source != "policy"
+    assert np.isfinite(found.control).all()
+    assert found.policy_rho == -np.inf
+
+
+def test_an_unknown_guard_is_told() -> None:
+    with pytest.raises(UsageError, match="full"):
+        Controller.load(exported("traffic", "car")[1], "full")  # type: ignore[arg-type]
+
+
+ALONE = """
+import sys
+import numpy as np
+from stlc.runtime import Controller
+
+controller = Controller.load(sys.argv[1], guard="paper")
+decision = controller.decide(np.zeros(len(controller.states)))
+print(decision.rule)
+heavy = {"torch", "lark", "typer", "rich", "yaml", "pydantic", "onnx"} & set(sys.modules)
+assert not heavy, heavy
+"""
+
+
+def test_nothing_heavy_is_imported() -> None:
+    command = [sys.executable, "-c", ALONE, str(exported("traffic", "car")[1])]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout.strip() in ("policy", "backup", "safest")
+
+
+def test_the_page_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
+    (block,) = [part.split("```")[0] for part in text.split("```python\n")[1:] if "stlc.runtime" in part]
+    run, folder = exported("traffic", "car")
+    monkeypatch.chdir(folder.parent)
+    exec(compile(block.replace('"controller"', repr(folder.name)), "export.md", "exec"), {})
+    said = capsys.readouterr().out
+    assert all(f"{rule.name}: " in said for rule in run.task.rules)
