@@ -11,12 +11,13 @@ from datetime import timedelta
 from pathlib import Path
 
 import pytest
+from exported import exported
 from several import ENVIRONMENT, free_port
 
 from stlc.cli.app import main
 from stlc.cli.pages import FOLDER, Example, read_page
 from stlc.controller.config import TrainConfig
-from stlc.diagnostics import CODES
+from stlc.diagnostics import CODES, RunError
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = {code: read_page(code) for code in CODES}
@@ -99,6 +100,24 @@ def test_a_trace(code, example, tmp_path, monkeypatch, capsys):
     exit_code, found = codes_of(capsys, "check", "near.stl", "drive.csv")
     assert exit_code == (3 if "wrong" in example.notes else 0)
     judge(example, code, found)
+
+
+# ---------------------------------------------------------------------- exported controllers
+
+
+@pytest.mark.parametrize(("code", "example"), examples("py"))
+def test_a_program(code, example, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("controller", "torn"):
+        shutil.copytree(exported("traffic", "car")[1], name)
+    Path("torn/judge.onnx").unlink()
+    program = compile(example.body, f"{code}.md", "exec")
+    if "right" in example.notes:
+        exec(program, {})
+        return
+    with pytest.raises(RunError) as caught:
+        exec(program, {})
+    assert [finding.code for finding in caught.value.diagnostics] == [code]
 
 
 # ---------------------------------------------------------------------- runs, commands, bugs
