@@ -13,11 +13,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
+from stlc.controller.sketch import DECIDED, GOAL, NOTE, STONE, deciders, tails
+from stlc.controller.stage import Ball, Stage
 from stlc.controller.streams import Streams
 
 GOALS = 200
@@ -35,8 +38,12 @@ ORIGINS = np.array(  # from one joint to the next, then the flange
 )
 ROLLS = np.radians([0, -90, 90, 90, -90, 90, 90])  # about x, joint by joint
 SIDE = 2.2  # m from the view from above to the one from the side
-DECIDED = ("#2563a8", "#e08a00", "#c0267e", "#2e9e5b")  # policy, backup, safest, polished
-POST, GOAL, FRAME = "#8a8f98", "#2f9e57", "#d5d8dd"
+REACH, LOW = 1.05, -0.95  # m that a picture shows
+TAIL = 10  # frames of a way that are seen
+MESHES = {  # of the links, among those that come with PyBullet
+    f"panda_link{link}": f"franka_panda/meshes/{'visual' if 0 < link < 7 else 'collision'}/link{link}.obj"
+    for link in range(8)
+}
 
 
 def links(q: np.ndarray) -> np.ndarray:
@@ -104,33 +111,45 @@ class Goals:
         return {"path": "m"}
 
     def snapshot(self) -> Mapping[str, np.ndarray]:
-        """Arms (agents, 9, 3) from base to flange, their goals (agents, 3), and post and radii (5,)."""
+        """Angles (agents, 7), arms from the base on (agents, 9, 3), goals (agents, 3), post, radii (5,)."""
         return {
+            "joints": self.state[:, self.joints].numpy(),
             "arms": links(self.state[:, self.joints].numpy()),
             "goals": self.state[:, self.goal].numpy(),
             "post": np.array([*self.post, self.r_post, self.r_goal]),
         }
+
+    KEYS: ClassVar = {"goal": GOAL, "obstacle": STONE}
 
     @staticmethod
     def draw(axes: Any, scene: Mapping[str, np.ndarray], index: int) -> None:
         """One frame: all arms from above, and from the side beside it, coloured by who decided."""
         from matplotlib.patches import Circle
 
-        arms, goals, post = scene["arms"][index], scene["goals"][index], scene["post"][index]
-        decided = scene["decision"][index] if "decision" in scene else np.zeros(len(arms), dtype=int)
-        for left, (across, up) in ((0.0, (0, 1)), (SIDE, (0, 2))):
-            axes.axhline(0.0, color=FRAME, lw=0.6, zorder=0)
-            axes.add_patch(Circle((left + post[across], post[up]), post[3], color=POST, lw=0, alpha=0.6))
-            for arm, goal, source in zip(arms, goals, decided, strict=True):
-                color = DECIDED[int(source)]
-                axes.plot(left + arm[:, across], arm[:, up], color=color, lw=2.0, alpha=0.8, zorder=3)
-                axes.plot(left + arm[-1, across], arm[-1, up], "o", color=color, ms=4, zorder=4)
-                place = (left + goal[across], goal[up])
-                axes.add_patch(Circle(place, post[4], fill=False, color=GOAL, lw=1.2, zorder=2))
-        axes.text(0.0, 1.25, "from above", ha="center", size=8, color="#4a4f57")
-        axes.text(SIDE, 1.25, "from the side", ha="center", size=8, color="#4a4f57")
-        axes.set(xlim=(-1.1, SIDE + 1.1), ylim=(-1.0, 1.4), aspect="equal")
+        arms, goals, post = scene["arms"], scene["goals"][index], scene["post"][index]
+        who = deciders(scene, index, arms.shape[1])
+        for left, title, (across, up) in ((0.0, "from above", (0, 1)), (SIDE, "from the side", (0, 2))):
+            level = 0.0 if up == 2 else LOW
+            axes.plot((left - REACH, left + REACH), (level, level), color=NOTE, lw=0.6, alpha=0.4, zorder=0)
+            at = (left + post[across], post[up])
+            axes.add_patch(Circle(at, post[3], color=STONE, lw=0, alpha=0.55))
+            tails(axes, arms[:, :, -1, [across, up]] + (left, 0.0), scene, index, frames=TAIL)
+            for arm, goal, source in zip(arms[index], goals, who, strict=True):
+                color, place = DECIDED[source], (left + goal[across], goal[up])
+                axes.plot(left + arm[:, across], arm[:, up], color=color, lw=2.6, alpha=0.85, zorder=3)
+                axes.plot(left + arm[-1, across], arm[-1, up], "o", color=color, ms=5, mec="white")
+                axes.add_patch(Circle(place, post[4], fc="none", ec=GOAL, lw=1.4, zorder=2))
+            axes.text(left, REACH + 0.12, title, ha="center", size=8, color=NOTE)
+        axes.set(xlim=(-REACH, SIDE + REACH), ylim=(LOW, REACH + 0.3), aspect="equal")
         axes.set_axis_off()
+
+    @staticmethod
+    def stage(scene: Mapping[str, np.ndarray]) -> Stage:
+        """The arms in space, as `panda.urdf` has them."""
+        goals, post = scene["goals"], scene["post"]
+        centre = np.broadcast_to(post[:, None, :3], goals.shape)
+        balls = (Ball(goals, float(post[0, 4]), GOAL), Ball(centre, float(post[0, 3]), STONE))
+        return Stage(Path(__file__).with_name("panda.urdf"), scene["joints"], balls, 0.95, MESHES)
 
     def _flange(self, states: torch.Tensor) -> np.ndarray:
         """Where flanges are, (agents, 3)."""

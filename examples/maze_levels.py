@@ -14,11 +14,12 @@ perhaps a goal in one of the gaps; level i has its upper edge at height 2.5 i. M
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
+from stlc.controller.sketch import DECIDED, GOAL, GROUND, NOTE, WALL, deciders, tails
 from stlc.controller.streams import Streams
 
 LEVELS = 200
@@ -26,8 +27,7 @@ EDGE = -0.1  # left edge of the first obstacle
 NONE = -1.0  # this level has no goal
 ROUNDING = 1e-9  # heights are sums of steps
 BELOW, ABOVE = 3.0, 6.0  # m of the shaft that a picture shows around the ball
-BLOCK, GOAL, SHAFT = "#8a8f98", "#2f9e57", "#f1f3f5"
-DECIDED = ("#2563a8", "#e08a00", "#c0267e", "#2e9e5b")  # policy, backup, safest, polished
+TAIL = 20  # frames of a way that are seen
 
 
 class MazeLevels:
@@ -89,28 +89,24 @@ class MazeLevels:
             "shape": np.array([self.width, self.h, self.d, self.r]),
         }
 
+    KEYS: ClassVar = {"goal": GOAL, "obstacle": WALL}
+
     @staticmethod
     def draw(axes: Any, scene: Mapping[str, np.ndarray], index: int) -> None:
         """One frame: the shafts side by side around their balls, coloured by who decided."""
-        from matplotlib.patches import Circle, Rectangle
+        from matplotlib.patches import Circle
 
-        balls, levels = scene["balls"][index], scene["levels"][index]
-        width, high, apart, radius = scene["shape"][index]
-        decided = scene["decision"][index] if "decision" in scene else np.zeros(len(balls), dtype=int)
-        for shaft, ((x, height), own) in enumerate(zip(balls, levels, strict=True)):
-            left = shaft * (width + 1.0)
-            axes.add_patch(Rectangle((left, -BELOW), width, BELOW + ABOVE, color=SHAFT, lw=0))
-            for level, (edge, length, goal) in enumerate(own):
-                top = (level + 1) * apart - height
-                if high - BELOW < top < ABOVE:
-                    start, end = max(edge, 0.0), min(edge + length, width)
-                    corner = (left + start, top - high)
-                    axes.add_patch(Rectangle(corner, end - start, high, color=BLOCK, lw=0))
-                    if goal > 0:
-                        place = (left + goal, top - high / 2)
-                        axes.add_patch(Circle(place, radius, fill=False, color=GOAL, lw=1.5))
-            axes.add_patch(Circle((left + x, 0.0), 0.18, color=DECIDED[int(decided[shaft])], lw=0, zorder=3))
-        axes.set(xlim=(-0.5, len(balls) * (width + 1.0) - 0.5), ylim=(-BELOW, ABOVE), aspect="equal")
+        balls, (width, high, apart, radius) = scene["balls"], scene["shape"][index]
+        pitch = width + 1.0
+        who = deciders(scene, index, balls.shape[1])
+        for shaft, own in enumerate(scene["levels"][index]):
+            draw_shaft(axes, shaft * pitch, own, balls[index, shaft, 1], (width, high, apart, radius))
+        left = pitch * np.arange(balls.shape[1])
+        seen = np.stack((balls[..., 0] + left, balls[..., 1] - balls[index, :, 1]), -1)
+        tails(axes, np.where(seen[..., 1:] > -BELOW, seen, np.nan), scene, index, frames=TAIL)
+        for at, source in zip(seen[index], who, strict=True):
+            axes.add_patch(Circle(at, 0.2, fc=DECIDED[source], ec="white", lw=0.6, zorder=3))
+        axes.set(xlim=(-0.1, len(who) * pitch - 0.9), ylim=(-BELOW, ABOVE), aspect="equal")
         axes.set_axis_off()
 
     def _first(self, level: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
@@ -146,3 +142,24 @@ class MazeLevels:
         self.met += above & (goal > 0)
         self.reached += above & self.near
         self.inside, self.near = self.inside & ~above, self.near & ~above
+
+
+def draw_shaft(
+    axes: Any, left: float, levels: np.ndarray, height: float, shape: tuple[float, float, float, float]
+) -> None:
+    """A shaft around this height, its levels (k, 3) of this shape: width, height, distance, radius."""
+    from matplotlib.patches import Circle, Rectangle
+
+    width, high, apart, radius = shape
+    shaft = axes.add_patch(Rectangle((left, -BELOW), width, BELOW + ABOVE, color=GROUND, lw=0))
+    for level, (edge, length, goal) in enumerate(levels, start=1):
+        top = level * apart - height
+        if not -BELOW < top < ABOVE + high:
+            continue
+        start, end = max(edge, 0.0), min(edge + length, width)
+        block = Rectangle((left + start, top - high), end - start, high, color=WALL, lw=0)
+        axes.add_patch(block).set_clip_path(shaft)
+        axes.text(left + width + 0.1, top - high / 2, f"{level}", size=6.5, color=NOTE, va="center")
+        if goal > 0:
+            place = (left + goal, top - high / 2)
+            axes.add_patch(Circle(place, radius, fc="none", ec=GOAL, lw=1.6)).set_clip_path(shaft)

@@ -21,11 +21,12 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
+from stlc.controller.sketch import BANK, NOTE, STONE, WATER, deciders, outlines, tails
 from stlc.controller.streams import Streams
 
 OBSTACLES = 100
@@ -36,8 +37,8 @@ NEAREST, FARTHEST = 15.0, 25.0  # from one obstacle of TrackRiver to the next
 ALLOWANCES = ((0.8, 15), (1.0, 20), (math.inf, 25))  # radius less than -> steps
 SHIFTED = 20  # obstacles of ShiftedRiver
 FOLD = 40.0  # m of river in one row of the picture
-WATER, BANK, STONE = "#e6eef5", "#cfd6c4", "#8a8f98"
-DECIDED = ("#2563a8", "#e08a00", "#c0267e", "#2e9e5b")  # policy, backup, safest, polished
+WAKE = 14  # frames of it that are seen
+HULL = np.array([(0.8, 0.0), (0.35, 0.3), (-0.55, 0.3), (-0.4, 0.0), (-0.55, -0.3), (0.35, -0.3)])  # m
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,33 +103,22 @@ class River(ABC):
             "half": np.float64(self.half),
         }
 
+    KEYS: ClassVar = {"obstacle": STONE}
+
     @staticmethod
     def draw(axes: Any, scene: Mapping[str, np.ndarray], index: int) -> None:
-        """One frame: the river in rows of 40 m from the top, the ships coloured by who decided."""
-        from matplotlib.patches import Circle, Polygon, Rectangle
-
-        ships, half = scene["ships"][index], float(scene["half"][index])
-        rows = max(int(scene["ships"][..., 0].max() // FOLD) + 1, 2)
-        pitch = 2 * half + 1.6
+        """One frame: the river in rows of 40 m from the top, ships and wakes coloured by who decided."""
+        ships, half = scene["ships"], float(scene["half"][index])
+        rows, pitch = max(int(ships[..., 0].max() // FOLD) + 1, 2), 2 * half + 1.8
         for row in range(rows):
-            middle = -row * pitch
-            axes.add_patch(Rectangle((0, middle - half - 0.25), FOLD, 2 * half + 0.5, color=BANK, lw=0))
-            water = Rectangle((0, middle - half), FOLD, 2 * half, color=WATER, lw=0)
-            axes.add_patch(water)
-            for x, y, r in scene["obstacles"][index]:
-                if -r < x - row * FOLD < FOLD + r:
-                    stone = axes.add_patch(Circle((x - row * FOLD, middle + y), r, color=STONE, lw=0))
-                    stone.set_clip_path(water)
-            axes.text(-0.6, middle, f"{row * FOLD:.0f} m", ha="right", va="center", size=7, color="#4a4f57")
-        decided = scene["decision"][index] if "decision" in scene else np.zeros(len(ships), dtype=int)
-        for (x, y, heading), source in zip(ships, decided, strict=True):
-            row = int(min(max(x // FOLD, 0), rows - 1))
-            cos, sin = math.cos(heading), math.sin(heading)
-            hull = np.array([(0.7, 0.0), (-0.5, 0.28), (-0.3, 0.0), (-0.5, -0.28)])
-            placed = hull @ np.array([(cos, sin), (-sin, cos)]) + (x - row * FOLD, y - row * pitch)
-            color = DECIDED[int(source)]
-            axes.add_patch(Polygon(placed, color=color, lw=0, zorder=3))
-        axes.set(xlim=(-4, FOLD + 1), ylim=(-(rows - 0.5) * pitch, pitch / 2), aspect="equal")
+            draw_row(axes, row, scene["obstacles"][index], half, pitch)
+        row = np.clip(ships[..., 0] // FOLD, 0, rows - 1)
+        placed = np.stack((ships[..., 0] - row * FOLD, ships[..., 1] - row * pitch), -1)
+        turned = np.diff(row, axis=0, prepend=row[:1])[..., None] != 0  # on to the next row
+        tails(axes, np.where(turned, np.nan, placed), scene, index, frames=WAKE)
+        poses = np.concatenate((placed[index], ships[index, :, 2:]), 1)
+        outlines(axes, HULL, poses, deciders(scene, index, ships.shape[1]))
+        axes.set(xlim=(-2.6, FOLD + 0.3), ylim=(-(rows - 0.5) * pitch + 0.5, pitch / 2 - 0.5), aspect="equal")
         axes.set_axis_off()
 
     # ------------------------------------------------------------- what rivers differ in
@@ -266,3 +256,18 @@ class ShiftedRiver(TrackRiver):
     def _allowed(self, states: torch.Tensor) -> torch.Tensor:
         """Every start: it is not one that the system file draws."""
         return torch.ones(len(states), dtype=torch.bool)
+
+
+def draw_row(axes: Any, row: int, obstacles: np.ndarray, half: float, pitch: float) -> None:
+    """One stretch of a river that is `2 * half` wide, with its obstacles (M, 3); rows are `pitch` apart."""
+    from matplotlib.patches import Circle, Rectangle
+
+    middle = -row * pitch
+    axes.add_patch(Rectangle((0, middle - half - 0.3), FOLD, 2 * half + 0.6, color=BANK, lw=0))
+    water = axes.add_patch(Rectangle((0, middle - half), FOLD, 2 * half, color=WATER, lw=0))
+    axes.plot((0, FOLD), (middle, middle), color="white", lw=0.8, ls=(0, (6, 6)), zorder=1.5)
+    for x, y, r in obstacles:
+        if -r < x - row * FOLD < FOLD + r:
+            stone = axes.add_patch(Circle((x - row * FOLD, middle + y), r, color=STONE, lw=0, zorder=2))
+            stone.set_clip_path(water)
+    axes.text(-0.5, middle, f"{row * FOLD:.0f} m", ha="right", va="center", size=7.5, color=NOTE)

@@ -16,19 +16,19 @@ A rover starts where training lets it, and so that its battery would last to a s
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
+from stlc.controller.sketch import CHARGE, DECIDED, GOAL, GROUND, NOTE, WALL, deciders, tails
 from stlc.controller.streams import Streams
 
 STATES = 100  # of the stations and of each rover that are drawn as in training
 SETS, STATIONS = 1000, 5
 POINTS = 101  # of a way that are looked at
 ROUNDING = 1e-6
-DECIDED = ("#2563a8", "#e08a00", "#c0267e", "#2e9e5b")  # policy, backup, safest, polished
-WALL, GROUND, CHARGE, GOAL = "#8a8f98", "#f1f3f5", "#e9c46a", "#2f9e57"
+TAIL = 25  # frames of a way that are seen
 
 
 class Stations:
@@ -128,28 +128,31 @@ class Stations:
             "shape": np.array([self.size, self.near]),
         }
 
+    KEYS: ClassVar = {"destination": GOAL, "charging station": CHARGE, "wall": WALL}
+
     @staticmethod
     def draw(axes: Any, scene: Mapping[str, np.ndarray], index: int) -> None:
-        """One frame: the map, and the rovers with a line to where they go, coloured by who decided."""
-        from matplotlib.patches import Circle, Rectangle
+        """One frame: the map; rovers with path, charge and destination, coloured by who decided."""
+        from matplotlib.patches import Arc, Circle, Rectangle
 
         size, near = scene["shape"][index]
-        axes.add_patch(Rectangle((0, 0), size, size, color=GROUND, lw=0))
+        ground = axes.add_patch(Rectangle((0, 0), size, size, color=GROUND, lw=0))
         for left, bottom, right, top in scene["walls"][index]:
             axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, color=WALL, lw=0))
         for place in scene["stations"][index]:
-            axes.add_patch(Circle(place, near, color=CHARGE, lw=0, alpha=0.7))
-        rovers = scene["rovers"][index]
-        decided = scene["decision"][index] if "decision" in scene else np.zeros(len(rovers), dtype=int)
-        for at, goal, left, source in zip(
-            rovers, scene["destinations"][index], scene["battery"][index], decided, strict=True
-        ):
-            color = DECIDED[int(source)]
-            axes.add_patch(Circle(goal, near, fill=False, color=GOAL, lw=1.2))
-            axes.plot(*np.transpose((at, goal)), color=color, lw=0.6, alpha=0.5)
-            axes.add_patch(Circle(at, 0.16, color=color, lw=0, zorder=3))
-            axes.text(at[0] + 0.2, at[1] + 0.2, f"{left:.1f}", size=7, color="#4a4f57", zorder=4)
-        axes.set(xlim=(-0.3, size + 0.3), ylim=(-0.3, size + 0.3), aspect="equal")
+            axes.add_patch(Circle(place, near, color=CHARGE, lw=0, alpha=0.8)).set_clip_path(ground)
+        rovers, goals = scene["rovers"], scene["destinations"][index]
+        tails(axes, rovers, scene, index, frames=TAIL)
+        most = max(float(scene["battery"].max()), 1e-9)
+        who = deciders(scene, index, rovers.shape[1])
+        for at, goal, left, source in zip(rovers[index], goals, scene["battery"][index], who, strict=True):
+            axes.plot(*np.transpose((at, goal)), color=GOAL, lw=0.8, ls=(0, (2, 3)), zorder=2)
+            axes.add_patch(Circle(goal, near, fc="none", ec=GOAL, lw=1.4, zorder=2)).set_clip_path(ground)
+            axes.add_patch(Circle(at, 0.17, fc=DECIDED[source], ec="white", lw=0.6, zorder=3))
+            full = 360 * min(max(left / most, 0.0), 1.0)
+            axes.add_patch(Arc(at, 0.62, 0.62, theta1=90 - full, theta2=90, color=NOTE, lw=1.6, zorder=3))
+            axes.text(at[0], at[1] + 0.4, f"{left:.1f} s", size=7.5, ha="center", color=NOTE, zorder=4)
+        axes.set(xlim=(-0.1, size + 0.1), ylim=(-0.1, size + 0.1), aspect="equal")
         axes.set_axis_off()
 
     def _first(self, states: torch.Tensor) -> int:

@@ -20,10 +20,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
+
+from stlc.controller.sketch import deciders, outlines, pieces, tails
 
 COLUMNS, ROWS = 4, 5
 COLUMN_SPACING = (13.0, 15.0, 18.0, 21.0)
@@ -39,9 +41,11 @@ LEFT, STRAIGHT, RIGHT = 1, 0, -1
 RADIUS = {LEFT: 0.75 * WIDTH, RIGHT: 0.25 * WIDTH}
 SPAN = {STRAIGHT: WIDTH, LEFT: math.pi / 2 * RADIUS[LEFT], RIGHT: math.pi / 2 * RADIUS[RIGHT]}
 STEP, BEFORE = 0.1, 2.0  # m: resolution of the conflict tables, and how long before the box they begin
-ROAD, MARKING = "#e3e5e8", "#ffffff"
+ROAD = {"color": "#e3e5e8", "lw": 0}
 SHOWN = {-1: "#4a4f57", 0: "#d43d3d", 1: "#2f9e57"}  # stop sign, red, green
-DECIDED = ("#2563a8", "#e08a00", "#c0267e", "#2e9e5b")  # policy, backup, safest, polished
+SEEN = np.array([(0.0, -1.0), (1.0, 0.0)])  # a point of the map in the picture: a quarter turn to the right
+CAR = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (0.9 * LENGTH_CAR, 0.9 * WIDTH_CAR)
+TAIL = 12  # frames of a way that are seen
 
 
 def right_of(direction: int) -> np.ndarray:
@@ -102,6 +106,21 @@ def conflicts(relative: int, mine: int, other: int) -> tuple[tuple[float, ...], 
 
     swept = np.logical_or.accumulate(overlap(a, b, grow=0.05)[:, ::-1], axis=1)[:, ::-1]
     return first(swept), first(overlap(a, b))
+
+
+def draw_roads(axes: Any, places: np.ndarray, shows: np.ndarray) -> None:
+    """Roads between junctions (20, 2) of the picture, and the stop lines with what they show (20, 2)."""
+    low, high = places.min(0), places.max(0)
+    for x in set(places[:, 0]):
+        axes.fill_between((x - WIDTH / 2, x + WIDTH / 2), low[1] - WIDTH / 2, high[1] + WIDTH / 2, **ROAD)
+    for y in set(places[:, 1]):
+        axes.fill_between((low[0] - WIDTH / 2, high[0] + WIDTH / 2), y - WIDTH / 2, y + WIDTH / 2, **ROAD)
+    for direction, forward in enumerate(WIDTH * DIRECTIONS @ SEEN):
+        known = (np.abs(places - forward - (low + high) / 2) < (high - low) / 2 + 1).all(1)
+        pieces(axes, places[known], np.outer((-0.6, -1.1), forward), "white", 1.0)
+        line = np.outer((0.06, 0.44), WIDTH * right_of(direction) @ SEEN) - forward / 2
+        for state, color in SHOWN.items():
+            pieces(axes, places[known & (shows[:, direction % 2] == state)], line, color, 2.4)
 
 
 @dataclass(slots=True)
@@ -245,32 +264,16 @@ class TrafficGrid:
         shows = np.where(self.grid.light[:, None], np.array(green, dtype=np.int8), np.int8(-1))
         return {"pose": self._poses(), "junctions": self.grid.places, "shows": shows}
 
+    KEYS: ClassVar = {"red light": SHOWN[0], "green light": SHOWN[1], "stop sign": SHOWN[-1]}
+
     @staticmethod
     def draw(axes: Any, scene: Mapping[str, np.ndarray], index: int) -> None:
-        """One frame: roads, signs, and the cars coloured by who decided (policy, backup, safest)."""
-        from matplotlib.patches import Polygon, Rectangle
-
-        places, shows = scene["junctions"][index], scene["shows"][index]
-        (left, bottom), (right, top) = places.min(0), places.max(0)
-        roads = [((x, bottom), (x, top)) for x in set(places[:, 0])]
-        for road in np.array([*roads, *(((left, y), (right, y)) for y in set(places[:, 1]))]):
-            corner, extent = road[0] - WIDTH / 2, road[1] - road[0] + WIDTH
-            axes.add_patch(Rectangle(corner, *extent, color=ROAD, lw=0))
-            axes.plot(*road.T, color=MARKING, lw=0.6, dashes=(4, 4), zorder=2)
-        for place, state in zip(places, shows, strict=True):
-            axes.add_patch(Rectangle(place - WIDTH / 2, WIDTH, WIDTH, color=ROAD, lw=0, zorder=3))
-            for direction, forward in enumerate(DIRECTIONS):
-                x, y = place - WIDTH * forward
-                if left - 1 < x < right + 1 and bottom - 1 < y < top + 1:
-                    line = place - WIDTH / 2 * forward + np.outer((0.06, 0.44), WIDTH * right_of(direction))
-                    axes.plot(*line.T, color=SHOWN[int(state[direction % 2])], lw=2, zorder=4)
-        decided = scene["decision"][index] if "decision" in scene else np.zeros(len(scene["pose"][index]))
-        for (x, y, angle), source in zip(scene["pose"][index], decided, strict=True):
-            cos, sin = math.cos(angle), math.sin(angle)
-            turned = np.array([(cos, sin), (-sin, cos)]) * (np.array([[LENGTH_CAR], [WIDTH_CAR]]) * 0.7)
-            corners = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) @ turned + (x, y)
-            axes.add_patch(Polygon(corners, color=DECIDED[int(source)], lw=0, zorder=5))
-        axes.set(xlim=(left - 4, right + 4), ylim=(bottom - 4, top + 4), aspect="equal")
+        """One frame, north to the right: roads, signs, and cars coloured by who decided."""
+        poses = np.concatenate((scene["pose"][..., :2] @ SEEN, scene["pose"][..., 2:] - math.pi / 2), -1)
+        draw_roads(axes, scene["junctions"][index] @ SEEN, scene["shows"][index])
+        tails(axes, poses[..., :2], scene, index, frames=TAIL)
+        outlines(axes, CAR, poses[index], deciders(scene, index, poses.shape[1]))
+        axes.set_aspect("equal")
         axes.set_axis_off()
 
     def _pass_on(self, car: Car, travel: float) -> None:
@@ -357,13 +360,10 @@ class TrafficGrid:
 
     def _leader(self, car: Car, lanes: Lanes, inside: Inside) -> Lead:
         """The nearest car on the path of `car`, or one in the junction ahead that it must let pass."""
-        found, start = (
-            list[Lead](),
-            -car.s,
-        )  # where the piece of road that is looked at begins, seen from the car
+        found, start = list[Lead](), -car.s  # and where the piece of road that is looked at begins
         ways = car.way, (car.here, car.onward, car.beyond)
-        pieces = (ways[0][:2], ways[0], ways[1][:2], ways[1], ways[1][1:])
-        for piece in pieces[car.inside :]:
+        route = (ways[0][:2], ways[0], ways[1][:2], ways[1], ways[1][1:])
+        for piece in route[car.inside :]:
             if start > SIGHT + LENGTH_CAR or found:
                 break
             if len(piece) == 2:

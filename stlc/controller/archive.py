@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from stlc.compile.modules import spec_sha256
+from stlc.controller.executed import as_foreseen
 from stlc.controller.run import SPEC, SYSTEM, read_library
 from stlc.files import atomic_path, read_source
 from stlc.trace import Trace, TraceMeta, save_trace
@@ -29,9 +30,9 @@ RESULT = "eval/simulate.json"
 def trace_of(run: Run, recording: Recording, setting: Setting) -> Trace:
     """All agents of all seeds as traces, decisions beside them.
 
-    Extras, each (traces, steps): `action.NAME` for every control, `decision` (0 policy, 1 backup, 2 safest),
-    `t0`, `plan_rho` of the plan that was followed, `policy_rho` of what the policy proposed; and (traces,):
-    `seed`, `agent`.
+    Extras, each (traces, steps): `action.NAME` for every control, `decision` (0 policy, 1 backup, 2 safest,
+    3 polished), `t0`, `plan_rho` of the plan that was followed, `policy_rho` of what the policy proposed,
+    `foreseen` (1 where the world did as the model says); and (traces,): `seed`, `agent`.
     """
     system = run.task.system
     states = np.moveaxis(recording.states, -1, 0)
@@ -47,6 +48,7 @@ def trace_of(run: Run, recording: Recording, setting: Setting) -> Trace:
             "t0": recording.t0,
             "plan_rho": recording.rho,
             "policy_rho": recording.policy_rho,
+            "foreseen": as_foreseen(run.task, recording).astype(np.int8),
             "seed": np.array(setting.seeds)[rows // recording.agents],
             "agent": rows % recording.agents,
         },

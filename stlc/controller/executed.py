@@ -95,12 +95,17 @@ def _margin(rule: Rule, columns: Mapping[str, NDArray[Any]], count: int) -> NDAr
     return np.broadcast_to(margin, (count, next(iter(columns.values())).shape[1]))
 
 
-def _foreseen(task: Task, recording: Recording, starts: int) -> Mask:
-    """Where the model predicted every sample of the window, (starts, rows)."""
+def as_foreseen(task: Task, recording: Recording) -> Mask:
+    """Whether the world did at a step what the model says, (rows, steps)."""
     before = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
     action = torch.from_numpy(recording.actions).flatten(0, 1)
     predicted = task.system.step(before, action).numpy(force=True).reshape(recording.states[:, 1:].shape)
-    right = (np.abs(predicted - recording.states[:, 1:]) <= SURPRISE).all(-1).T
+    return np.asarray((np.abs(predicted - recording.states[:, 1:]) <= SURPRISE).all(-1))
+
+
+def _foreseen(task: Task, recording: Recording, starts: int) -> Mask:
+    """Where the model predicted every sample of the window, (starts, rows)."""
+    right = as_foreseen(task, recording).T
     so_far = np.concatenate([np.zeros((1, right.shape[1]), dtype=int), np.cumsum(right, 0)])
     whole: Mask = so_far[task.horizon : task.horizon + starts] - so_far[:starts] == task.horizon
     return whole

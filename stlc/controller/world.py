@@ -14,18 +14,16 @@ from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from stlc.controller.events import Events
+from stlc.controller.sketch import DECIDED, Scene, deciders
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.registry import closest
 
 if TYPE_CHECKING:
     from stlc.dynamics.decl import SystemDecl, WorldRef
     from stlc.dynamics.system import System
-
-Scene = Mapping[str, NDArray[Any]]
 
 
 class World(Protocol):
@@ -116,9 +114,9 @@ class ModelWorld:
     def draw(axes: Any, scene: Scene, index: int) -> None:
         """Agents in the plane of the first two columns; `scene["state"]` is (frames, agents, n)."""
         names, state = scene["names"][index], scene["state"]
-        decided = scene["decision"][index] if "decision" in scene else np.zeros(state.shape[1], dtype=int)
+        decided = deciders(scene, index, state.shape[1])
         second = min(1, state.shape[2] - 1)
-        for source, color in enumerate(("#2563a8", "#e08a00", "#c0267e", "#2e9e5b")):
+        for source, color in enumerate(DECIDED):
             points = state[index][decided == source]
             axes.scatter(points[:, 0], points[:, second], s=18, color=color, lw=0)
         for column, limit in ((0, axes.set_xlim), (second, axes.set_ylim)):
