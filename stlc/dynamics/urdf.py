@@ -54,7 +54,7 @@ def chain(text: str, tip: str, base: str | None = None) -> tuple[Joint, ...]:
     Raises:
         ValueError: the text is no URDF, has no such link, or holds a joint that has no closed form here.
     """
-    joints = {joint.get("name", ""): joint for joint in _robot(text).findall("joint")}
+    joints = {joint.get("name", ""): joint for joint in robot_of(text).findall("joint")}
     above = {_link(joint, "child"): joint for joint in joints.values()}
     links = above.keys() | {_link(joint, "parent") for joint in joints.values()}
     for link in (tip, base):
@@ -79,7 +79,8 @@ def read_urdf(path: Path) -> str:
     return path.read_text(encoding="utf-8")
 
 
-def _robot(text: str) -> ElementTree.Element:
+def robot_of(text: str) -> ElementTree.Element:
+    """The root of a description. Raises ValueError where it is none, or not plain XML."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("a robot description has no document type and no entities")
     try:

@@ -3,86 +3,195 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 import numpy as np
+from numpy.typing import NDArray
 
+from stlc.controller.stage import Stage, Staged
 from stlc.diagnostics import StlcError
 from stlc.rundir import RunDir
 from stlc.trace import Trace, load_trace
+from stlc.view import bullet
 from stlc.view.chart import Chart, chart_film, chart_of
 from stlc.view.driven import monitor_of
-from stlc.view.film import MAX_BYTES, MAX_FRAMES, Film, Scene, save_gif, save_still, scene_film, signal_film
+from stlc.view.film import MAX_BYTES, MAX_FRAMES, Film, save_film, save_still
+from stlc.view.scene import Scene, Staging, scene_film
+from stlc.view.signal_film import signal_film
+from stlc.view.strip import Strip
+from stlc.view.video import encoder
+
+if TYPE_CHECKING:
+    from stlc.controller.world import WorldType
 
 SCENE = "scene.npz"
 TRACE = "trace.npz"
+SYSTEM = "system.yaml"
 RESULT = "eval/simulate.json"
 STILL = "scene.png"
+ENOUGH = 0.4
+"""The least share of instants from which the world did for somebody as the model says, to show only those."""
+AS_FORESEEN = "least margin from each instant on, of the agents for which the world did as the model says"
+
+
+@dataclass(frozen=True, slots=True)
+class Animation:
+    """The files of an animation; no video where there is no ffmpeg."""
+
+    gif: Path
+    mp4: Path | None
 
 
 def film_of(run: RunDir) -> Film | None:
     """What there is to see of the run's deployment; None where nothing was recorded.
 
-    A world draws its own scene and is loaded from the folder. Without one, or where it cannot be loaded,
-    the paths of the trace are shown over the places that its specification names, else its signals.
+    A world draws its own scene and is loaded from the folder. Without one, or where it cannot be loaded or
+    fails to draw, the paths of the trace are shown over the places that its specification names, else its
+    signals.
     """
     return _scene_film(run) or _signal_film(run)
 
 
-def gif_name(run: RunDir) -> str:
-    """File name of the run's animation: that of its specification."""
-    return re.sub(r"[^\w-]+", "-", str(run.record().get("spec", "deployment"))).strip("-") + ".gif"
+def film_name(run: RunDir) -> str:
+    """File name of the run's animation, without a suffix: that of its specification."""
+    return re.sub(r"[^\w-]+", "-", str(run.record().get("spec", "deployment"))).strip("-")
 
 
-def write_gif(run: RunDir, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_BYTES) -> Path | None:
+def animate(run: RunDir, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_BYTES) -> Animation | None:
     """Animate the deployment of `run` into its folder, with a still beside it.
 
     Args:
         run: a run that was simulated.
         max_frames: of the animation; instants are left out evenly beyond that.
-        max_bytes: of the file; the picture gets smaller where it would be larger.
+        max_bytes: of the GIF; the picture gets smaller where it would be larger.
 
     Returns:
-        The path of the GIF, or None where nothing was recorded.
+        The files, or None where nothing was recorded.
 
     Raises:
-        MissingError: R301, matplotlib or Pillow is missing; R201, the file cannot be written.
+        MissingError: R301, matplotlib or Pillow is missing; R201, a file cannot be written.
     """
     film = film_of(run)
     if film is None:
         return None
+    gif = run.path / f"{film_name(run)}.gif"
+    mp4 = gif.with_suffix(".mp4") if encoder() is not None else None
     save_still(film, run.path / STILL)
-    return save_gif(film, run.path / gif_name(run), max_frames=max_frames, max_bytes=max_bytes)
+    save_film(film, gif, mp4, max_frames=max_frames, max_bytes=max_bytes)
+    if mp4 is None:
+        gif.with_suffix(".mp4").unlink(missing_ok=True)  # of an older deployment
+    return Animation(gif, mp4)
 
 
-def current_gif(run: RunDir) -> Path | None:
+def current(run: RunDir) -> Animation | None:
     """The animation of the newest deployment, drawn now if it is not there yet."""
-    path = run.path / gif_name(run)
+    gif = run.path / f"{film_name(run)}.gif"
     recorded = [run.path / name for name in (SCENE, TRACE) if (run.path / name).exists()]
-    if path.exists() and all(path.stat().st_mtime >= record.stat().st_mtime for record in recorded):
-        return path
-    return write_gif(run)
+    if gif.exists() and all(gif.stat().st_mtime >= record.stat().st_mtime for record in recorded):
+        mp4 = gif.with_suffix(".mp4")
+        return Animation(gif, mp4 if mp4.exists() else None)
+    return animate(run)
 
 
-def _scene_film(run: RunDir) -> Film | None:
-    scene = _load_scene(run.path / SCENE)
-    if scene is None:
-        return None
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """A recorded scene with its world.
+
+    Attributes:
+        scene: snapshots stacked to (frames, …).
+        world: what draws them.
+        dt: seconds between them.
+        scenario: under which they were recorded, if any.
+    """
+
+    scene: Scene
+    world: WorldType
+    dt: float
+    scenario: str | None
+
+    @property
+    def stage(self) -> Stage | None:
+        """The robots in space; None where the world has none."""
+        return self.world.stage(self.scene) if isinstance(self.world, Staged) else None
+
+
+def seen_in(run: RunDir) -> Seen | None:
+    """The scene of the run's deployment; None without one, or where its world cannot be loaded."""
     from stlc.controller.world import world_type
     from stlc.dynamics.scenario import under
     from stlc.dynamics.schema import load_system_decl
 
+    scene = _load_scene(run.path / SCENE)
+    if scene is None:
+        return None
     try:
-        decl = load_system_decl(run.path / "system.yaml")
+        decl = load_system_decl(run.path / SYSTEM)
         scenario = _scenario(run)
         decl = decl if scenario is None else under(decl, scenario)
-        if decl.test.world is None:
-            return None
-        world = world_type(decl)
+        world = None if decl.test.world is None else world_type(decl)
     except StlcError:
         return None
-    return scene_film(scene, world.draw, float(decl.dt), title=_title(run))
+    return None if world is None else Seen(scene, world, float(decl.dt), scenario)
+
+
+def _scene_film(run: RunDir) -> Film | None:
+    seen = seen_in(run)
+    if seen is None:
+        return None
+    keys: Mapping[str, str] = getattr(seen.world, "KEYS", {})
+    strip = _strip(run, seen.scene, seen.dt)
+    try:
+        stage = seen.stage if bullet.available() else None
+        draw = seen.world.draw if stage is None else bullet.stage_drawing(stage)
+        return scene_film(seen.scene, Staging(draw, seen.dt, _title(run, seen.scenario), keys, strip))
+    except Exception:  # whatever a world's own code raises: there are other pictures
+        return None
+
+
+def _strip(run: RunDir, scene: Scene, dt: float) -> Strip | None:
+    """Margins of the agents that the scene shows, those of the first seed; None where they are not known."""
+    frames = min(len(values) for values in scene.values())
+    decisions = scene.get("decision")
+    times = np.arange(frames, dtype=np.float64) * np.float64(dt)
+    try:
+        trace = load_trace(run.path / TRACE)
+        if decisions is None or trace.samples != frames:
+            return None
+        shown = decisions.shape[1]
+        first = {name: values[:shown] for name, values in trace.data.items()}
+        monitor = monitor_of(trace, system=run.path / SYSTEM)
+        found = monitor.requirement_robustness(replace(trace, data=first, extras={}))
+    except StlcError:
+        return None
+    rows = {name: np.atleast_2d(rho)[:, :frames] for name, rho in found.items()}
+    margins = {name: _least(rho, _foreseen(trace, shown)) for name, rho in rows.items()}
+    if _known(margins) >= ENOUGH * _known({name: _least(rho) for name, rho in rows.items()}):
+        return Strip(times, margins, decisions.astype(np.int64), AS_FORESEEN)
+    return Strip(times, {name: _least(rho) for name, rho in rows.items()}, decisions.astype(np.int64))
+
+
+def _known(margins: Mapping[str, NDArray[np.float64]]) -> int:
+    """How many margins there are."""
+    return sum(int(np.isfinite(rho).sum()) for rho in margins.values())
+
+
+def _foreseen(trace: Trace, agents: int) -> NDArray[np.bool_]:
+    """From which samples on the world did as the model says, for the length of a plan, (agents, samples)."""
+    steps, horizon = trace.extras.get("foreseen"), trace.meta.horizon
+    if steps is None or horizon is None or steps.shape != (trace.traces, trace.samples - 1):
+        return np.ones((agents, trace.samples), dtype=bool)
+    wrong = np.cumsum(np.pad(steps[:agents] == 0, ((0, 0), (1, horizon))), axis=1)
+    return np.asarray(wrong[:, horizon : horizon + trace.samples] == wrong[:, : trace.samples])
+
+
+def _least(rho: NDArray[np.float64], counts: NDArray[np.bool_] | bool = True) -> NDArray[np.float64]:
+    """The least of the agents that count, (samples,); NaN where none is known."""
+    known = np.where(counts & ~np.isnan(rho), rho, np.inf).min(0)
+    return np.where(np.isfinite(known), known, np.nan)
 
 
 def _scenario(run: RunDir) -> str | None:
@@ -99,8 +208,9 @@ def _signal_film(run: RunDir) -> Film | None:
         trace = load_trace(run.path / TRACE)
     except StlcError:
         return None
+    title = _title(run, _scenario(run))
     chart = _chart(trace)
-    return signal_film(trace, title=_title(run)) if chart is None else chart_film(chart, title=_title(run))
+    return signal_film(trace, title=title) if chart is None else chart_film(chart, title=title)
 
 
 def _chart(trace: Trace) -> Chart | None:
@@ -122,5 +232,6 @@ def _load_scene(path: Path) -> Scene | None:
     return scene if whole else None
 
 
-def _title(run: RunDir) -> str:
-    return f"{run.record().get('spec', '')} · {run.name}"
+def _title(run: RunDir, scenario: str | None) -> str:
+    spec = str(run.record().get("spec", ""))
+    return " · ".join(part for part in (spec, scenario, run.name) if part)

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from stlc.grammar import ast
 from stlc.monitor.verdict import Verdict
 from stlc.trace import Trace
-from stlc.view.film import MOST_AGENTS, Film
+from stlc.view.film import Film
 from stlc.view.places import Place, Plane, labelled, plane_of
+from stlc.view.signal_film import MOST_AGENTS
 from stlc.view.style import (
     BLUE,
     FAINT,
@@ -126,11 +127,12 @@ def chart_film(chart: Chart, *, title: str = "") -> Film:
                 area.set_facecolor(_tint(chart.color(place), strength))
             for cursor in cursors:
                 cursor.set_xdata([now, now])
+            figure.canvas.draw()
 
         return turn
 
     alt = f"{title}: {_summary(chart)}, in motion over the places of the specification."
-    return Film(chart.trace.samples, chart.trace.dt, (8.4, 4.1), begin, alt)
+    return Film(chart.trace.samples, chart.trace.dt, (8.4, 4.1), begin, alt, chart.trace.samples // 2)
 
 
 def _heading(title: str, seconds: float) -> str:

@@ -6,8 +6,8 @@ import base64
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from stlc.view.animate import STILL, current_gif
-from stlc.view.html import Child, Html, classed, el, figure, join, table
+from stlc.view.animate import STILL, current
+from stlc.view.html import Child, Html, classed, el, figure, join, table, video
 from stlc.view.material import Material
 from stlc.view.page import Section
 from stlc.view.words import count, seconds, share, spread
@@ -87,23 +87,18 @@ def film_section(material: Material) -> Section | None:
     """The animation of the first seed."""
     if material.trace is None:
         return None
-    path = current_gif(material.run)
-    if path is None:
+    found = current(material.run)
+    if found is None:
         return None
-    uri = "data:image/gif;base64," + base64.b64encode(path.read_bytes()).decode()
-    caption = join(
-        "In real time. Who decided: ",
-        _key("#2563a8", "policy"),
-        _key("#2e9e5b", "polished plan"),
-        _key("#e08a00", "backup"),
-        _key("#c0267e", "safest prefix"),
+    alt = f"Animation of the deployment; a still is in {STILL}."
+    caption = (
+        "The first seed; the colours say who decided. Over time: for how many agents the guard acted, and "
+        "the least margin of each requirement over the agents for which the world did what the model says."
     )
-    film = figure(uri, f"Animation of the deployment; a still is in {STILL}.", caption, kind="film")
-    return Section("film", "What it looks like", film)
-
-
-def _key(color: str, name: str) -> Html:
-    return join(el("span", attrs={"class": "key", "style": f"background:{color}"}), f"{name}  ")
+    path, show = (found.gif, figure) if found.mp4 is None else (found.mp4, video)
+    kind = "image/gif" if found.mp4 is None else "video/mp4"
+    uri = f"data:{kind};base64," + base64.b64encode(path.read_bytes()).decode()
+    return Section("film", "What it looks like", show(uri, alt, caption, kind="film"))
 
 
 def _compared(title: str, guards: Mapping[str, Record], rows: list[tuple[Child, ...]]) -> Html | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ def driven_section(material: Material) -> Section | None:
     if trace is None:
         return None
     try:
-        monitor = monitor_of(trace, material.texts.get("spec.stl", ""))
+        monitor = _monitor(material, trace)
         verdict = monitor.check(trace)
         margins = monitor.requirement_robustness(trace)
     except StlcError as error:
@@ -56,14 +57,23 @@ def driven_section(material: Material) -> Section | None:
     return Section("driven", TITLE, body, picture)
 
 
-def monitor_of(trace: Trace, text: str = "") -> Monitor:
+def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None) -> Monitor:
     """What judges a trace: by the specification that it carries, or else by `text`.
+
+    `system` is the system file, which provides the functions that a specification takes from outside.
 
     Raises:
         SpecError: the specification is invalid.
     """
     source = Source("spec.stl", trace.meta.spec_text or text)
-    return Monitor(replace(parse(source), library=trace.meta.spec_library or None))
+    spec = replace(parse(source), library=trace.meta.spec_library or None)
+    outside = any(isinstance(item, ast.Extern) for item in spec.items)
+    return Monitor(spec, system=system if outside and system is not None and system.is_file() else None)
+
+
+def _monitor(material: Material, trace: Trace) -> Monitor:
+    text, system = material.texts.get("spec.stl", ""), material.run.path / "system.yaml"
+    return monitor_of(trace, text, system=system)
 
 
 def map_section(material: Material) -> Section | None:
@@ -72,7 +82,7 @@ def map_section(material: Material) -> Section | None:
     if trace is None:
         return None
     try:
-        monitor = monitor_of(trace, material.texts.get("spec.stl", ""))
+        monitor = _monitor(material, trace)
         chart = chart_of(monitor.spec, monitor.check(trace), trace)
     except StlcError:
         return None

@@ -73,6 +73,13 @@ def figure(uri: str, alt: str, caption: Child = None, *, kind: str = "plain") ->
     return classed("figure", kind, image, el("figcaption", caption) if caption else None)
 
 
+def video(uri: str, alt: str, caption: Child = None, *, kind: str = "plain") -> Html:
+    """A film with its words, which begins by itself, without sound, and can be stopped."""
+    switches = dict.fromkeys(("controls", "autoplay", "loop", "muted", "playsinline"), "")
+    shown = el("video", attrs={"src": uri, "aria-label": alt, **switches})
+    return classed("figure", kind, shown, el("figcaption", caption) if caption else None)
+
+
 def facts(pairs: Iterable[tuple[str, Child]]) -> Html:
     """Names and values, side by side."""
     return classed("dl", "facts", [Html(el("dt", name) + el("dd", value)) for name, value in pairs if value])

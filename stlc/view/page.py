@@ -48,7 +48,7 @@ def page(title: str, head: Child, sections: Sequence[Section], foot: Child) -> s
         foot: the last line.
     """
     links = el("nav", [el("a", part.title, attrs={"href": f"#{part.anchor}"}) for part in sections])
-    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+    policy = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'"
     html = el(
         "html",
         el(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.semantics import TOLERANCE
+from stlc.controller.sketch import DECIDED, DECIDERS
 from stlc.signature import Column
 from stlc.trace import Trace
 from stlc.view.style import (
@@ -19,7 +20,6 @@ from stlc.view.style import (
     GREEN,
     INK,
     MUTED,
-    ORANGE,
     RED,
     SKY,
     Picture,
@@ -36,10 +36,8 @@ Margins: TypeAlias = Mapping[str, NDArray[np.float64]]
 
 POLICY, BACKUP, SAFEST, POLISHED = 0, 1, 2, 3
 DECISIONS = {
-    POLICY: ("policy", FAINT),
-    BACKUP: ("backup", ORANGE),
-    SAFEST: ("safest prefix", RED),
-    POLISHED: ("polished", GREEN),
+    POLICY: (DECIDERS[POLICY], FAINT),
+    **{source: (DECIDERS[source], DECIDED[source]) for source in (BACKUP, SAFEST, POLISHED)},
 }
 MOST_LINES = 8  # panels of numbers; beyond that those that move come first
 _HEIGHTS = {"line": 0.62, "strip": 0.2, "robustness": 0.5, "decision": 0.2}
@@ -221,11 +219,11 @@ def _draw_robustness(axes: Axes, agent: _Agent, name: str) -> None:
     axes.fill_between(times, rho, 0, where=rho < -TOLERANCE, step="post", color=RED, alpha=0.3, lw=0)
     axes.step(times, rho, where="post", color=BLUE, lw=1)
     axes.step(times, np.where(rho < -TOLERANCE, rho, np.nan), where="post", color=RED, lw=1.4)
-    axes.set_ylim(*_limits(agent.margins[name]))
+    axes.set_ylim(*margin_limits(agent.margins[name]))
     axes.locator_params(axis="y", nbins=3)
 
 
-def _limits(rho: NDArray[np.float64]) -> tuple[float, float]:
+def margin_limits(rho: NDArray[np.float64]) -> tuple[float, float]:
     """Down to the least value; large margins are cut so that violations stay visible; zero is always seen."""
     finite = rho[np.isfinite(rho)]
     if not len(finite):

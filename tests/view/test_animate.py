@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stlc.view.animate import current_gif, film_of, gif_name, write_gif
+from stlc.view.animate import animate, current, film_name, film_of
 
 WORLD = """
 class Dots:
@@ -44,14 +44,15 @@ def test_a_world_draws_its_scene(seen):
     film = film_of(seen)
     assert film.frames == 7
     assert film.dt == pytest.approx(0.1)
-    path = write_gif(seen)
+    path = animate(seen).gif
     assert path.name == "traffic.gif"
     assert frame_count(path) == 7
     assert (seen.path / "scene.png").exists()
 
 
 @pytest.mark.parametrize(
-    "damage", ["no scene", "no world file", "a world that fails", "a scene that is no archive"]
+    "damage",
+    ["no scene", "no world file", "a world that fails", "a drawing that fails", "a scene that is no archive"],
 )
 def test_without_a_world_signals_are_shown(seen, damage, recording):
     match damage:
@@ -61,6 +62,8 @@ def test_without_a_world_signals_are_shown(seen, damage, recording):
             (seen.path / "dots.py").unlink()
         case "a world that fails":
             (seen.path / "dots.py").write_text("raise RuntimeError('broken')\n")
+        case "a drawing that fails":
+            (seen.path / "dots.py").write_text(WORLD.replace('scene["x"]', 'scene["y"]'))
         case _:
             (seen.path / "scene.npz").write_bytes(b"nothing")
     assert film_of(seen).frames == recording.samples
@@ -68,19 +71,19 @@ def test_without_a_world_signals_are_shown(seen, damage, recording):
 
 def test_a_run_without_a_deployment_has_no_film(trained):
     assert film_of(trained) is None
-    assert write_gif(trained) is None
+    assert animate(trained) is None
     assert not list(trained.path.glob("*.gif"))
 
 
 def test_a_gif_is_drawn_again_only_for_a_newer_recording(seen):
-    path = write_gif(seen)
+    path = animate(seen).gif
     drawn = path.stat().st_mtime_ns
-    assert current_gif(seen).stat().st_mtime_ns == drawn
+    assert current(seen).gif.stat().st_mtime_ns == drawn
     later = drawn + 2_000_000_000
     os.utime(seen.path / "scene.npz", ns=(later, later))
-    assert current_gif(seen).stat().st_mtime_ns != drawn
+    assert current(seen).gif.stat().st_mtime_ns != drawn
 
 
 def test_a_hostile_name_stays_in_the_folder(seen):
     seen.update({"spec": "../../etc/passwd"})
-    assert gif_name(seen) == "etc-passwd.gif"
+    assert film_name(seen) == "etc-passwd"

@@ -10,7 +10,7 @@ from stlc.trace import save_trace
 from stlc.view.animate import film_of
 from stlc.view.chart import chart_film, chart_of, draw_chart
 from stlc.view.driven import map_section
-from stlc.view.film import save_gif
+from stlc.view.film import save_film
 from stlc.view.material import gather
 from stlc.view.style import RED, look, new_figure
 
@@ -65,7 +65,8 @@ def test_places_are_strong_while_they_matter(chart):
 
 
 def test_the_film_moves(chart, tmp_path):
-    path = save_gif(chart_film(chart), tmp_path / "walk.gif", max_frames=3)
+    path = tmp_path / "walk.gif"
+    save_film(chart_film(chart), path, max_frames=3)
     with Image.open(path) as image:
         assert image.n_frames == 3
 

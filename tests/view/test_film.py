@@ -1,10 +1,17 @@
 """Films: frames, time, size."""
 
+import re
+import subprocess
+
 import numpy as np
 import pytest
 from PIL import Image
 
-from stlc.view.film import save_gif, save_still, scene_film, signal_film
+from stlc.diagnostics import MissingError
+from stlc.view.film import save_film, save_still
+from stlc.view.scene import Staging, scene_film
+from stlc.view.signal_film import signal_film
+from stlc.view.video import encoder
 
 
 def draw_dot(axes, scene, index):
@@ -12,6 +19,16 @@ def draw_dot(axes, scene, index):
     axes.plot(scene["x"][index], 5, "o", color="#0072b2")
     axes.set(xlim=(0, 20), ylim=(0, 10), aspect="equal")
     axes.set_axis_off()
+
+
+def film_of(scene, draw=draw_dot, dt=0.1):
+    return scene_film(scene, Staging(draw, dt, "dot"))
+
+
+def saved(film, folder, **limits):
+    path = folder / "a.gif"
+    save_film(film, path, **limits)
+    return path
 
 
 def frames_of(path):
@@ -24,20 +41,21 @@ def frames_of(path):
 
 
 def test_a_scene_moves_in_real_time(tmp_path):
-    film = scene_film({"x": np.linspace(1, 19, 12)}, draw_dot, 0.1, title="dot")
+    film = film_of({"x": np.linspace(1, 19, 12)})
     assert film.frames == 12
     assert film.size[0] > film.size[1]
-    frames = frames_of(save_gif(film, tmp_path / "a.gif"))
+    frames = frames_of(saved(film, tmp_path))
     assert len(frames) == 12
     assert {duration for _, duration in frames} == {100}
-    places = [np.nonzero((image[:, :, 2] > 140) & (image[:, :, 0] < 60))[1].mean() for image, _ in frames]
+    scenes = [image[60:] for image, _ in frames]  # without the head
+    places = [np.nonzero((image[:, :, 2] > 140) & (image[:, :, 0] < 60))[1].mean() for image in scenes]
     assert places == sorted(places)
     assert places[-1] - places[0] > 0.7 * frames[0][0].shape[1]
 
 
 def test_many_instants_are_thinned_and_keep_their_pace(tmp_path):
-    film = scene_film({"x": np.linspace(1, 19, 50)}, draw_dot, 0.1)
-    frames = frames_of(save_gif(film, tmp_path / "a.gif", max_frames=10))
+    film = film_of({"x": np.linspace(1, 19, 50)})
+    frames = frames_of(saved(film, tmp_path, max_frames=10))
     assert len(frames) == 10
     assert {duration for _, duration in frames} == {500}
 
@@ -47,8 +65,8 @@ def test_a_large_film_is_made_smaller(tmp_path):
         axes.imshow(scene["field"][index], cmap="gray")
 
     field = np.random.default_rng(0).random((4, 80, 80))
-    film = scene_film({"field": field}, draw_noise, 0.1)
-    path = save_gif(film, tmp_path / "a.gif", max_bytes=150_000)
+    film = film_of({"field": field}, draw_noise)
+    path = saved(film, tmp_path, max_bytes=150_000)
     assert path.stat().st_size <= 150_000
     assert len(frames_of(path)) == 4
 
@@ -56,9 +74,51 @@ def test_a_large_film_is_made_smaller(tmp_path):
 def test_signals_grow(recording, tmp_path):
     film = signal_film(recording, title="run")
     assert film.frames == recording.samples
-    path = save_still(film, tmp_path / "still.png", at=1.0, dpi=40)
+    path = save_still(film, tmp_path / "still.png", at=film.frames - 1, dpi=40)
     with Image.open(path) as image:
         assert image.size[0] == pytest.approx(6.4 * 40, abs=1)
-    frames = frames_of(save_gif(film, tmp_path / "a.gif", max_frames=3))
+    frames = frames_of(saved(film, tmp_path, max_frames=3))
     first, last = frames[0][0].astype(int), frames[-1][0].astype(int)
     assert (last < 128).sum() > (first < 128).sum()
+
+
+def test_what_takes_long_is_shown_faster(tmp_path):
+    film = film_of({"x": np.linspace(1, 19, 400)})
+    assert film.speed == 3
+    frames = frames_of(saved(film, tmp_path, max_frames=8))
+    assert {duration for _, duration in frames} == {1660}  # 5 s, in hundredths
+
+
+@pytest.mark.skipif(encoder() is None, reason="without ffmpeg there is no video")
+def test_a_video_has_the_same_pictures_twice_as_fine(tmp_path):
+    film = film_of({"x": np.linspace(1, 19, 6)})
+    save_film(film, tmp_path / "a.gif", tmp_path / "a.mp4")
+    assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.n_frames == 6
+    told = subprocess.run(
+        [encoder(), "-i", tmp_path / "a.mp4", "-f", "null", "-"], capture_output=True, text=True, check=True
+    ).stderr
+    width, height = (round(2 * 100 * side) for side in film.size)
+    assert f"{width}x{height - height % 2}" in told
+    assert re.search(r"frame= *6 ", told)
+
+
+def test_without_ffmpeg_there_is_no_video(tmp_path, monkeypatch):
+    monkeypatch.setattr("stlc.view.video.encoder", lambda: None)
+    film = film_of({"x": np.linspace(1, 19, 2)})
+    with pytest.raises(MissingError, match="R301"):
+        save_film(film, tmp_path / "a.gif", tmp_path / "a.mp4")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_ffmpeg_that_fails_leaves_nothing(tmp_path, monkeypatch):
+    broken = tmp_path / "ffmpeg"
+    broken.write_text("#!/bin/sh\necho no such codec >&2\nexit 1\n")
+    broken.chmod(0o755)
+    monkeypatch.setattr("stlc.view.video.encoder", lambda: str(broken))
+    film = film_of({"x": np.linspace(1, 19, 2)})
+    with pytest.raises(MissingError) as raised:
+        save_film(film, tmp_path / "a.gif", tmp_path / "a.mp4")
+    assert raised.value.diagnostics[0].note == ("no such codec",)
+    assert list(tmp_path.iterdir()) == [broken]

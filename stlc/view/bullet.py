@@ -1,0 +1,224 @@
+"""Robots as bodies, by PyBullet: rendered without a display, or in its window."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.controller.sketch import DECIDED, NOTE, deciders
+from stlc.controller.stage import Ball, Stage
+from stlc.diagnostics import Diagnostic, MissingError
+from stlc.view.bodies import dressed
+from stlc.view.scene import Scene
+
+Mode: TypeAlias = Literal["picture", "window"]
+Draw: TypeAlias = Callable[[Any, Scene, int], None]
+Rgba: TypeAlias = tuple[float, float, float, float]
+
+ADVICE = "pip install 'stlc[panda]'"
+SIZE = 1216
+"""Pixels across a picture."""
+PITCH = 1.32
+"""From one base to the next, in reaches."""
+CLEAR = 0.6
+"""How much of a ball is seen where something is behind it."""
+_AWAY, _TILT, _FIELD = 9.0, -16.0, 0.86  # reaches to the camera, its degrees, what it sees above the middle
+_WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
+
+
+def available() -> bool:
+    """Whether PyBullet is installed."""
+    return find_spec("pybullet") is not None and find_spec("pybullet_data") is not None
+
+
+def stage_drawing(stage: Stage) -> Draw:
+    """What draws frame `index` of a scene as a rendered picture of all robots, side by side."""
+    theatre = Theatre(stage, "picture")
+
+    def draw(axes: Any, scene: Scene, index: int) -> None:
+        picture = theatre.picture(index, deciders(scene, index, stage.joints.shape[1]))
+        height, width = picture.shape[:2]
+        axes.imshow(picture, extent=(0, width, 0, height), interpolation="antialiased")
+        for robot in range(stage.joints.shape[1]):
+            across = width * (robot + 0.5) / stage.joints.shape[1]
+            axes.text(across, 0.02 * height, f"arm {robot}", ha="center", size=7.5, color=NOTE)
+        axes.set(xlim=(0, width), ylim=(0, height), aspect="equal")
+        axes.set_axis_off()
+
+    return draw
+
+
+def show(stage: Stage, scene: Scene, dt: float) -> None:
+    """Play a scene in PyBullet's window, in real time, until it ends.
+
+    Raises:
+        MissingError: R301, PyBullet is not installed; R302, there is no display.
+    """
+    require_window()
+    theatre = Theatre(stage, "window")
+    for index in range(len(stage.joints)):
+        begin = time.perf_counter()
+        if not theatre.open:
+            return
+        theatre.turn(index, deciders(scene, index, stage.joints.shape[1]))
+        time.sleep(max(0.0, dt - (time.perf_counter() - begin)))
+
+
+def require_window() -> None:
+    """Raise MissingError R301 without PyBullet, R302 without a display."""
+    if not available():
+        message = "a window needs pybullet, which is not installed"
+        raise MissingError(Diagnostic("R301", message, help=(ADVICE,)))
+    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        advice = ("leave `--window` out: the animation shows the same, and needs no display",)
+        raise MissingError(Diagnostic("R302", "there is no display for a window", help=advice))
+
+
+class Theatre:
+    """All robots of a stage and the balls around them, side by side along x."""
+
+    def __init__(self, stage: Stage, mode: Mode) -> None:
+        with _silenced():
+            import pybullet
+            from pybullet_utils.bullet_client import BulletClient
+
+            self.client: Any = BulletClient(pybullet.GUI if mode == "window" else pybullet.DIRECT)
+            self.stage, self.clear = stage, CLEAR if mode == "window" else 1.0
+            self.count = stage.joints.shape[1]
+            self.places = PITCH * stage.reach * np.arange(self.count)[:, None] * np.array([1.0, 0.0, 0.0])
+            self.robots = self._robots()
+            self.discs = [self._disc(place) for place in self.places]
+            self.balls = [[self._ball(ball) for _ in range(self.count)] for ball in stage.balls]
+            if mode == "window":
+                self._look()
+        self.shown = np.full(self.count, -1)
+
+    @property
+    def open(self) -> bool:
+        """Whether the window has not been closed."""
+        return bool(self.client.isConnected())
+
+    def turn(self, index: int, who: NDArray[np.int64]) -> None:
+        """Show frame `index`, robots by who decided, (robots,)."""
+        for robot, body in enumerate(self.robots):
+            for joint, angle in zip(self.movable, self.stage.joints[index, robot].tolist(), strict=True):
+                self.client.resetJointState(body, joint, angle)
+            if self.shown[robot] != who[robot]:
+                self._colour(robot, int(who[robot]))
+        for ball, bodies in zip(self.stage.balls, self.balls, strict=True):
+            for robot, body in enumerate(bodies):
+                self._put(body, self.places[robot] + ball.centre[index, robot])
+        self.shown = who.copy()
+
+    def picture(self, index: int, who: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Frame `index` as (height, width, 3); balls are seen through, which the renderer cannot do."""
+        self.turn(index, who)
+        whole = self._rendered()
+        for body in (body for bodies in self.balls for body in bodies):
+            self._put(body, np.array([0.0, 0.0, -1000.0]))
+        return np.asarray(CLEAR * whole + (1 - CLEAR) * self._rendered()).astype(np.uint8)
+
+    # --------------------------------------------------------------------- making
+
+    def _robots(self) -> list[int]:
+        with tempfile.TemporaryDirectory() as folder:
+            path = str(dressed(self.stage.urdf, self.stage.meshes, Path(folder)))
+            robots = [self.client.loadURDF(path, place.tolist(), useFixedBase=True) for place in self.places]
+        joints = range(self.client.getNumJoints(robots[0]))
+        self.movable = [j for j in joints if self.client.getJointInfo(robots[0], j)[2] in (0, 1)]
+        self.links = [-1, *joints]
+        return robots
+
+    def _disc(self, place: NDArray[np.float64]) -> int:
+        """What a robot stands on."""
+        radius = 0.28 * self.stage.reach
+        shape = self.client.createVisualShape(self.client.GEOM_CYLINDER, radius=radius, length=0.01)
+        return int(self.client.createMultiBody(0, -1, shape, (place - (0, 0, 0.006)).tolist()))
+
+    def _ball(self, ball: Ball) -> int:
+        import pybullet_data
+
+        round_one = str(Path(pybullet_data.getDataPath()) / "sphere_smooth.obj")
+        shape = self.client.createVisualShape(
+            self.client.GEOM_MESH,
+            fileName=round_one,
+            meshScale=[ball.radius] * 3,
+            rgbaColor=_rgba(ball.color, self.clear),
+        )
+        return int(self.client.createMultiBody(0, -1, shape))
+
+    def _colour(self, robot: int, source: int) -> None:
+        """Its disc says who decided; the robot itself changes colour where the policy did not."""
+        self.client.changeVisualShape(self.discs[robot], -1, rgbaColor=_rgba(DECIDED[source]))
+        body = _WHITE if source == 0 else _rgba(DECIDED[source])
+        for link in self.links:
+            self.client.changeVisualShape(self.robots[robot], link, rgbaColor=body)
+
+    def _put(self, body: int, place: NDArray[np.float64]) -> None:
+        self.client.resetBasePositionAndOrientation(body, place.tolist(), (0, 0, 0, 1))
+
+    # --------------------------------------------------------------------- seeing
+
+    def _middle(self) -> list[float]:
+        return [float(self.places[:, 0].mean()), 0.0, 0.5 * self.stage.reach]
+
+    def _look(self) -> None:
+        self.client.configureDebugVisualizer(self.client.COV_ENABLE_GUI, 0)
+        away = 1.3 * PITCH * self.stage.reach * max(self.count, 2)
+        self.client.resetDebugVisualizerCamera(away, 10, -20, self._middle())
+
+    def _rendered(self) -> NDArray[np.float64]:
+        reach = self.stage.reach
+        wide, high = 0.5 * PITCH * reach * self.count, _FIELD * reach
+        far = _AWAY * reach * max(self.count / 2, 1.0)
+        view = self.client.computeViewMatrixFromYawPitchRoll(self._middle(), far, 0.0, _TILT, 0.0, 2)
+        near = 0.5 * far
+        sides = (-wide * near / far, wide * near / far, -high * near / far, high * near / far)
+        lens = self.client.computeProjectionMatrix(*sides, near, 2 * far)
+        height = round(SIZE * high / wide)
+        _, _, pixels, _, _ = self.client.getCameraImage(
+            SIZE,
+            height,
+            view,
+            lens,
+            shadow=0,
+            lightDirection=(0.5, -0.8, 2.0),
+            lightAmbientCoeff=0.62,
+            lightDiffuseCoeff=0.42,
+            lightSpecularCoeff=0.04,
+            renderer=self.client.ER_TINY_RENDERER,
+            flags=self.client.ER_NO_SEGMENTATION_MASK,
+        )
+        return np.reshape(np.asarray(pixels, dtype=np.float64), (height, SIZE, 4))[..., :3]
+
+
+def _rgba(color: str, strength: float = 1.0) -> Rgba:
+    red, green, blue = (int(color[k : k + 2], 16) / 255 for k in (1, 3, 5))
+    return red, green, blue, strength
+
+
+@contextmanager
+def _silenced() -> Iterator[None]:
+    """PyBullet talks to the standard output past Python, where results belong."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = [os.dup(number) for number in (1, 2)]
+    try:
+        with Path(os.devnull).open("wb") as nowhere:
+            for number in (1, 2):
+                os.dup2(nowhere.fileno(), number)
+            yield
+    finally:
+        for number, saved in zip((1, 2), kept, strict=True):
+            os.dup2(saved, number)
+            os.close(saved)

@@ -1,0 +1,194 @@
+"""The film of a recorded scene: what its world draws, a legend above it, and a strip of margins beneath."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.controller.sketch import DECIDED, DECIDERS
+from stlc.view.film import Film, speed_of
+from stlc.view.strip import Mover, Strip, draw_strip
+from stlc.view.style import INK, MUTED, look, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.text import Text
+
+Scene = Mapping[str, NDArray[Any]]
+DrawScene = Callable[[Any, Scene, int], None]
+
+WIDTH, TALLEST = 7.6, 4.4
+"""Inches: of a picture, and of a scene that has its strip beneath it; a taller one has it beside."""
+_HEAD, _KEYS, _EDGE = 0.36, 0.24, 0.12
+_ROW, _GAP, _FOOT = 0.27, 0.07, 0.42
+_NAMES, _VALUES = 1.15, 0.62
+_BESIDE = 3.8
+
+
+@dataclass(frozen=True, slots=True)
+class Staging:
+    """How a scene is shown.
+
+    Attributes:
+        draw: what draws one frame of it.
+        dt: seconds between frames.
+        title: of the picture.
+        keys: word -> colour of what else is seen, for the legend.
+        strip: what is shown over time; None leaves it out.
+    """
+
+    draw: DrawScene
+    dt: float
+    title: str = ""
+    keys: Mapping[str, str] = field(default_factory=dict)
+    strip: Strip | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """Where things stand, in inches from the lower left: (left, bottom, width, height)."""
+
+    size: tuple[float, float]
+    scene: tuple[float, float, float, float]
+    rows: tuple[tuple[float, float, float, float], ...]
+
+
+def scene_film(scene: Scene, staging: Staging) -> Film:
+    """The film of arrays (instants, …)."""
+    frames = min(len(values) for values in scene.values())
+    keys = _keys(scene, staging)
+    plan = _planned(_ratio(staging.draw, scene), 0 if staging.strip is None else staging.strip.height, keys)
+    seconds, speed = (frames - 1) * staging.dt, speed_of(frames, staging.dt)
+
+    def begin(figure: Figure) -> Callable[[int], None]:
+        figure.set_layout_engine("none")
+        clock = _head(figure, plan, staging.title, keys)
+        movers = _draw_over_time(figure, plan, staging.strip)
+        axes = _panel(figure, plan, plan.scene)
+        moving = [axes, clock, *(artist for mover in movers for artist in mover.artists)]
+        for artist in moving:
+            artist.set_animated(True)  # left out of the ground, which is drawn once
+        canvas: Any = figure.canvas
+        canvas.draw()
+        ground = canvas.copy_from_bbox(figure.bbox)
+
+        def turn(index: int) -> None:
+            axes.clear()
+            staging.draw(axes, scene, index)
+            pace = f"   {speed}x" if speed > 1 else ""
+            clock.set_text(f"{index * staging.dt:.1f} s{pace}")
+            for mover in movers:
+                mover.turn(index)
+            canvas.restore_region(ground)
+            for artist in moving:
+                figure.draw_artist(artist)
+
+        return turn
+
+    alt = f"{staging.title}: {seconds:.0f} s of deployment."
+    return Film(frames, staging.dt, plan.size, begin, alt, _moment(scene, frames))
+
+
+def _moment(scene: Scene, frames: int) -> int:
+    """When most agents were guarded, the ends left out; the middle where none was."""
+    middle = frames // 2
+    if "decision" not in scene:
+        return middle
+    acted = (scene["decision"][:frames] > 0).sum(1).astype(float)
+    low, high = frames // 6, max(frames - frames // 6, frames // 6 + 1)
+    inner = acted[low:high]
+    if not inner.any():
+        return middle
+    best = np.flatnonzero(inner == inner.max()) + low
+    return int(best[np.abs(best - middle).argmin()])
+
+
+def _ratio(draw: DrawScene, scene: Scene) -> float:
+    """Height over width of what the world draws."""
+    with look():
+        axes = new_figure(4, 4).add_subplot()
+        draw(axes, scene, 0)
+        (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+        fixed = axes.get_aspect() != "auto"
+    ratio = float(abs((high - low) / (right - left))) if fixed and right != left else 0.6
+    return min(max(ratio, 0.15), 1.6)
+
+
+def _planned(ratio: float, rows: int, keys: Mapping[str, str]) -> _Plan:
+    head = _HEAD + (_KEYS if keys else 0.0)
+    width = WIDTH - 2 * _EDGE
+    high = rows * (_ROW + _GAP) + _FOOT + 0.2 if rows else 0.0
+    if width * ratio <= TALLEST:
+        scene = (_EDGE, high + _EDGE, width, width * ratio)
+        bottom = high - 0.2 - _ROW
+        boxes = [
+            (_EDGE + _NAMES, bottom - row * (_ROW + _GAP), width - _NAMES - _VALUES, _ROW)
+            for row in range(rows)
+        ]
+        return _Plan((WIDTH, head + scene[3] + scene[1]), scene, tuple(boxes))
+    tall = TALLEST + 0.4
+    wide = tall / ratio
+    scene = (_EDGE, _EDGE, wide, tall)
+    total = wide + 2 * _EDGE + (_BESIDE if rows else 0.0)
+    room = (tall - _FOOT - 0.2) / max(rows, 1)
+    left = wide + 2 * _EDGE + _NAMES
+    boxes = [
+        (left, _EDGE + _FOOT + (rows - 1 - row) * room, _BESIDE - _NAMES - _VALUES, min(room - 0.1, 0.8))
+        for row in range(rows)
+    ]
+    return _Plan((total, head + tall + _EDGE), scene, tuple(boxes))
+
+
+def _panel(figure: Figure, plan: _Plan, box: tuple[float, float, float, float]) -> Axes:
+    (width, height), (left, bottom, wide, high) = plan.size, box
+    return figure.add_axes((left / width, bottom / height, wide / width, high / height))
+
+
+def _keys(scene: Scene, staging: Staging) -> dict[str, str]:
+    """Who decided, as far as anybody else than the policy did, and what the world adds."""
+    sources = {0, *np.unique(scene["decision"]).tolist()} if "decision" in scene else {0}
+    who = {DECIDERS[source]: DECIDED[source] for source in sorted(sources)}
+    return {**(who if len(who) > 1 else {}), **staging.keys}
+
+
+def _head(figure: Figure, plan: _Plan, title: str, keys: Mapping[str, str]) -> Text:
+    """The title, the clock and the legend; returns the clock."""
+    from matplotlib.lines import Line2D
+
+    width, height = plan.size
+    top = 1 - 0.5 * _HEAD / height
+    figure.text(_EDGE / width, top, title, color=INK, va="center", weight="bold", fontsize=10)
+    clock = figure.text(1 - _EDGE / width, top, "", color=INK, va="center", ha="right", fontsize=10)
+    if keys:
+        dots = [Line2D([], [], marker="o", ls="", ms=6, mew=0, color=color) for color in keys.values()]
+        figure.legend(
+            dots,
+            list(keys),
+            loc="center left",
+            bbox_to_anchor=(0.0, 1 - (_HEAD + 0.4 * _KEYS) / height),
+            ncols=len(keys),
+            handletextpad=0.1,
+            columnspacing=1.2,
+            borderpad=0.2,
+            fontsize=8,
+            labelcolor=INK,
+        )
+    return clock
+
+
+def _draw_over_time(figure: Figure, plan: _Plan, strip: Strip | None) -> list[Mover]:
+    """The strip and what it is, above its first row."""
+    if strip is None or not plan.rows:
+        return []
+    movers = draw_strip(strip, [_panel(figure, plan, box) for box in plan.rows])
+    (width, height), (left, bottom, wide, high) = plan.size, plan.rows[0]
+    narrow = wide < WIDTH / 2
+    words = strip.words.replace(", ", ",\n") if narrow else strip.words
+    at = ((left - (_NAMES - 0.2 if narrow else 0.0)) / width, (bottom + high + 0.05) / height)
+    figure.text(*at, words, color=MUTED, fontsize=7.5, va="bottom")
+    return movers
