@@ -78,11 +78,13 @@ def simulate(
     set_: SetOption = None,
     runs: RunsOption = Path("runs"),
     pictures: Annotated[bool, typer.Option(help="Draw the animation and the report.")] = True,
+    window: Annotated[bool, typer.Option("--window", help="Show robots in PyBullet's window, too.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Deploy the policy of a run, record it, and say how it did."""
     chosen = _guard(backup, guard)
     from stlc.cli.output import emit_json
+    from stlc.cli.simulate_pictures import draw, require_robots
     from stlc.cli.simulate_text import closing, screen
     from stlc.controller.drive import Setting
     from stlc.controller.run import Run
@@ -90,9 +92,10 @@ def simulate(
 
     if record is not None:
         check_writable(record)
-
     overrides = parse_overrides(set_)
     opened = Run.open(run, root=runs, overrides=overrides)
+    if window:
+        require_robots(opened)
     test, which = opened.task.system.decl.test, tuple(range(seed, seed + seeds))
     limit = parse_limit(time_limit)
     setting = Setting(which, agents or test.agents, steps or test.steps, test.replan, limit)
@@ -106,11 +109,19 @@ def simulate(
     code = 1 if fail_under is not None and _accuracy(document, chosen) < fail_under else 0
     if not json:
         _print(screen(document))  # before the pictures: what was measured must not depend on them
-    drawn = _draw(opened) if pictures else {}
+    drawn = draw(opened) if pictures else {}
     if json:
         emit_json("simulate/1", ok=code == 0, exit_code=code, result=document | drawn)
     else:
         _print(closing(document["trace"], drawn, record, _needed_system(opened)))
+    _end(opened, window=window, code=code)
+
+
+def _end(run: Run, *, window: bool, code: int) -> None:
+    from stlc.cli.simulate_pictures import show
+
+    if window:
+        show(run)
     if code:
         raise typer.Exit(code)
 
@@ -218,20 +229,3 @@ def _save(run: Run, setting: Setting, found: Mapping[Mode, Deployment], record: 
 def _laid_over(run: Run) -> str | None:
     scenario = run.task.system.decl.scenario
     return None if scenario is None else scenario.name
-
-
-def _draw(run: Run) -> dict[str, str]:
-    """The animation and the report, where matplotlib is there."""
-    from stlc.cli.output import say
-    from stlc.view import available
-
-    if not available():
-        say("no pictures: they need matplotlib and pillow (pip install 'stlc[plot]')")
-        return {}
-    from stlc.view.animate import write_gif
-    from stlc.view.report import write_report
-
-    gif = write_gif(run.dir)
-    write_report(run.dir)
-    drawn = {"report": f"{run.dir.shown}/report.html"}
-    return drawn if gif is None else {"animation": f"{run.dir.shown}/{gif.name}", **drawn}

@@ -170,3 +170,10 @@ def test_pictures_are_drawn(there: RunDir, capsys: pytest.CaptureFixture[str]) -
     assert "traffic.gif" in out
     assert (there.path / "report.html").exists()
     assert (there.path / "traffic.gif").read_bytes()[:6] in (b"GIF89a", b"GIF87a")
+
+
+def test_a_window_is_refused_before_anything_is_driven(
+    there: RunDir, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["simulate", there.name, *SMALL, "--window"]) == 2
+    assert "`--window` shows robots, and `car` has none" in capsys.readouterr().err
