@@ -18,9 +18,9 @@ from torch import Tensor
 from stlc.compile.graph import evaluate
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.semantics import TOLERANCE
-from stlc.controller.drive import Setting, Worlds
 from stlc.controller.task import Task
 from stlc.controller.world import world_type
+from stlc.controller.worlds import Setting, Worlds
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.system import System
 from stlc.files import find_system, read_source

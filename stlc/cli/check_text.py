@@ -79,8 +79,8 @@ def _robustness(judged: Judgement) -> str:
 
 
 def signed(value: float) -> str:
-    """A robustness, three digits behind the point, or what there is of a tiny one."""
-    if math.isfinite(value) and 0 < abs(value) < 0.0005:
+    """A robustness, three digits behind the point, or what there is of a tiny or a huge one."""
+    if math.isfinite(value) and (0 < abs(value) < 0.0005 or abs(value) >= 1e9):
         return f"{value:+.1e}"
     return f"{value:+.3f}"
 

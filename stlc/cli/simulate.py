@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
@@ -10,19 +10,21 @@ import typer
 
 from stlc.cli.options import JsonOption, RunArgument, RunsOption, SetOption, describe, parse_overrides
 from stlc.cli.ranges import parse_limit
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import Diagnostic, RunError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    from stlc.cli.simulate_watch import Watching
     from stlc.controller.deploy import Mode
-    from stlc.controller.drive import Setting, Tick
+    from stlc.controller.drive import Setting
     from stlc.controller.evaluate import Deployment
     from stlc.controller.run import Run
+    from stlc.dynamics.decl import ScenarioDecl
 
 Record: TypeAlias = "dict[str, Any]"
 
-ALL = "all"
+ALL, USUAL = "all", "disturbed"
 SCENARIOS = "eval/scenarios.json"
 GUARDS: dict[Mode, tuple[Mode, ...]] = {
     "none": ("none",),
@@ -38,6 +40,24 @@ LimitOption = Annotated[
     str, typer.Option(metavar="TIME", help="Of a decision of the full guard, per agent; or `none`.")
 ]
 
+RecordOption = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Write the trace there too (.npz or .csv).")
+]
+FailUnderOption = Annotated[
+    float | None, typer.Option(metavar="SHARE", help="Exit with 1 if the plan accuracy is less.")
+]
+ScenarioOption = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="An overlay of the system file; all of them, or `disturbed`."),
+]
+LiveOption = Annotated[bool, typer.Option("--live", help="Show margins and decisions as it runs.")]
+MarginsOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE", help="Write the margins there, a JSON object per agent and step; `-` prints them."
+    ),
+]
+
 
 def register(app: typer.Typer) -> None:
     """Add the command to the program."""
@@ -48,9 +68,12 @@ def register(app: typer.Typer) -> None:
             "stlc simulate --backup",
             "stlc simulate latest --backup --seeds 20 --record trace.npz",
             "stlc simulate specs/ship_track.stl --backup --scenario all",
+            "stlc simulate --backup --seeds 1 --live --margins margins.jsonl",
             note="The newest run unless one is named. With --backup the paper's backup policy guards it, "
             "and the same seeds are driven without it too, to compare. Trace, scene and figures go "
-            "into the run's folder. Means over seeds come with 95 % intervals (Student's t).",
+            "into the run's folder. Means over seeds come with 95 % intervals (Student's t). Every system "
+            "has the scenarios mismatch, disturb and noise, also with a number of per cent (mismatch-20); "
+            "--scenario disturbed drives them all.",
         ),
     )(simulate)
 
@@ -66,15 +89,11 @@ def simulate(
     seed: Annotated[int, typer.Option(min=0, max=2**62, help="Seed of the first; the others follow.")] = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Of each; by default the system's.")] = None,
     agents: Annotated[int | None, typer.Option(min=1, help="In each; by default the system's.")] = None,
-    record: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the trace there too (.npz or .csv).")
-    ] = None,
-    fail_under: Annotated[
-        float | None, typer.Option(metavar="SHARE", help="Exit with 1 if the plan accuracy is less.")
-    ] = None,
-    scenario: Annotated[
-        str | None, typer.Option(metavar="NAME", help="An overlay of the system file, or all of them.")
-    ] = None,
+    record: RecordOption = None,
+    fail_under: FailUnderOption = None,
+    scenario: ScenarioOption = None,
+    live: LiveOption = False,
+    margins: MarginsOption = None,
     set_: SetOption = None,
     runs: RunsOption = Path("runs"),
     pictures: Annotated[bool, typer.Option(help="Draw the animation and the report.")] = True,
@@ -83,37 +102,35 @@ def simulate(
 ) -> None:
     """Deploy the policy of a run, record it, and say how it did."""
     chosen = _guard(backup, guard)
+    printed = _printed(json=json, margins=margins)
     from stlc.cli.output import emit_json
     from stlc.cli.simulate_pictures import draw, require_robots
     from stlc.cli.simulate_text import closing, screen
+    from stlc.cli.simulate_watch import require_writable
     from stlc.controller.drive import Setting
     from stlc.controller.run import Run
     from stlc.trace import check_writable
 
     if record is not None:
         check_writable(record)
-    overrides = parse_overrides(set_)
-    opened = Run.open(run, root=runs, overrides=overrides)
+    require_writable(margins)
+    opened = Run.open(run, root=runs, overrides=parse_overrides(set_))
     if window:
         require_robots(opened)
     test, which = opened.task.system.decl.test, tuple(range(seed, seed + seeds))
     limit = parse_limit(time_limit)
     setting = Setting(which, agents or test.agents, steps or test.steps, test.replan, limit)
-
-    def driven(name: str | None) -> Record:
-        laid = opened if name is None else Run.open(opened.dir.path, overrides=overrides, scenario=name)
-        found = {mode: _deploy(laid, setting, mode, record) for mode in GUARDS[chosen]}
-        return _save(laid, setting, found, record)
-
-    document = _all(opened, driven) if scenario == ALL else driven(scenario)
+    several = _several(opened, scenario)
+    order = _Order(opened, chosen, setting, record, live, margins, parse_overrides(set_))
+    document = _all(order, several) if several else _driven(order, scenario)
     code = 1 if fail_under is not None and _accuracy(document, chosen) < fail_under else 0
     if not json:
-        _print(screen(document))  # before the pictures: what was measured must not depend on them
+        _print(screen(document), printed)  # before the pictures: they must not change what was measured
     drawn = draw(opened) if pictures else {}
     if json:
         emit_json("simulate/1", ok=code == 0, exit_code=code, result=document | drawn)
     else:
-        _print(closing(document["trace"], drawn, record, _needed_system(opened)))
+        _print(closing(document["trace"], drawn, record, _needed_system(opened)), printed)
     _end(opened, window=window, code=code)
 
 
@@ -124,6 +141,68 @@ def _end(run: Run, *, window: bool, code: int) -> None:
         show(run)
     if code:
         raise typer.Exit(code)
+
+
+@dataclass(frozen=True, slots=True)
+class _Order:
+    """What is to be deployed and kept."""
+
+    run: Run
+    guard: Mode
+    setting: Setting
+    record: Path | None
+    live: bool
+    margins: str | None
+    overrides: Mapping[str, str]
+
+
+def _driven(order: _Order, name: str | None, *, kept: bool = True) -> Record:
+    """Deploy without and with the guard under a scenario; margins are written where it is `kept`."""
+    from stlc.cli.output import show_diagnostics
+    from stlc.cli.simulate_text import TITLES
+    from stlc.cli.simulate_watch import Watching
+    from stlc.controller.run import Run
+
+    run, found = order.run, {}
+    if name is not None:
+        run = Run.open(run.dir.path, overrides=order.overrides, scenario=name)
+    for mode in GUARDS[order.guard]:
+        title = " · ".join((run.task.compiled.name, TITLES[mode], *([name] if name else [])))
+        last = kept and mode == order.guard
+        watching = Watching(title, order.live, order.margins if last else None)
+        try:
+            found[mode] = _deploy(run, order.setting, mode, watching, order.record)
+        except RunError as error:
+            if mode == order.guard:
+                raise
+            show_diagnostics(error.diagnostics)  # only the comparison is missing: the guard may go on
+    return _save(run, order.setting, found, order.record)
+
+
+def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
+    """Where what a person reads goes: the standard output, unless the margins are wanted there."""
+    from stlc.cli.output import emit, say
+    from stlc.cli.simulate_watch import STANDARD_OUTPUT
+
+    if margins != STANDARD_OUTPUT:
+        return emit
+    if json:
+        message = "`--json` and `--margins -` both want the standard output"
+        raise UsageError(Diagnostic("U101", message, help=("--margins margins.jsonl",)))
+    return say
+
+
+def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
+    """The scenarios that are driven beside the deployment as it is; none where one is named."""
+    from stlc.dynamics.scenario import DISTURBED, find_scenario
+
+    decl = run.task.system.decl
+    declared = {each.name: each for each in decl.scenarios}
+    if scenario in declared:
+        return {}
+    if scenario == ALL:
+        return declared
+    return {name: find_scenario(decl, name) for name in DISTURBED} if scenario == USUAL else {}
 
 
 def _needed_system(run: Run) -> str | None:
@@ -137,26 +216,24 @@ def _accuracy(document: Record, guard: Mode) -> float:
     return min(float(one["guards"][guard]["metrics"]["plan_accuracy"]["mean"]) for one in each)
 
 
-def _all(run: Run, driven: Callable[[str | None], Record]) -> Record:
-    """The deployment as it is, and all scenarios beside it; the trace is that of the former."""
-    scenarios = {}
-    for scenario in run.task.system.decl.scenarios:
-        found = driven(scenario.name)
-        scenarios[scenario.name] = {
+def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Record:
+    """The deployment as it is, and scenarios beside it; the trace is that of the former."""
+    found = {
+        name: {
             "doc": scenario.doc,
             "expect": scenario.expect,
-            "guards": found["guards"],
+            "guards": _driven(order, name, kept=False)["guards"],
         }
-    document = {**driven(None), "scenarios": scenarios}
-    run.dir.write_json(SCENARIOS, document)
+        for name, scenario in scenarios.items()
+    }
+    document = {**_driven(order, None), "scenarios": found}
+    order.run.dir.write_json(SCENARIOS, document)
     return document
 
 
-def _print(lines: Iterator[str]) -> None:
-    from stlc.cli.output import emit
-
+def _print(lines: Iterator[str], printed: Callable[[str], None]) -> None:
     for line in lines:
-        emit(line)
+        printed(line)
 
 
 def _guard(backup: bool | None, guard: str | None) -> Mode:
@@ -173,35 +250,20 @@ def _guard(backup: bool | None, guard: str | None) -> Mode:
     return "paper" if backup else "none"
 
 
-def _deploy(run: Run, setting: Setting, mode: Mode, record: Path | None) -> Deployment:
-    """One deployment with a progress bar; what was driven before a failure is saved."""
+def _deploy(run: Run, setting: Setting, mode: Mode, watching: Watching, record: Path | None) -> Deployment:
+    """One deployment that is watched; what was driven before a failure or Ctrl-C is saved."""
     from stlc.cli.output import say
-    from stlc.cli.simulate_text import TITLES
     from stlc.controller.archive import save_trace_of
     from stlc.controller.evaluate import InterruptedDeploymentError, deploy
 
     try:
-        with _bar(TITLES[mode]) as tick:
-            return deploy(run.task, run.policy, setting, mode, tick=tick)
+        with watching.of(run.task, setting) as watch:
+            return deploy(run.task, run.policy, setting, mode, watch=watch)
     except InterruptedDeploymentError as error:
         if error.recording is not None:
             paths = save_trace_of(run, error.recording, setting, record)
             say(f"the first {error.recording.steps} steps are in {paths[0]}")
         raise (error.__cause__ or error) from None
-
-
-@contextmanager
-def _bar(title: str) -> Iterator[Tick]:
-    """A progress bar on the standard error, if that is a terminal."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    from stlc.cli.output import console
-
-    talk = console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=talk, transient=True, disable=not talk.is_terminal) as progress:
-        bar = progress.add_task(title, total=None)
-        yield lambda step, total: progress.update(bar, completed=step, total=total)
 
 
 def _save(run: Run, setting: Setting, found: Mapping[Mode, Deployment], record: Path | None) -> Record:

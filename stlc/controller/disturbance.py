@@ -6,7 +6,10 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from stlc.controller.streams import seeded
+from stlc.dynamics.decl_errors import ErrorsDecl
 from stlc.dynamics.draws import Drawing, Rows
+from stlc.units import parse_unit
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,11 +19,15 @@ if TYPE_CHECKING:
     from stlc.dynamics.decl import Assign
     from stlc.dynamics.system import System
 
+SECOND = parse_unit("s")
+_GAINS, _PUSHES, _BLURS = range(3)
+"""Which stream of a seed is whose: worlds meet the same, whatever is disturbed."""
+
 
 class Disturbance:
-    """The `disturb` and `noise` of the scenario of a system; nothing without one.
+    """The `disturb`, `noise` and `errors` of the scenario of a system; nothing without one.
 
-    Both read the state at hand and the time `t` of the deployment, and may draw.
+    The former two read the state at hand and the time `t` of the deployment, and may draw.
     """
 
     def __init__(self, system: System, generators: Sequence[torch.Generator], agents: int) -> None:
@@ -31,6 +38,40 @@ class Disturbance:
         self._generators, self._agents = generators, agents
         self._pushes = _drawings(scenario.disturb if scenario else ())
         self._noises = _drawings(scenario.noise if scenario else ())
+        self._errors = scenario.errors if scenario else ErrorsDecl()
+        own = [[seeded(each.initial_seed(), key) for key in range(3)] for each in generators]
+        self._streams = tuple(zip(*own, strict=True))
+        self._factor, self._offset = self._wrong_gains(system)
+        self._reach = 0.5 * (system.control_high - system.control_low).double()
+        self._spread = self._errors.sensor_noise * _ranges(system)
+
+    def acted(self, action: Tensor) -> Tensor:
+        """What actuators make of (rows, m) commands at this step."""
+        given = action
+        if self._errors.actuator_gain:
+            given = given * self._factor.to(given) + self._offset.to(given)
+        if self._errors.actuator_noise:
+            drawn = self._normal(_PUSHES, action.shape[1])
+            given = given + (self._errors.actuator_noise * self._reach * drawn).to(given)
+        return given
+
+    def _wrong_gains(self, system: System) -> tuple[Tensor, Tensor]:
+        """Factors and offsets of controls, (rows, m) each: as much too large as too small, evenly."""
+        off = self._errors.actuator_gain
+        angle = torch.tensor([control.squash == "angle" for control in system.controls])
+        signs = torch.cat(
+            [
+                2.0 * torch.randint(2, (self._agents, len(angle)), generator=each).double() - 1.0
+                for each in self._streams[_GAINS]
+            ]
+        )
+        return torch.where(angle, 1.0, 1.0 + off * signs), torch.where(angle, off * signs, 0.0)
+
+    def _normal(self, stream: int, count: int) -> Tensor:
+        """(rows, count) standard normal numbers, those of each seed from its own stream."""
+        shape = (self._agents, count)
+        streams = self._streams[stream]
+        return torch.cat([torch.randn(shape, generator=each, dtype=torch.float64) for each in streams])
 
     def pushed(self, x: Tensor, before: Tensor, step: int) -> Tensor:
         """The (rows, n) states after a step that began in `before` at time `(step - 1) dt`, disturbed."""
@@ -41,9 +82,14 @@ class Disturbance:
 
     def seen(self, x: Tensor, step: int) -> Tensor:
         """What agents see of (rows, n) states; columns behind those of the system are as they are."""
-        if not self._noises:
-            return x
-        return self._changed(x, self._drawn(self._noises, x, step), clamped=False)
+        seen = x
+        if self._noises:
+            seen = self._changed(x, self._drawn(self._noises, x, step), clamped=False)
+        if self._errors.sensor_noise:
+            drawn = self._spread * self._normal(_BLURS, len(self._spread))
+            later = torch.zeros((len(x), x.shape[1] - len(self._spread)), dtype=drawn.dtype)
+            seen = seen + torch.cat((drawn, later), 1).to(x)
+        return seen
 
     def _drawn(self, drawings: Sequence[Drawing], x: Tensor, step: int) -> dict[str, Tensor]:
         """Values for all rows, those of each seed from its own generator."""
@@ -69,3 +115,17 @@ class Disturbance:
 
 def _drawings(assigns: Sequence[Assign]) -> tuple[Drawing, ...]:
     return tuple(Drawing(assign) for assign in assigns)
+
+
+def _ranges(system: System) -> Tensor:
+    """How wide the nominal range of each state is, (n,); 0 for clocks and for what is no measure."""
+    widths = [
+        column.high - column.low
+        if column.kind == "real"
+        and column.unit.dims != SECOND.dims
+        and column.low is not None
+        and column.high is not None
+        else 0.0
+        for column in system.decl.signature.columns
+    ]
+    return torch.tensor(widths, dtype=torch.float64)

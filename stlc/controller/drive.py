@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,16 +12,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stlc.controller.disturbance import Disturbance
-from stlc.controller.world import Choosing
-from stlc.diagnostics import Diagnostic, RunError, StlcError, SystemFileError
+from stlc.controller.worlds import Setting, Worlds
+from stlc.diagnostics import Diagnostic, RunError
 
 if TYPE_CHECKING:
     from stlc.controller.deploy import Decision, Guard
-    from stlc.controller.task import Task
-    from stlc.controller.world import World, WorldType
+    from stlc.controller.world import WorldType
 
-Tick = Callable[[int, int], None]
+__all__ = ["Moment", "Recorder", "Recording", "Setting", "Watch", "drive"]
+
+Frame = Mapping[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,21 +70,21 @@ class Recorder:
     states: list[Tensor] = field(default_factory=list)
     actions: list[Tensor] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
-    frames: list[Mapping[str, NDArray[Any]]] = field(default_factory=list)
+    frames: list[Frame] = field(default_factory=list)
     options: list[Tensor] = field(default_factory=list)
     progress: tuple[Mapping[str, float], ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
 
-    def start(self, x: Tensor, world: World) -> None:
+    def start(self, x: Tensor, frame: Frame) -> None:
         """The first sample: `x` (rows, n), agents of all seeds one after the other."""
         self.states.append(x)
-        self.frames.append(world.snapshot())
+        self.frames.append(frame)
 
-    def step(self, decision: Decision, action: Tensor, x: Tensor, world: World) -> None:
+    def step(self, decision: Decision, action: Tensor, x: Tensor, frame: Frame) -> None:
         """One more step with `action` (rows, m), and the sample `x` (rows, n) behind it."""
         self.decisions.append(decision)
         self.actions.append(action)
-        self.start(x, world)
+        self.start(x, frame)
 
     def chosen(self, x: Tensor, options: Tensor) -> None:
         """The present sample is `x` (rows, n) by the choice of the agents among `options` (rows, k, n)."""
@@ -92,116 +92,52 @@ class Recorder:
         self.options.append(options)
 
     def recording(self) -> Recording | None:
-        """What there is so far; None before the first step."""
-        if not self.actions:
+        """What there is so far, whole steps only; None before the first one."""
+        steps = min(len(self.actions), len(self.frames) - 1)
+        if steps < 1:
             return None
+        decisions, frames = self.decisions[:steps], self.frames[: steps + 1]
         columns = {
-            name: torch.stack([getattr(decision, name) for decision in self.decisions], 1).numpy(force=True)
+            name: torch.stack([getattr(decision, name) for decision in decisions], 1).numpy(force=True)
             for name in ("source", "t0", "rho", "policy_rho", "safe")
         }
-        scene = {name: np.stack([frame[name] for frame in self.frames]) for name in self.frames[0]}
+        scene = {name: np.stack([frame[name] for frame in frames]) for name in frames[0]}
         decided = columns["source"][: self.agents].T
         scene["decision"] = np.concatenate((decided, decided[-1:])).astype(np.int8)
         return Recording(
             self.agents,
-            torch.stack(self.states, 1).numpy(force=True),
-            torch.stack(self.actions, 1).numpy(force=True),
+            torch.stack(self.states[: steps + 1], 1).numpy(force=True),
+            torch.stack(self.actions[:steps], 1).numpy(force=True),
             **columns,
             progress=self.progress,
             units=self.units,
             scene=scene,
-            options=torch.stack(self.options, 1).numpy(force=True) if self.options else None,
+            options=torch.stack(self.options[:steps], 1).numpy(force=True) if self.options else None,
         )
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
-    """A deployment: which seeds, how many agents each, how long, and how often they plan anew.
+class Moment:
+    """A step of a deployment, as it has been decided.
 
-    An agent that the world tells something new (a signal of role `env` has changed) plans at once.
-
-    `limit`: seconds that a decision of the full guard may take per agent; None: as long as it takes.
+    Attributes:
+        step: its number, from 0; `steps` at the end, when nothing is decided any more.
+        steps: of the deployment.
+        x: the states, (rows, n).
+        decision: what is followed; None at the end.
+        planned: how many rows planned anew.
+        seconds: that deciding took.
     """
 
-    seeds: tuple[int, ...]
-    agents: int
+    step: int
     steps: int
-    replan: int = 1
-    limit: float | None = 0.1
+    x: Tensor
+    decision: Decision | None
+    planned: int = 0
+    seconds: float = 0.0
 
 
-class Worlds:
-    """The worlds of all seeds, as one."""
-
-    def __init__(self, task: Task, make: WorldType, setting: Setting) -> None:
-        self.system = task.system
-        self.size = (len(setting.seeds) * setting.agents, len(task.plain.names))
-        self.parts = [setting.agents] * len(setting.seeds)
-        with _blame("be made"):
-            self.generators = [torch.Generator().manual_seed(seed) for seed in setting.seeds]
-            real = task.plain.truth
-            self.worlds = [make(real, setting.agents, generator) for generator in self.generators]
-        self.disturbance = Disturbance(task.plain, self.generators, setting.agents)
-
-    def reset(self) -> Tensor:
-        """The first states, (rows, n); parameters are drawn, timers as at the start of a mission."""
-        with _blame("begin"):
-            states = [world.reset() for world in self.worlds]
-        parts = zip(torch.split(self._checked(states, 0), self.parts), self.generators, strict=True)
-        return torch.cat([self.system.begun(x, generator) for x, generator in parts])
-
-    def advance(self, x: Tensor, action: Tensor, step: int) -> Tensor:
-        """(rows, n), (rows, m) -> the (rows, n) states after step number `step`.
-
-        Worlds know neither parameters nor timers: those stay, these follow from the true states.
-        """
-        known = x[:, : self.size[1]]
-        each = zip(self.worlds, torch.split(known, self.parts), torch.split(action, self.parts), strict=True)
-        with _blame(f"take step {step}"):
-            states = [world.advance(before, act) for world, before, act in each]
-        moved = self.disturbance.pushed(self._checked(states, step), known, step)
-        return torch.cat((moved, self.system.added_later(x)), 1)
-
-    def options(self, x: Tensor) -> Tensor | None:
-        """States under every choice that there is, (rows, k, n); None where the worlds leave none."""
-        choosing = [world for world in self.worlds if isinstance(world, Choosing)]
-        if not choosing:
-            return None
-        with _blame("give options"):
-            options = torch.cat([world.options() for world in choosing]).to(torch.float64)
-        later = x[:, None, self.size[1] :].expand(-1, options.shape[1], -1)
-        return torch.cat((options, later), 2)
-
-    def choose(self, pick: Tensor, x: Tensor) -> Tensor:
-        """The (rows, n) states when every agent has taken an option, (rows,)."""
-        each = zip(self.worlds, torch.split(pick, self.parts), strict=True)
-        with _blame("take a choice"):
-            states = [world.choose(part) for world, part in each if isinstance(world, Choosing)]
-        return torch.cat((self._checked(states, 0), x[:, self.size[1] :]), 1)
-
-    def _checked(self, states: list[Tensor], step: int) -> Tensor:
-        with _blame(f"give states at step {step}"):
-            x = torch.cat(states).to(torch.float64)
-        if x.shape != self.size:
-            message = f"the world gives states of shape {tuple(x.shape)}, not {self.size}"
-            raise SystemFileError(Diagnostic("S207", message))
-        if not bool(torch.isfinite(x).all()):
-            raise SystemFileError(Diagnostic("S302", f"the world gives NaN or infinity at step {step}"))
-        return x
-
-
-@contextmanager
-def _blame(what: str) -> Iterator[None]:
-    """Whatever a world raises becomes S207."""
-    try:
-        yield
-    except StlcError:
-        raise
-    except Exception as error:
-        note = f"{type(error).__name__}: {error}"
-        raise SystemFileError(
-            Diagnostic("S207", f"the world cannot {what}: {error}", note=(note,))
-        ) from error
+Watch = Callable[[Moment], None]
 
 
 class _Pilot:
@@ -244,9 +180,9 @@ class _Pilot:
 
 
 def drive(
-    guard: Guard, make: WorldType, setting: Setting, recorder: Recorder, tick: Tick | None = None
+    guard: Guard, make: WorldType, setting: Setting, recorder: Recorder, watch: Watch | None = None
 ) -> None:
-    """Deploy in fresh worlds, one a seed, into `recorder`.
+    """Deploy in fresh worlds, one a seed, into `recorder`; `watch` is told every step.
 
     Raises:
         SystemFileError: S207, a world fails; S302, it gives states that are no numbers.
@@ -254,21 +190,35 @@ def drive(
     """
     worlds, pilot = Worlds(guard.task, make, setting), _Pilot(guard, setting)
     x = worlds.reset()
-    recorder.start(x, worlds.worlds[0])
-    recorder.units = dict(worlds.worlds[0].units())
+    recorder.start(x, worlds.snapshot())
+    recorder.units = worlds.units()
     for step in range(setting.steps):
         due = pilot.due(x, step)
         seen = worlds.disturbance.seen(x, step) if len(due) else x
-        options = worlds.options(x)
+        options, begun = worlds.options(x), perf_counter()
         if options is not None:
             chosen = worlds.choose(pilot.prefer(options + (seen - x)[:, None], due), x)
             seen, x = seen + (chosen - x), chosen
             recorder.chosen(x, options)
         decision, action = pilot.decide(x, seen, due)
-        if not bool(torch.isfinite(action).all()):
-            raise RunError(Diagnostic("R402", f"the policy's plan at step {step} is not a number"))
+        seconds = perf_counter() - begun
+        _require_numbers(action, x, step, guard)
+        if watch is not None:
+            watch(Moment(step, setting.steps, x, decision, len(due), seconds))
         x = worlds.advance(x, action, step + 1)
-        recorder.step(decision, action, x, worlds.worlds[0])
-        recorder.progress = tuple(dict(world.progress()) for world in worlds.worlds)
-        if tick is not None:
-            tick(step + 1, setting.steps)
+        recorder.step(decision, action, x, worlds.snapshot())
+        recorder.progress = worlds.progress()
+    if watch is not None:
+        watch(Moment(setting.steps, setting.steps, x, None))
+
+
+def _require_numbers(action: Tensor, x: Tensor, step: int, guard: Guard) -> None:
+    """Raise RunError (R402) where an action (rows, m) that is about to be taken is no number."""
+    broken = torch.nonzero(~torch.isfinite(action).all(1)).squeeze(1).tolist()
+    if not broken:
+        return
+    state = zip(guard.task.names, x[broken[0]].tolist(), strict=True)
+    note = "its state: " + ", ".join(f"{name} = {value:.6g}" for name, value in state)
+    help_ = ("`--backup` lets the backup policy act where the policy cannot",) if guard.backup is None else ()
+    message = f"the policy's plan at step {step} is not a number, for {len(broken)} of {len(x)} agents"
+    raise RunError(Diagnostic("R402", message, note=(note,), help=help_))

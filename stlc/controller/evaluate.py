@@ -13,7 +13,7 @@ import torch
 
 from stlc.compile.semantics import TOLERANCE
 from stlc.controller.deploy import SOURCES, Guard, Mode
-from stlc.controller.drive import Recorder, Recording, Setting, Tick, drive
+from stlc.controller.drive import Recorder, Recording, Setting, Watch, drive
 from stlc.controller.executed import Executed, judge_executed
 from stlc.controller.intervals import Interval
 from stlc.controller.polish import Limits
@@ -93,31 +93,37 @@ class InterruptedDeploymentError(Exception):
 
 
 def deploy(
-    task: Task, policy: Policy, setting: Setting, guard: Mode, *, tick: Tick | None = None
+    task: Task, policy: Policy, setting: Setting, guard: Mode, *, watch: Watch | None = None
 ) -> Deployment:
-    """Deploy a policy in the world of its system.
+    """Deploy a policy in the world of its system; `watch` is told every step.
 
     Raises:
-        InterruptedDeploymentError: from a SystemFileError or RunError of `drive`, which is its `__cause__`.
+        InterruptedDeploymentError: from whatever has ended it early, which is its `__cause__`: a
+            SystemFileError or RunError of `drive`, or an interruption, also one while it is judged.
         SystemFileError: S206, the world cannot be loaded.
     """
     make = world_type(task.system.decl)
     guarded = Guard(task, policy, guard, limits=Limits(seconds=setting.limit))
     recorder = Recorder(setting.agents)
     try:
-        drive(guarded, make, setting, recorder, tick)
+        drive(guarded, make, setting, recorder, watch)
+        recording = recorder.recording()
+        assert recording is not None
+        return judged(guarded, recording)
     except BaseException as error:
         raise InterruptedDeploymentError(recorder.recording()) from error
-    recording = recorder.recording()
-    assert recording is not None
-    executed = judge_executed(task, recording)
+
+
+def judged(guard: Guard, recording: Recording) -> Deployment:
+    """What is to be known of a recorded deployment under a guard."""
+    executed = judge_executed(guard.task, recording)
     return Deployment(
-        guard,
+        guard.mode,
         recording,
         measure(recording, executed),
         decided(recording),
-        latency(guarded, recording),
-        unsafe_agents(executed, setting.agents),
+        latency(guard, recording),
+        unsafe_agents(executed, recording.agents),
     )
 
 

@@ -61,14 +61,14 @@ def judge_executed(task: Task, recording: Recording) -> Executed:
     """Judge what happened. Without a window that fits, there are no starts."""
     columns = dict(zip(task.names, np.moveaxis(recording.states, -1, 0).transpose(0, 2, 1), strict=True))
     starts = max(recording.steps + 1 - task.horizon, 0)
-    rules = {rule.name: _held(_driven(rule, task), columns, task.horizon) for rule in task.rules}
+    rules = {rule.name: _held(as_driven(rule, task), columns, task.horizon) for rule in task.rules}
     safety = tuple(rule.name for rule in task.compiled.safety)
     found = savable(task, torch.from_numpy(recording.states[:, 0])).numpy()
     executed = Executed(rules, safety, _foreseen(task, recording, starts), found)
     return replace(executed, savable=found | executed.agents(safety))
 
 
-def _driven(rule: Rule, task: Task) -> Rule:
+def as_driven(rule: Rule, task: Task) -> Rule:
     """A requirement on the mission clock is judged as it was written, once, on all that was driven."""
     if not rule.absolute:
         return rule

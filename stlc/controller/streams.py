@@ -33,7 +33,7 @@ class Streams:
     def of(cls, generator: torch.Generator, agents: int) -> Streams:
         """Streams for so many agents; the first ones are those of fewer agents."""
         base = int(torch.randint(2**62, (), generator=generator))
-        made = [_seeded(base, key) for key in range(agents + 1)]
+        made = [seeded(base, key) for key in range(agents + 1)]
         return cls(made[0], tuple(made[1:]))
 
     def states(self, system: System, count: int = 1) -> Tensor:
@@ -42,6 +42,7 @@ class Streams:
         return torch.stack(drawn)
 
 
-def _seeded(base: int, key: int) -> torch.Generator:
+def seeded(base: int, key: int) -> torch.Generator:
+    """A generator that follows from a seed and a number, and shares nothing with those of other numbers."""
     seed = np.random.SeedSequence(base, spawn_key=(key,)).generate_state(1, np.uint64)
     return torch.Generator().manual_seed(int(seed[0] >> np.uint64(1)))

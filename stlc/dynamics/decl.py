@@ -12,6 +12,7 @@ from typing import Literal, TypeAlias
 from stlc.compile import ir
 from stlc.compile.interface import Grid, Interface
 from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.dynamics.decl_errors import ErrorsDecl
 from stlc.signature import Signature
 from stlc.source import Source, Span
 from stlc.units import Unit
@@ -284,6 +285,7 @@ class ScenarioDecl:
         noise: what is added to the states that agents see.
         mismatch: constants of the truth that the model does not know, as text.
         world: in the place of that of `test`.
+        errors: of actuators and sensors.
     """
 
     name: str
@@ -296,6 +298,7 @@ class ScenarioDecl:
     noise: tuple[Assign, ...] = ()
     mismatch: Mapping[str, str] = field(default_factory=dict)
     world: WorldRef | None = None
+    errors: ErrorsDecl = field(default_factory=ErrorsDecl)
 
 
 @dataclass(frozen=True)

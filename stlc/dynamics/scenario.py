@@ -1,26 +1,59 @@
-"""A scenario laid over a system: what is different in it, and for whom."""
+"""A scenario laid over a system: what is different in it, and for whom.
+
+Some are there for every system: `mismatch`, `disturb` and `noise`, with a number of per cent behind a hyphen
+or without.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.decl import ScenarioDecl, SystemDecl
+from stlc.dynamics.decl_errors import ErrorsDecl
 from stlc.dynamics.schema import load_system_decl, parse_system
 from stlc.registry import closest
 
+DISTURBED = ("mismatch-5", "mismatch-10", "mismatch-20", "disturb", "noise")
+"""Scenarios of every system that the documentation measures."""
+_STANDARD = re.compile(r"(mismatch|disturb|noise)(?:-(\d{1,3}(?:\.\d{1,3})?))?")
+_USUAL = {"mismatch": 10.0, "disturb": 10.0, "noise": 0.5}
+
+
+def standard(name: str) -> ScenarioDecl | None:
+    """A scenario that every system has, such as `mismatch-20`; None where the name is not one of theirs."""
+    found = _STANDARD.fullmatch(name)
+    percent = float(found[2] or _USUAL[found[1]]) if found else 0.0
+    if found is None or not 0.0 < percent <= 100.0:
+        return None
+    match found[1]:
+        case "mismatch":
+            doc = f"actuators give {percent:g} % more or less than they are told"
+            errors = ErrorsDecl(actuator_gain=percent / 100)
+        case "disturb":
+            doc = f"noise on what actuators give, {percent:g} % of half their range"
+            errors = ErrorsDecl(actuator_noise=percent / 100)
+        case _:
+            doc = f"noise on what agents see, {percent:g} % of the range of each state"
+            errors = ErrorsDecl(sensor_noise=percent / 100)
+    return ScenarioDecl(name, doc, "ood", errors=errors)
+
 
 def find_scenario(decl: SystemDecl, name: str) -> ScenarioDecl:
-    """The overlay of that name. Raises UsageError (U101)."""
+    """The overlay of that name, one of the file or one of every system's. Raises UsageError (U101)."""
     for scenario in decl.scenarios:
         if scenario.name == name:
             return scenario
+    if (usual := standard(name)) is not None:
+        return usual
     names = [scenario.name for scenario in decl.scenarios]
-    near = closest(name, names)
+    near = closest(name, [*names, *DISTURBED, "mismatch"])
     listed = f"scenarios of {decl.name}: {', '.join(names)}" if names else f"{decl.name} declares none"
-    help_ = (f"did you mean `{near}`?  {listed}" if near else listed,)
+    every = f"every system has {', '.join(DISTURBED)}"
+    help_ = (f"did you mean `{near}`?  {listed}" if near else listed, every)
     raise UsageError(Diagnostic("U101", f"there is no scenario `{name}`", help=help_))
 
 

@@ -8,12 +8,14 @@ from stlc.compile import ir
 from stlc.compile.scope import Known
 from stlc.compile.values import Number
 from stlc.dynamics.decl import Assign, ScenarioDecl
+from stlc.dynamics.decl_errors import ErrorsDecl
 from stlc.dynamics.schema_deploy import read_event, read_world
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import rate_unit, read_sets, states_of
 from stlc.dynamics.schema_names import Clockwork, Names
 from stlc.dynamics.schema_reader import Reader
 from stlc.dynamics.yaml_nodes import Entry, Node
+from stlc.units import DIMENSIONLESS
 
 SCENARIO_KEYS = (
     "doc",
@@ -24,8 +26,10 @@ SCENARIO_KEYS = (
     "disturb",
     "noise",
     "model_mismatch",
+    "errors",
     "world",
 )
+ERROR_KEYS = ("actuator_gain", "actuator_noise", "sensor_noise")
 EXPECTED = ("nominal", "ood")
 
 
@@ -54,7 +58,18 @@ def _scenario(entry: Entry, reader: Reader, names: Names, clock: Clockwork) -> S
             _constants(found.get("model_mismatch"), f"`model_mismatch` of {where}", reader, names)
         ),
         read_world(found.get("world"), reader),
+        _errors(found.get("errors"), f"`errors` of {where}", timed),
     )
+
+
+def _errors(node: Node | None, where: str, here: Expressions) -> ErrorsDecl:
+    """Shares such as `10 %` or `0.1`."""
+    found = here.reader.fields(node, where, ERROR_KEYS)
+    shares = {key: here.constant(value, f"`{key}`", DIMENSIONLESS) for key, value in found.items()}
+    for key, share in shares.items():
+        if share is not None and not 0.0 <= share <= 1.0:
+            here.reader.wrong(found[key], f"`{key}`", "a share between 0 and 1", "write `10 %`")
+    return ErrorsDecl(**{key: share for key, share in shares.items() if share is not None})
 
 
 def _timed(here: Expressions, names: Names) -> Expressions:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -205,15 +205,21 @@ class Whole:
         if stop <= start:
             return Bounds(np.zeros(0), np.zeros(0))
         starts = range(start, stop)
-        return Bounds(self._end(starts, "lower"), self._end(starts, "upper"))
+        low, high = self.of_all(starts)
+        return Bounds(low[:, 0], high[:, 0])
 
-    def _end(self, starts: range, end: Literal["lower", "upper"]) -> Floats:
-        """One end of what is possible, wherever the trace ends."""
-        record, formula = Record(with_seen(self._signals), NUMPY), self._ends[end]
-        if self.window is None:
-            return np.asarray(record.values([lengthened(formula, self.samples)], starts, end, FAR)[0][:, 0])
-        both = window_bounds(formula, record, starts, self.window, "open")
-        return np.asarray(both[end == "upper"][:, 0])
+    def of_all(self, starts: range) -> tuple[Floats, Floats]:
+        """Both ends of what is possible, wherever the traces end: (instants, traces) each."""
+        record, window = Record(with_seen(self._signals), NUMPY), self.window
+        lower, upper = self._ends["lower"], self._ends["upper"]
+        if window is None:
+            low = record.values([lengthened(lower, self.samples)], starts, "lower", FAR)[0]
+            high = record.values([lengthened(upper, self.samples)], starts, "upper", FAR)[0]
+            return np.asarray(low), np.asarray(high)
+        low, high = window_bounds(lower, record, starts, window, "open")
+        if upper != lower:
+            high = window_bounds(upper, record, starts, window, "open")[1]
+        return np.asarray(low), np.asarray(high)
 
     def ended(self, starts: range) -> Bounds:
         """Where the trace is over."""

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,9 @@ from documents import misfits
 
 from stlc.cli.app import main
 from stlc.cli.schema import load_schema
+from stlc.controller.worlds import Worlds
+from stlc.dynamics.scenario import DISTURBED
+from stlc.monitor.verdict import Monitor
 from stlc.rundir import RunDir
 from stlc.trace import load_trace
 
@@ -126,6 +130,9 @@ def test_fail_under_is_exit_code_1() -> None:
         (["--backup", "--guard", "none"], "contradict"),
         (["--no-backup", "--guard", "paper"], "contradict"),
         (["0099"], "0099"),
+        (["--margins", "-", "--json"], "both want the standard output"),
+        (["--margins", "nowhere/m.jsonl"], "cannot write"),
+        (["--scenario", "mismatch-200"], "every system has mismatch-5"),
         (["--agents", "63"], "63 cars"),
         (["--seeds", "0"], "seeds"),
     ],
@@ -137,8 +144,8 @@ def test_what_cannot_be_done_is_said(
     rest = [] if "--agents" in options or "--seeds" in options else SMALL
     code = main(["simulate", *options, *rest])
     captured = capsys.readouterr()
-    assert code == (3 if "--agents" in options else 2)
-    assert said in captured.err
+    assert code == {"63 cars": 3, "cannot write": 5}.get(said, 2)
+    assert said in captured.err + captured.out
     assert "Traceback" not in captured.err
 
 
@@ -161,6 +168,78 @@ def test_a_world_that_fails_on_the_way_leaves_a_trace(
     assert "S207" in error
     assert "the first 4 steps" in error
     assert load_trace(tmp_path / "t.npz").samples == 5
+
+
+def test_margins_come_as_json_lines(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
+    """One object an agent and step, whose statuses at the end are those of `stlc check`."""
+    options = [*SMALL, "--steps", "30", "--backup", "--margins", "m.jsonl", "--live"]
+    assert main(["simulate", there.name, *options]) == 0
+    captured = capsys.readouterr()
+    assert "step 30 / 30" in captured.err
+    lines = [json.loads(line) for line in Path("m.jsonl").read_text().splitlines()]
+    assert len(lines) == 31 * 8
+    wanted = load_schema("simulate/1")["$defs"]["margins"]
+    assert [misfits(line, wanted) for line in lines] == [[]] * len(lines)
+    assert [(line["step"], line["seed"], line["agent"]) for line in lines] == [
+        (step, seed, agent) for step in range(31) for seed in (0, 1) for agent in range(4)
+    ]
+    trace = load_trace(there.path / "trace.npz")
+    decided = [["policy", "backup", "safest"].index(line["decided"].split()[0]) for line in lines[:-8]]
+    assert decided == trace.extras["decision"].T.flatten().tolist()
+    assert [line["plan_rho"] for line in lines[:-8]] == trace.extras["plan_rho"].T.flatten().tolist()
+    assert lines[-1]["decided"] is lines[-1]["plan_rho"] is None
+    verdict = Monitor(there.path / "spec.stl", system=there.path / "system.yaml").check(trace)
+    for judgement in verdict:  # starts whose window has closed by the end
+        fails = judgement.fails.sum(0).tolist()
+        told = [line["margins"][judgement.name]["violated"] for line in lines[-8:]]
+        assert all(later >= sooner for later, sooner in zip(told, fails, strict=True))
+
+
+def test_margins_may_be_the_standard_output(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", there.name, *SMALL, "--margins", "-"]) == 0
+    captured = capsys.readouterr()
+    assert [json.loads(line)["step"] for line in captured.out.splitlines()][::8] == list(range(7))
+    assert "plan accuracy" in captured.err
+
+
+def test_the_disturbed_scenarios_of_every_system(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", there.name, *SMALL, "--scenario", "disturbed", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert misfits(document, load_schema("simulate/1")) == []
+    assert list(document["result"]["scenarios"]) == list(DISTURBED)
+    assert main(["simulate", there.name, *SMALL, "--scenario", "mismatch-15", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["result"]["scenario"] == "mismatch-15"
+
+
+@pytest.mark.usefixtures("there")
+def test_an_interruption_leaves_the_trace_and_the_margins(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ctrl-C, in the midst of a step."""
+    real = Worlds.progress
+
+    def interrupted(worlds: Worlds) -> object:
+        if worlds.worlds[0].clock == 3:  # type: ignore[attr-defined]
+            signal.raise_signal(signal.SIGINT)
+        return real(worlds)
+
+    monkeypatch.setattr(Worlds, "progress", interrupted)
+    assert main(["simulate", *SMALL, "--live", "--margins", "m.jsonl", "--record", "t.npz"]) == 130
+    assert "the first 3 steps are in" in capsys.readouterr().err
+    assert load_trace("t.npz").samples == 4
+    assert len(Path("m.jsonl").read_text().splitlines()) == 3 * 8
+    assert main(["check", "t.npz"]) in (0, 1, 4)
+
+
+@pytest.mark.usefixtures("there")
+def test_an_interruption_while_it_is_judged_keeps_everything(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(
+        "stlc.controller.evaluate.judge_executed", lambda *_: signal.raise_signal(signal.SIGINT)
+    )
+    assert main(["simulate", *SMALL]) == 130
+    assert "the first 6 steps are in" in capsys.readouterr().err
 
 
 def test_pictures_are_drawn(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from stlc.controller.deploy import Guard
+from stlc.controller.disturbance import Disturbance
 from stlc.controller.drive import Recorder, Recording, Setting, drive
 from stlc.controller.task import Task
 from stlc.controller.world import world_type
 from stlc.diagnostics import StlcError
-from stlc.dynamics.scenario import under
+from stlc.dynamics.decl_errors import ErrorsDecl
+from stlc.dynamics.scenario import standard, under
 from stlc.dynamics.schema import parse_system
 from stlc.dynamics.system import System
 from stlc.grammar.parser import parse
@@ -42,6 +45,7 @@ scenario:
   current: {disturb: {y: "0.4 m/s * sin(t / 1 s)", p: [0, 1]}}
   blurred: {noise: {x: "normal(0, 0.1)"}}
   drifting: {model_mismatch: {drift: 0.5 m/s}, override: {x: 5}}
+  shaky: {errors: {actuator_gain: 10 %, actuator_noise: 0.05, sensor_noise: 2 %}}
 """
 SPEC = "signal x [m]\nsignal p: real[2] [m]\nconst speed = 1 m/s\nrequire a: always[0, T] x > -speed * 1 s\n"
 
@@ -139,6 +143,94 @@ def test_a_scenario_may_name_a_world_of_its_own() -> None:
     assert decl.worlds == (world,)
 
 
+# ------------------------------------------------------- scenarios of every system
+
+
+class Steady(Still):
+    """Commands the same always."""
+
+    def plan(self, x0: Tensor) -> Tensor:
+        return super().plan(x0) + 0.5
+
+
+def steady(scenario: str, agents: int = 40) -> tuple[Recording, Steady]:
+    task = task_of(scenario)
+    policy, recorder = Steady(task), Recorder(agents)
+    drive(Guard(task, policy), world_type(task.system.decl), Setting((0, 1), agents, 2), recorder)
+    found = recorder.recording()
+    assert found is not None
+    return found, policy
+
+
+@pytest.mark.parametrize(("scenario", "off"), [("mismatch", 0.1), ("mismatch-5", 0.05), ("mismatch-20", 0.2)])
+def test_actuators_give_more_or_less_all_the_time(scenario: str, off: float) -> None:
+    states = steady(scenario)[0].states[:, :, 1]
+    moves = (states[:, 1:] - states[:, :-1]) / 0.25
+    low, high = moves[:, 0] < 1, moves[:, 0] > 1
+    assert moves[low] == pytest.approx(1 - off)
+    assert moves[high] == pytest.approx(1 + off)
+    assert 20 < low.sum() < 60
+    actions = steady(scenario)[0].actions
+    assert (actions == 0.5).all()  # as commanded
+
+
+def test_a_direction_is_off_by_a_part_of_a_radian() -> None:
+    text = SYSTEM.replace("range: [-1, 1]}}", "range: [-3.14159, 3.14159], squash: angle}}").replace(
+        "m/s, r", "rad, r"
+    )
+    text = text.replace("y: u + drift", "y: speed * sin(u) + drift")
+    decl = under(parse_system(Source("boat.yaml", text), Path("boat.yaml")), "mismatch-20")
+    made = Disturbance(System(decl), [torch.Generator().manual_seed(0)], 50)
+    given = made.acted(torch.full((50, 1), 3.0, dtype=torch.float64)) - 3.0
+    assert sorted(set(given.flatten().tolist())) == pytest.approx([-0.2, 0.2])
+
+
+def test_actuators_are_noisy_anew_at_every_step() -> None:
+    states = steady("disturb-20", 400)[0].states[:, :, 1]
+    moves = (states[:, 1:] - states[:, :-1]) / 0.5
+    assert moves.mean() == pytest.approx(0.5, abs=0.03)
+    assert moves.std() == pytest.approx(0.2, rel=0.1)  # of half of the range [-1, 1]
+    assert abs(np.corrcoef(moves[:, 0], moves[:, 1])[0, 1]) < 0.15
+
+
+def test_agents_see_states_with_noise_where_a_range_is_known() -> None:
+    recording, policy = steady("noise-10", 400)
+    errors = policy.saw[1] - torch.from_numpy(recording.states[:, 1])
+    assert float(errors[:, 1].std()) == pytest.approx(0.2, rel=0.1)  # of [-1, 1]
+    assert not bool(errors[:, [0, 2, 3, 4]].any())
+
+
+def test_a_file_may_ask_for_all_of_them() -> None:
+    scenario = task_of("shaky").system.decl.scenario
+    assert scenario is not None
+    assert scenario.errors == ErrorsDecl(0.1, 0.05, 0.02)
+
+
+def test_worlds_are_the_same_whatever_is_disturbed() -> None:
+    text = SYSTEM.replace("draw: {x: 0, y: 0", 'draw: {x: "uniform(0, 1)", y: 0')
+    found = []
+    for scenario in ("nominal", "mismatch-20", "noise-10"):
+        decl = under(parse_system(Source("boat.yaml", text), Path("boat.yaml")), scenario)
+        task, recorder = Task.of(parse(Source("a.stl", SPEC)), System(decl)), Recorder(3)  # type: ignore[arg-type]
+        drive(Guard(task, Steady(task)), world_type(decl), Setting((0, 1), 3, 1), recorder)
+        found.append(recorder.recording().states[:, 0, 0].tolist())  # type: ignore[union-attr]
+    assert found[0] == found[1] == found[2]
+
+
+@pytest.mark.parametrize("name", ["mismatch-0", "mismatch-101", "noise-", "noisy", "disturb-5%"])
+def test_what_is_no_scenario_of_every_system(name: str) -> None:
+    assert standard(name) is None
+    with pytest.raises(StlcError) as caught:
+        task_of(name)
+    assert "every system has mismatch-5" in caught.value.diagnostics[0].help[1]
+
+
+def test_a_scenario_of_the_file_goes_first() -> None:
+    text = SYSTEM.replace("  nominal: {}\n", "  noise: {const: {speed: 2 m/s}}\n")
+    decl = under(parse_system(Source("boat.yaml", text), Path("boat.yaml")), "noise")
+    assert decl.constants["speed"][0] == 2.0
+
+
 def test_an_unknown_scenario_is_said() -> None:
     with pytest.raises(StlcError) as caught:
         task_of("fats")
@@ -155,6 +247,8 @@ def test_an_unknown_scenario_is_said() -> None:
         ("0.4 m/s * sin", "0.4 m * sin", "E203"),
         ("expect: ood", "expect: bad", "S103"),
         ("at: 1 s, ", "", "S102"),
+        ("sensor_noise: 2 %", "sensors: 2 %", "S101"),
+        ("sensor_noise: 2 %", "sensor_noise: 200 %", "S103"),
     ],
 )
 def test_scenarios_are_checked_whether_chosen_or_not(old: str, new: str, code: str) -> None:

@@ -1,0 +1,140 @@
+"""The worlds of all seeds of a deployment, as one; what they do wrong is told, and where."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stlc.controller.disturbance import Disturbance
+from stlc.controller.faults import blamed, require_numbers, scene_of, states_of, wrong
+from stlc.controller.world import Choosing
+
+if TYPE_CHECKING:
+    from stlc.controller.task import Task
+    from stlc.controller.world import WorldType
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A deployment: which seeds, how many agents each, how long, and how often they plan anew.
+
+    An agent that the world tells something new (a signal of role `env` has changed) plans at once.
+
+    `limit`: seconds that a decision of the full guard may take per agent; None: as long as it takes.
+    """
+
+    seeds: tuple[int, ...]
+    agents: int
+    steps: int
+    replan: int = 1
+    limit: float | None = 0.1
+
+
+class Worlds:
+    """The worlds of all seeds, as one.
+
+    Raises SystemFileError, pointing into the world's file, where one fails: S207, or S302 for states that
+    are no numbers. Worlds get states and actions of their own: what they write into them is nobody else's.
+    """
+
+    def __init__(self, task: Task, make: WorldType, setting: Setting) -> None:
+        self.system, self.names = task.system, task.plain.names
+        self.size = (setting.agents, len(self.names))
+        self.seeds = setting.seeds
+        self.parts = [setting.agents] * len(setting.seeds)
+        with blamed(make, "__init__", "be made"):
+            self.generators = [torch.Generator().manual_seed(seed) for seed in setting.seeds]
+            real = task.plain.truth
+            self.worlds = [make(real, setting.agents, generator) for generator in self.generators]
+        self.disturbance = Disturbance(task.plain, self.generators, setting.agents)
+        self._scene: dict[str, NDArray[Any]] | None = None
+
+    def reset(self) -> Tensor:
+        """The first states, (rows, n); parameters are drawn, timers as at the start of a mission."""
+        given = []
+        for world in self.worlds:
+            with blamed(world, "reset", "begin"):
+                given.append(world.reset())
+        parts = zip(torch.split(self._checked("reset", given, 0), self.parts), self.generators, strict=True)
+        return torch.cat([self.system.begun(x, generator) for x, generator in parts])
+
+    def advance(self, x: Tensor, action: Tensor, step: int) -> Tensor:
+        """(rows, n), (rows, m) -> the (rows, n) states after step number `step`.
+
+        Worlds know neither parameters nor timers: those stay, these follow from the true states.
+        """
+        known = x[:, : self.size[1]]
+        before, given = torch.split(known.clone(), self.parts), []
+        acts = torch.split(self.disturbance.acted(action.clone()), self.parts)
+        for world, state, act in zip(self.worlds, before, acts, strict=True):
+            with blamed(world, "advance", f"take step {step}"):
+                given.append(world.advance(state, act))
+        moved = self.disturbance.pushed(self._checked("advance", given, step), known, step)
+        return torch.cat((moved, self.system.added_later(x)), 1)
+
+    def options(self, x: Tensor) -> Tensor | None:
+        """States under every choice that there is, (rows, k, n); None where the worlds leave none."""
+        given = []
+        for world in self.worlds:
+            if isinstance(world, Choosing):
+                with blamed(world, "options", "give options"):
+                    given.append(self._optional(world, world.options()))
+        if not given:
+            return None
+        options = torch.cat(given)
+        later = x[:, None, self.size[1] :].expand(-1, options.shape[1], -1)
+        return torch.cat((options, later), 2)
+
+    def _optional(self, world: object, given: object) -> Tensor:
+        agents, states = self.size
+        shape = tuple(given.shape) if isinstance(given, Tensor) else ()
+        if not isinstance(given, Tensor) or len(shape) != 3 or (shape[0], shape[2]) != self.size:
+            raise wrong(world, "options", f"gives no tensor of shape ({agents}, k, {states})")
+        return given.detach().to(torch.float64)
+
+    def choose(self, pick: Tensor, x: Tensor) -> Tensor:
+        """The (rows, n) states when every agent has taken an option, (rows,)."""
+        given = []
+        for world, part in zip(self.worlds, torch.split(pick, self.parts), strict=True):
+            if isinstance(world, Choosing):
+                with blamed(world, "choose", "take a choice"):
+                    given.append(world.choose(part))
+        return torch.cat((self._checked("choose", given, None), x[:, self.size[1] :]), 1)
+
+    def _checked(self, method: str, given: list[Tensor], step: int | None) -> Tensor:
+        """All states as one, (rows, n) float64."""
+        found = []
+        for world, seed, each in zip(self.worlds, self.seeds, given, strict=True):
+            x = states_of(world, method, each, self.size)
+            when = "" if step is None else f"at step {step} "
+            require_numbers(world, method, x, (self.names, f"{when}(seed {seed})"))
+            found.append(x)
+        return torch.cat(found)
+
+    # ------------------------------------------------------------- what worlds tell of themselves
+
+    def progress(self) -> tuple[Mapping[str, float], ...]:
+        """How much of the task got done, seed by seed."""
+        found = []
+        for world in self.worlds:
+            with blamed(world, "progress", "say its progress"):
+                found.append({str(name): float(value) for name, value in world.progress().items()})
+        return tuple(found)
+
+    def units(self) -> dict[str, str]:
+        """Units of entries of `progress`."""
+        with blamed(self.worlds[0], "units", "say its units"):
+            return {str(name): str(unit) for name, unit in self.worlds[0].units().items()}
+
+    def snapshot(self) -> Mapping[str, NDArray[Any]]:
+        """What a picture of the first seed needs; arrays that keep their shapes."""
+        world = self.worlds[0]
+        with blamed(world, "snapshot", "give a snapshot"):
+            given = world.snapshot()
+        self._scene = scene_of(world, given, self._scene)
+        return self._scene
