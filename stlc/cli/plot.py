@@ -169,7 +169,7 @@ def _choices(trace: Trace, margins: Margins, wanted: int | None) -> tuple[Choice
     import numpy as np
 
     from stlc.view.driven import trace_names
-    from stlc.view.signals import Choice, choose_traces
+    from stlc.view.signals import Choice, acted_in, choose_traces
 
     names = trace_names(trace)
     if wanted is not None:
@@ -177,7 +177,7 @@ def _choices(trace: Trace, margins: Margins, wanted: int | None) -> tuple[Choice
         return (Choice(wanted, names[wanted]),)
     per_trace = [np.nanmin(np.where(np.isnan(rho), np.inf, rho), axis=1) for rho in margins.values()]
     least = np.min(per_trace, axis=0) if per_trace else np.zeros(len(names))
-    return choose_traces(np.where(np.isfinite(least), least, np.nan), names)
+    return choose_traces(np.where(np.isfinite(least), least, np.nan), names, acted_in(trace))
 
 
 def _save(picture: object, target: Path) -> None:

@@ -61,10 +61,29 @@ def _commands(material: Material) -> list[str]:
             train += [f"--{option}", str(options[option])]
     for name, value in (record.get("overrides") or {}).items():
         train += ["--set", f"{name}={value}"]
-    commands = [shlex.join(train), f"stlc simulate {run} --backup"]
+    commands = [shlex.join(train), _simulate(material)]
     if material.trace is not None:
-        commands.append(f"stlc check {shlex.quote(f'{material.run.shown}/trace.npz')}")
+        check = ["stlc", "check", f"{material.run.shown}/trace.npz"]
+        if material.outside:
+            check += ["--system", f"{material.run.shown}/system.yaml"]
+        commands.append(shlex.join(check))
     return [*commands, f"stlc report {run}"]
+
+
+def _simulate(material: Material) -> str:
+    """The command of the newest deployment; with the backup where there was none."""
+    done = material.simulation or {}
+    guard = list(done.get("guards") or {"paper": {}})[-1]
+    words = ["stlc", "simulate", material.run.shown, *_GUARDS.get(str(guard), ("--guard", str(guard)))]
+    if done.get("scenario"):
+        words += ["--scenario", str(done["scenario"])]
+    seeds = done.get("seeds") or range(10)
+    if list(seeds) != list(range(10)):
+        words += ["--seeds", str(len(seeds))] + (["--seed", str(seeds[0])] if seeds[0] else [])
+    return shlex.join(words)
+
+
+_GUARDS = {"none": (), "paper": ("--backup",)}
 
 
 def texts_section(material: Material) -> Section | None:

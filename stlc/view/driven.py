@@ -19,8 +19,7 @@ from stlc.view.chart import chart_of, draw_chart
 from stlc.view.html import Child, Html, classed, el, figure, join, table
 from stlc.view.material import Material, untagged
 from stlc.view.page import Section
-from stlc.view.signals import choose_traces, draw_signals
-from stlc.view.style import ORANGE, RED
+from stlc.view.signals import DECISIONS, POLICY, acted_in, choose_traces, draw_signals
 from stlc.view.words import count, share
 
 TITLE = "What was driven"
@@ -46,7 +45,7 @@ def driven_section(material: Material) -> Section | None:
         )
         return Section("driven", TITLE, reason)
     names = trace_names(trace)
-    choices = choose_traces(_per_trace(verdict), names)
+    choices = choose_traces(_per_trace(verdict), names, acted_in(trace))
     picture = draw_signals(trace, {name: np.atleast_2d(rho) for name, rho in margins.items()}, choices)
     body = join(
         el("p", _summary(verdict)),
@@ -153,11 +152,16 @@ def _caption(trace: Trace) -> Html:
         "Beneath the signals the robustness of each requirement at every start "
         "(red: violated; large margins are cut). "
     )
-    if "decision" not in trace.extras:
+    acted = acted_in(trace)
+    if acted is None or not acted.any():
         return join(words)
-    backup = el("span", attrs={"class": "key", "style": f"background:{ORANGE}"})
-    safest = el("span", attrs={"class": "key", "style": f"background:{RED}"})
-    return join(words, "Shaded: ", backup, "the backup acted, ", safest, "the longest safe prefix was taken.")
+    sources = {int(value) for value in np.unique(trace.extras["decision"])} & DECISIONS.keys()
+    keys = [_key(*DECISIONS[source]) for source in sorted(sources - {POLICY})]
+    return join(words, "Shaded, where the policy did not decide: ", keys)
+
+
+def _key(word: str, color: str) -> Html:
+    return join(el("span", attrs={"class": "key", "style": f"background:{color}"}), f"{word}  ")
 
 
 def causes_of(verdict: Verdict, names: list[str], spec: ast.Spec) -> Html | None:

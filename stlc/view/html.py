@@ -69,7 +69,7 @@ def _cell(name: str, value: Child, numeric: bool) -> Html:
 
 def figure(uri: str, alt: str, caption: Child = None, *, kind: str = "plain") -> Html:
     """A picture with its words."""
-    image = el("img", attrs={"src": uri, "alt": alt})
+    image = classed("div", "scroll", el("img", attrs={"src": uri, "alt": alt}))
     return classed("figure", kind, image, el("figcaption", caption) if caption else None)
 
 

@@ -52,6 +52,11 @@ class Material:
         return result if isinstance(result, Mapping) else {}
 
     @property
+    def outside(self) -> bool:
+        """Whether the specification takes functions from outside, which its system provides."""
+        return any(isinstance(item, ast.Extern) for item in _items(self.texts.get("spec.stl", "")))
+
+    @property
     def spec(self) -> str:
         """Name of the specification."""
         return str(self.record.get("spec", "specification"))
@@ -97,11 +102,14 @@ def _text(run: RunDir, name: str) -> str:
 
 
 def _requirements(text: str) -> dict[str, ast.Require]:
+    return {item.name: item for item in _items(text) if isinstance(item, ast.Require)}
+
+
+def _items(text: str) -> tuple[ast.Item, ...]:
     try:
-        spec = parse(Source("spec.stl", text))
+        return tuple(parse(Source("spec.stl", text)).items)
     except StlcError:
-        return {}
-    return {item.name: item for item in spec.items if isinstance(item, ast.Require)}
+        return ()
 
 
 def _signature(run: RunDir) -> Signature | None:

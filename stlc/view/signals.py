@@ -51,20 +51,30 @@ class Choice:
     title: str
 
 
-def choose_traces(least: NDArray[np.float64], names: Sequence[str] = ()) -> tuple[Choice, ...]:
-    """The worst trace and a typical one (median); only one where there is only one.
+def choose_traces(
+    least: NDArray[np.float64], names: Sequence[str] = (), acted: NDArray[np.int64] | None = None
+) -> tuple[Choice, ...]:
+    """The worst trace, and that in which the guard acted most, or a typical one; one where there is only one.
 
     Args:
         least: robustness per trace, (traces,); NaN where it is not known.
         names: how traces are called; by default by their number.
+        acted: how often the guard acted in each, (traces,).
     """
     order = np.argsort(least, kind="stable")
-    known = max(1, int(np.isfinite(least).sum()))
-    worst, typical = int(order[0]), int(order[known // 2])
+    worst, other, word = int(order[0]), int(order[max(1, int(np.isfinite(least).sum())) // 2]), "typical"
+    if acted is not None and acted.any():
+        other, word = int(np.argmax(acted)), f"guard acted most, {int(acted.max())} times"
     called = names or [f"trace {index}" for index in range(len(least))]
-    if worst == typical:
+    if worst == other:
         return (Choice(worst, called[worst]),)
-    return Choice(worst, f"worst: {called[worst]}"), Choice(typical, f"typical: {called[typical]}")
+    return Choice(worst, f"worst: {called[worst]}"), Choice(other, f"{word}: {called[other]}")
+
+
+def acted_in(trace: Trace) -> NDArray[np.int64] | None:
+    """How often something else than the policy decided, (traces,); None where that was not recorded."""
+    decisions = _decisions(trace)
+    return None if decisions is None else np.asarray((decisions != POLICY).sum(1))
 
 
 def draw_signals(trace: Trace, margins: Margins, choices: Sequence[Choice]) -> Picture:

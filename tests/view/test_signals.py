@@ -28,6 +28,16 @@ def test_the_worst_and_the_median_are_chosen():
     assert worst.title == "worst: trace 1"
 
 
+def test_the_trace_in_which_the_guard_acted_most_is_chosen():
+    least = np.array([3.0, -1.0, 2.0])
+    worst, guarded = choose_traces(least, acted=np.array([4, 0, 7]))
+    assert (worst.index, guarded.index) == (1, 2)
+    assert guarded.title == "guard acted most, 7 times: trace 2"
+    (only,) = choose_traces(least, acted=np.array([0, 9, 1]))
+    assert only.index == 1
+    assert choose_traces(least, acted=np.zeros(3, dtype=int))[1].title == "typical: trace 2"
+
+
 def test_traces_can_have_names():
     worst, typical = choose_traces(np.array([3.0, -1.0]), ["a", "b"])
     assert (worst.title, typical.title) == ("worst: b", "typical: a")
