@@ -227,13 +227,14 @@ class Value:
         return out
 
 
-def joined(parts: Sequence[Value]) -> Value:
-    """One behind the other along axis 0; the other axes agree."""
+def joined(parts: Sequence[Value], axis: int = 0) -> Value:
+    """One behind the other along an axis; the other axes agree."""
     if len(parts) == 1:
         return parts[0]
     first = parts[0]
-    shape = (sum(part.shape[0] for part in parts), *first.shape[1:])
-    (out,) = first.sheet.emit("Concat", parts, [shape], first.kind, {"axis": 0})
+    shape = list(first.shape)
+    shape[axis] = sum(part.shape[axis] for part in parts)
+    (out,) = first.sheet.emit("Concat", parts, [tuple(shape)], first.kind, {"axis": axis})
     return out
 
 

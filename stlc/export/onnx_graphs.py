@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from stlc.compile.ops_onnx import ONNX_OPS as ONNX
+from stlc.compile.semantics import TOLERANCE
 from stlc.compile.sheet import BATCH, Sheet, Value, joined
 from stlc.export.onnx_judge import columns_of, deepened, falls, judged, rank
 from stlc.export.onnx_policy import proposed
@@ -30,24 +32,78 @@ def deciding(task: Task, network: PlanNetwork) -> dict[str, Value]:
     """
     state = Sheet().input("state", (BATCH, len(task.names)))
     plans = proposed(task, network, columns_of(state, task.names))
+    table = _table(task, state, plans)
+    return _shown(_picked(table, _best(table["rank"]))) | _added(task, state)
+
+
+def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
+    """`state` and `begun`, what is left of a plan, -> the plan to follow, as `Guard` chooses, in one pass.
+
+    The outputs of `deciding` are those of `begun` where it is gone on with, which `kept` (batch,) says: it
+    satisfies the specification, and the policy's plan ranks no higher, or it keeps a promise better and
+    better. `policy_plan` and `policy_rho` are what the policy planned.
+
+    Raises:
+        Untranslatable: the task holds something that has no form as a graph.
+    """
+    sheet = Sheet()
+    state = sheet.input("state", (BATCH, len(task.names)))
+    begun = sheet.input("begun", (BATCH, task.horizon, len(task.system.controls)))
+    fresh = proposed(task, network, columns_of(state, task.names))
+    count = fresh.shape[1]
+    table = _table(task, state, joined([fresh, begun.reshaped(BATCH, 1, *begun.shape[1:])], axis=1))
+    best = _best(table["rank"].T[:count].T)
+    policy = _picked(table, best)
+    better = ONNX.ge(_one(table["rank"], count), policy["rank"])
+    if task.promises.items:
+        better = ONNX.either(better, _one(table["deepened"], count))
+    kept = ONNX.both(better, ONNX.ge(_one(table["rho"], count), -TOLERANCE))
+    index = kept.reshaped(BATCH, 1).apply("Where", sheet.constant([[count]], "int64"), best, kind="int64")
+    shown = {"kept": kept, "policy_plan": policy["plan"], "policy_rho": policy["rho"]}
+    return _shown(_picked(table, index)) | shown | _added(task, state)
+
+
+def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:
+    """`rank`, `plan` and verdicts of several plans (batch, count, T, m) of every agent: (batch, count, …)."""
+    names = task.names
     count, steps, controls = plans.shape[1:]
-    each = state.T.reshaped(len(task.names), BATCH, 1).spread(len(task.names), BATCH, count, like=state.T)
-    starts = dict(zip(task.names, each.reshaped(len(task.names), BATCH).rows(), strict=True))
+    each = state.T.reshaped(len(names), BATCH, 1).spread(len(names), BATCH, count, like=state.T)
+    starts = dict(zip(names, each.reshaped(len(names), BATCH).rows(), strict=True))
     found = judged(task, starts, plans.reshaped(BATCH, steps, controls))
-    score = rank(found).reshaped(BATCH, count)
+    rows = {"rank": rank(found), "rho": found.rho, "safe": found.safe, "cost": found.cost}
+    if task.promises.items:
+        rows["deepened"] = deepened(task, found.states)
+    table = {name: row.reshaped(BATCH, count) for name, row in rows.items()}
+    requirements = joined(found.each).T.reshaped(BATCH, count, len(found.each))
+    return {**table, "requirements": requirements, "plan": plans}
+
+
+def _best(score: Value) -> Value:
+    """Which plan ranks first, (batch, 1)."""
     (best,) = score.sheet.emit("ArgMax", (score,), [(BATCH, 1)], "int64", {"axis": 1, "keepdims": 1})
-    verdicts = {"rho": found.rho, "safe": found.safe, "cost": found.cost}
-    outputs = {"plan": _picked(plans, best)}
-    outputs |= {name: _picked(value.reshaped(BATCH, count), best) for name, value in verdicts.items()}
-    table = joined(found.each).T.reshaped(BATCH, count, len(found.each))
-    outputs["requirements"] = _picked(table, best)
-    return outputs | _added(task, state)
+    return best
 
 
-def _picked(values: Value, index: Value) -> Value:
-    """One of the rows of every agent: (batch, count, …) by (batch, 1) -> (batch, …)."""
+def _picked(table: Mapping[str, Value], index: Value) -> dict[str, Value]:
+    """One row of the table of every agent, by (batch, 1): (batch, …)."""
+    outputs = {}
+    for name, values in table.items():
+        shape = (BATCH, *values.shape[2:])
+        (outputs[name],) = values.sheet.emit(
+            "GatherND", (values, index), [shape], values.kind, {"batch_dims": 1}
+        )
+    return outputs
+
+
+def _shown(picked: Mapping[str, Value]) -> dict[str, Value]:
+    return {name: picked[name] for name in ("plan", "rho", "safe", "cost", "requirements")}
+
+
+def _one(values: Value, place: int) -> Value:
+    """The same plan of every agent: (batch, count, …) -> (batch, …)."""
     shape = (BATCH, *values.shape[2:])
-    (out,) = values.sheet.emit("GatherND", (values, index), [shape], values.kind, {"batch_dims": 1})
+    index = values.sheet.constant(place, "int64")
+    (out,) = values.sheet.emit("Gather", (values, index), [shape], values.kind, {"axis": 1})
     return out
 
 
@@ -65,8 +121,7 @@ def _added(task: Task, state: Value) -> dict[str, Value]:
 def judging(task: Task) -> dict[str, Value]:
     """`state` (batch, n) and `plan` (batch, T, m) -> verdicts, and the states under the plan.
 
-    `rho`, `safe` and `cost` (batch,), `requirements` (batch, R), `states` (batch, T + 1, n); on a mission
-    with promises `deepened` (batch,), whether the next step adds to what one has to spare.
+    `rho`, `safe` and `cost` (batch,), `requirements` (batch, R), `states` (batch, T + 1, n).
 
     Raises:
         Untranslatable: the task holds something that has no form as a graph.
@@ -81,8 +136,6 @@ def judging(task: Task) -> dict[str, Value]:
     outputs["requirements"] = joined(found.each).T
     states = joined(wide).reshaped(len(task.names), rows, BATCH)
     outputs["states"] = states.transposed(2, 1, 0)
-    if task.promises.items:
-        outputs["deepened"] = deepened(task, found.states).reshaped(BATCH)
     return outputs
 
 

@@ -16,11 +16,11 @@ from stlc.controller import backup
 from stlc.controller.run import spec_hash, system_hash
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.export.onnx_file import model_of, require_onnx
-from stlc.export.onnx_graphs import deciding, falling, judging
+from stlc.export.onnx_graphs import deciding, falling, following, judging
 from stlc.jsontext import dumps
 from stlc.provenance import sha256
 from stlc.runtime import Controller
-from stlc.runtime.facts import DECIDE, FACTS, FALL, FORMAT, JUDGE, Quantity
+from stlc.runtime.facts import DECIDE, FACTS, FALL, FOLLOW, FORMAT, JUDGE, Quantity
 from stlc.version import __version__
 
 if TYPE_CHECKING:
@@ -34,14 +34,14 @@ TIMED = 200
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """Milliseconds that the policy's plan of one agent and its verdict take, on one thread."""
+    """Milliseconds that a decision of one agent takes on one thread: the policy's plan, and the begun one."""
 
     median: float
     p99: float
 
 
 def write_onnx(run: Run, folder: Path) -> None:
-    """`decide.onnx`, `judge.onnx`, `fall.onnx` where there is something to be safe from, `controller.json`.
+    """`decide.onnx`, `follow.onnx`, `judge.onnx`, `controller.json`, and `fall.onnx` where there is danger.
 
     Raises:
         UsageError: U101, the task holds something that has no form as a graph.
@@ -51,6 +51,7 @@ def write_onnx(run: Run, folder: Path) -> None:
     task, facts = run.task, _facts(run)
     graphs: dict[str, Callable[[], dict[str, Value]]] = {
         DECIDE: lambda: deciding(task, run.policy.network),
+        FOLLOW: lambda: following(task, run.policy.network),
         JUDGE: lambda: judging(task),
     }
     if task.compiled.safety:
@@ -85,7 +86,6 @@ def _facts(run: Run) -> dict[str, object]:
         "dt": task.dt,
         "horizon": task.horizon,
         "backup": {"values": grid.values, "lengths": grid.lengths, "batch": grid.batch},
-        "promises": bool(task.promises.items),
     }
 
 
@@ -106,11 +106,10 @@ def _states(task: Task) -> list[Quantity]:
 
 
 def timed(task: Task, folder: Path) -> Latency:
-    """How long the runtime takes for a fresh decision in random states, the first ones apart."""
+    """How long the runtime takes in random states, the first ones apart."""
     controller = Controller.load(folder)
     taken = []
     for state in task.sample(TIMED, seed=8, dtype=torch.float64).numpy():
-        controller.reset()
         begun = time.perf_counter()
         controller.decide(state)
         taken.append(1e3 * (time.perf_counter() - begun))

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from stlc import native
+from stlc.controller.deploy import Guard
 from stlc.controller.prefix import prefix_robustness
 from stlc.controller.task import rank
 from stlc.diagnostics import Diagnostic, RunError
@@ -20,7 +21,7 @@ from stlc.export.programs import unmoved
 if TYPE_CHECKING:
     from stlc.controller.policy import Mlp
     from stlc.controller.task import Task
-    from stlc.runtime.graphs import Graphs
+    from stlc.runtime.graphs import Graphs, Judged
 
 PLAN = 1e-4
 """How far a control may be from the original's, in parts of its range: the network is float32."""
@@ -61,15 +62,15 @@ def agreement(policy: Mlp, decide: Callable[[Tensor], Answer], *, states: int, s
     Raises:
         RunError: R105, they disagree.
     """
+    x = policy.task.sample(states, seed=seed, dtype=torch.float64)
     with torch.no_grad():
-        return _compared(policy, decide, policy.task.sample(states, seed=seed, dtype=torch.float64))
+        return _compared(policy.task, x, policy.plan(x), decide(x))
 
 
-def _compared(policy: Mlp, decide: Callable[[Tensor], Answer], x: Tensor) -> Agreement:
-    """`agreement` in given states."""
-    task = policy.task
-    plan, judged = policy.plan_judged(x)
-    mine, rho, safe, each = decide(x)
+def _compared(task: Task, x: Tensor, plan: Tensor, answer: Answer) -> Agreement:
+    """An answer in states (B, n) in which the original follows `plan` (B, T, m)."""
+    mine, rho, safe, each = answer
+    judged = task.judge(x, plan)
     width = (task.system.control_high - task.system.control_low).double()
     far = ((mine - plan).abs() / width).amax((1, 2))
     again = task.judge(x, mine)
@@ -113,13 +114,27 @@ def by_torch(path: Path) -> Callable[[Tensor], Answer]:
 
 def by_onnx(graphs: Graphs) -> Callable[[Tensor], Answer]:
     """The graphs of a folder, as the runtime runs them."""
+    return lambda x: _answer(graphs.decided(x.numpy())[0])
 
-    def decide(x: Tensor) -> Answer:
-        judged, _ = graphs.decided(x.numpy())
-        plan, rho, safe, each = map(torch.from_numpy, (judged.plan, judged.rho, judged.safe, judged.each))
-        return plan, rho, safe, each
 
-    return decide
+def _answer(judged: Judged) -> Answer:
+    plan, rho, safe, each = map(torch.from_numpy, (judged.plan, judged.rho, judged.safe, judged.each))
+    return plan, rho, safe, each
+
+
+def kept_agreement(policy: Mlp, graphs: Graphs, *, states: int, seed: int = 9) -> Agreement:
+    """Ask both a step later, with the plans that were begun.
+
+    Raises:
+        RunError: R105, they disagree.
+    """
+    guard, task = Guard(policy.task, policy, "none"), policy.task
+    x = task.sample(states, seed=seed, dtype=torch.float64)
+    begun = guard.decide(x)
+    x, left = task.system.step(x, begun.action), begun.later()
+    wanted = guard.decide(x, left)
+    judged, _ = graphs.followed(x.numpy(), left.plan.numpy())
+    return _compared(task, x, wanted.plan, _answer(judged))
 
 
 def same_verdicts(task: Task, graphs: Graphs, *, states: int, seed: int = 7) -> float:

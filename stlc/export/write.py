@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
@@ -15,7 +15,7 @@ from stlc.diagnostics import Diagnostic, UsageError
 from stlc.export import c_weights, emit
 from stlc.export.onnx_write import Latency, timed, write_onnx
 from stlc.export.programs import recorded
-from stlc.export.verify import Agreement, agreement, by_c, by_onnx, by_torch, same_verdicts
+from stlc.export.verify import Agreement, agreement, by_c, by_onnx, by_torch, kept_agreement, same_verdicts
 from stlc.files import write_atomic
 from stlc.jsontext import dumps
 from stlc.runtime.facts import read_facts
@@ -96,9 +96,11 @@ def _onnx(run: Run, folder: Path) -> Checked:
     """The graphs of `stlc.export.onnx_graphs`, and `controller.json`."""
     write_onnx(run, folder)
     graphs = Graphs(read_facts(folder))
-    found = agreement(run.policy, by_onnx(graphs), states=STATES)
-    off = same_verdicts(run.task, graphs, states=STATES // 4)
-    return replace(found, rho=max(found.rho, off)), timed(run.task, folder)
+    fresh = agreement(run.policy, by_onnx(graphs), states=STATES)
+    kept = kept_agreement(run.policy, graphs, states=STATES)
+    off = max(fresh.rho, kept.rho, same_verdicts(run.task, graphs, states=STATES // 4))
+    found = Agreement(STATES, max(fresh.plan, kept.plan), off, fresh.ties + kept.ties)
+    return found, timed(run.task, folder)
 
 
 def _c(run: Run, folder: Path) -> Checked:

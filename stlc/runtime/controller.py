@@ -81,6 +81,8 @@ class Controller:
         self.facts = facts
         self.guard = guard
         self._graphs = Graphs(facts, threads=threads)
+        if guard == "paper":
+            self._graphs.prepare()
         self._parameters = dict(parameters or {})
         self._begun: _Followed | None = None
         self._added: Numbers | None = None
@@ -142,12 +144,12 @@ class Controller:
         x, single = self._read(state, elapsed)
         if self._begun is not None and len(self._begun.source) != len(x):
             raise _misfit(f"{len(x)} agents where {len(self._begun.source)} were", "`reset` begins anew")
-        fresh, said = self._graphs.decided(x)
-        policy_rho = fresh.rho.copy()
-        followed = self._followed(x, fresh, elapsed)
+        followed, said = self._followed(x, elapsed)
+        fresh = said.get("policy_plan", said["plan"])
+        policy_rho = said.get("policy_rho", said["rho"]).copy()
         if self.guard == "paper":
             for row in np.flatnonzero(~(followed.judged.rho >= -TOLERANCE)):
-                self._search(followed, x[row], fresh.plan[row], int(row))
+                self._search(followed, x[row], fresh[row], int(row))
         if not np.isfinite(followed.judged.plan[:, 0]).all():
             raise RunError(Diagnostic("R402", "the policy's plan is not a number"))
         self._begun = followed
@@ -200,27 +202,17 @@ class Controller:
 
     # ------------------------------------------------------------------------ plans
 
-    def _followed(self, x: Numbers, fresh: Judged, elapsed: int) -> _Followed:
-        """The policy's plans, or what is left of those that were begun."""
-        zero, none = np.zeros(len(x), dtype=np.int64), np.zeros(len(x), dtype=bool)
-        new = _Followed(fresh, zero + POLICY, zero, none)
-        if self._begun is None:
-            return new
+    def _followed(self, x: Numbers, elapsed: int) -> tuple[_Followed, Mapping[str, Numbers]]:
+        """The policy's plans, or what is left of those that were begun, and what the graph says besides."""
         before = self._begun
-        rest, said = self._graphs.judged(x, _later(before.judged.plan, elapsed))
-        better = rest.rank >= fresh.rank
-        if self.facts.promises:
-            better = better | said["deepened"].astype(bool)
-        keep = better & (rest.rho >= -TOLERANCE)
-        rows = keep.reshape(-1, 1)
-        judged = Judged(
-            np.where(rows[..., None], rest.plan, fresh.plan),
-            np.where(keep, rest.rho, fresh.rho),
-            np.where(keep, rest.safe, fresh.safe),
-            np.where(keep, rest.cost, fresh.cost),
-            np.where(rows, rest.each, fresh.each),
-        )
-        return _Followed(judged, np.where(keep, before.source, POLICY), np.where(keep, before.t0, 0), keep)
+        if before is None:
+            judged, said = self._graphs.decided(x)
+            zero = np.zeros(len(x), dtype=np.int64)
+            return _Followed(judged, zero + POLICY, zero, zero > 0), said
+        judged, said = self._graphs.followed(x, _later(before.judged.plan, elapsed))
+        kept = said["kept"].astype(bool)
+        source, t0 = np.where(kept, before.source, POLICY), np.where(kept, before.t0, 0)
+        return _Followed(judged, source, t0, kept), said
 
     def _search(self, followed: _Followed, x: Numbers, plan: Numbers, row: int) -> None:
         """Ask the backup policy for one agent."""

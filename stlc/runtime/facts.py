@@ -13,7 +13,7 @@ from stlc.diagnostics import Diagnostic, RunError, UsageError
 
 FACTS = "controller.json"
 FORMAT = "stlc-controller/1"
-DECIDE, JUDGE, FALL = "decide.onnx", "judge.onnx", "fall.onnx"
+DECIDE, FOLLOW, JUDGE, FALL = "decide.onnx", "follow.onnx", "judge.onnx", "fall.onnx"
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,6 @@ class Facts:
         horizon: steps of a plan.
         grid: of the backup policy.
         graphs: name of a file -> its bytes.
-        promises: the mission keeps promises, and plans are gone on with for their sake.
     """
 
     spec: Mapping[str, str]
@@ -72,7 +71,6 @@ class Facts:
     horizon: int
     grid: Grid
     graphs: Mapping[str, bytes]
-    promises: bool
 
     @property
     def added(self) -> tuple[Quantity, ...]:
@@ -120,7 +118,6 @@ def _facts(read: Mapping[str, Any], folder: Path) -> Facts:
         int(read["horizon"]),
         Grid(tuple(map(tuple, grid["values"])), tuple(grid["lengths"]), int(grid["batch"])),
         {name: _whole(folder / name, digest) for name, digest in read["files"].items()},
-        bool(read["promises"]),
     )
 
 

@@ -10,14 +10,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.semantics import TOLERANCE
 from stlc.diagnostics import Diagnostic, MissingError
-from stlc.runtime.facts import DECIDE, FALL, JUDGE, Facts
+from stlc.runtime.facts import DECIDE, FALL, FOLLOW, JUDGE, Facts
 
 Numbers: TypeAlias = NDArray[np.float64]
-
-TIE = 1e-4
-"""What cost may weigh where robustness does not differ, as in training."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,15 +33,6 @@ class Judged:
     safe: Numbers
     cost: Numbers
     each: Numbers
-
-    @property
-    def rank(self) -> Numbers:
-        """Larger is better: the cheapest that satisfies, else the most robust, safe ones first."""
-        with np.errstate(all="ignore"):
-            cheap = np.nan_to_num(1.0 / (1.0 + np.maximum(self.cost, 0.0)))
-            poor = np.where(np.isfinite(self.rho), self.rho / (1.0 + np.abs(self.rho)), -1.0) + TIE * cheap
-        poor = np.where(self.safe >= -TOLERANCE, poor, poor - 2.0)
-        return np.where((self.rho >= -TOLERANCE) & ~np.isnan(self.cost), 1.0 + cheap, poor)
 
     def of(self, rows: Any) -> Judged:
         """Some rows: indices or a mask."""
@@ -71,11 +58,20 @@ class Graphs:
     def __init__(self, facts: Facts, *, threads: int = 1) -> None:
         self.facts = facts
         self.threads = threads
-        self._decide = self._session(DECIDE)
+        self._decide, self._follow = self._session(DECIDE), self._session(FOLLOW)
+
+    def prepare(self) -> None:
+        """Load now what only the backup policy needs, so that its first decision does not wait for it."""
+        _ = self._judge, self._fall
 
     def decided(self, x: Numbers) -> tuple[Judged, Mapping[str, Numbers]]:
         """The best of the policy's plans, and all that the graph says besides."""
         found = _run(self._decide, {"state": x})
+        return _judged(found["plan"], found), found
+
+    def followed(self, x: Numbers, begun: Numbers) -> tuple[Judged, Mapping[str, Numbers]]:
+        """The plans to follow where plans were begun; `kept` says where it is those."""
+        found = _run(self._follow, {"state": x, "begun": begun})
         return _judged(found["plan"], found), found
 
     def judged(self, x: Numbers, plans: Numbers) -> tuple[Judged, Mapping[str, Numbers]]:

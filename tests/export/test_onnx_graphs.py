@@ -13,8 +13,9 @@ from stlc.compile import ir
 from stlc.compile.sheet import BATCH, Sheet
 from stlc.dynamics.step import Step
 from stlc.export.onnx_graphs import deciding, judging
+from stlc.export.onnx_judge import columns_of, deepened, judged
 from stlc.export.onnx_rollout import rolled
-from stlc.export.verify import same_verdicts
+from stlc.export.verify import kept_agreement, same_verdicts
 from stlc.runtime.facts import read_facts
 from stlc.runtime.graphs import Graphs
 
@@ -26,11 +27,21 @@ def test_promises_deepen_as_the_task_says() -> None:
     x[:, 1] = torch.linspace(0.6, -0.6, 80).roll(20)
     plans = torch.zeros(80, run.task.horizon, 1, dtype=torch.float64)
     wanted = run.task.promises.deepened(run.task.judge(x, plans).columns)
-    graphs = Graphs(read_facts(folder))
-    _, said = graphs.judged(x.numpy(), plans.numpy())
-    assert said["deepened"].tolist() == wanted.tolist()
+    sheet = Sheet()
+    start = columns_of(sheet.input("state", (BATCH, len(run.task.names))), run.task.names)
+    given = sheet.input("plan", (BATCH, run.task.horizon, 1))
+    found = deepened(run.task, judged(run.task, start, given).states)
+    said = computed({"deepened": found}, {"state": x.numpy(), "plan": plans.numpy()})["deepened"]
+    assert said[0].tolist() == wanted.tolist()
     assert set(wanted.tolist()) == {True, False}
-    assert same_verdicts(run.task, graphs, states=30) <= 1e-9
+    assert same_verdicts(run.task, Graphs(read_facts(folder)), states=30) <= 1e-9
+
+
+def test_a_begun_plan_is_gone_on_with_where_the_guard_does() -> None:
+    run, folder = mission()
+    found = kept_agreement(run.policy, Graphs(read_facts(folder)), states=100)
+    assert found.plan <= 1e-5
+    assert found.rho <= 1e-9
 
 
 def test_what_a_mission_adds_moves_as_in_the_model() -> None:
@@ -53,10 +64,10 @@ def test_mirrors_and_angles_are_those_of_the_network(tmp_path: Path) -> None:
     run = untrained(tmp_path / "near.stl", tmp_path / "cart.yaml", tmp_path / "runs")
     x = run.task.sample(60, seed=3, dtype=torch.float64)
     assert set((x[:, 0] < 0).tolist()) == {True, False}
-    wanted, judged = run.policy.plan_judged(x)
+    wanted, verdict = run.policy.plan_judged(x)
     found = computed(deciding(run.task, run.policy.network), {"state": x.numpy()})
     np.testing.assert_allclose(found["plan"], wanted, rtol=0.0, atol=2e-6)
-    np.testing.assert_allclose(found["rho"], judged.rho, rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(found["rho"], verdict.rho, rtol=0.0, atol=1e-6)
     np.testing.assert_array_equal(found["safe"], np.full(60, np.inf))
     assert "added" not in found
 

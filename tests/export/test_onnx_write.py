@@ -40,7 +40,7 @@ def test_every_benchmark_has_graphs(spec: str, system: str, tmp_path: Path) -> N
 def test_the_files_say_what_they_are(tmp_path: Path) -> None:
     run = run_of("traffic", "car", tmp_path)
     done = export(run, "onnx", tmp_path / "out")
-    assert done.files == ("controller.json", "decide.onnx", "fall.onnx", "judge.onnx")
+    assert done.files == ("controller.json", "decide.onnx", "fall.onnx", "follow.onnx", "judge.onnx")
     assert done.agreement is not None
     assert done.agreement.rho <= 1e-9
     assert done.latency is not None
