@@ -85,6 +85,9 @@ def simulate(
     ] = None,
     guard: GuardOption = None,
     time_limit: LimitOption = "100ms",
+    ceiling: Annotated[
+        int, typer.Option(min=0, help="Visited states to search for a plan, where the followed one fails.")
+    ] = 0,
     seeds: Annotated[int, typer.Option(min=1, help="How many deployments.")] = 10,
     seed: Annotated[int, typer.Option(min=0, max=2**62, help="Seed of the first; the others follow.")] = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Of each; by default the system's.")] = None,
@@ -119,7 +122,7 @@ def simulate(
         require_robots(opened)
     test, which = opened.task.system.decl.test, tuple(range(seed, seed + seeds))
     limit = parse_limit(time_limit)
-    setting = Setting(which, agents or test.agents, steps or test.steps, test.replan, limit)
+    setting = Setting(which, agents or test.agents, steps or test.steps, test.replan, limit, ceiling)
     several = _several(opened, scenario)
     order = _Order(opened, chosen, setting, record, live, margins, parse_overrides(set_))
     document = _all(order, several) if several else _driven(order, scenario)

@@ -17,6 +17,8 @@ COMPARED = {"plan accuracy": "plan_accuracy", "savable": "savable", "saved": "sa
 
 ROWS = {
     "plan accuracy": "plan_accuracy",
+    "  visited states that have one": "feasible",
+    "  share of these": "feasible_followed",
     "plan safety": "plan_safety",
     "policy's own plans": "policy_accuracy",
     "executed, agents": "executed",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from stlc.compile.semantics import TOLERANCE
 from stlc.controller.deploy import SOURCES, Guard, Mode
@@ -17,6 +18,7 @@ from stlc.controller.drive import Recorder, Recording, Setting, Watch, drive
 from stlc.controller.executed import Executed, judge_executed
 from stlc.controller.intervals import Interval
 from stlc.controller.polish import Limits
+from stlc.controller.savable import solvable
 from stlc.controller.world import world_type
 
 if TYPE_CHECKING:
@@ -31,6 +33,8 @@ METRICS = {
     "plan_accuracy": "share of followed plans that satisfy the specification",
     "policy_accuracy": "share of plans that the policy proposed and that satisfy it",
     "plan_safety": "share of followed plans that satisfy the safety requirements",
+    "feasible": "share of visited states where the followed plan, or one that a search finds, does",
+    "feasible_followed": "share of those whose followed plan does",
     "executed": "share of agents that satisfied it at every start",
     "executed_safe": "share of agents that satisfied the safety requirements at every start",
     "savable": "share of agents that were driven safely, or from whose start a search finds a safe plan",
@@ -120,7 +124,7 @@ def judged(guard: Guard, recording: Recording) -> Deployment:
     return Deployment(
         guard.mode,
         recording,
-        measure(recording, executed),
+        measure(recording, executed, feasible_states(task, recording, setting.ceiling)),
         decided(recording),
         latency(guard, recording),
         unsafe_agents(executed, recording.agents),
@@ -133,9 +137,34 @@ def unsafe_agents(executed: Executed, agents: int) -> tuple[Unsafe, ...]:
     return tuple(Unsafe(*divmod(row, agents), bool(executed.savable[row])) for row in rows)
 
 
-def measure(recording: Recording, executed: Executed) -> dict[str, Interval]:
-    """All metrics over the seeds that have them: a share of nothing is none, and so is what is not finite."""
+def feasible_states(task: Task, recording: Recording, count: int) -> NDArray[np.float64]:
+    """Whether some plan satisfies the specification, in `count` visited states, evenly spread: (rows, steps).
+
+    1: the plan that was followed does, or a search has found one; 0: neither; NaN: nobody has looked.
+    """
+    known = np.full(recording.rho.shape, math.nan)
+    if count:
+        known.ravel()[np.linspace(0, known.size - 1, min(count, known.size)).astype(int)] = 1.0
+    open_ = np.isfinite(known) & ~(recording.rho >= -TOLERANCE)
+    known[open_] = solvable(task, torch.from_numpy(recording.states[:, :-1][open_])).numpy()
+    return known
+
+
+def measure(
+    recording: Recording, executed: Executed, feasible: NDArray[np.float64] | None = None
+) -> dict[str, Interval]:
+    """All metrics over the seeds that have them: a share of nothing is none, and so is what is not finite.
+
+    Args:
+        recording: what happened.
+        executed: the verdicts on it.
+        feasible: what `feasible_states` knows.
+    """
     each = [_of_seed(recording, executed, seed) for seed in range(len(recording.progress))]
+    if feasible is not None:
+        for seed, shares in enumerate(each):
+            rows = slice(seed * recording.agents, (seed + 1) * recording.agents)
+            shares |= _ceiling(feasible[rows], recording.rho[rows] >= -TOLERANCE)
     found = {
         name: [seed[name] for seed in each if math.isfinite(seed.get(name, math.nan))] for name in each[0]
     }
@@ -164,6 +193,12 @@ def _of_seed(recording: Recording, executed: Executed, seed: int) -> dict[str, f
     shares |= {f"holds.{name}": held[:, rows] for name, held in executed.rules.items()}
     found = {name: float(mask.mean()) if mask.size else math.nan for name, mask in shares.items()}
     return found | {name: float(value) for name, value in recording.progress[seed].items()}
+
+
+def _ceiling(feasible: NDArray[np.float64], good: NDArray[np.bool_]) -> dict[str, float]:
+    looked, can = np.isfinite(feasible), feasible == 1.0
+    shares = {"feasible": feasible[looked], "feasible_followed": good[can]}
+    return {name: float(found.mean()) if found.size else math.nan for name, found in shares.items()}
 
 
 def decided(recording: Recording) -> dict[str, float]:
@@ -207,6 +242,7 @@ def as_json(
         "steps": setting.steps,
         "replan": setting.replan,
         "time_limit": setting.limit,
+        "ceiling": setting.ceiling,
         "interval": "95 %, Student's t over the deployment seeds",
         "guards": {
             name: {

@@ -18,11 +18,12 @@ from torch.quasirandom import SobolEngine
 
 from stlc.compile.semantics import TOLERANCE
 from stlc.controller.backup import Backup, Found, Grid, finite
+from stlc.controller.savable import safely
 from stlc.controller.search import Searcher
-from stlc.controller.task import Task
 
 if TYPE_CHECKING:
     from stlc.controller.policy import Policy
+    from stlc.controller.task import Task
 
 POLISHED = 3
 """Index of a polished plan into `deploy.SOURCES`."""
@@ -159,11 +160,6 @@ class FullBackup:
         engine = SobolEngine(length * len(low), scramble=True, seed=SEED)  # type: ignore[no-untyped-call]
         unit = engine.draw(self.limits.prefixes, dtype=torch.float64).view(-1, length, len(low))
         return low + (high - low) * unit
-
-
-def safely(task: Task) -> Task:
-    """The task of phi_safe alone."""
-    return Task(replace(task.compiled, requirements=task.compiled.safety), task.plain)
 
 
 def _value(rho: Tensor, safe: Tensor, margin: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Which agents can be saved at all: a search for a plan that is safe, from each start."""
+"""What can be done at all: a search for a satisfying plan, or a safe one, from each state."""
 
 from __future__ import annotations
 
@@ -24,32 +24,41 @@ MOST = 2048
 """Plans in the bank, at most."""
 
 
-@torch.no_grad()
 def savable(task: Task, x0: Tensor) -> Tensor:
-    """Where some plan satisfies phi_safe, as far as a search finds one: (B, n) -> (B,) booleans.
+    """Where some plan satisfies phi_safe, as far as a search finds one: (B, n) -> (B,) booleans."""
+    if not task.compiled.safety:
+        return torch.ones(len(x0), dtype=torch.bool)
+    return solvable(safely(task), x0)
+
+
+@torch.no_grad()
+def solvable(task: Task, x0: Tensor) -> Tensor:
+    """Where some plan satisfies phi, as far as a search finds one: (B, n) -> (B,) booleans.
 
     Each pass climbs from another plan: from the middle of every control, then from plans that hold each
     control at an end of its range or in the middle of it, thirds of the horizon long. A start without a
-    safe plan may have one that was not found; one with a plan has it, judged exactly.
+    plan may have one that was not found; one with a plan has it, judged exactly.
     """
-    found = torch.ones(len(x0), dtype=torch.bool)
-    if not task.compiled.safety:
-        return found
-    safety = Task(replace(task.compiled, requirements=task.compiled.safety), task.plain)
+    found = torch.zeros(len(x0), dtype=torch.bool)
     generator = torch.Generator().manual_seed(0)
-    searcher = Searcher(safety, generator, enough=ENOUGH)
-    bank = extremes(safety, generator)
-    middle = 0.5 * (safety.system.control_low + safety.system.control_high)
-    start = middle.expand(len(x0), safety.horizon, -1)
-    tries, found = (THOROUGH if safety.native is None else TRIES), ~found
+    searcher = Searcher(task, generator, enough=ENOUGH)
+    bank = extremes(task, generator)
+    middle = 0.5 * (task.system.control_low + task.system.control_high)
+    start = middle.expand(len(x0), task.horizon, -1)
+    tries = THOROUGH if task.native is None else TRIES
     for _ in range(PASSES):
         still = torch.nonzero(~found).squeeze(1)
         if not len(still):
             break
         plans = searcher.repair(x0[still].float(), start[still].clone(), bank, tries=tries).plans
-        found[still] = safety.judge(x0[still].double(), plans.double(), states=False).rho >= -TOLERANCE
+        found[still] = task.judge(x0[still].double(), plans.double(), states=False).rho >= -TOLERANCE
         start = bank[torch.randint(len(bank), (len(x0),), generator=generator)]
     return found
+
+
+def safely(task: Task) -> Task:
+    """The task of phi_safe alone."""
+    return Task(replace(task.compiled, requirements=task.compiled.safety), task.plain)
 
 
 def extremes(task: Task, generator: torch.Generator) -> Tensor:

@@ -26,6 +26,7 @@ class Setting:
     An agent that the world tells something new (a signal of role `env` has changed) plans at once.
 
     `limit`: seconds that a decision of the full guard may take per agent; None: as long as it takes.
+    `ceiling`: visited states, of all seeds, that are searched for a plan where the followed one fails.
     """
 
     seeds: tuple[int, ...]
@@ -33,6 +34,7 @@ class Setting:
     steps: int
     replan: int = 1
     limit: float | None = 0.1
+    ceiling: int = 0
 
 
 class Worlds:

@@ -20,6 +20,11 @@ SHARES = {
         "plan accuracy",
         "of the plans that were followed, the share that satisfies the specification",
     ),
+    "feasible": (
+        "visited states that have a plan",
+        "the followed plan satisfies the specification, or a search finds one that does",
+    ),
+    "feasible_followed": ("share of these", "of such states, those whose followed plan satisfies it"),
     "policy_accuracy": ("policy's plan accuracy", "the same of what the policy proposed"),
     "plan_safety": (
         "plan safety",

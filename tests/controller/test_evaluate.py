@@ -20,12 +20,14 @@ from stlc.controller.evaluate import (
     as_json,
     decided,
     deploy,
+    feasible_states,
     measure,
 )
 from stlc.controller.executed import judge_executed
 from stlc.controller.intervals import Interval, student
 from stlc.controller.policy import Mlp
 from stlc.controller.run import Run
+from stlc.controller.savable import solvable
 from stlc.controller.task import Task
 from stlc.diagnostics import MissingError, RunError, SystemFileError
 from stlc.monitor.verdict import Monitor
@@ -241,13 +243,29 @@ def test_what_was_foreseen_went_as_the_model_says(car_task: Task, recorded: Reco
 
 def test_metrics_are_means_over_seeds(car_task: Task, recorded: Recording) -> None:
     metrics = measure(recorded, judge_executed(car_task, recorded))
-    assert set(METRICS) <= set(metrics)
+    assert set(METRICS) - set(metrics) == {"feasible", "feasible_followed"}
     assert len(metrics["plan_accuracy"].values) == 2
     accuracy = [(recorded.rho[rows] >= -1e-6).mean() for rows in (slice(0, 6), slice(6, 12))]
     assert metrics["plan_accuracy"].values == pytest.approx(tuple(accuracy))
     assert metrics["mean_speed"].mean == pytest.approx(np.mean([p["mean_speed"] for p in recorded.progress]))
     shares = decided(recorded)
     assert sum(shares[name] for name in ("policy", "backup", "safest")) == pytest.approx(1.0)
+
+
+def test_the_ceiling_is_searched_for_in_visited_states(car_task: Task, recorded: Recording) -> None:
+    assert np.isnan(feasible_states(car_task, recorded, 0)).all()
+    some = feasible_states(car_task, recorded, 60)
+    looked, good = np.isfinite(some), recorded.rho >= -1e-6
+    assert looked.sum() == 60
+    assert (some[looked & good] == 1.0).all()
+    open_ = looked & ~good
+    found = solvable(car_task, torch.from_numpy(recorded.states[:, :-1][open_])).numpy()
+    assert np.array_equal(some[open_], found)
+    assert open_.sum() > 0
+    metrics = measure(recorded, judge_executed(car_task, recorded), some)
+    rows = slice(6, 12)
+    assert metrics["feasible"].values[1] == pytest.approx(np.nanmean(some[rows]))
+    assert metrics["feasible_followed"].values[1] == pytest.approx(good[rows][some[rows] == 1.0].mean())
 
 
 def test_a_deployment_shorter_than_a_window_has_no_executed_starts(car_task: Task) -> None:

@@ -9,7 +9,8 @@ import torch
 
 from stlc.controller.backup import Backup, Grid
 from stlc.controller.deploy import SOURCES, Guard
-from stlc.controller.polish import POLISHED, FullBackup, Limits, safely
+from stlc.controller.polish import POLISHED, FullBackup, Limits
+from stlc.controller.savable import safely
 from stlc.controller.task import Task
 from tests.controller.test_backup import F64, Constant, failing, grid
 
