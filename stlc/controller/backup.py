@@ -37,7 +37,9 @@ class Grid:
         """The grid that the system declares: `levels` of a control, else evenly spaced over its range."""
         decl = task.system.decl
         values = tuple(
-            control.levels or tuple(torch.linspace(control.low, control.high, decl.backup.bins).tolist())
+            decl.backup.levels.get(control.name)
+            or control.levels
+            or tuple(torch.linspace(control.low, control.high, decl.backup.bins).tolist())
             for control in decl.controls
         )
         lengths = tuple(length for length in decl.backup.lengths if 0 < length < task.horizon)

@@ -113,18 +113,18 @@ def deploy(
         drive(guarded, make, setting, recorder, watch)
         recording = recorder.recording()
         assert recording is not None
-        return judged(guarded, recording)
+        return judged(guarded, recording, setting.ceiling)
     except BaseException as error:
         raise InterruptedDeploymentError(recorder.recording()) from error
 
 
-def judged(guard: Guard, recording: Recording) -> Deployment:
-    """What is to be known of a recorded deployment under a guard."""
+def judged(guard: Guard, recording: Recording, ceiling: int = 0) -> Deployment:
+    """What is to be known of a recorded deployment under a guard; see `feasible_states` for `ceiling`."""
     executed = judge_executed(guard.task, recording)
     return Deployment(
         guard.mode,
         recording,
-        measure(recording, executed, feasible_states(task, recording, setting.ceiling)),
+        measure(recording, executed, feasible_states(guard.task, recording, ceiling)),
         decided(recording),
         latency(guard, recording),
         unsafe_agents(executed, recording.agents),

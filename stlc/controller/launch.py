@@ -85,7 +85,8 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
     for name, path in function_files(decl).items():
         write_atomic(folder.path / name, path.read_bytes())
     write_atomic(folder.path / "compiled.txt", dump(task.compiled))
-    folder.update({"spec_hash": spec_hash(folder), "system_hash": system_hash(folder)})
+    hashes = {"spec_hash": spec_hash(folder), "system_hash": system_hash(folder), "learnt": decl.learnt}
+    folder.update(hashes)
     return folder
 
 

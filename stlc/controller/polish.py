@@ -3,11 +3,12 @@
 The paper's backup policy tries a grid of prefixes and lets the policy finish them. Most plans that the
 monitor rejects are nearly right, and a hill climb that starts at them mends them within a millisecond. What
 it cannot mend is started anew from prefixes, few enough to be judged in time, and the best of those are
-climbed from.
+climbed from. Where not even phi_safe is in sight, climbs from plans at the ends of the controls come before.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import TYPE_CHECKING
@@ -18,7 +19,7 @@ from torch.quasirandom import SobolEngine
 
 from stlc.compile.semantics import TOLERANCE
 from stlc.controller.backup import Backup, Found, Grid, finite
-from stlc.controller.savable import safely
+from stlc.controller.savable import Hunt, safely
 from stlc.controller.search import Searcher
 
 if TYPE_CHECKING:
@@ -41,12 +42,14 @@ class Limits:
         tries: plans that a climb tries per place that it starts from.
         prefixes: prefixes of one length at most; where the grid has more, a low-discrepancy sample of them.
         places: of the plans that prefixes gave, how many are climbed from.
+        rescue: whether phi_safe alone is hunted for, without the policy, where nothing else was safe.
     """
 
     seconds: float | None = 0.1
     tries: int = 2000
     prefixes: int = 1000
     places: int = 8
+    rescue: bool = True
 
 
 class FullBackup:
@@ -72,6 +75,7 @@ class FullBackup:
         enough = TO_SPARE * task.system.decl.objective.gamma
         self._whole = Searcher(task, self._generator, enough=enough)
         self._safe = self._whole
+        self._hunt = Hunt(safely(task) if task.compiled.safety else task)
         if task.compiled.safety and len(task.compiled.safety) < len(task.rules):
             self._safe = Searcher(safely(task), self._generator, enough=enough)
 
@@ -92,6 +96,9 @@ class FullBackup:
         plan = finite(plan.to(x.dtype), self.task)
         places = [plan] if rest is None else [plan, finite(rest.to(x.dtype), self.task)]
         found = self._polished(x, torch.stack(places, 1))
+        lost = (~found.safe).nonzero()[:, 0]
+        if len(lost) and self.limits.rescue:
+            _improve(found, lost, self._rescued(x[lost], until))
         for length in self.grid.lengths:
             todo = (found.rho < -TOLERANCE).nonzero()[:, 0]
             if len(todo) == 0 or (until is not None and perf_counter() >= until):
@@ -110,6 +117,13 @@ class FullBackup:
         if len(unsafe) and self._safe is not self._whole:
             _improve(found, unsafe, self._climbed(x[unsafe], found.plan[unsafe][:, None], self._safe))
         return found
+
+    def _rescued(self, x: Tensor, until: float | None) -> Found:
+        """Plans for phi_safe that have nothing to do with the policy."""
+        plans, _ = self._hunt.plans(x, math.inf if until is None else until)
+        judged = self.task.judge(x, plans)
+        number = torch.zeros(len(x), dtype=torch.int64, device=x.device)
+        return Found(plans, number + POLISHED, number, judged.rho, judged.safe >= -TOLERANCE)
 
     def _climbed(self, x: Tensor, places: Tensor, searcher: Searcher) -> Found:
         """The best plan an agent of climbs from each of its places, as polished ones."""

@@ -15,6 +15,7 @@ from stlc.controller.policy import Mlp, network_of
 from stlc.controller.task import Task
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.dynamics.scenario import scenario_constants
+from stlc.dynamics.schema import load_system_decl
 from stlc.dynamics.system import System
 from stlc.files import read_source, write_atomic
 from stlc.grammar import ast
@@ -70,7 +71,7 @@ class Run:
         folder = RunDir.open(where, root)
         task = load_task(folder, overrides, scenario)
         engine = load_engine(folder)
-        saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
+        saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=_trained_on(folder))
         network = network_of(task, engine)
         try:
             network.load_state_dict(weights(saved, "average"))
@@ -109,6 +110,19 @@ def spec_hash(folder: RunDir) -> str:
 def system_hash(folder: RunDir) -> str:
     """SHA-256 of the system file in a run's folder and of what `--set` changed in it."""
     return _hash(folder, SYSTEM)
+
+
+def _trained_on(folder: RunDir) -> str:
+    """The hash of the system that a policy was trained on, if it may be deployed on the one in the folder.
+
+    What a policy learns from must be as it was; worlds, scenarios and the backup may be edited since.
+    """
+    now, record = system_hash(folder), folder.record()
+    then, learnt = record.get("system_hash"), record.get("learnt")
+    if now == then or not isinstance(then, str) or learnt is None:
+        return now
+    decl = load_system_decl(folder.path / SYSTEM, record.get("overrides") or {})
+    return then if decl.learnt == learnt else now
 
 
 def _hash(folder: RunDir, name: str, library: Mapping[str, str] | None = None) -> str:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import product
+from time import perf_counter
 from typing import TYPE_CHECKING
 
 import torch
@@ -31,29 +33,44 @@ def savable(task: Task, x0: Tensor) -> Tensor:
     return solvable(safely(task), x0)
 
 
-@torch.no_grad()
 def solvable(task: Task, x0: Tensor) -> Tensor:
-    """Where some plan satisfies phi, as far as a search finds one: (B, n) -> (B,) booleans.
+    """Where some plan satisfies phi, as far as a search finds one: (B, n) -> (B,) booleans."""
+    return Hunt(task).plans(x0)[1]
+
+
+class Hunt:
+    """A search for plans of one task that knows of no policy; the same one gives the same plans again.
 
     Each pass climbs from another plan: from the middle of every control, then from plans that hold each
     control at an end of its range or in the middle of it, thirds of the horizon long. A start without a
     plan may have one that was not found; one with a plan has it, judged exactly.
     """
-    found = torch.zeros(len(x0), dtype=torch.bool)
-    generator = torch.Generator().manual_seed(0)
-    searcher = Searcher(task, generator, enough=ENOUGH)
-    bank = extremes(task, generator)
-    middle = 0.5 * (task.system.control_low + task.system.control_high)
-    start = middle.expand(len(x0), task.horizon, -1)
-    tries = THOROUGH if task.native is None else TRIES
-    for _ in range(PASSES):
-        still = torch.nonzero(~found).squeeze(1)
-        if not len(still):
-            break
-        plans = searcher.repair(x0[still].float(), start[still].clone(), bank, tries=tries).plans
-        found[still] = task.judge(x0[still].double(), plans.double(), states=False).rho >= -TOLERANCE
-        start = bank[torch.randint(len(bank), (len(x0),), generator=generator)]
-    return found
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.middle = 0.5 * (task.system.control_low + task.system.control_high)
+        self.bank = extremes(task, torch.Generator().manual_seed(0))
+
+    @torch.no_grad()
+    def plans(self, x0: Tensor, until: float = math.inf) -> tuple[Tensor, Tensor]:
+        """Plans (B, T, m) float64 from states (B, n), and which of them satisfy the specification, (B,).
+
+        No pass begins when `perf_counter()` has come to `until`.
+        """
+        generator = torch.Generator().manual_seed(0)
+        searcher = Searcher(self.task, generator, enough=ENOUGH)
+        tries = THOROUGH if self.task.native is None else TRIES
+        start = self.middle.expand(len(x0), self.task.horizon, -1)
+        best, found = start.double().clone(), torch.zeros(len(x0), dtype=torch.bool)
+        for _ in range(PASSES):
+            still = torch.nonzero(~found).squeeze(1)
+            if not len(still) or perf_counter() >= until:
+                break
+            plans = searcher.repair(x0[still].float(), start[still].clone(), self.bank, tries=tries).plans
+            best[still] = plans.double()
+            found[still] = self.task.judge(x0[still].double(), best[still], states=False).rho >= -TOLERANCE
+            start = self.bank[torch.randint(len(self.bank), (len(x0),), generator=generator)]
+        return best, found
 
 
 def safely(task: Task) -> Task:

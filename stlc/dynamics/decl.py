@@ -186,11 +186,12 @@ class TrainDecl:
 
 @dataclass(frozen=True, slots=True)
 class BackupDecl:
-    """The paper's backup policy: `bins` values a control, prefixes of length `lengths`, `batch` at a time."""
+    """Prefixes of `lengths` with `bins` values a control, or the `levels` of its name; `batch` at a time."""
 
     bins: int = 5
     lengths: tuple[int, ...] = (1, 2, 3)
     batch: int = 8192
+    levels: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,6 +287,8 @@ class ScenarioDecl:
         mismatch: constants of the truth that the model does not know, as text.
         world: in the place of that of `test`.
         errors: of actuators and sensors.
+        prefer: performance terms that plans are chosen by, beside those of the objective.
+        backup: in the place of the system's.
     """
 
     name: str
@@ -299,6 +302,8 @@ class ScenarioDecl:
     mismatch: Mapping[str, str] = field(default_factory=dict)
     world: WorldRef | None = None
     errors: ErrorsDecl = field(default_factory=ErrorsDecl)
+    prefer: tuple[Term, ...] = ()
+    backup: BackupDecl | None = None
 
 
 @dataclass(frozen=True)

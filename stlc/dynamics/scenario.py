@@ -84,7 +84,9 @@ def _laid_over(decl: SystemDecl, name: str) -> SystemDecl:
     init = replace(decl.init, override=(*decl.init.override, *scenario.override))
     events = (*decl.test.events, *scenario.events)
     test = replace(decl.test, events=events, world=scenario.world or decl.test.world)
-    return replace(decl, init=init, test=test, scenario=scenario)
+    objective = replace(decl.objective, terms=(*decl.objective.terms, *scenario.prefer))
+    backup = scenario.backup or decl.backup
+    return replace(decl, init=init, test=test, objective=objective, backup=backup, scenario=scenario)
 
 
 def _with_constants(decl: SystemDecl, constants: Mapping[str, str]) -> SystemDecl:

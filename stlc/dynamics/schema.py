@@ -151,7 +151,7 @@ def _declaration(
         objective=read_objective(found.get("objective"), reader, names),
         policy=read_policy(found.get("policy"), reader, names),
         train=read_train(found.get("train"), reader, names),
-        backup=read_backup(found.get("backup"), reader, clock.horizon),
+        backup=read_backup(found.get("backup"), reader, names, clock.horizon),
         test=read_test(found.get("test"), reader, names, clock.dt),
         scenarios=read_scenarios(found.get("scenario"), reader, names, clock),
         functions=functions,

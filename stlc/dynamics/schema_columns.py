@@ -170,18 +170,26 @@ def _controls(name: str, found: dict[str, Node], where: str, here: Expressions) 
     bounds = read_ranges(found.get("range"), where, unit, size, here) or ((-1.0, 1.0),) * len(called)
     word = reader.option(found.get("squash"), f"`squash` of {where}", get_args(Squash)) or "tanh"
     squash: Squash = "clip" if word == "clip" else "angle" if word == "angle" else "tanh"
-    items = reader.items(found.get("levels"), f"`levels` of {where}")
-    levels = [here.constant(item, f"a level of {where}", unit) for item in items]
     low, high = max(low for low, _ in bounds), min(high for _, high in bounds)
+    kept = read_levels(found.get("levels"), where, unit, (low, high), here)
+    return tuple(
+        ControlDecl(each, unit, *ends, squash, kept) for each, ends in zip(called, bounds, strict=True)
+    )
+
+
+def read_levels(
+    node: Node | None, where: str, unit: Unit, bounds: tuple[float, float], here: Expressions
+) -> tuple[float, ...]:
+    """The values of a control that a search may try, within its range."""
+    items = here.reader.items(node, f"`levels` of {where}")
+    levels = [here.constant(item, f"a level of {where}", unit) for item in items]
+    low, high = bounds
     for item, level in zip(items, levels, strict=True):
         if level is not None and not low <= level <= high:
-            reader.report(
+            here.reader.report(
                 "S204",
                 f"a level of {where} is outside its range",
                 item.span,
                 f"the range is [{low:g}, {high:g}]",
             )
-    kept = tuple(level for level in levels if level is not None)
-    return tuple(
-        ControlDecl(each, unit, *ends, squash, kept) for each, ends in zip(called, bounds, strict=True)
-    )
+    return tuple(level for level in levels if level is not None)

@@ -14,6 +14,7 @@ from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import rate_unit, read_sets, states_of
 from stlc.dynamics.schema_names import Clockwork, Names
 from stlc.dynamics.schema_reader import Reader
+from stlc.dynamics.schema_settings import read_backup, read_terms
 from stlc.dynamics.yaml_nodes import Entry, Node
 from stlc.units import DIMENSIONLESS
 
@@ -28,6 +29,8 @@ SCENARIO_KEYS = (
     "model_mismatch",
     "errors",
     "world",
+    "prefer",
+    "backup",
 )
 ERROR_KEYS = ("actuator_gain", "actuator_noise", "sensor_noise")
 EXPECTED = ("nominal", "ood")
@@ -59,6 +62,10 @@ def _scenario(entry: Entry, reader: Reader, names: Names, clock: Clockwork) -> S
         ),
         read_world(found.get("world"), reader),
         _errors(found.get("errors"), f"`errors` of {where}", timed),
+        read_terms(found.get("prefer"), f"`prefer` of {where}", reader, names),
+        read_backup(found["backup"], reader, names, clock.horizon, f"`backup` of {where}")
+        if "backup" in found
+        else None,
     )
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import MappingProxyType
 
 from stlc.compile import ir
 from stlc.compile.scope import Entry, Known
 from stlc.compile.values import Number, Vector
 from stlc.dynamics.algebra import names_in, substitute
 from stlc.dynamics.decl import START, BackupDecl, ObjectiveDecl, PolicyDecl, Term, TrainDecl
+from stlc.dynamics.schema_columns import read_levels
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import component_texts
 from stlc.dynamics.schema_mirror import read_mirror
@@ -23,7 +25,7 @@ POLICY_KEYS = ("type", "hidden", "observe", "mirror")
 POLICIES = ("mlp",)
 TRAIN_KEYS = ("budget", "steps", "seed", "lr", "batch", "samples", "method")
 METHODS = ("guided", "gradient")
-BACKUP_KEYS = ("bins", "T0", "batch")
+BACKUP_KEYS = ("bins", "levels", "T0", "batch")
 OUTCOME = {
     "sat": "1 where the trajectory satisfies the specification",
     "rho": "robustness of the trajectory",
@@ -35,12 +37,6 @@ def read_objective(node: Node | None, reader: Reader, names: Names) -> Objective
     """The section `objective`; terms read `sat`, `rho`, `k`, `t`, and `x_start`, where a state `x` began."""
     found = reader.fields(node, "`objective`", OBJECTIVE_KEYS)
     default = ObjectiveDecl()
-    entries = {name: Known(Number(ir.Col(name), flexible=True), about) for name, about in OUTCOME.items()}
-    entries["t"] = Known(Number(ir.Col("t"), SECOND), "seconds since the start of the plan")
-    entries |= {
-        f"{name}{START}": _first(names.entries[name]) for name in names.states if name in names.entries
-    }
-    here = names.expressions(reader).extended({n: e for n, e in entries.items() if n not in names.entries})
     gamma = reader.number(found.get("gamma"), "`gamma`")
     smoothing = reader.number(found.get("smoothing"), "`smoothing`", low=1e-9)
     weight = reader.number(found.get("lambda"), "`lambda`")
@@ -48,8 +44,19 @@ def read_objective(node: Node | None, reader: Reader, names: Names) -> Objective
         default.gamma if gamma is None else gamma,
         default.smoothing if smoothing is None else smoothing,
         default.stl_weight if weight is None else weight,
-        tuple(term for item in reader.items(found.get("terms"), "`terms`") for term in _term(item, here)),
+        read_terms(found.get("terms"), "`terms`", reader, names),
     )
+
+
+def read_terms(node: Node | None, where: str, reader: Reader, names: Names) -> tuple[Term, ...]:
+    """A list of performance terms."""
+    entries = {name: Known(Number(ir.Col(name), flexible=True), about) for name, about in OUTCOME.items()}
+    entries["t"] = Known(Number(ir.Col("t"), SECOND), "seconds since the start of the plan")
+    entries |= {
+        f"{name}{START}": _first(names.entries[name]) for name in names.states if name in names.entries
+    }
+    here = names.expressions(reader).extended({n: e for n, e in entries.items() if n not in names.entries})
+    return tuple(term for item in reader.items(node, where) for term in _term(item, here))
 
 
 def _first(state: Entry) -> Known:
@@ -124,9 +131,11 @@ def read_train(node: Node | None, reader: Reader, names: Names) -> TrainDecl:
     )
 
 
-def read_backup(node: Node | None, reader: Reader, horizon: int) -> BackupDecl:
-    """The section `backup`."""
-    found = reader.fields(node, "`backup`", BACKUP_KEYS)
+def read_backup(
+    node: Node | None, reader: Reader, names: Names, horizon: int, where: str = "`backup`"
+) -> BackupDecl:
+    """The section `backup`, or that of a scenario."""
+    found = reader.fields(node, where, BACKUP_KEYS)
     default = BackupDecl()
     lengths = _integers(found.get("T0"), "`T0`", reader) or default.lengths
     if "T0" in found and 0 < horizon < max(lengths):
@@ -135,7 +144,25 @@ def read_backup(node: Node | None, reader: Reader, horizon: int) -> BackupDecl:
         reader.integer(found.get("bins"), "`bins`", low=2) or default.bins,
         tuple(length for length in lengths if length <= horizon) or (1,),
         reader.integer(found.get("batch"), "`batch`") or default.batch,
+        MappingProxyType(_levels(found.get("levels"), reader, names)),
     )
+
+
+def _levels(node: Node | None, reader: Reader, names: Names) -> dict[str, tuple[float, ...]]:
+    """Values of controls, in the place of what those declare themselves."""
+    known = {control.name: control for control in names.controls}
+    found = {}
+    for entry in reader.entries(node, "`levels`"):
+        control = known.get(entry.key.text)
+        if control is None:
+            reader.unknown(entry.key, "`levels`", tuple(known))
+            continue
+        where = f"the control `{control.name}`"
+        bounds = (control.low, control.high)
+        levels = read_levels(entry.value, where, control.unit, bounds, names.expressions(reader))
+        if levels:
+            found[control.name] = levels
+    return found
 
 
 def _integers(node: Node | None, where: str, reader: Reader) -> tuple[int, ...]:

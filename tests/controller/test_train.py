@@ -160,6 +160,21 @@ def test_a_changed_spec_is_refused(car_task: Task, tmp_path: Path) -> None:
         assert caught.value.diagnostics[0].code == "R102"
 
 
+def test_the_deployment_may_be_edited_but_not_what_is_learnt(car_task: Task, tmp_path: Path) -> None:
+    config = TrainConfig(held_out=200, steps=5, batch=32)
+    folder = _folder(car_task, tmp_path, config)
+    train(car_task, config, folder)
+    path = folder.path / "system.yaml"
+    text = path.read_text()
+    path.write_text(text.replace("steps: 150", "steps: 15") + "# a note\n")
+    assert Run.open(folder.path).task.system.decl.test.steps == 15
+    path.write_text(text.replace("gamma: 0.5", "gamma: 0.4"))
+    assert path.read_text() != text
+    with pytest.raises(RunError) as caught:
+        Run.open(folder.path)
+    assert caught.value.diagnostics[0].code == "R102"
+
+
 def test_a_budget_becomes_steps(car_task: Task, tmp_path: Path) -> None:
     config = TrainConfig(held_out=200, budget=3.0, batch=32)
     folder = _folder(car_task, tmp_path, config)
