@@ -150,18 +150,16 @@ def read_backup(
 
 def _levels(node: Node | None, reader: Reader, names: Names) -> dict[str, tuple[float, ...]]:
     """Values of controls, in the place of what those declare themselves."""
-    known = {control.name: control for control in names.controls}
     found = {}
     for entry in reader.entries(node, "`levels`"):
-        control = known.get(entry.key.text)
-        if control is None:
-            reader.unknown(entry.key, "`levels`", tuple(known))
-            continue
-        where = f"the control `{control.name}`"
-        bounds = (control.low, control.high)
-        levels = read_levels(entry.value, where, control.unit, bounds, names.expressions(reader))
-        if levels:
-            found[control.name] = levels
+        name = entry.key.text
+        meant = [each for each in names.controls if each.name == name or each.name.startswith(f"{name}[")]
+        if not meant:
+            reader.unknown(entry.key, "`levels`", tuple(each.name for each in names.controls))
+        for control in meant:
+            where, bounds = f"the control `{control.name}`", (control.low, control.high)
+            levels = read_levels(entry.value, where, control.unit, bounds, names.expressions(reader))
+            found[control.name] = levels or control.levels
     return found
 
 

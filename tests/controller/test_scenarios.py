@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from stlc.controller.backup import Grid
 from stlc.controller.deploy import Guard
 from stlc.controller.disturbance import Disturbance
 from stlc.controller.drive import Recorder, Recording, Setting, drive
@@ -46,6 +47,9 @@ scenario:
   blurred: {noise: {x: "normal(0, 0.1)"}}
   drifting: {model_mismatch: {drift: 0.5 m/s}, override: {x: 5}}
   shaky: {errors: {actuator_gain: 10 %, actuator_noise: 0.05, sensor_noise: 2 %}}
+  fragile:
+    backup: {levels: {u: [-1, 0.5]}, T0: [1, 3]}
+    prefer: [{name: low, weight: 2, expr: y - 1 m}, {expr: "u^2"}]
 """
 SPEC = "signal x [m]\nsignal p: real[2] [m]\nconst speed = 1 m/s\nrequire a: always[0, T] x > -speed * 1 s\n"
 
@@ -256,3 +260,18 @@ def test_scenarios_are_checked_whether_chosen_or_not(old: str, new: str, code: s
     with pytest.raises(StlcError) as caught:
         parse_system(Source("boat.yaml", SYSTEM.replace(old, new)), Path("boat.yaml"))
     assert code in {finding.code for finding in caught.value.diagnostics}
+
+
+def test_a_scenario_brings_a_backup_and_preferences_of_its_own() -> None:
+    usual, fragile = task_of("nominal"), task_of("fragile")
+    assert Grid.of(fragile).values == ((-1.0, 0.5),)
+    assert Grid.of(fragile).lengths == (1, 3)
+    assert len(Grid.of(usual).values[0]) == usual.system.decl.backup.bins
+    x, u = usual.sample(1, seed=0, dtype=torch.float64), torch.full((1, 4, 1), 0.5, dtype=torch.float64)
+    y = usual.rollout(x, u)[0, :, usual.names.index("y")]
+    assert float(usual.cost(usual.judge(x, u))) == 0.0
+    assert float(fragile.cost(fragile.judge(x, u))) == pytest.approx(2.0 * float((y - 1.0).mean()) + 0.25)
+    assert fragile.system.decl.learnt != usual.system.decl.learnt  # only where it is laid over
+    plain = parse_system(Source("boat.yaml", SYSTEM), Path("boat.yaml"))
+    without = parse_system(Source("boat.yaml", SYSTEM[: SYSTEM.index("  fragile:")]), Path("boat.yaml"))
+    assert plain.learnt == without.learnt

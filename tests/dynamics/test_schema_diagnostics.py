@@ -101,6 +101,10 @@ CHANGES: dict[str, tuple[str, str]] = {
     "vector_of_another_size": ("  x: v\n", "  x: [v, v]\n"),
     "vector_without_size": ("x: {unit: m,", "x: {size: 3, unit: m,"),
     "scenario_of_nothing": ("test:\n", "scenario:\n  windy: {disturb: {z: 1}, const: {wal: 3}}\ntest:\n"),
+    "scenario_backup": (
+        "test:\n",
+        "scenario:\n  odd: {backup: {levels: {w: [1], u: [9]}, T0: [99]}, prefer: [{expr: wal}]}\ntest:\n",
+    ),
     "version": ("stlc: 1\n", "stlc: 2\n"),
     "tag": ("name: cart", "name: !!python/object/apply:os.system [id]"),
     "tab": ("  x: v\n", "\tx: v\n"),
