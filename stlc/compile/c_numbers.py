@@ -47,7 +47,7 @@ CLIP = "LEAST(MOST({0}, {1}), {2})"
 
 
 class Untranslatable(Exception):  # noqa: N818 - not an error: another back end takes over
-    """The IR holds something that has no C form, such as a function that the system provides."""
+    """The IR holds something that a back end has no form for, such as a function that the system provides."""
 
 
 Leaf: TypeAlias = ir.Col | ir.At | ir.Held | ir.Extern

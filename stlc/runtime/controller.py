@@ -160,6 +160,8 @@ class Controller:
 
     def _read(self, state: ArrayLike | Mapping[str, ArrayLike], elapsed: int) -> tuple[Numbers, bool]:
         """(agents, n), and whether it is one agent."""
+        if elapsed < 0:
+            raise _misfit(f"{elapsed} steps since the decision before", "`elapsed` counts from it onwards")
         if isinstance(state, Mapping):
             state = np.stack(np.broadcast_arrays(*self._named(state)), -1)
         given = np.asarray(state, dtype=np.float64)

@@ -33,8 +33,9 @@ def test_an_episode_is_that_of_the_decisions() -> None:
     sys.modules["gym_loop"] = module
     spec.loader.exec_module(module)
     run, folder = exported("traffic", "car")
-    found = module.drive(Controller.load(folder), make(SPEC), seed=4)
     controller, env = Controller.load(folder), make(SPEC)
+    found = module.drive(controller, env, seed=4)
+    controller.reset()
     _, info = env.reset(seed=4)
     for _ in range(run.task.horizon):
         _, _, over, _, info = env.step(controller.decide(info["state"]).control)

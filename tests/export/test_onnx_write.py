@@ -109,11 +109,11 @@ def test_without_the_package_the_way_is_said(tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_plan_that_is_no_number_counts_as_violated() -> None:
-    run, folder = exported("ship_safe", "ship_safe")
+    run, folder = exported("traffic", "car")
     graphs = Graphs(read_facts(folder))
     x = run.task.sample(3, seed=2, dtype=torch.float64)
     plans = torch.zeros(3, run.task.horizon, len(run.task.system.controls), dtype=torch.float64)
-    plans[0, 2, 0], plans[1, 0, 1] = torch.nan, torch.inf
+    plans[0, 2, 0], plans[1, 0, 0] = torch.nan, torch.inf
     wanted = run.task.judge(x, plans)
     found, _ = graphs.judged(x.numpy(), plans.numpy())
     assert found.rho[:2].tolist() == found.safe[:2].tolist() == [-torch.inf, -torch.inf]
