@@ -46,14 +46,17 @@ class Animation:
     mp4: Path | None
 
 
-def film_of(run: RunDir) -> Film | None:
+def film_of(run: RunDir, *, title: str | None = None) -> Film | None:
     """What there is to see of the run's deployment; None where nothing was recorded.
+
+    Its title names specification, scenario and run where no other is given.
 
     A world draws its own scene and is loaded from the folder. Without one, or where it cannot be loaded or
     fails to draw, the paths of the trace are shown over the places that its specification names, else its
     signals.
     """
-    return _scene_film(run) or _signal_film(run)
+    title = _title(run) if title is None else title
+    return _scene_film(run, title) or _signal_film(run, title)
 
 
 def film_name(run: RunDir) -> str:
@@ -105,13 +108,11 @@ class Seen:
         scene: snapshots stacked to (frames, …).
         world: what draws them.
         dt: seconds between them.
-        scenario: under which they were recorded, if any.
     """
 
     scene: Scene
     world: WorldType
     dt: float
-    scenario: str | None
 
     @property
     def stage(self) -> Stage | None:
@@ -135,10 +136,10 @@ def seen_in(run: RunDir) -> Seen | None:
         world = None if decl.test.world is None else world_type(decl)
     except StlcError:
         return None
-    return None if world is None else Seen(scene, world, float(decl.dt), scenario)
+    return None if world is None else Seen(scene, world, float(decl.dt))
 
 
-def _scene_film(run: RunDir) -> Film | None:
+def _scene_film(run: RunDir, title: str) -> Film | None:
     seen = seen_in(run)
     if seen is None:
         return None
@@ -147,7 +148,7 @@ def _scene_film(run: RunDir) -> Film | None:
     try:
         stage = seen.stage if bullet.available() else None
         draw = seen.world.draw if stage is None else bullet.stage_drawing(stage)
-        return scene_film(seen.scene, Staging(draw, seen.dt, _title(run, seen.scenario), keys, strip))
+        return scene_film(seen.scene, Staging(draw, seen.dt, title, keys, strip))
     except Exception:  # whatever a world's own code raises: there are other pictures
         return None
 
@@ -203,12 +204,11 @@ def _scenario(run: RunDir) -> str | None:
     return None if name is None else str(name)
 
 
-def _signal_film(run: RunDir) -> Film | None:
+def _signal_film(run: RunDir, title: str) -> Film | None:
     try:
         trace = load_trace(run.path / TRACE)
     except StlcError:
         return None
-    title = _title(run, _scenario(run))
     chart = _chart(trace)
     return signal_film(trace, title=title) if chart is None else chart_film(chart, title=title)
 
@@ -232,6 +232,6 @@ def _load_scene(path: Path) -> Scene | None:
     return scene if whole else None
 
 
-def _title(run: RunDir, scenario: str | None) -> str:
+def _title(run: RunDir) -> str:
     spec = str(run.record().get("spec", ""))
-    return " · ".join(part for part in (spec, scenario, run.name) if part)
+    return " · ".join(part for part in (spec, _scenario(run), run.name) if part)

@@ -66,12 +66,16 @@ def show(stage: Stage, scene: Scene, dt: float) -> None:
     """
     require_window()
     theatre = Theatre(stage, "window")
-    for index in range(len(stage.joints)):
-        begin = time.perf_counter()
-        if not theatre.open:
-            return
-        theatre.turn(index, deciders(scene, index, stage.joints.shape[1]))
-        time.sleep(max(0.0, dt - (time.perf_counter() - begin)))
+    try:
+        for index in range(len(stage.joints)):
+            begin = time.perf_counter()
+            theatre.turn(index, deciders(scene, index, stage.joints.shape[1]))
+            time.sleep(max(0.0, dt - (time.perf_counter() - begin)))
+    except theatre.client.error:  # somebody closed the window
+        if theatre.open:
+            raise
+    finally:
+        theatre.close()
 
 
 def require_window() -> None:
@@ -96,11 +100,12 @@ class Theatre:
             self.stage, self.clear = stage, CLEAR if mode == "window" else 1.0
             self.count = stage.joints.shape[1]
             self.places = PITCH * stage.reach * np.arange(self.count)[:, None] * np.array([1.0, 0.0, 0.0])
+            if mode == "window":
+                self._look()
             self.robots = self._robots()
             self.discs = [self._disc(place) for place in self.places]
             self.balls = [[self._ball(ball) for _ in range(self.count)] for ball in stage.balls]
-            if mode == "window":
-                self._look()
+            self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 1)
         self.shown = np.full(self.count, -1)
 
     @property
@@ -108,17 +113,25 @@ class Theatre:
         """Whether the window has not been closed."""
         return bool(self.client.isConnected())
 
+    def close(self) -> None:
+        """End it."""
+        if self.open:
+            with _silenced():
+                self.client.disconnect()
+
     def turn(self, index: int, who: NDArray[np.int64]) -> None:
         """Show frame `index`, robots by who decided, (robots,)."""
+        self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 0)  # until all is in place
         for robot, body in enumerate(self.robots):
-            for joint, angle in zip(self.movable, self.stage.joints[index, robot].tolist(), strict=True):
-                self.client.resetJointState(body, joint, angle)
+            angles = self.stage.joints[index, robot, :, None].tolist()
+            self.client.resetJointStatesMultiDof(body, self.movable, angles)
             if self.shown[robot] != who[robot]:
                 self._colour(robot, int(who[robot]))
         for ball, bodies in zip(self.stage.balls, self.balls, strict=True):
             for robot, body in enumerate(bodies):
                 self._put(body, self.places[robot] + ball.centre[index, robot])
         self.shown = who.copy()
+        self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 1)
 
     def picture(self, index: int, who: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Frame `index` as (height, width, 3); balls are seen through, which the renderer cannot do."""
@@ -173,8 +186,10 @@ class Theatre:
         return [float(self.places[:, 0].mean()), 0.0, 0.5 * self.stage.reach]
 
     def _look(self) -> None:
+        """The window without its panels, and still while robots come in."""
         self.client.configureDebugVisualizer(self.client.COV_ENABLE_GUI, 0)
-        away = 1.3 * PITCH * self.stage.reach * max(self.count, 2)
+        self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 0)
+        away = 0.5 * PITCH * self.stage.reach * max(self.count, 2)
         self.client.resetDebugVisualizerCamera(away, 10, -20, self._middle())
 
     def _rendered(self) -> NDArray[np.float64]:

@@ -150,10 +150,10 @@ def _panel(figure: Figure, plan: _Plan, box: tuple[float, float, float, float]) 
 
 
 def _keys(scene: Scene, staging: Staging) -> dict[str, str]:
-    """Who decided, as far as anybody else than the policy did, and what the world adds."""
-    sources = {0, *np.unique(scene["decision"]).tolist()} if "decision" in scene else {0}
+    """Who decided, where that was recorded, and what the world adds."""
+    sources = {0, *np.unique(scene["decision"]).tolist()} if "decision" in scene else set()
     who = {DECIDERS[source]: DECIDED[source] for source in sorted(sources)}
-    return {**(who if len(who) > 1 else {}), **staging.keys}
+    return {**who, **staging.keys}
 
 
 def _head(figure: Figure, plan: _Plan, title: str, keys: Mapping[str, str]) -> Text:

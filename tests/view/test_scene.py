@@ -73,7 +73,7 @@ def test_the_legend_names_who_decided_and_what_the_world_adds(acted):
     figure, _ = drawn(scene_film(scene_of(decision=acted), staging), 0)
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == [*DECIDERS[:3], "goal"]
-    free, _ = drawn(scene_film(scene_of(decision=0 * acted), Staging(draw_field, 0.1)), 0)
+    free, _ = drawn(scene_film(scene_of(), Staging(draw_field, 0.1)), 0)
     assert not free.legends
 
 
