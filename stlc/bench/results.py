@@ -10,6 +10,8 @@ from typing import Any
 from stlc.bench import ablation, family, paper
 from stlc.bench.ceilings import Ceiling
 from stlc.files import write_atomic
+from stlc.provenance import git_state, hardware, versions
+from stlc.rundir import now
 from stlc.view import available
 from stlc.view.benchmarks import Curve, Panel, draw_benchmarks
 
@@ -223,6 +225,16 @@ def provenance(documents: Iterable[Mapping[str, Any]]) -> list[str]:
         line = f"- {count} on {key[0]}; {key[1]}; {key[2]}; {when}; commit {commits}"
         lines += wrap(line, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
     return lines
+
+
+def made_here() -> str:
+    """The machine, the software and the commit of what has just been measured, as a line of a page."""
+    machine, software, git = hardware(), versions(), git_state()
+    commit = str((git or {}).get("commit") or "unknown")[:10]
+    return (
+        f"- {machine.get('processor') or machine.get('machine')}, {machine.get('cores')} cores; torch"
+        f" {software.get('torch')}; {now()[:10]}; commit `{commit}`"
+    )
 
 
 def _counted(count: int, what: str) -> str:

@@ -6,6 +6,7 @@ import typer
 
 from stlc.cli.bench_ablation import ablation
 from stlc.cli.bench_family import family
+from stlc.cli.bench_latency import latency
 from stlc.cli.bench_paper import paper
 from stlc.cli.bench_robustness import robustness
 from stlc.cli.bench_step import step
@@ -66,4 +67,13 @@ def register(app: typer.Typer) -> None:
             note="Milliseconds of processor time on one thread; the search beside it runs on another core.",
         )
     )(step)
+    group.command(
+        help=describe(
+            "Time decisions for one agent, without a guard and with each.",
+            "stlc bench latency",
+            "stlc bench latency runs/traffic/latest runs/ship_track/latest --page docs/benchmarks.md",
+            note="Milliseconds on one thread, in states of deployments. The full guard has its usual limit "
+            "of 100 ms a decision.",
+        )
+    )(latency)
     app.add_typer(group)

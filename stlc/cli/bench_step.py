@@ -72,19 +72,11 @@ def step(
 
 def _section(steps: Sequence[StepTiming], speeds: Sequence[Speed], warm: int) -> str:
     """Both tables as Markdown, with the machine behind them."""
-    from stlc.bench.results import markdown
-    from stlc.provenance import git_state, hardware, versions
-    from stlc.rundir import now
+    from stlc.bench.results import made_here, markdown
 
-    machine, software, git = hardware(), versions(), git_state()
-    commit = str((git or {}).get("commit") or "unknown")[:10]
     lines = [_TEXT.format(warm=warm), *markdown(_STEP_HEADER, [_step_row(each) for each in steps])]
     lines += [_SPEED, *markdown(_SPEED_HEADER, [_speed_row(each) for each in speeds]), ""]
-    lines.append(
-        f"- {machine.get('processor') or machine.get('machine')}, {machine.get('cores')} cores; torch"
-        f" {software.get('torch')}; {now()[:10]}; commit `{commit}`"
-    )
-    return "\n".join(lines)
+    return "\n".join([*lines, made_here()])
 
 
 def _step_row(each: StepTiming) -> tuple[str, ...]:

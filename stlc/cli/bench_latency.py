@@ -1,0 +1,74 @@
+"""`stlc bench latency`: how long decisions take, and the table of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stlc.cli.bench_options import SeedsOption
+from stlc.cli.options import JsonOption
+from stlc.cli.output import emit, emit_json, say, table
+from stlc.cli.ranges import parse_seeds
+
+if TYPE_CHECKING:
+    from stlc.bench.latency import Row, Times
+
+HEADER = ("benchmark", "guard", "median", "99 %", "where it acts: median", "99 %", "decisions")
+TEXT = """## A decision
+
+Written by `stlc bench latency`. Milliseconds that one decision for one agent takes on one thread, the plan
+that was begun, its verdict and what is tried instead included: in states that are spread evenly over
+deployments under the paper's guard, and where the guard replaced the policy's plan.
+"""
+
+
+def latency(
+    runs: Annotated[
+        list[str] | None, typer.Argument(metavar="RUN…", help="Runs; the newest one if none.")
+    ] = None,
+    samples: Annotated[int, typer.Option("--samples", min=2, help="States a policy.")] = 600,
+    seeds: SeedsOption = "100,101",
+    page: Annotated[
+        Path | None, typer.Option("--page", metavar="FILE", help="A page that takes the table.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Print the table; write it where a page is named."""
+    from stlc.bench.latency import rows_of
+    from stlc.bench.results import write_section
+    from stlc.rundir import RunDir
+
+    folders = [RunDir.open(name) for name in runs or ["latest"]]
+    rows = []
+    for row in rows_of(folders, samples=samples, seeds=parse_seeds(seeds)):
+        say(f"{row.benchmark}, {row.guard}: {_cell(row.every, 'median')} ms")
+        rows.append(row)
+    if page is not None:
+        write_section(page, "latency", _section(rows))
+    if as_json:
+        result = {"what": "latency", "rows": [asdict(row) for row in rows]}
+        emit_json("bench/1", ok=True, exit_code=0, result=result)
+        return
+    emit(table([_cells(row) for row in rows], header=HEADER, indent=""))
+
+
+def _section(rows: Sequence[Row]) -> str:
+    """The table as Markdown, with the machine behind it."""
+    from stlc.bench.results import made_here, markdown
+
+    return "\n".join([TEXT, *markdown(HEADER, [_cells(row) for row in rows]), "", made_here()])
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    every = (_cell(row.every, "median"), _cell(row.every, "p99"))
+    acting = (_cell(row.acting, "median"), _cell(row.acting, "p99"))
+    counts = [str(times.samples) if times else "0" for times in (row.every, row.acting)]
+    return (row.benchmark, row.guard, *every, *acting, " / ".join(counts))
+
+
+def _cell(times: Times | None, name: str) -> str:
+    return "" if times is None else f"{getattr(times, name):.2f}"
