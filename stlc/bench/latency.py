@@ -103,7 +103,8 @@ def picked(recording: Recording, samples: int) -> tuple[NDArray[np.int64], NDArr
 
 
 def _spread(places: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    return places[np.linspace(0, len(places) - 1, min(count, len(places))).astype(int)]
+    found: NDArray[np.int64] = places[np.linspace(0, len(places) - 1, min(count, len(places))).astype(int)]
+    return found
 
 
 def _timed(guard: Guard, recording: Recording, places: NDArray[np.int64]) -> list[tuple[float, int]]:
