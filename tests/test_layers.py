@@ -86,6 +86,7 @@ HOMES = {
         "stlc.controller",
         "stlc.export",
         "stlc.view",
+        "stlc.bench",
         "stlc.gym",
         "stlc.cli",
     ),
