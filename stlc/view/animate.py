@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stlc.controller.stage import Stage, Staged
 from stlc.diagnostics import StlcError
@@ -20,6 +19,7 @@ from stlc.view import bullet
 from stlc.view.chart import Chart, chart_film, chart_of
 from stlc.view.driven import monitor_of
 from stlc.view.film import MAX_BYTES, MAX_FRAMES, Film, save_film, save_still
+from stlc.view.margins import strip_of
 from stlc.view.scene import Scene, Staging, scene_film
 from stlc.view.signal_film import signal_film
 from stlc.view.strip import Strip
@@ -33,9 +33,6 @@ TRACE = "trace.npz"
 SYSTEM = "system.yaml"
 RESULT = "eval/simulate.json"
 STILL = "scene.png"
-ENOUGH = 0.4
-"""The least share of instants from which the world did for somebody as the model says, to show only those."""
-AS_FORESEEN = "least margin from each instant on, of the agents for which the world did as the model says"
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +141,7 @@ def _scene_film(run: RunDir, title: str) -> Film | None:
     if seen is None:
         return None
     keys: Mapping[str, str] = getattr(seen.world, "KEYS", {})
-    strip = _strip(run, seen.scene, seen.dt)
+    strip = _strip(run, seen)
     try:
         stage = seen.stage if bullet.available() else None
         draw = seen.world.draw if stage is None else bullet.stage_drawing(stage)
@@ -153,46 +150,13 @@ def _scene_film(run: RunDir, title: str) -> Film | None:
         return None
 
 
-def _strip(run: RunDir, scene: Scene, dt: float) -> Strip | None:
-    """Margins of the agents that the scene shows, those of the first seed; None where they are not known."""
-    frames = min(len(values) for values in scene.values())
-    decisions = scene.get("decision")
-    times = np.arange(frames, dtype=np.float64) * np.float64(dt)
+def _strip(run: RunDir, seen: Seen) -> Strip | None:
+    """What is shown over time; None where it is not known."""
     try:
         trace = load_trace(run.path / TRACE)
-        if decisions is None or trace.samples != frames:
-            return None
-        shown = decisions.shape[1]
-        first = {name: values[:shown] for name, values in trace.data.items()}
-        monitor = monitor_of(trace, system=run.path / SYSTEM)
-        found = monitor.requirement_robustness(replace(trace, data=first, extras={}))
+        return strip_of(seen.scene, trace, seen.dt, system=run.path / SYSTEM)
     except StlcError:
         return None
-    rows = {name: np.atleast_2d(rho)[:, :frames] for name, rho in found.items()}
-    margins = {name: _least(rho, _foreseen(trace, shown)) for name, rho in rows.items()}
-    if _known(margins) >= ENOUGH * _known({name: _least(rho) for name, rho in rows.items()}):
-        return Strip(times, margins, decisions.astype(np.int64), AS_FORESEEN)
-    return Strip(times, {name: _least(rho) for name, rho in rows.items()}, decisions.astype(np.int64))
-
-
-def _known(margins: Mapping[str, NDArray[np.float64]]) -> int:
-    """How many margins there are."""
-    return sum(int(np.isfinite(rho).sum()) for rho in margins.values())
-
-
-def _foreseen(trace: Trace, agents: int) -> NDArray[np.bool_]:
-    """From which samples on the world did as the model says, for the length of a plan, (agents, samples)."""
-    steps, horizon = trace.extras.get("foreseen"), trace.meta.horizon
-    if steps is None or horizon is None or steps.shape != (trace.traces, trace.samples - 1):
-        return np.ones((agents, trace.samples), dtype=bool)
-    wrong = np.cumsum(np.pad(steps[:agents] == 0, ((0, 0), (1, horizon))), axis=1)
-    return np.asarray(wrong[:, horizon : horizon + trace.samples] == wrong[:, : trace.samples])
-
-
-def _least(rho: NDArray[np.float64], counts: NDArray[np.bool_] | bool = True) -> NDArray[np.float64]:
-    """The least of the agents that count, (samples,); NaN where none is known."""
-    known = np.where(counts & ~np.isnan(rho), rho, np.inf).min(0)
-    return np.where(np.isfinite(known), known, np.nan)
 
 
 def _scenario(run: RunDir) -> str | None:

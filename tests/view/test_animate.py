@@ -69,6 +69,19 @@ def test_without_a_world_signals_are_shown(seen, damage, recording):
     assert film_of(seen).frames == recording.samples
 
 
+STAGED = """
+    @staticmethod
+    def stage(scene):
+        raise RuntimeError("bodies are asked for")
+"""
+
+
+def test_robots_are_drawn_by_their_world_where_there_is_no_pybullet(seen, monkeypatch):
+    (seen.path / "dots.py").write_text(WORLD + STAGED)
+    monkeypatch.setattr("stlc.view.bullet.available", lambda: False)
+    assert film_of(seen).frames == 7
+
+
 def test_a_run_without_a_deployment_has_no_film(trained):
     assert film_of(trained) is None
     assert animate(trained) is None

@@ -1,0 +1,40 @@
+"""The least margins of the agents that a scene shows."""
+
+import numpy as np
+import pytest
+
+from stlc.signature import Signature
+from stlc.trace import Trace, TraceMeta
+from stlc.view.margins import AS_FORESEEN, as_foreseen, least, strip_of
+
+
+def test_margins_count_where_the_world_did_as_the_model_says():
+    rho = np.array([[1.0, 2.0, 3.0, np.nan], [-1.0, 5.0, np.nan, np.nan]])
+    steps = np.array([[1, 1, 1], [0, 1, 1]])
+    meta = TraceMeta(horizon=2)
+    trace = Trace(Signature(()), 0.1, {"x": np.zeros((2, 4))}, extras={"foreseen": steps}, meta=meta)
+    counts = as_foreseen(trace, 2)
+    assert counts.tolist() == [[True] * 4, [False, True, True, True]]
+    np.testing.assert_array_equal(least(rho), [-1, 2, 3, np.nan])
+    np.testing.assert_array_equal(least(rho, counts), [1, 2, 3, np.nan])
+
+
+def test_the_agents_of_the_first_seed_are_shown(recording, tmp_path):
+    scene = {"decision": recording.extras["decision"][:10].T.astype(np.int8)}
+    scene["decision"] = np.concatenate([scene["decision"], scene["decision"][-1:]])
+    strip = strip_of(scene, recording, 0.1, system=tmp_path / "none.yaml")
+    assert strip.rows == ["no_collision", "stop_sign", "give_way", "red_light"]
+    assert strip.decisions.shape == (151, 10)
+    assert strip.words != AS_FORESEEN  # nobody recorded whether it was so
+    assert np.isnan(strip.margins["red_light"][-25:]).all()
+    assert strip_of({"decision": scene["decision"][1:]}, recording, 0.1, system=tmp_path) is None
+
+
+@pytest.mark.parametrize("right", [0, 1])
+def test_where_little_goes_as_foreseen_all_agents_count(recording, tmp_path, right):
+    extras = {**recording.extras, "foreseen": np.full((20, 150), right, dtype=np.int8)}
+    told = Trace(recording.signature, 0.1, recording.data, extras=extras, meta=recording.meta)
+    scene = {"decision": np.zeros((151, 10), dtype=np.int8)}
+    strip = strip_of(scene, told, 0.1, system=tmp_path / "none.yaml")
+    assert (strip.words == AS_FORESEEN) is bool(right)
+    assert np.isfinite(strip.margins["red_light"][0])
