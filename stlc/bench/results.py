@@ -220,7 +220,7 @@ def provenance(documents: Iterable[Mapping[str, Any]]) -> list[str]:
     for key, group in groups.items():
         dates = sorted({str(document["finished"])[:10] for document in group})
         when = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
-        commits = ", ".join(f"`{commit}`" for commit in sorted({_commit(document) for document in group}))
+        commits = ", ".join(f"`{commit}`" for commit in sorted({commit_of(document) for document in group}))
         count = _counted(len(group), "trainings")
         line = f"- {count} on {key[0]}; {key[1]}; {key[2]}; {when}; commit {commits}"
         lines += wrap(line, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
@@ -242,7 +242,8 @@ def _counted(count: int, what: str) -> str:
     return f"{count} {what if count != 1 else what.removesuffix('s')}"
 
 
-def _commit(document: Mapping[str, Any]) -> str:
+def commit_of(document: Mapping[str, Any]) -> str:
+    """Of the source tree that made a result, with `+` where that had changes."""
     git = document.get("git") or {}
     commit = str(git.get("commit") or "unknown")[:10]
     return commit + ("+" if git.get("dirty") else "")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import typer
 
 from stlc.cli.bench_ablation import ablation
+from stlc.cli.bench_disturbed import disturbed
 from stlc.cli.bench_family import family
 from stlc.cli.bench_latency import latency
 from stlc.cli.bench_paper import paper
@@ -50,6 +51,14 @@ def register(app: typer.Typer) -> None:
             note=_KEPT + " So is a verdict at a value of the parameter.",
         )
     )(family)
+    group.command(
+        help=describe(
+            "Deploy policies in worlds that are not as their model says, without a guard and with one.",
+            "stlc bench disturbed",
+            "stlc bench disturbed runs/traffic/latest --guards none,paper --seeds 0..2 --steps 60",
+            note="Deployments that are there are kept if run, world and size are still the same.",
+        )
+    )(disturbed)
     group.command(
         help=describe(
             "Time the robustness of whole traces, forward and backward.",

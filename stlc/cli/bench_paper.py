@@ -102,7 +102,7 @@ def search(extent: Extent, place: Place, passes: int) -> None:
     for benchmark in extent.benchmarks:
         own = [document for document in documents if document["benchmark"] == benchmark]
         if own:
-            run = _best_run(own, place)
+            run = best_run(own, place)
             search_on(own, place.out, passes=passes, run=run, told=_teller(benchmark))
 
 
@@ -110,7 +110,7 @@ def _teller(benchmark: str) -> Callable[[int, int], None]:
     return lambda number, still: say(f"ceiling of {benchmark}: search {number}, {still:,} states open")
 
 
-def _best_run(own: Sequence[Mapping[str, Any]], place: Place) -> RunDir | None:
+def best_run(own: Sequence[Mapping[str, Any]], place: Place) -> RunDir | None:
     """The run of the most accurate policy, if it is still there."""
     from stlc.bench.cells import inputs_of
     from stlc.bench.study import cell_of, newest_run

@@ -17,7 +17,7 @@ from stlc.compile.lower import lower
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.semantics import TOLERANCE
 from stlc.compile.simplify import simplify
-from stlc.controller.savable import savable
+from stlc.controller.savable import savable as search_safe
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import Rule
@@ -57,13 +57,18 @@ class Executed:
         return held
 
 
-def judge_executed(task: Task, recording: Recording) -> Executed:
-    """Judge what happened. Without a window that fits, there are no starts."""
+def judge_executed(task: Task, recording: Recording, *, savable: Mask | None = None) -> Executed:
+    """Judge what happened. Without a window that fits, there are no starts.
+
+    `savable`: (rows,) from whose first states a safe plan is known; a search finds them if not given.
+    """
     columns = dict(zip(task.names, np.moveaxis(recording.states, -1, 0).transpose(0, 2, 1), strict=True))
     starts = max(recording.steps + 1 - task.horizon, 0)
     rules = {rule.name: _held(as_driven(rule, task), columns, task.horizon) for rule in task.rules}
     safety = tuple(rule.name for rule in task.compiled.safety)
-    found = savable(task, torch.from_numpy(recording.states[:, 0])).numpy()
+    found = savable
+    if found is None:
+        found = search_safe(task, torch.from_numpy(recording.states[:, 0])).numpy()
     executed = Executed(rules, safety, _foreseen(task, recording, starts), found)
     return replace(executed, savable=found | executed.agents(safety))
 

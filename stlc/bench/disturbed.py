@@ -1,0 +1,222 @@
+"""`stlc bench disturbed`: policies in worlds that are not as the model says, without a guard and with one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from stlc.bench.cells import BENCHMARKS, read_json
+from stlc.controller.deploy import Guard, Mode
+from stlc.controller.drive import Recorder, Setting, drive
+from stlc.controller.evaluate import decided, measure
+from stlc.controller.executed import judge_executed
+from stlc.controller.intervals import Interval
+from stlc.controller.polish import Limits
+from stlc.controller.run import SPEC, SYSTEM, Run
+from stlc.controller.savable import savable
+from stlc.controller.world import world_type
+from stlc.dynamics.scenario import DISTURBED
+from stlc.files import write_atomic
+from stlc.jsontext import dumps
+from stlc.provenance import git_state, hardware, sha256, versions
+from stlc.rundir import RunDir, now
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from stlc.controller.task import Task
+
+FORMAT = "bench-disturbed/1"
+FILE = "disturbed.json"
+NOMINAL = "as it is"
+SCENARIOS = (NOMINAL, *DISTURBED)
+GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
+SHOWN = ("saved", "executed_safe", "executed_starts", "executed_safe_starts", "plan_accuracy", "savable")
+"""The metrics that are kept; see `stlc.controller.evaluate.METRICS`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """Which deployments are wanted.
+
+    Attributes:
+        scenarios: some of `SCENARIOS`, or others that the systems know.
+        guards: some of `GUARDS`.
+        seeds: of the deployments.
+        agents: in each, at most; None: as many as the system says.
+        steps: of each, at most; None: as many as the system says.
+        limit: seconds that a decision of the full guard may take per agent.
+    """
+
+    scenarios: Sequence[str] = SCENARIOS
+    guards: Sequence[Mode] = GUARDS
+    seeds: tuple[int, ...] = (0, 1, 2)
+    agents: int | None = None
+    steps: int | None = None
+    limit: float | None = 0.1
+
+    def setting(self, run: Run) -> Setting:
+        """How a run is deployed."""
+        test = run.task.system.decl.test
+        agents = min(self.agents or test.agents, test.agents)
+        steps = min(self.steps or test.steps, test.steps)
+        return Setting(self.seeds, agents, steps, test.replan, self.limit)
+
+
+@dataclass(frozen=True, slots=True)
+class Deployed:
+    """A deployment of the table.
+
+    Attributes:
+        name: such as `traffic-noise-paper`.
+        document: what is kept of it.
+        kept: it was there already.
+    """
+
+    name: str
+    document: Mapping[str, Any]
+    kept: bool
+
+
+def fill(
+    runs: Sequence[RunDir], extent: Extent, folder: Path, begun: Callable[[str], None] = lambda _: None
+) -> Iterator[Deployed]:
+    """All deployments, one after the other; each is kept as soon as it is over, and never driven twice.
+
+    Args:
+        runs: of the policies.
+        extent: which scenarios and guards, and how long.
+        folder: of the results.
+        begun: called with the name of a deployment before it starts.
+
+    Raises:
+        RunError, SystemFileError: a run is damaged, or a world fails.
+    """
+    for folder_of_run in runs:
+        starts = _Starts()
+        for scenario in extent.scenarios:
+            laid = Run.open(folder_of_run.path, scenario=None if scenario == NOMINAL else scenario)
+            setting = extent.setting(laid)
+            for mode in extent.guards:
+                name = f"{laid.task.compiled.name}-{scenario.replace(' ', '_')}-{mode}"
+                key = _key(laid, scenario, mode, setting)
+                known = (read_json(folder / FILE).get("deployments") or {}).get(name) or {}
+                if known.get("key") == key:
+                    yield Deployed(name, known, kept=True)
+                    continue
+                begun(name)
+                found = {"key": key, "scenario": scenario, **_deployed(laid, mode, setting, starts)}
+                _keep(folder, name, found)
+                yield Deployed(name, found, kept=False)
+
+
+@dataclass(slots=True)
+class _Starts:
+    """Which starts can be saved: searched for once, scenarios and guards begin alike."""
+
+    x0: list[Tensor] = field(default_factory=list)
+    found: list[Tensor] = field(default_factory=list)
+
+    def savable(self, task: Task, x0: Tensor) -> Tensor:
+        """Where a search finds a safe plan, (rows,)."""
+        for known, found in zip(self.x0, self.found, strict=True):
+            if known.shape == x0.shape and bool((known == x0).all()):
+                return found
+        self.x0.append(x0)
+        self.found.append(savable(task, x0))
+        return self.found[-1]
+
+
+def _deployed(run: Run, mode: Mode, setting: Setting, starts: _Starts) -> dict[str, Any]:
+    """Drive, and measure what was driven."""
+    guard = Guard(run.task, run.policy, mode, limits=Limits(seconds=setting.limit))
+    recorder, begin = Recorder(setting.agents), perf_counter()
+    drive(guard, world_type(run.task.system.decl), setting, recorder)
+    recording = recorder.recording()
+    assert recording is not None
+    seconds = perf_counter() - begin
+    known = starts.savable(run.task, torch.from_numpy(recording.states[:, 0]))
+    metrics = measure(recording, judge_executed(run.task, recording, savable=known.numpy()))
+    return {
+        "spec": run.task.compiled.name,
+        "run": run.dir.name,
+        "guard": mode,
+        "seeds": list(setting.seeds),
+        **{"agents": setting.agents, "steps": setting.steps, "replan": setting.replan},
+        "time_limit": setting.limit if mode == "full" else None,
+        "metrics": {name: _plain(metrics[name]) for name in SHOWN if name in metrics},
+        "progress": {name: _plain(metrics[name]) for name in recording.progress[0] if name in metrics},
+        "acted": 1.0 - decided(recording)["policy"],
+        "seconds": seconds,
+        **{"date": now(), "versions": versions(), "git": git_state(), "hardware": hardware()},
+    }
+
+
+def _plain(found: Interval) -> dict[str, Any]:
+    return {"mean": found.mean, "low": found.low, "high": found.high, "values": list(found.values)}
+
+
+def _key(run: Run, scenario: str, mode: Mode, setting: Setting) -> str:
+    """All that a deployment depends on, in a few digits."""
+    folder, world = run.dir.path, run.task.system.decl.test.world
+    texts = [(folder / name).read_text(encoding="utf-8") for name in (SPEC, SYSTEM, "ckpt/last.json")]
+    texts += [world.path.read_text(encoding="utf-8")] if world is not None else []
+    limit = setting.limit if mode == "full" else None
+    asked = [scenario, mode, *map(str, (setting.seeds, setting.agents, setting.steps, setting.replan, limit))]
+    return sha256("\0".join([*texts, *asked]))[:16]
+
+
+def _keep(folder: Path, name: str, found: Mapping[str, Any]) -> None:
+    kept = read_json(folder / FILE).get("deployments") or {}
+    kept[name] = dict(found)
+    write_atomic(folder / FILE, dumps({"format": FORMAT, "deployments": kept}, indent=1) + "\n")
+
+
+def kept_in(folder: Path) -> list[dict[str, Any]]:
+    """All deployments that a folder holds."""
+    return list((read_json(folder / FILE).get("deployments") or {}).values())
+
+
+# ----------------------------------------------------------------------- the table
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A policy under a scenario, by guard.
+
+    Attributes:
+        spec: name of the specification.
+        scenario: name.
+        size: seeds, agents and steps.
+        guards: guard -> its document.
+    """
+
+    spec: str
+    scenario: str
+    size: tuple[int, int, int]
+    guards: Mapping[str, Mapping[str, Any]]
+
+    def metric(self, guard: str, name: str) -> Mapping[str, Any] | None:
+        """Mean and interval of a metric under a guard; None where that was not driven, or is of nothing."""
+        found: Mapping[str, Any] | None = (self.guards.get(guard) or {}).get("metrics", {}).get(name)
+        return found
+
+
+def disturbed_rows(documents: Iterable[Mapping[str, Any]]) -> list[Row]:
+    """The table: specifications in the paper's order, then others; scenarios in that of `SCENARIOS`."""
+    groups: dict[tuple[str, str, tuple[int, int, int]], dict[str, Mapping[str, Any]]] = {}
+    for each in documents:
+        size = (len(each["seeds"]), int(each["agents"]), int(each["steps"]))
+        groups.setdefault((each["spec"], each["scenario"], size), {})[each["guard"]] = each
+    return sorted((Row(*key, guards) for key, guards in groups.items()), key=_place)
+
+
+def _place(row: Row) -> tuple[int, str, int, str, tuple[int, int, int]]:
+    spec = BENCHMARKS.index(row.spec) if row.spec in BENCHMARKS else len(BENCHMARKS)
+    scenario = SCENARIOS.index(row.scenario) if row.scenario in SCENARIOS else len(SCENARIOS)
+    return spec, row.spec, scenario, row.scenario, row.size

@@ -1,0 +1,120 @@
+"""`stlc bench disturbed`: policies under disturbances, without a guard and with one, and the table of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from stlc.cli.bench_options import OutOption, SeedsOption, chosen
+from stlc.cli.options import JsonOption
+from stlc.cli.output import emit, emit_json, say, table
+from stlc.cli.ranges import parse_limit, parse_seeds
+from stlc.diagnostics import Diagnostic, UsageError
+
+if TYPE_CHECKING:
+    from stlc.bench.disturbed import Row
+    from stlc.rundir import RunDir
+
+
+def disturbed(
+    runs: Annotated[
+        list[str] | None, typer.Argument(metavar="RUN…", help="Runs; the best of `stlc bench paper` if none.")
+    ] = None,
+    scenarios: Annotated[
+        str | None,
+        typer.Option(
+            "--scenarios", metavar="NAMES", help="Such as noise,mismatch-20; the usual ones if none."
+        ),
+    ] = None,
+    guards: Annotated[
+        str, typer.Option("--guards", metavar="NAMES", help="Some of none,paper,full.")
+    ] = "none,paper,full",
+    seeds: SeedsOption = "0..2",
+    agents: Annotated[
+        int | None, typer.Option("--agents", min=1, help="In each deployment, at most.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Of each deployment, at most.")] = None,
+    time_limit: Annotated[
+        str, typer.Option("--time-limit", metavar="TIME", help="Of a decision of the full guard, or `none`.")
+    ] = "100ms",
+    out: OutOption = Path("bench"),
+    trained: Annotated[
+        Path, typer.Option("--runs", metavar="DIR", help="Where `stlc bench paper` has left its runs.")
+    ] = Path("runs/bench"),
+    page: Annotated[Path, typer.Option("--page", metavar="FILE", help="The page that shows them.")] = Path(
+        "docs/worlds.md"
+    ),
+    as_json: JsonOption = False,
+) -> None:
+    """Drive what has not been driven yet, and write the table into the page."""
+    from stlc.bench.disturbed import GUARDS, SCENARIOS, Extent, disturbed_rows, fill, kept_in
+    from stlc.bench.disturbed_text import disturbed_section
+    from stlc.bench.results import write_section
+
+    extent = Extent(
+        tuple(name.strip() for name in scenarios.split(",")) if scenarios else SCENARIOS,
+        [mode for mode in GUARDS if mode in chosen(guards, GUARDS, "guard")],
+        parse_seeds(seeds),
+        agents,
+        steps,
+        parse_limit(time_limit),
+    )
+    found, kept = [], 0
+    for each in fill(_folders(runs, out, trained), extent, out, lambda name: say(f"deploying {name}")):
+        found.append(each.document)
+        kept += each.kept
+        say(f"{each.name}  {'kept' if each.kept else format(each.document['seconds'], '.0f') + ' s'}")
+    write_section(page, "disturbed", disturbed_section(kept_in(out)))
+    rows = disturbed_rows(found)
+    if as_json:
+        result = {"what": "disturbed", "page": str(page), "driven": len(found) - kept, "kept": kept}
+        emit_json(
+            "bench/1", ok=True, exit_code=0, result={**result, "rows": [_row_json(row) for row in rows]}
+        )
+        return
+    header = (
+        "",
+        "scenario",
+        *(f"{name}: {what}" for what in ("safe", "satisfied") for name in extent.guards),
+    )
+    emit(table([_cells(row, extent.guards) for row in rows], header=header, indent=""))
+    say(f"written: {page}, {out}")
+
+
+def _folders(names: Sequence[str] | None, out: Path, trained: Path) -> list[RunDir]:
+    """The runs that are named, else those of the most accurate policies. Raises UsageError (U101)."""
+    from stlc.bench.cells import BENCHMARKS
+    from stlc.bench.study import Place, valid_results
+    from stlc.cli.bench_paper import best_run
+    from stlc.rundir import RunDir
+
+    if names:
+        return [RunDir.open(name) for name in names]
+    documents, place = valid_results(out, "paper"), Place(out, trained)
+    own = [[each for each in documents if each["benchmark"] == benchmark] for benchmark in BENCHMARKS]
+    found = [run for each in own if each and (run := best_run(each, place)) is not None]
+    if not found:
+        help_ = ("stlc bench paper  trains them", "stlc bench disturbed RUN  takes any other run")
+        raise UsageError(
+            Diagnostic("U101", f"there are no policies of the benchmarks in `{trained}`", help=help_)
+        )
+    return found
+
+
+def _cells(row: Row, guards: Sequence[str]) -> tuple[str, ...]:
+    from stlc.bench.disturbed_text import spread
+
+    metrics = (row.metric(guard, name) for name in ("saved", "executed_starts") for guard in guards)
+    return (row.spec, row.scenario, *map(spread, metrics))
+
+
+def _row_json(row: Row) -> Mapping[str, Any]:
+    seeds, agents, steps = row.size
+    guards = {name: {"metrics": each["metrics"], "acted": each["acted"]} for name, each in row.guards.items()}
+    return {
+        **{"spec": row.spec, "scenario": row.scenario, "seeds": seeds, "agents": agents, "steps": steps},
+        "guards": guards,
+    }
