@@ -1,0 +1,186 @@
+"""Deployments under disturbances: driven once, kept, and laid out as a table."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from documents import misfits
+
+from stlc.bench import disturbed
+from stlc.bench.cells import BENCHMARKS, read_json
+from stlc.bench.disturbed import FILE, NOMINAL, SCENARIOS, Row, _Starts, disturbed_rows
+from stlc.bench.disturbed_text import disturbed_section, spread
+from stlc.cli.app import main
+from stlc.cli.schema import load_schema
+from stlc.rundir import RunDir
+
+ROOT = Path(__file__).parents[2]
+SPEC = "signal p [m]\n@safety\nrequire near: always[0, T] abs(p) <= 1.2 m\n"
+SYSTEM = """\
+stlc: 1
+name: dot
+time: {dt: 0.5 s, horizon: 4 steps}
+state: {p: {unit: m, range: [-2, 2]}, w: {unit: m/s, range: [-2, 2]}}
+control: {u: {unit: m/s^2, range: [-1, 1]}}
+flow: {p: w, w: u}
+init: {mixture: [{draw: {p: "uniform(-1, 1)", w: 0}}]}
+policy: {hidden: [8]}
+backup: {bins: 3, T0: [1], batch: 64}
+test: {steps: 12, agents: 4}
+"""
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("home")
+    (folder / "dot.stl").write_text(SPEC)
+    (folder / "dot.yaml").write_text(SYSTEM)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        command = ["train", "dot.stl", "--system", "dot.yaml", "--steps", "3", "--batch", "16"]
+        assert main([*command, "--held-out", "50", "--no-pictures"]) in (0, 1)
+    return folder
+
+
+@pytest.fixture
+def run(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> RunDir:
+    monkeypatch.chdir(home)
+    capsys.readouterr()
+    return RunDir.newest()
+
+
+def bench(run: RunDir, out: Path, *options: str) -> int:
+    page = ["--page", str(out / "page.md"), "--out", str(out)]
+    return main(["bench", "disturbed", str(run.path), "--seeds", "0,1", *page, *options])
+
+
+def test_what_was_driven_is_kept(
+    run: RunDir, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    some = ["--scenarios", "as it is,mismatch-20,noise", "--guards", "none,paper"]
+    assert bench(run, tmp_path, *some) == 0
+    captured = capsys.readouterr()
+    assert captured.err.count("deploying") == 6
+    first = read_json(tmp_path / FILE)
+    (name,) = {each["spec"] for each in first["deployments"].values()}
+    assert len(first["deployments"]) == 6
+    published = load_schema("bench/1")
+    assert misfits(first, {"$defs": published["$defs"], **published["$defs"]["disturbed"]}) == []
+    page = (tmp_path / "page.md").read_text()
+    assert f"| {name}, 2 x 4 x 12 | as it is |" in page
+    assert "| safe, no guard | safe, paper's | satisfied, no guard | satisfied, paper's |" in page
+
+    monkeypatch.setattr(disturbed, "drive", lambda *_: pytest.fail("driven twice"))
+    assert bench(run, tmp_path, *some, "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert misfits(document, published) == []
+    result = document["result"]
+    assert (result["driven"], result["kept"]) == (0, 6)
+    assert [row["scenario"] for row in result["rows"]] == ["as it is", "mismatch-20", "noise"]
+    assert read_json(tmp_path / FILE) == first
+    monkeypatch.undo()
+
+    monkeypatch.chdir(run.path.parents[2])
+    assert bench(run, tmp_path, "--scenarios", "noise", "--guards", "none", "--steps", "6") == 0
+    assert capsys.readouterr().err.count("deploying") == 1  # of another size
+
+
+def test_guards_and_scenarios_begin_alike_and_end_otherwise(run: RunDir, tmp_path: Path) -> None:
+    """An agent is savable under every scenario and guard or under none: only so can they be compared."""
+    assert bench(run, tmp_path, "--guards", "none,full", "--scenarios", "as it is,mismatch-20") == 0
+    found = read_json(tmp_path / FILE)["deployments"].values()
+    assert {each["metrics"]["savable"]["mean"] for each in found} == {1.0}
+    safe = {(each["scenario"], each["guard"]): each["metrics"]["saved"]["mean"] for each in found}
+    assert safe[NOMINAL, "full"] == 1.0
+    assert safe[NOMINAL, "full"] >= safe[NOMINAL, "none"]
+    acted = {each["guard"]: each["acted"] for each in found if each["scenario"] == NOMINAL}
+    assert acted["none"] == 0.0
+
+
+def test_starts_are_searched_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def search(_task: Any, x0: torch.Tensor) -> torch.Tensor:
+        asked.append(len(x0))
+        return x0[:, 0] > 0
+
+    monkeypatch.setattr(disturbed, "savable", search)
+    starts, x0 = _Starts(), torch.tensor([[1.0], [-1.0]])
+    for _ in range(3):
+        assert starts.savable(None, x0.clone()).tolist() == [True, False]  # type: ignore[arg-type]
+    assert starts.savable(None, -x0).tolist() == [False, True]  # type: ignore[arg-type]
+    assert asked == [2, 2]
+
+
+def test_without_policies_that_is_said(
+    run: RunDir, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", "disturbed", "--out", str(tmp_path), "--runs", str(tmp_path)]) == 2
+    assert "no policies of the benchmarks" in capsys.readouterr().err
+    assert bench(run, tmp_path, "--guards", "fulll") == 2
+    assert "did you mean `full`" in capsys.readouterr().err
+    assert bench(run, tmp_path, "--scenarios", "nois") == 2
+    assert "there is no scenario `nois`" in capsys.readouterr().err
+
+
+# ------------------------------------------------------------------------- the table
+
+
+def document(spec: str, scenario: str, guard: str, seeds: int = 2) -> dict[str, Any]:
+    share = {"mean": 0.5, "low": 0.25, "high": 0.75, "values": [0.5] * seeds}
+    return {
+        **{"spec": spec, "scenario": scenario, "guard": guard, "seeds": list(range(seeds))},
+        **{"agents": 4, "steps": 12, "metrics": {"saved": share}, "acted": 0.0, "date": "2026-01-02T03"},
+        **{"versions": {"torch": "2"}, "hardware": {"cores": 2}, "git": {"commit": "0123456789ab"}},
+    }
+
+
+def test_rows_are_in_order_and_guards_side_by_side() -> None:
+    documents = [
+        document("own", "noise", "none"),
+        document("ship_safe", "shifted", "none"),
+        document("ship_safe", NOMINAL, "none"),
+        document("traffic", "noise", "full"),
+        document("traffic", "noise", "none"),
+        document("traffic", "mismatch-5", "none"),
+    ]
+    rows = disturbed_rows(documents)
+    assert [(row.spec, row.scenario) for row in rows] == [
+        ("traffic", "mismatch-5"),
+        ("traffic", "noise"),
+        ("ship_safe", NOMINAL),
+        ("ship_safe", "shifted"),
+        ("own", "noise"),
+    ]
+    assert set(rows[1].guards) == {"none", "full"}
+    section = disturbed_section(documents)
+    assert "| traffic, 2 x 4 x 12 | mismatch-5 | .500 ± .250 |  |" in section
+    assert "|  | noise | .500 ± .250 | .500 ± .250 |" in section
+    assert "6 deployments" in section
+
+
+def test_shares_are_short() -> None:
+    assert spread({"mean": 1.0, "high": 1.0}) == "1.000 ± .000"
+    assert spread({"mean": 0.957, "high": 1.5}) == ".957 ± .543"
+    assert spread({"mean": 0.25, "high": None}) == ".250"
+    assert spread(None) == ""
+
+
+def test_what_is_published_is_complete() -> None:
+    """All six benchmarks under every scenario, without and with the guard, as the page says."""
+    kept = read_json(ROOT / "bench" / FILE)
+    published = load_schema("bench/1")
+    assert misfits(kept, {"$defs": published["$defs"], **published["$defs"]["disturbed"]}) == []
+    rows: list[Row] = disturbed_rows(kept["deployments"].values())
+    assert [(row.spec, row.scenario) for row in rows] == [
+        (spec, scenario) for spec in BENCHMARKS for scenario in SCENARIOS
+    ]
+    assert all({"none", "paper"} <= set(row.guards) for row in rows)
+    page = (ROOT / "docs" / "worlds.md").read_text(encoding="utf-8")
+    (shown,) = re.findall(r"<!-- disturbed -->\n(.*?)<!-- /disturbed -->", page, re.DOTALL)
+    assert shown.strip() == disturbed_section(list(kept["deployments"].values())).strip()
