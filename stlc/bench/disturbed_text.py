@@ -26,7 +26,7 @@ def disturbed_section(documents: Sequence[Mapping[str, Any]]) -> str:
     rows = disturbed_rows(documents)
     guards = [guard for guard in GUARDS if any(guard in row.guards for row in rows)]
     header = ("", "scenario", *(f"{what}, {_TITLES[guard]}" for what in _COLUMNS for guard in guards))
-    lines = ["### Disturbed", "", _HEAD]
+    lines = [_HEAD]
     cells, last = [], ""
     for row in rows:
         metrics = (row.metric(guard, name) for name in _COLUMNS.values() for guard in guards)

@@ -100,10 +100,10 @@ def _opened(where: str) -> TextIO:
 def _write(oversight: Oversight, stream: TextIO) -> None:
     """One object an agent, a line each."""
     from stlc.cli.output import tolerate_closed
-    from stlc.jsontext import dumps, plain
+    from stlc.jsontext import dumps
 
     with tolerate_closed(stream):
-        stream.writelines(dumps(plain(record)) + "\n" for record in oversight.records())
+        stream.writelines(dumps(record) + "\n" for record in oversight.records())
         stream.flush()
 
 

@@ -98,8 +98,9 @@ class _Watched:
             assert self.last is not None
             return self.last
         stop = samples if self.everywhere else 1
-        starts = range(self.next - first, stop - first)
-        self.whole.grow(env, 0, samples - first)
+        begin = max(self.needs(), first)  # as many samples every time: what is planned for them is known
+        starts = range(self.next - begin, stop - begin)
+        self.whole.grow({name: column[begin - first :] for name, column in env.items()}, 0, samples - begin)
         shape = (len(starts), _traces(env))
         low, high = (np.broadcast_to(end, shape) for end in self.whole.of_all(starts))
         fails, holds = high < -TOLERANCE, low >= -TOLERANCE

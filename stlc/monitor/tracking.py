@@ -166,6 +166,7 @@ class Whole:
     samples: int = 0
     _signals: Mapping[str, Floats] = field(default_factory=dict)
     _ends: dict[End, ir.Formula] = field(default_factory=dict)
+    _long: tuple[int, ir.Formula, ir.Formula] = (-1, ir.Truth(True), ir.Truth(True))
 
     def __post_init__(self) -> None:
         if self.truth:
@@ -213,8 +214,10 @@ class Whole:
         record, window = Record(with_seen(self._signals), NUMPY), self.window
         lower, upper = self._ends["lower"], self._ends["upper"]
         if window is None:
-            low = record.values([lengthened(lower, self.samples)], starts, "lower", FAR)[0]
-            high = record.values([lengthened(upper, self.samples)], starts, "upper", FAR)[0]
+            if self._long[0] != self.samples:
+                self._long = self.samples, lengthened(lower, self.samples), lengthened(upper, self.samples)
+            low = record.values([self._long[1]], starts, "lower", FAR)[0]
+            high = record.values([self._long[2]], starts, "upper", FAR)[0]
             return np.asarray(low), np.asarray(high)
         low, high = window_bounds(lower, record, starts, window, "open")
         if upper != lower:
