@@ -13,6 +13,7 @@ from rich.text import Text
 
 from stlc.cli.check_text import signed
 from stlc.cli.output import table
+from stlc.compile.semantics import TOLERANCE
 from stlc.controller.deploy import SOURCES
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ LINES = 10
 """How many lines there are elsewhere."""
 HALF = 10
 """Half the width of a bar: what stands right of its middle is to spare."""
-STYLES = {"satisfied": "green", "inconclusive": "", "violated": "red"}
 
 
 class LiveView:
@@ -140,7 +140,7 @@ class LiveView:
             open_ = margin.low[row] < margin.high[row]
             value = f"{'at most ' if open_ else ''}{signed(high)}"
             text = Text(f"  {name:<{label}}  ")
-            text.append(self._bar(name, high), style="red" if high < 0 else "green")
+            text.append(self._bar(name, high), style="red" if high < -TOLERANCE else "green")
             told = f"  {value:<16}  {self._agent(row)}"
             text.append(told)
             if count:
@@ -180,8 +180,7 @@ class LiveView:
         text = table(cells, header=("agent", "decided by", "plan", "least margin", *units))
         lines = [Text(line[:width]) for line in text.splitlines()]
         for line, row in zip(lines[1:], rows, strict=True):
-            worst = {margin.status(row) for margin in oversight.margins.values()}
-            line.stylize(STYLES["violated"] if "violated" in worst else "")
+            line.stylize("red" if least[row] < -TOLERANCE else "")
         return lines
 
 
