@@ -51,6 +51,7 @@ class Extent:
         agents: in each, at most; None: as many as the system says.
         steps: of each, at most; None: as many as the system says.
         limit: seconds that a decision of the full guard may take per agent.
+        margin: what guards ask plans to spare of every safety requirement.
     """
 
     scenarios: Sequence[str] = SCENARIOS
@@ -59,13 +60,14 @@ class Extent:
     agents: int | None = None
     steps: int | None = None
     limit: float | None = 0.1
+    margin: float = 0.0
 
     def setting(self, run: Run) -> Setting:
         """How a run is deployed."""
         test = run.task.system.decl.test
         agents = min(self.agents or test.agents, test.agents)
         steps = min(self.steps or test.steps, test.steps)
-        return Setting(self.seeds, agents, steps, test.replan, self.limit)
+        return Setting(self.seeds, agents, steps, test.replan, self.limit, self.margin)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +105,8 @@ def fill(
             laid = Run.open(folder_of_run.path, scenario=None if scenario == NOMINAL else scenario)
             setting = extent.setting(laid)
             for mode in extent.guards:
-                name = f"{laid.task.compiled.name}-{scenario.replace(' ', '_')}-{mode}"
+                called = guard_name(mode, setting.margin)
+                name = f"{laid.task.compiled.name}-{scenario.replace(' ', '_')}-{called}"
                 key = _key(laid, scenario, mode, setting)
                 known = (read_json(folder / FILE).get("deployments") or {}).get(name) or {}
                 if known.get("key") == key:
@@ -113,6 +116,11 @@ def fill(
                 found = {"key": key, "scenario": scenario, **_deployed(laid, mode, setting, starts)}
                 _keep(folder, name, found)
                 yield Deployed(name, found, kept=False)
+
+
+def guard_name(mode: str, margin: float) -> str:
+    """Such as `full`, or `full+0.2` where it asks for something to spare."""
+    return f"{mode}+{margin:g}" if margin and mode != "none" else mode
 
 
 @dataclass(slots=True)
@@ -134,7 +142,7 @@ class _Starts:
 
 def _deployed(run: Run, mode: Mode, setting: Setting, starts: _Starts) -> dict[str, Any]:
     """Drive, and measure what was driven."""
-    guard = Guard(run.task, run.policy, mode, limits=Limits(seconds=setting.limit))
+    guard = Guard(run.task, run.policy, mode, limits=Limits(seconds=setting.limit, margin=setting.margin))
     recorder, begin = Recorder(setting.agents), perf_counter()
     drive(guard, world_type(run.task.system.decl), setting, recorder)
     recording = recorder.recording()
@@ -145,7 +153,7 @@ def _deployed(run: Run, mode: Mode, setting: Setting, starts: _Starts) -> dict[s
     return {
         "spec": run.task.compiled.name,
         "run": run.dir.name,
-        "guard": mode,
+        "guard": guard_name(mode, setting.margin),
         "seeds": list(setting.seeds),
         **{"agents": setting.agents, "steps": setting.steps, "replan": setting.replan},
         "time_limit": setting.limit if mode == "full" else None,
@@ -167,7 +175,11 @@ def _key(run: Run, scenario: str, mode: Mode, setting: Setting) -> str:
     texts = [(folder / name).read_text(encoding="utf-8") for name in (SPEC, SYSTEM, "ckpt/last.json")]
     texts += [world.path.read_text(encoding="utf-8")] if world is not None else []
     limit = setting.limit if mode == "full" else None
-    asked = [scenario, mode, *map(str, (setting.seeds, setting.agents, setting.steps, setting.replan, limit))]
+    asked = [
+        scenario,
+        guard_name(mode, setting.margin),
+        *map(str, (setting.seeds, setting.agents, setting.steps, setting.replan, limit)),
+    ]
     return sha256("\0".join([*texts, *asked]))[:16]
 
 

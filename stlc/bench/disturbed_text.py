@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from textwrap import wrap
 from typing import Any
 
-from stlc.bench.disturbed import GUARDS, Row, disturbed_rows
+from stlc.bench.disturbed import Row, disturbed_rows
 from stlc.bench.results import WIDTH, commit_of, markdown
 
 _HEAD = """\
@@ -24,8 +24,8 @@ _COLUMNS = {"safe": "saved", "satisfied": "executed_starts"}
 def disturbed_section(documents: Sequence[Mapping[str, Any]]) -> str:
     """A table of all deployments, and what they were made with."""
     rows = disturbed_rows(documents)
-    guards = [guard for guard in GUARDS if any(guard in row.guards for row in rows)]
-    header = ("", "scenario", *(f"{what}, {_TITLES[guard]}" for what in _COLUMNS for guard in guards))
+    guards = sorted({guard for row in rows for guard in row.guards}, key=_order)
+    header = ("", "scenario", *(f"{what}, {_title(guard)}" for what in _COLUMNS for guard in guards))
     lines = [_HEAD]
     cells, last = [], ""
     for row in rows:
@@ -34,6 +34,16 @@ def disturbed_section(documents: Sequence[Mapping[str, Any]]) -> str:
         cells.append((first, row.scenario, *map(spread, metrics)))
         last = row.spec
     return "\n".join([*lines, *markdown(header, cells), "", *_made(documents)])
+
+
+def _order(guard: str) -> tuple[int, float]:
+    mode, _, margin = guard.partition("+")
+    return [*_TITLES].index(mode), float(margin or 0)
+
+
+def _title(guard: str) -> str:
+    mode, _, margin = guard.partition("+")
+    return _TITLES[mode] + (f", {margin} to spare" if margin else "")
 
 
 def _size(row: Row) -> str:

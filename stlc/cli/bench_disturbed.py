@@ -40,6 +40,10 @@ def disturbed(
     time_limit: Annotated[
         str, typer.Option("--time-limit", metavar="TIME", help="Of a decision of the full guard, or `none`.")
     ] = "100ms",
+    margin: Annotated[
+        float,
+        typer.Option("--margin", min=0.0, help="What guards ask safety requirements to spare."),
+    ] = 0.0,
     out: OutOption = Path("bench"),
     trained: Annotated[
         Path, typer.Option("--runs", metavar="DIR", help="Where `stlc bench paper` has left its runs.")
@@ -50,7 +54,7 @@ def disturbed(
     as_json: JsonOption = False,
 ) -> None:
     """Drive what has not been driven yet, and write the table into the page."""
-    from stlc.bench.disturbed import GUARDS, SCENARIOS, Extent, disturbed_rows, fill, kept_in
+    from stlc.bench.disturbed import GUARDS, SCENARIOS, Extent, disturbed_rows, fill, guard_name, kept_in
     from stlc.bench.disturbed_text import disturbed_section
     from stlc.bench.results import write_section
 
@@ -61,6 +65,7 @@ def disturbed(
         agents,
         steps,
         parse_limit(time_limit),
+        margin,
     )
     found, kept = [], 0
     for each in fill(_folders(runs, out, trained), extent, out, lambda name: say(f"deploying {name}")):
@@ -75,12 +80,13 @@ def disturbed(
             "bench/1", ok=True, exit_code=0, result={**result, "rows": [_row_json(row) for row in rows]}
         )
         return
+    called = [guard_name(mode, margin) for mode in extent.guards]
     header = (
         "",
         "scenario",
-        *(f"{name}: {what}" for what in ("safe", "satisfied") for name in extent.guards),
+        *(f"{name}: {what}" for what in ("safe", "satisfied") for name in called),
     )
-    emit(table([_cells(row, extent.guards) for row in rows], header=header, indent=""))
+    emit(table([_cells(row, called) for row in rows], header=header, indent=""))
     say(f"written: {page}, {out}")
 
 

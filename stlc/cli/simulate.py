@@ -40,6 +40,9 @@ LimitOption = Annotated[
     str, typer.Option(metavar="TIME", help="Of a decision of the full guard, per agent; or `none`.")
 ]
 
+MarginOption = Annotated[
+    float, typer.Option(min=0.0, help="What a guard asks plans to spare of each safety requirement.")
+]
 RecordOption = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Write the trace there too (.npz or .csv).")
 ]
@@ -88,6 +91,7 @@ def simulate(
     ceiling: Annotated[
         int, typer.Option(min=0, help="Visited states to search for a plan, where the followed one fails.")
     ] = 0,
+    margin: MarginOption = 0.0,
     seeds: Annotated[int, typer.Option(min=1, help="How many deployments.")] = 10,
     seed: Annotated[int, typer.Option(min=0, max=2**62, help="Seed of the first; the others follow.")] = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Of each; by default the system's.")] = None,
@@ -122,7 +126,8 @@ def simulate(
         require_robots(opened)
     test, which = opened.task.system.decl.test, tuple(range(seed, seed + seeds))
     limit = parse_limit(time_limit)
-    setting = Setting(which, agents or test.agents, steps or test.steps, test.replan, limit, ceiling)
+    size = agents or test.agents, steps or test.steps
+    setting = Setting(which, *size, test.replan, limit, ceiling, margin)
     several = _several(opened, scenario)
     order = _Order(opened, chosen, setting, record, live, margins, parse_overrides(set_))
     document = _all(order, several) if several else _driven(order, scenario)

@@ -10,7 +10,10 @@ from torch import Tensor
 
 from stlc.compile.semantics import TOLERANCE
 from stlc.controller.backup import Backup, Found, Grid
+from stlc.controller.policy import Mlp
 from stlc.controller.polish import FullBackup, Limits
+from stlc.controller.prefix import robustness_until
+from stlc.controller.spare import sparing
 from stlc.controller.task import rank
 
 if TYPE_CHECKING:
@@ -83,7 +86,8 @@ class Guard:
         mode: where the monitor finds a plan violated, "paper" calls the paper's backup policy and "full" the
             polishing one; "none" only records.
         grid: candidates of the backup; by default what the system file says.
-        limits: of a decision of the full guard.
+        limits: of a decision. With a margin robustness and verdicts of decisions are those of the task all
+            the same; only what the guard lets pass is another.
     """
 
     def __init__(
@@ -95,13 +99,19 @@ class Guard:
         grid: Grid | None = None,
         limits: Limits | None = None,
     ) -> None:
-        self.task, self.policy, self.mode = task, policy, mode
+        self.task, self.mode = task, mode
+        self.strict = sparing(task, 0.0 if mode == "none" or limits is None else limits.margin)
+        self.policy = policy
+        if isinstance(policy, Mlp) and self.strict is not task:
+            self.policy = Mlp(
+                self.strict, policy.network
+            )  # of its plans it takes one with that much to spare
         self.backup: Backup | FullBackup | None = None
         match mode:
             case "paper":
-                self.backup = Backup(task, policy, grid=grid)
+                self.backup = Backup(self.strict, self.policy, grid=grid)
             case "full":
-                self.backup = FullBackup(task, policy, grid=grid, limits=limits)
+                self.backup = FullBackup(self.strict, self.policy, grid=grid, limits=limits)
 
     @torch.no_grad()
     def decide(self, x: Tensor, begun: Decision | None = None) -> Decision:
@@ -129,7 +139,32 @@ class Guard:
             plan = plan.index_copy(0, failing, found.plan)
             source, t0 = source.index_copy(0, failing, found.source), t0.index_copy(0, failing, found.t0)
             rho, safe = rho.index_copy(0, failing, found.rho), safe.index_copy(0, failing, found.safe)
-        return Decision(plan[:, 0], plan, source, t0, rho, safe, judged.rho)
+        decision = Decision(plan[:, 0], plan, source, t0, rho, safe, judged.rho)
+        return decision if self.strict is self.task else self._plainly(decision, x, fresh)
+
+    def _plainly(self, decision: Decision, x: Tensor, fresh: Tensor) -> Decision:
+        """The decision with the verdicts of the task itself."""
+        taken = self.task.judge(x, decision.plan, states=False)
+        policy_rho = self.task.judge(x, fresh, states=False).rho
+        return replace(decision, rho=taken.rho, safe=taken.safe >= -TOLERANCE, policy_rho=policy_rho)
+
+    @torch.no_grad()
+    def endangered(self, x: Tensor, begun: Decision, steps: int) -> Tensor:
+        """Who would, by the model, violate the safety requirements with the next steps of a begun plan.
+
+        Args:
+            x: (agents, n) states.
+            begun: what is left of the decision before.
+            steps: until everybody plans anew.
+
+        Returns:
+            (agents,) booleans; nobody without a guard.
+        """
+        formulas = [rule.formula for rule in self.strict.compiled.safety]
+        if self.backup is None or not formulas:
+            return torch.zeros(len(x), dtype=torch.bool)
+        columns = self.strict.system.rollout_columns(x.to(torch.float64), begun.plan.to(torch.float64))
+        return ~(robustness_until(formulas, columns, steps) >= -TOLERANCE)
 
     @torch.no_grad()
     def prefer(self, options: Tensor, begun: Decision | None = None) -> Tensor:
@@ -147,12 +182,12 @@ class Guard:
         _, judged = self._plan(options.flatten(0, 1))
         score = self._score(judged).view(agents, count)
         if begun is not None:
-            rest = self._score(self.task.judge(options[:, 0], begun.plan))
+            rest = self._score(self.strict.judge(options[:, 0], begun.plan))
             score[:, 0] = torch.maximum(score[:, 0], rest)
         return (score >= score.amax(1, keepdim=True)).to(torch.uint8).argmax(1)
 
     def _score(self, judged: Judged) -> Tensor:
-        return rank(judged.rho, self.task.cost(judged), judged.safe)
+        return rank(judged.rho, self.strict.cost(judged), judged.safe)
 
     def _kept(self, x: Tensor, begun: Decision | None, fresh: Tensor, judged: Judged) -> Found:
         """The policy's plans, or what is left of those that were begun."""
@@ -160,8 +195,8 @@ class Guard:
         safe = judged.safe >= -TOLERANCE
         if begun is None:
             return Found(fresh, zero, zero, judged.rho, safe)
-        rest = self.task.judge(x, begun.plan)
-        better = rank(rest.rho, self.task.cost(rest)) >= rank(judged.rho, self.task.cost(judged))
+        rest = self.strict.judge(x, begun.plan)
+        better = rank(rest.rho, self.strict.cost(rest)) >= rank(judged.rho, self.strict.cost(judged))
         keep = (better | self._deepened(rest)) & (rest.rho >= -TOLERANCE)
         return Found(
             torch.where(keep[:, None, None], begun.plan, fresh),
@@ -178,8 +213,10 @@ class Guard:
         return self.task.promises.deepened(rest.columns)
 
     def _plan(self, x: Tensor) -> tuple[Tensor, Judged]:
-        if isinstance(self.policy, _JudgesItself):
+        if isinstance(self.policy, _JudgesItself) and (
+            self.strict is self.task or isinstance(self.policy, Mlp)
+        ):
             plan, judged = self.policy.plan_judged(x)
             return plan.to(x.dtype), judged
         plan = self.policy.plan(x).to(x.dtype)
-        return plan, self.task.judge(x, plan)
+        return plan, self.strict.judge(x, plan)

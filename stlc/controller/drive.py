@@ -150,11 +150,16 @@ class _Pilot:
         self.decision: Decision | None = None
         self.age = torch.zeros(0, dtype=torch.int64)
 
-    def due(self, x: Tensor, step: int) -> Tensor:
-        """Who plans now, (k,) rows: everybody every `replan` steps, and whom the world told something."""
+    def due(self, x: Tensor, seen: Tensor, step: int) -> Tensor:
+        """Who plans now, (k,) rows: everybody every `replan` steps, and whom the world told something.
+
+        So does whom the guard sees run into danger before the others plan again.
+        """
         if self.decision is None or step % self.replan == 0:
             return torch.arange(len(x))
-        return torch.nonzero((x != self.before)[:, self.told].any(1)).squeeze(1)
+        left = self.replan - step % self.replan
+        danger = self.guard.endangered(seen, self.decision.later(self.age), left)
+        return torch.nonzero((x != self.before)[:, self.told].any(1) | danger).squeeze(1)
 
     def prefer(self, options: Tensor, due: Tensor) -> Tensor:
         """Which option everybody takes, (rows,); those who do not plan now stay with theirs."""
@@ -193,8 +198,8 @@ def drive(
     recorder.start(x, worlds.snapshot())
     recorder.units = worlds.units()
     for step in range(setting.steps):
-        due = pilot.due(x, step)
-        seen = worlds.disturbance.seen(x, step) if len(due) else x
+        seen = worlds.disturbance.seen(x, step)
+        due = pilot.due(x, seen, step)
         options, begun = worlds.options(x), perf_counter()
         if options is not None:
             chosen = worlds.choose(pilot.prefer(options + (seen - x)[:, None], due), x)

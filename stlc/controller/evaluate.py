@@ -107,7 +107,7 @@ def deploy(
         SystemFileError: S206, the world cannot be loaded.
     """
     make = world_type(task.system.decl)
-    guarded = Guard(task, policy, guard, limits=Limits(seconds=setting.limit))
+    guarded = Guard(task, policy, guard, limits=Limits(seconds=setting.limit, margin=setting.margin))
     recorder = Recorder(setting.agents)
     try:
         drive(guarded, make, setting, recorder, watch)
@@ -243,6 +243,7 @@ def as_json(
         "replan": setting.replan,
         "time_limit": setting.limit,
         "ceiling": setting.ceiling,
+        "margin": setting.margin,
         "interval": "95 %, Student's t over the deployment seeds",
         "guards": {
             name: {

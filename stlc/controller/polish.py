@@ -43,6 +43,8 @@ class Limits:
         prefixes: prefixes of one length at most; where the grid has more, a low-discrepancy sample of them.
         places: of the plans that prefixes gave, how many are climbed from.
         rescue: whether phi_safe alone is hunted for, without the policy, where nothing else was safe.
+        margin: what a plan must have to spare of every safety requirement before the guard lets it pass, in
+            the requirement's unit; of the paper's guard too.
     """
 
     seconds: float | None = 0.1
@@ -50,6 +52,7 @@ class Limits:
     prefixes: int = 1000
     places: int = 8
     rescue: bool = True
+    margin: float = 0.0
 
 
 class FullBackup:

@@ -52,6 +52,18 @@ def anchored(formula: ir.Formula) -> ir.Formula:
             return formula
 
 
+def robustness_until(formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor], last: int) -> Tensor:
+    """The least robustness of formulas on the samples 0 to `last`, whatever comes after them: (batch,).
+
+    `columns`: name -> (time, batch), as long as the formulas look.
+    """
+    like = next(iter(columns.values()))
+    beyond = torch.where(torch.arange(len(like), device=like.device) > last, 1.0, -1.0).to(like.dtype)
+    env = {**columns, BEYOND: beyond[:, None].expand(like.shape)}
+    margins = evaluate([open_ended(formula) for formula in formulas], env, ops=TORCH)
+    return torch.stack([margin[0].expand(like.shape[1]) for margin in margins]).amin(0)
+
+
 def prefix_robustness(formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor]) -> Tensor:
     """The least robustness of the anchored formulas on every prefix, whatever comes after it; exact.
 

@@ -27,6 +27,7 @@ class Setting:
 
     `limit`: seconds that a decision of the full guard may take per agent; None: as long as it takes.
     `ceiling`: visited states, of all seeds, that are searched for a plan where the followed one fails.
+    `margin`: what a guard asks plans to spare of every safety requirement.
     """
 
     seeds: tuple[int, ...]
@@ -35,6 +36,7 @@ class Setting:
     replan: int = 1
     limit: float | None = 0.1
     ceiling: int = 0
+    margin: float = 0.0
 
 
 class Worlds:
