@@ -1,0 +1,155 @@
+"""Safety requirements with something to spare: robustness is less by that much, and guards keep away."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from stlc.compile.ir import Atom, Col
+from stlc.controller.deploy import Guard, Mode
+from stlc.controller.drive import Recorder, Recording, Setting, drive
+from stlc.controller.policy import Mlp, PlanNetwork
+from stlc.controller.polish import Limits
+from stlc.controller.prefix import prefix_robustness, robustness_until
+from stlc.controller.spare import sparing, tighter
+from stlc.controller.task import Task
+from stlc.controller.world import world_type
+from stlc.dynamics.scenario import under
+from stlc.dynamics.schema import parse_system
+from stlc.dynamics.system import System
+from stlc.grammar.parser import parse
+from stlc.source import Source
+
+SYSTEM = """\
+stlc: 1
+name: cart
+time: {dt: 0.5 s, horizon: 6 steps}
+state: {p: {unit: m, range: [-4, 4]}, w: {unit: m/s, range: [-2, 2]}}
+control: {u: {unit: m/s^2, range: [-2, 2]}}
+flow: {p: w, w: u}
+init: {mixture: [{draw: {p: 0, w: "uniform(0, 0.2)"}}]}
+backup: {bins: 5, T0: [1, 2], batch: 256}
+test: {steps: 24, agents: 8, replan: 4}
+"""
+SPEC = """\
+signal p, w
+@safety
+require clear: always[0, T] p <= 2
+require quick: eventually[0, T] w >= 0.1
+"""
+
+
+def task_of(scenario: str = "") -> Task:
+    decl = parse_system(Source("cart.yaml", SYSTEM), Path("cart.yaml"))
+    return Task.of(parse(Source("a.stl", SPEC)), System(under(decl, scenario) if scenario else decl))  # type: ignore[arg-type]
+
+
+class Onward:
+    """Speeds up for half of the plan, and brakes for the other half."""
+
+    def __init__(self, horizon: int) -> None:
+        self.horizon = horizon
+
+    def plan(self, x0: Tensor) -> Tensor:
+        plan = torch.full((len(x0), self.horizon, 1), 0.4, dtype=x0.dtype)
+        plan[:, self.horizon // 2 :] = -0.4
+        return plan
+
+
+def driven(mode: Mode, margin: float, scenario: str = "") -> Recording:
+    task = task_of(scenario)
+    guard = Guard(task, Onward(task.horizon), mode, limits=Limits(margin=margin, seconds=None))
+    recorder = Recorder(8)
+    drive(guard, world_type(task.system.decl), Setting((0,), 8, 24, 4), recorder)
+    found = recorder.recording()
+    assert found is not None
+    return found
+
+
+def test_robustness_is_less_by_the_margin(car_task: Task) -> None:
+    x0 = car_task.sample(300, seed=0, dtype=torch.float64)
+    low, high = car_task.system.control_low.double(), car_task.system.control_high.double()
+    generator = torch.Generator().manual_seed(1)
+    u = low + (high - low) * torch.rand((300, car_task.horizon, 1), generator=generator, dtype=torch.float64)
+    strict = sparing(car_task, 0.25)
+    before, after = car_task.judge(x0, u).requirements, strict.judge(x0, u).requirements
+    safe = [rule.name for rule in car_task.compiled.safety]
+    assert safe
+    for index, rule in enumerate(car_task.rules):
+        less = 0.25 if rule.name in safe else 0.0
+        torch.testing.assert_close(after[:, index], before[:, index] - less, rtol=0, atol=1e-9)
+    assert sparing(car_task, 0.0) is car_task
+
+
+def test_time_tests_stay_and_negated_predicates_are_tightened_too() -> None:
+    guard = Atom(Col("t"), guard=True)
+    assert tighter(guard, 1.0) is guard
+    task = Task.of(parse(Source("a.stl", SPEC.replace("p <= 2", "not (p > 2)"))), task_of().plain)
+    x0 = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
+    still = torch.zeros((1, 6, 1), dtype=torch.float64)
+    assert float(sparing(task, 0.5).judge(x0, still).requirements[0, 0]) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("mode", ["paper", "full"])
+def test_a_guard_keeps_away_and_tells_the_plain_verdict(mode: Mode) -> None:
+    task, x = task_of(), torch.tensor([[1.0, 0.0]], dtype=torch.float64)
+    policy = Onward(task.horizon)
+    plain = Guard(task, policy, mode, limits=Limits(seconds=None)).decide(x)
+    assert int(plain.source[0]) == 0
+    away = Guard(task, policy, mode, limits=Limits(seconds=None, margin=0.3)).decide(x)
+    assert int(away.source[0]) != 0
+    judged = task.judge(x, away.plan)
+    assert float(away.rho[0]) == pytest.approx(float(judged.rho[0]))
+    assert float(judged.safe[0]) >= 0.3 - 1e-6
+    assert float(away.policy_rho[0]) == pytest.approx(float(plain.policy_rho[0]))
+    none = Guard(task, policy, "none", limits=Limits(margin=0.3)).decide(x)
+    assert int(none.source[0]) == 0
+
+
+def test_a_network_chooses_among_its_plans_by_what_they_spare() -> None:
+    task = task_of()
+    torch.manual_seed(0)
+
+    class Two(PlanNetwork):
+        def __init__(self) -> None:
+            torch.nn.Module.__init__(self)
+
+        def forward(self, x0: Tensor) -> Tensor:
+            fast, slow = (torch.full((len(x0), 1, task.horizon, 1), u) for u in (0.15, 0.08))
+            return torch.cat((fast, slow), 1).to(x0)
+
+    x = torch.tensor([[1.2, 0.0]], dtype=torch.float64)
+    guard = Guard(task, Mlp(task, Two()), "paper", limits=Limits(margin=0.4))
+    assert guard.strict.judge(x, guard.policy.plan(x)).safe >= 0
+
+
+def test_a_margin_makes_up_for_a_mistaken_model() -> None:
+    """What a guard without one lets pass, actuators that give more than they are told run into."""
+    passed = {margin: driven("full", margin, "mismatch-50").states[:, :, 0].max() for margin in (0.0, 0.6)}
+    assert passed[0.0] > 2.0
+    assert passed[0.6] <= 2.0
+
+
+def test_who_runs_into_danger_plans_before_the_others() -> None:
+    task = task_of()
+    guard = Guard(task, Onward(task.horizon), "paper")
+    x = torch.tensor([[0.0, 0.0], [1.6, 0.0]], dtype=torch.float64)
+    begun = Guard(task, Onward(task.horizon), "none").decide(x)
+    assert guard.endangered(x, begun, 4).tolist() == [False, True]
+    assert guard.endangered(x, begun, 1).tolist() == [False, False]
+    assert not Guard(task, Onward(task.horizon), "none").endangered(x, begun, 4).any()
+
+
+def test_robustness_until_a_sample_is_that_of_the_prefix() -> None:
+    task = task_of()
+    generator = torch.Generator().manual_seed(0)
+    x0 = task.sample(50, seed=3, dtype=torch.float64)
+    u = 2 * torch.randn((50, task.horizon, 1), generator=generator, dtype=torch.float64)
+    columns = task.system.rollout_columns(x0, u)
+    formulas = [rule.formula for rule in task.compiled.safety]
+    every = prefix_robustness(formulas, columns)
+    for last in range(task.horizon + 1):
+        torch.testing.assert_close(robustness_until(formulas, columns, last), every[last])
