@@ -153,6 +153,7 @@ def _deployed(run: Run, mode: Mode, setting: Setting, starts: _Starts) -> dict[s
     return {
         "spec": run.task.compiled.name,
         "run": run.dir.name,
+        "policy": policy_of(run.dir),
         "guard": guard_name(mode, setting.margin),
         "seeds": list(setting.seeds),
         **{"agents": setting.agents, "steps": setting.steps, "replan": setting.replan},
@@ -162,6 +163,17 @@ def _deployed(run: Run, mode: Mode, setting: Setting, starts: _Starts) -> dict[s
         "acted": 1.0 - decided(recording)["policy"],
         "seconds": seconds,
         **{"date": now(), "versions": versions(), "git": git_state(), "hardware": hardware()},
+    }
+
+
+def policy_of(folder: RunDir) -> dict[str, Any]:
+    """How the policy of a run was trained, and how much of the held-out starts it solves."""
+    record = folder.record()
+    result = record.get("result") or {}
+    return {
+        "method": (record.get("engine") or {}).get("method"),
+        "seed": record.get("seed"),
+        **{name: result.get(name) for name in ("accuracy", "seconds")},
     }
 
 

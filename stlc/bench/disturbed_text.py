@@ -18,6 +18,7 @@ were driven safely, `satisfied` the share of starts from which what was driven s
 Means over deployment seeds with half of their 95 % intervals (Student's t; of few seeds they are wide).
 """
 _TITLES = {"none": "no guard", "paper": "paper's", "full": "full"}
+_TRAINED = (("accuracy", 3), ("seconds", 0))
 _COLUMNS = {"safe": "saved", "satisfied": "executed_starts"}
 
 
@@ -33,7 +34,16 @@ def disturbed_section(documents: Sequence[Mapping[str, Any]]) -> str:
         first = "" if row.spec == last else f"{row.spec}, {_size(row)}"
         cells.append((first, row.scenario, *map(spread, metrics)))
         last = row.spec
-    return "\n".join([*lines, *markdown(header, cells), "", *_made(documents)])
+    policies = dict.fromkeys(_policy(each) for row in rows for each in row.guards.values())
+    return "\n".join([*lines, *markdown(header, cells), "", *policies, *_made(documents)])
+
+
+def _policy(document: Mapping[str, Any]) -> str:
+    known = document["policy"]
+    trained = [f"{known[name]:.{digits}f}" if known[name] is not None else "?" for name, digits in _TRAINED]
+    method, (accuracy, seconds) = known["method"] or "?", trained
+    told = f"method {method}, seed {known['seed']}, {seconds} s of training"
+    return f"- {document['spec']}: run {document['run']}, {told}, plan accuracy {accuracy} on held-out starts"
 
 
 def _order(guard: str) -> tuple[int, float]:

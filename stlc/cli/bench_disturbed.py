@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stlc.cli.bench_options import OutOption, SeedsOption, chosen
+from stlc.cli.bench_options import OutOption, PageOption, SeedsOption, chosen
 from stlc.cli.options import JsonOption
 from stlc.cli.output import emit, emit_json, say, table
 from stlc.cli.ranges import parse_limit, parse_seeds
@@ -19,38 +19,39 @@ if TYPE_CHECKING:
     from stlc.rundir import RunDir
 
 
+RunsArgument = Annotated[
+    list[str] | None, typer.Argument(metavar="RUN…", help="Runs; the best of `stlc bench paper` if none.")
+]
+ScenariosOption = Annotated[
+    str | None,
+    typer.Option("--scenarios", metavar="NAMES", help="Such as noise,mismatch-20; the usual ones if none."),
+]
+GuardsOption = Annotated[str, typer.Option("--guards", metavar="NAMES", help="Some of none,paper,full.")]
+AgentsOption = Annotated[int | None, typer.Option("--agents", min=1, help="In each deployment, at most.")]
+StepsOption = Annotated[int | None, typer.Option("--steps", min=1, help="Of each deployment, at most.")]
+LimitOption = Annotated[
+    str, typer.Option("--time-limit", metavar="TIME", help="Of a decision of the full guard, or `none`.")
+]
+MarginOption = Annotated[
+    float, typer.Option("--margin", min=0.0, help="What guards ask safety requirements to spare.")
+]
+TrainedOption = Annotated[
+    Path, typer.Option("--runs", metavar="DIR", help="Where `stlc bench paper` has left its runs.")
+]
+
+
 def disturbed(
-    runs: Annotated[
-        list[str] | None, typer.Argument(metavar="RUN…", help="Runs; the best of `stlc bench paper` if none.")
-    ] = None,
-    scenarios: Annotated[
-        str | None,
-        typer.Option(
-            "--scenarios", metavar="NAMES", help="Such as noise,mismatch-20; the usual ones if none."
-        ),
-    ] = None,
-    guards: Annotated[
-        str, typer.Option("--guards", metavar="NAMES", help="Some of none,paper,full.")
-    ] = "none,paper,full",
+    runs: RunsArgument = None,
+    scenarios: ScenariosOption = None,
+    guards: GuardsOption = "none,paper,full",
     seeds: SeedsOption = "0..2",
-    agents: Annotated[
-        int | None, typer.Option("--agents", min=1, help="In each deployment, at most.")
-    ] = None,
-    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Of each deployment, at most.")] = None,
-    time_limit: Annotated[
-        str, typer.Option("--time-limit", metavar="TIME", help="Of a decision of the full guard, or `none`.")
-    ] = "100ms",
-    margin: Annotated[
-        float,
-        typer.Option("--margin", min=0.0, help="What guards ask safety requirements to spare."),
-    ] = 0.0,
+    agents: AgentsOption = None,
+    steps: StepsOption = None,
+    time_limit: LimitOption = "100ms",
+    margin: MarginOption = 0.0,
     out: OutOption = Path("bench"),
-    trained: Annotated[
-        Path, typer.Option("--runs", metavar="DIR", help="Where `stlc bench paper` has left its runs.")
-    ] = Path("runs/bench"),
-    page: Annotated[Path, typer.Option("--page", metavar="FILE", help="The page that shows them.")] = Path(
-        "docs/worlds.md"
-    ),
+    trained: TrainedOption = Path("runs/bench"),
+    page: PageOption = Path("docs/worlds.md"),
     as_json: JsonOption = False,
 ) -> None:
     """Drive what has not been driven yet, and write the table into the page."""

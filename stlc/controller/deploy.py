@@ -158,10 +158,10 @@ class Guard:
             steps: until everybody plans anew.
 
         Returns:
-            (agents,) booleans; nobody without a guard.
+            (agents,) booleans; nobody without the full guard: the paper's looks at plans as they are made.
         """
         formulas = [rule.formula for rule in self.strict.compiled.safety]
-        if self.backup is None or not formulas:
+        if not isinstance(self.backup, FullBackup) or not formulas:
             return torch.zeros(len(x), dtype=torch.bool)
         columns = self.strict.system.rollout_columns(x.to(torch.float64), begun.plan.to(torch.float64))
         return ~(robustness_until(formulas, columns, steps) >= -TOLERANCE)

@@ -153,7 +153,7 @@ class _Pilot:
     def due(self, x: Tensor, seen: Tensor, step: int) -> Tensor:
         """Who plans now, (k,) rows: everybody every `replan` steps, and whom the world told something.
 
-        So does whom the guard sees run into danger before the others plan again.
+        So does whom the full guard sees run into danger before the others plan again.
         """
         if self.decision is None or step % self.replan == 0:
             return torch.arange(len(x))

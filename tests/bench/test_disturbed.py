@@ -135,6 +135,7 @@ def document(spec: str, scenario: str, guard: str, seeds: int = 2) -> dict[str, 
     share = {"mean": 0.5, "low": 0.25, "high": 0.75, "values": [0.5] * seeds}
     return {
         **{"spec": spec, "scenario": scenario, "guard": guard, "seeds": list(range(seeds))},
+        **{"run": "0001-a-b", "policy": {"method": "guided", "seed": 0, "accuracy": 0.5, "seconds": None}},
         **{"agents": 4, "steps": 12, "metrics": {"saved": share}, "acted": 0.0, "date": "2026-01-02T03"},
         **{"versions": {"torch": "2"}, "hardware": {"cores": 2}, "git": {"commit": "0123456789ab"}},
     }
@@ -162,6 +163,7 @@ def test_rows_are_in_order_and_guards_side_by_side() -> None:
     assert "| traffic, 2 x 4 x 12 | mismatch-5 | .500 ± .250 |  |" in section
     assert "|  | noise | .500 ± .250 | .500 ± .250 |" in section
     assert "6 deployments" in section
+    assert section.count("- traffic: run 0001-a-b, method guided, seed 0, ? s of training") == 1
 
 
 def test_shares_are_short() -> None:
