@@ -67,7 +67,7 @@ class Extent:
         test = run.task.system.decl.test
         agents = min(self.agents or test.agents, test.agents)
         steps = min(self.steps or test.steps, test.steps)
-        return Setting(self.seeds, agents, steps, test.replan, self.limit, self.margin)
+        return Setting(self.seeds, agents, steps, test.replan, self.limit, margin=self.margin)
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,9 +196,11 @@ def _key(run: Run, scenario: str, mode: Mode, setting: Setting) -> str:
 
 
 def _keep(folder: Path, name: str, found: Mapping[str, Any]) -> None:
+    """Enter a deployment into the file of a folder."""
     kept = read_json(folder / FILE).get("deployments") or {}
     kept[name] = dict(found)
-    write_atomic(folder / FILE, dumps({"format": FORMAT, "deployments": kept}, indent=1) + "\n")
+    lines = ",\n".join(f"{dumps(key)}: {dumps(value)}" for key, value in kept.items())  # one a line
+    write_atomic(folder / FILE, f'{{"format": {dumps(FORMAT)}, "deployments": {{\n{lines}\n}}}}\n')
 
 
 def kept_in(folder: Path) -> list[dict[str, Any]]:
