@@ -43,6 +43,11 @@ def register(app: typer.Typer) -> None:
             note=_KEPT,
         )
     )(ablation)
+    _register_others(group)
+    app.add_typer(group)
+
+
+def _register_others(group: typer.Typer) -> None:
     group.command(
         help=describe(
             "Train one policy for all values of a parameter, and judge it inside and outside of its range.",
@@ -85,4 +90,3 @@ def register(app: typer.Typer) -> None:
             "of 100 ms a decision.",
         )
     )(latency)
-    app.add_typer(group)
