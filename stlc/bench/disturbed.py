@@ -13,7 +13,7 @@ import torch
 from stlc.bench.cells import BENCHMARKS, read_json
 from stlc.controller.deploy import Guard, Mode
 from stlc.controller.drive import Recorder, Setting, drive
-from stlc.controller.evaluate import decided, measure
+from stlc.controller.evaluate import decided, feasible_states, measure
 from stlc.controller.executed import judge_executed
 from stlc.controller.intervals import Interval
 from stlc.controller.polish import Limits
@@ -36,7 +36,10 @@ FILE = "disturbed.json"
 NOMINAL = "as it is"
 SCENARIOS = (NOMINAL, *DISTURBED)
 GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
-SHOWN = ("saved", "executed_safe", "executed_starts", "executed_safe_starts", "plan_accuracy", "savable")
+SHOWN = (
+    *("saved", "savable", "executed_safe", "executed_starts", "executed_safe_starts", "foreseen_safe_starts"),
+    *("plan_accuracy", "plan_safety", "policy_accuracy", "feasible", "feasible_followed"),
+)
 """The metrics that are kept; see `stlc.controller.evaluate.METRICS`."""
 
 
@@ -52,6 +55,8 @@ class Extent:
         steps: of each, at most; None: as many as the system says.
         limit: seconds that a decision of the full guard may take per agent.
         margin: what guards ask plans to spare of every safety requirement.
+        ceiling: visited states that are searched for a plan; see `stlc.controller.evaluate.feasible_states`.
+        file: that the deployments are kept in.
     """
 
     scenarios: Sequence[str] = SCENARIOS
@@ -61,13 +66,15 @@ class Extent:
     steps: int | None = None
     limit: float | None = 0.1
     margin: float = 0.0
+    ceiling: int = 0
+    file: str = FILE
 
     def setting(self, run: Run) -> Setting:
         """How a run is deployed."""
         test = run.task.system.decl.test
         agents = min(self.agents or test.agents, test.agents)
         steps = min(self.steps or test.steps, test.steps)
-        return Setting(self.seeds, agents, steps, test.replan, self.limit, margin=self.margin)
+        return Setting(self.seeds, agents, steps, test.replan, self.limit, self.ceiling, margin=self.margin)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,13 +115,13 @@ def fill(
                 called = guard_name(mode, setting.margin)
                 name = f"{laid.task.compiled.name}-{scenario.replace(' ', '_')}-{called}"
                 key = _key(laid, scenario, mode, setting)
-                known = (read_json(folder / FILE).get("deployments") or {}).get(name) or {}
+                known = (read_json(folder / extent.file).get("deployments") or {}).get(name) or {}
                 if known.get("key") == key:
                     yield Deployed(name, known, kept=True)
                     continue
                 begun(name)
                 found = {"key": key, "scenario": scenario, **_deployed(laid, mode, setting, starts)}
-                _keep(folder, name, found)
+                _keep(folder / extent.file, name, found)
                 yield Deployed(name, found, kept=False)
 
 
@@ -149,7 +156,8 @@ def _deployed(run: Run, mode: Mode, setting: Setting, starts: _Starts) -> dict[s
     assert recording is not None
     seconds = perf_counter() - begin
     known = starts.savable(run.task, torch.from_numpy(recording.states[:, 0]))
-    metrics = measure(recording, judge_executed(run.task, recording, savable=known.numpy()))
+    feasible = feasible_states(run.task, recording, setting.ceiling)
+    metrics = measure(recording, judge_executed(run.task, recording, savable=known.numpy()), feasible)
     return {
         "spec": run.task.compiled.name,
         "run": run.dir.name,
@@ -192,20 +200,21 @@ def _key(run: Run, scenario: str, mode: Mode, setting: Setting) -> str:
         guard_name(mode, setting.margin),
         *map(str, (setting.seeds, setting.agents, setting.steps, setting.replan, limit)),
     ]
+    asked += [str(setting.ceiling)] if setting.ceiling else []
     return sha256("\0".join([*texts, *asked]))[:16]
 
 
-def _keep(folder: Path, name: str, found: Mapping[str, Any]) -> None:
-    """Enter a deployment into the file of a folder."""
-    kept = read_json(folder / FILE).get("deployments") or {}
+def _keep(path: Path, name: str, found: Mapping[str, Any]) -> None:
+    """Enter a deployment into a file."""
+    kept = read_json(path).get("deployments") or {}
     kept[name] = dict(found)
     lines = ",\n".join(f"{dumps(key)}: {dumps(value)}" for key, value in kept.items())  # one a line
-    write_atomic(folder / FILE, f'{{"format": {dumps(FORMAT)}, "deployments": {{\n{lines}\n}}}}\n')
+    write_atomic(path, f'{{"format": {dumps(FORMAT)}, "deployments": {{\n{lines}\n}}}}\n')
 
 
-def kept_in(folder: Path) -> list[dict[str, Any]]:
-    """All deployments that a folder holds."""
-    return list((read_json(folder / FILE).get("deployments") or {}).values())
+def kept_in(folder: Path, file: str = FILE) -> list[dict[str, Any]]:
+    """All deployments that a file of a folder holds."""
+    return list((read_json(folder / file).get("deployments") or {}).values())
 
 
 # ----------------------------------------------------------------------- the table

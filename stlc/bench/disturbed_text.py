@@ -34,11 +34,12 @@ def disturbed_section(documents: Sequence[Mapping[str, Any]]) -> str:
         first = "" if row.spec == last else f"{row.spec}, {_size(row)}"
         cells.append((first, row.scenario, *map(spread, metrics)))
         last = row.spec
-    policies = dict.fromkeys(_policy(each) for row in rows for each in row.guards.values())
-    return "\n".join([*lines, *markdown(header, cells), "", *policies, *_made(documents)])
+    policies = dict.fromkeys(policy_line(each) for row in rows for each in row.guards.values())
+    return "\n".join([*lines, *markdown(header, cells), "", *policies, *made(documents)])
 
 
-def _policy(document: Mapping[str, Any]) -> str:
+def policy_line(document: Mapping[str, Any]) -> str:
+    """How the policy of a deployment was trained, as a line."""
     known = document["policy"]
     trained = [f"{known[name]:.{digits}f}" if known[name] is not None else "?" for name, digits in _TRAINED]
     method, (accuracy, seconds) = known["method"] or "?", trained
@@ -69,7 +70,7 @@ def spread(metric: Mapping[str, Any] | None) -> str:
     return re.sub(r"\b0\.", ".", text)
 
 
-def _made(documents: Sequence[Mapping[str, Any]]) -> list[str]:
+def made(documents: Sequence[Mapping[str, Any]]) -> list[str]:
     """A line for every machine and version, with commits and dates."""
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for each in documents:

@@ -11,6 +11,7 @@ from stlc.cli.bench_latency import latency
 from stlc.cli.bench_paper import paper
 from stlc.cli.bench_robustness import robustness
 from stlc.cli.bench_step import step
+from stlc.cli.bench_worlds import worlds
 from stlc.cli.options import describe
 
 _KEPT = (
@@ -90,3 +91,12 @@ def _register_others(group: typer.Typer) -> None:
             "of 100 ms a decision.",
         )
     )(latency)
+    group.command(
+        help=describe(
+            "Deploy policies in their worlds, without a guard and with each, and write the table.",
+            "stlc bench worlds",
+            "stlc bench worlds runs/ship_track/latest --seeds 0..9 --guards none,full",
+            note="What was driven with the same policy, system and setting is kept. A system's scenarios "
+            "that have worlds of their own are driven, too.",
+        )
+    )(worlds)

@@ -69,7 +69,7 @@ def disturbed(
         margin,
     )
     found, kept = [], 0
-    for each in fill(_folders(runs, out, trained), extent, out, lambda name: say(f"deploying {name}")):
+    for each in fill(folders_of(runs, out, trained), extent, out, lambda name: say(f"deploying {name}")):
         found.append(each.document)
         kept += each.kept
         say(f"{each.name}  {'kept' if each.kept else format(each.document['seconds'], '.0f') + ' s'}")
@@ -77,9 +77,7 @@ def disturbed(
     rows = disturbed_rows(found)
     if as_json:
         result = {"what": "disturbed", "page": str(page), "driven": len(found) - kept, "kept": kept}
-        emit_json(
-            "bench/1", ok=True, exit_code=0, result={**result, "rows": [_row_json(row) for row in rows]}
-        )
+        emit_json("bench/1", ok=True, exit_code=0, result={**result, "rows": [row_json(row) for row in rows]})
         return
     called = [guard_name(mode, margin) for mode in extent.guards]
     header = (
@@ -91,7 +89,7 @@ def disturbed(
     say(f"written: {page}, {out}")
 
 
-def _folders(names: Sequence[str] | None, out: Path, trained: Path) -> list[RunDir]:
+def folders_of(names: Sequence[str] | None, out: Path, trained: Path) -> list[RunDir]:
     """The runs that are named, else those of the most accurate policies. Raises UsageError (U101)."""
     from stlc.bench.cells import BENCHMARKS
     from stlc.bench.study import Place, valid_results
@@ -118,7 +116,8 @@ def _cells(row: Row, guards: Sequence[str]) -> tuple[str, ...]:
     return (row.spec, row.scenario, *map(spread, metrics))
 
 
-def _row_json(row: Row) -> Mapping[str, Any]:
+def row_json(row: Row) -> Mapping[str, Any]:
+    """A row as plain data."""
     seeds, agents, steps = row.size
     guards = {name: {"metrics": each["metrics"], "acted": each["acted"]} for name, each in row.guards.items()}
     return {

@@ -15,6 +15,7 @@ from stlc.bench import disturbed
 from stlc.bench.cells import BENCHMARKS, read_json
 from stlc.bench.disturbed import FILE, NOMINAL, SCENARIOS, Row, _Starts, disturbed_rows
 from stlc.bench.disturbed_text import disturbed_section, spread
+from stlc.bench.worlds_text import wholly_savable
 from stlc.cli.app import main
 from stlc.cli.schema import load_schema
 from stlc.rundir import RunDir
@@ -115,6 +116,37 @@ def test_starts_are_searched_once(monkeypatch: pytest.MonkeyPatch) -> None:
         assert starts.savable(None, x0.clone()).tolist() == [True, False]  # type: ignore[arg-type]
     assert starts.savable(None, -x0).tolist() == [False, True]  # type: ignore[arg-type]
     assert asked == [2, 2]
+
+
+def test_worlds_are_driven_kept_and_laid_out(
+    run: RunDir, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "worlds.md"
+    command = ["bench", "worlds", str(run.path), "--seeds", "0..2", "--guards", "none,full", "--json"]
+    assert main([*command, "--ceiling", "30", "--page", str(page), "--out", str(tmp_path)]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert misfits(document, load_schema("bench/1")) == []
+    (row,) = document["result"]["rows"]
+    shares = {name: each["metrics"]["feasible_followed"]["mean"] for name, each in row["guards"].items()}
+    assert 0.0 < shares["none"] <= shares["full"] == 1.0
+    assert (tmp_path / "worlds.json").exists()
+    assert not (tmp_path / FILE).exists()
+    text = page.read_text()
+    assert text.count(f"| {row['spec']}, as it is, 3 x 4 x 12 | none |") == 1
+    assert "|  | full |" in text
+
+
+def test_seeds_without_lost_starts_are_told_apart() -> None:
+    def document(accuracy: list[float], saved: list[float]) -> dict[str, Any]:
+        values = {"savable": [1.0, 0.9, 1.0], "plan_accuracy": accuracy, "saved": saved}
+        return {"metrics": {name: {"values": each} for name, each in values.items()}}
+
+    guards = {"none": document([0.6, 0.1, 0.8], [0.5, 0, 0.5]), "full": document([0.9, 0, 0.7], [1, 0, 1])}
+    (line,) = wholly_savable(Row("a", "b", (3, 2, 1), guards))
+    assert "in the 2 of 3 seeds" in line
+    assert line.endswith("none 0.700 and 0.500; full 0.800 and 1.000")
+    guards = {"none": {"metrics": {"savable": {"values": [1.0]}}}}
+    assert list(wholly_savable(Row("a", "b", (1, 2, 1), guards))) == []
 
 
 def test_without_policies_that_is_said(

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from documents import misfits
 
 from stlc.bench.latency import GUARDS, Times, picked
 from stlc.cli.app import main
+from stlc.cli.schema import load_schema
 from stlc.controller.drive import Recording
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -54,7 +56,9 @@ def test_guards_are_timed_and_the_page_is_written(
     page.write_text("# Page\n")
     command = ["bench", "latency", "--samples", "8", "--seeds", "3", "--page", str(page), "--json"]
     assert main(command) == 0
-    rows = json.loads(capsys.readouterr().out)["result"]["rows"]
+    document = json.loads(capsys.readouterr().out)
+    assert misfits(document, load_schema("bench/1")) == []
+    rows = document["result"]["rows"]
     assert [row["guard"] for row in rows] == list(GUARDS)
     assert rows[0]["acting"] is None
     assert all(row["every"]["samples"] == 4 for row in rows)
