@@ -98,7 +98,8 @@ def search(extent: Extent, place: Place, passes: int) -> None:
     from stlc.bench.ceilings import search_on
     from stlc.bench.study import valid_results
 
-    documents = [each for each in valid_results(place.out) if each["held_out"] == extent.held_out]
+    kept = valid_results(place.out, "paper")  # an ablation is of another system
+    documents = [each for each in kept if each["held_out"] == extent.held_out]
     for benchmark in extent.benchmarks:
         own = [document for document in documents if document["benchmark"] == benchmark]
         if own:
@@ -125,9 +126,8 @@ def write_page(place: Place, page: Path) -> tuple[list[dict[str, Any]], dict[str
     from stlc.bench.results import draw_paper, paper_section, write_section
     from stlc.bench.study import valid_results
 
-    everything = valid_results(place.out)
-    documents = [document for document in everything if document["study"] == "paper"]
-    ceilings = ceilings_of(place.out, everything)
+    documents = valid_results(place.out, "paper")
+    ceilings = ceilings_of(place.out, documents)
     place_ceilings(place, documents, ceilings)
     picture = draw_paper(documents, ceilings, page.parent)
     write_section(page, "paper", paper_section(documents, ceilings, picture=picture is not None))

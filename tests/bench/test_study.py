@@ -19,7 +19,7 @@ from stlc.bench.ablation import Extent as AblationExtent
 from stlc.bench.ceilings import TRIES, ceilings_of, search_on
 from stlc.bench.cells import BENCHMARKS, Cell, Length, inputs_of, load, pack, read_json, union, unpack
 from stlc.bench.paper import Extent, paper_cells, paper_rows
-from stlc.bench.study import Filled, Place, cell_of, fill, runs_of, valid_results
+from stlc.bench.study import Filled, Place, cell_of, fill, runs_of, valid_results, write_result
 from stlc.cli.app import main
 from stlc.cli.bench_options import _left
 from stlc.cli.schema import load_schema
@@ -182,6 +182,12 @@ def test_the_command_from_training_to_the_page(
     assert page.count("<!-- paper -->") == 1
     assert f"| traffic | gradient | 2 steps | 5 | {cell['accuracy']:.4f} [" in page
     assert (tmp_path / "docs" / "img" / "results.svg").read_text().startswith("<svg")
+    ablated = inputs_of(
+        quick(held_out=40, overrides={"objective.gamma": "0.3"})
+    )  # of the same benchmark, but of another system
+    other = {**cell, **ablated.values, "study": "ablation", "axis": "k", "value": "7", "solved": "0" * 10}
+    write_result(Place(tmp_path / "bench", tmp_path / "runs"), other)
+    assert answer("--passes", "2")["ceilings"] == second["ceilings"]
 
 
 def test_what_there_is_to_choose_from(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
