@@ -13,16 +13,17 @@ from stlc.bench.results import markdown
 FILE = "worlds.json"
 HEADER = (
     *("", "guard", "plan accuracy", "of what can be", "plans that are safe", "driven safely, of the savable"),
-    "progress",
+    *("safe starts, as foreseen", "progress"),
 )
 _HEAD = """\
 Written by `stlc bench worlds` from `bench/worlds.json`: one policy for each specification, the most accurate
 of `stlc bench paper`, in its world. `of what can be` is the share of visited states with a satisfying plan,
 the followed one or one that a search of up to 80,000 plans finds, whose followed plan satisfies the
 specification. `savable` agents were driven safely, or a search finds a plan from their start that is safe
-through the horizon. Means over deployment seeds with half of their 95 % intervals (Student's t).
+through the horizon. `as foreseen` are starts from which the world did as the model says through the window;
+some worlds never do. Means over deployment seeds with half of their 95 % intervals (Student's t).
 """
-_SHARES = ("plan_accuracy", "feasible_followed", "plan_safety", "saved")
+_SHARES = ("plan_accuracy", "feasible_followed", "plan_safety", "saved", "foreseen_safe_starts")
 
 
 def worlds_section(documents: Sequence[Mapping[str, Any]]) -> str:
