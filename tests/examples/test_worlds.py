@@ -109,7 +109,7 @@ def test_an_episode_ends_with_a_trace_that_check_reads(
     task: Task, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("stlc.controller.evaluate.LATENCY_SECONDS", 0.05)
-    everybody = "stlc.controller.executed.savable"
+    everybody = "stlc.controller.executed.search_safe"
     monkeypatch.setattr(everybody, lambda _, x0: torch.ones(len(x0), dtype=torch.bool))
     setting = Setting((0, 1), 2, task.horizon + 4, task.system.decl.test.replan)
     found = deploy(task, Wild(task), setting, "none")  # type: ignore[arg-type]
