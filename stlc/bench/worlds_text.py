@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from statistics import fmean
+from textwrap import wrap
 from typing import Any
 
 from stlc.bench.disturbed import Row, disturbed_rows
 from stlc.bench.disturbed_text import made, policy_line, spread
-from stlc.bench.results import markdown
+from stlc.bench.results import WIDTH, markdown
 
 FILE = "worlds.json"
 HEADER = (
@@ -65,4 +66,5 @@ def wholly_savable(row: Row) -> Iterator[str]:
         parts.append(f"{guard} {chosen[0]:.3f} and {chosen[1]:.3f}")
     where = f"in the {len(whole)} of {len(first['values'])} seeds in which every start can be saved"
     figures = "; ".join(parts)
-    yield f"- {row.spec}, {row.scenario}: {where}, plan accuracy and share driven safely: {figures}"
+    line = f"- {row.spec}, {row.scenario}: {where}, plan accuracy and share driven safely: {figures}"
+    yield from wrap(line, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
