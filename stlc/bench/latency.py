@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from stlc.rundir import RunDir
 
 GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
+POLICY = "policy"
 AGENTS = 5
 WARM = 5
 
@@ -60,20 +61,20 @@ class Row:
     Attributes:
         benchmark: name of the specification.
         run: of the policy.
-        guard: which.
+        guard: which; `policy` for its plan, rollout and verdict alone.
         every: decisions in states that are spread evenly over what was visited.
         acting: decisions in which the guard replaced the policy's plan; None where it never did.
     """
 
     benchmark: str
     run: str
-    guard: Mode
+    guard: str
     every: Times | None
     acting: Times | None
 
 
 def rows_of(folders: Iterable[RunDir], *, samples: int, seeds: Sequence[int]) -> Iterator[Row]:
-    """Measure policies one after the other, three rows each."""
+    """Measure policies one after the other, a row for the policy alone and one for every guard."""
     with one_thread():
         for folder in folders:
             yield from _rows(Run.open(folder.path), samples, tuple(seeds))
@@ -88,6 +89,7 @@ def _rows(run: Run, samples: int, seeds: tuple[int, ...]) -> Iterator[Row]:
     recording = recorder.recording()
     assert recording is not None
     even, acted = picked(recording, samples)
+    yield Row(task.compiled.name, run.dir.name, POLICY, Times.of(_alone(run, recording, even)), None)
     for mode, guard in guards.items():
         every, there = _timed(guard, recording, even), _timed(guard, recording, acted)
         acting = [seconds for seconds, source in (*every, *there) if source]
@@ -105,6 +107,17 @@ def picked(recording: Recording, samples: int) -> tuple[NDArray[np.int64], NDArr
 def _spread(places: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     found: NDArray[np.int64] = places[np.linspace(0, len(places) - 1, min(count, len(places))).astype(int)]
     return found
+
+
+def _alone(run: Run, recording: Recording, places: NDArray[np.int64]) -> list[float]:
+    """Seconds of a plan of the policy, its rollout and its verdict."""
+    found = []
+    for row, step in (*places[:WARM], *places):
+        x = torch.from_numpy(recording.states[row, step])[None]
+        begin = perf_counter()
+        run.policy.plan_judged(x)
+        found.append(perf_counter() - begin)
+    return found[min(WARM, len(places)) :]
 
 
 def _timed(guard: Guard, recording: Recording, places: NDArray[np.int64]) -> list[tuple[float, int]]:

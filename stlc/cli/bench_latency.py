@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 HEADER = ("benchmark", "guard", "median", "99 %", "where it acts: median", "99 %", "decisions")
 TEXT = """## A decision
 
-Written by `stlc bench latency`. Milliseconds that one decision for one agent takes on one thread, the plan
-that was begun, its verdict and what is tried instead included: in states that are spread evenly over
-deployments under the paper's guard, and where the guard replaced the policy's plan.
+Written by `stlc bench latency`. Milliseconds that one decision for one agent takes on one thread, in states
+that are spread evenly over deployments under the paper's guard, and where the guard replaced the policy's
+plan. `policy`: its plan, rollout and verdict. With a guard (also `none`): the verdict on the plan that was
+begun as well, the choice where the world leaves one (of five stations), and what is tried instead.
 """
 
 

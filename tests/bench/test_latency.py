@@ -59,11 +59,11 @@ def test_guards_are_timed_and_the_page_is_written(
     document = json.loads(capsys.readouterr().out)
     assert misfits(document, load_schema("bench/1")) == []
     rows = document["result"]["rows"]
-    assert [row["guard"] for row in rows] == list(GUARDS)
+    assert [row["guard"] for row in rows] == ["policy", *GUARDS]
     assert rows[0]["acting"] is None
     assert all(row["every"]["samples"] == 4 for row in rows)
     assert all(0 < row["every"]["median"] <= row["every"]["p99"] for row in rows)
     assert any(row["acting"] and row["acting"]["samples"] > 0 for row in rows)
     text = page.read_text()
     assert "<!-- latency -->" in text
-    assert text.count("| traffic | ") == 3
+    assert text.count("| traffic | ") == 4
