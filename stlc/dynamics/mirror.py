@@ -48,11 +48,9 @@ class Mirror:
     def plans(self, u: Tensor) -> Tensor:
         """The images of controls: (…, m) -> (…, m). Angles stay within a turn of their range."""
         moved = _applied(self._inputs, u, [control.name for control in self._controls])
-        turning = [index for index, each in enumerate(self._controls) if each.squash == "angle"]
-        if not turning:
-            return moved
-        low = moved.new_tensor([self._controls[index].low for index in turning])
-        moved[..., turning] = torch.remainder(moved[..., turning] - low, 2.0 * torch.pi) + low
+        for index, each in enumerate(self._controls):
+            if each.squash == "angle":
+                moved[..., index] = torch.remainder(moved[..., index] - each.low, 2.0 * torch.pi) + each.low
         return moved
 
     def fold(self, x: Tensor) -> tuple[Tensor, Tensor]:
