@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import time
-
 import pytest
+from effort import effort
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -106,7 +105,6 @@ def test_suggestions_without_a_neighbour():
 
 
 def test_a_name_of_thousands_of_letters_is_a_slip_of_nothing():
-    began = time.process_time()
-    assert closest("x" * 100_000, ["x", "x" * 99_999]) is None
     assert closest("xy", ["x" * 100_000, "x"]) == "x"
-    assert time.process_time() - began < 0.5
+    assert closest("x" * 100_000, ["x", "x" * 99_999]) is None
+    assert effort(lambda: closest("x" * 100_000, ["x", "x" * 99_999])) < 100

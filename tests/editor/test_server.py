@@ -70,12 +70,14 @@ def test_a_finding_of_the_syntax(session, project, spec):
     assert finding["code"] == "E010"
 
 
+@pytest.mark.bench
 def test_a_change_takes_no_time(session, project, spec):
     session.open(uri(project), spec)
     start = time.perf_counter()
     for version in range(5):
         session.change(uri(project), f"{spec}\n# {version}\n", version)
-    assert (time.perf_counter() - start) / 5 < 0.5  # 15 ms on a quiet machine
+    milliseconds = (time.perf_counter() - start) / 5 * 1e3
+    sys.stdout.write(f"a change of {len(spec)} letters: {milliseconds:.0f} ms\n")
 
 
 def test_hover(session, project, spec):

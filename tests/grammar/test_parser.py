@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 
 import pytest
 import yaml
+from effort import refused
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -391,11 +391,9 @@ def test_parentheses_cost_no_depth():
     "text", ["1e999999999", "1e-999999999", "9" * 5000, "1" + "0" * 350, "1e309", "0." + "1" * 5000]
 )
 def test_numbers_beyond_doubles_are_refused_at_once(text):
-    began = time.process_time()
-    with pytest.raises(SpecError) as caught:
-        expr(text)
-    assert caught.value.diagnostics[0].code == "E005"
-    assert time.process_time() - began < 1
+    error, spent = refused(lambda: expr(text), SpecError)
+    assert error.diagnostics[0].code == "E005"
+    assert spent < 10_000
 
 
 def test_numbers_within_doubles_are_exact():
@@ -414,11 +412,9 @@ def test_a_text_is_bounded():
     "text", ["x+" * 400_000, "(" * 900_000, "if x then " * 20_000, "x > 0 and " * 20_000]
 )
 def test_a_text_of_endless_words_is_refused_at_once(text):
-    began = time.process_time()
-    with pytest.raises(SpecError) as caught:
-        parse(Source("big.stl", f"require r: {text} x > 0"))
-    assert [finding.code for finding in caught.value.diagnostics] == ["E005"]
-    assert time.process_time() - began < 1
+    error, spent = refused(lambda: parse(Source("big.stl", f"require r: {text} x > 0")), SpecError)
+    assert [finding.code for finding in error.diagnostics] == ["E005"]
+    assert spent < 200_000
 
 
 def test_empty_texts():
@@ -463,9 +459,7 @@ def mutations(draw: st.DrawFn) -> str:
 @settings(max_examples=150)
 @given(mutations())
 def test_damaged_texts_give_findings_or_trees(text):
-    began = time.process_time()
     found = findings(parse, text)
-    assert time.process_time() - began < 1
     assert found is None or 1 <= len(found) <= 20
     for finding in found or ():
         assert finding.span is not None
