@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from stlc.controller.drive import Setting
     from stlc.controller.evaluate import Deployment
     from stlc.controller.run import Run
-    from stlc.dynamics.decl import ScenarioDecl
+    from stlc.dynamics.decl_deployment import ScenarioDecl
 
 Record: TypeAlias = "dict[str, Any]"
 

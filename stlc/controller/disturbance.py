@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from stlc.controller.streams import seeded
-from stlc.dynamics.decl_errors import ErrorsDecl
+from stlc.dynamics.decl_deployment import ErrorsDecl
 from stlc.dynamics.draws import Drawing, Rows
 from stlc.units import parse_unit
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from stlc.dynamics.decl import Assign
+    from stlc.dynamics.decl_model import Assign
     from stlc.dynamics.system import System
 
 SECOND = parse_unit("s")

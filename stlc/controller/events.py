@@ -11,7 +11,7 @@ from stlc.compile import ir
 from stlc.compile.arith import Program
 from stlc.compile.ops_torch import TORCH
 from stlc.compile.switch import Hard
-from stlc.dynamics.decl import EventDecl
+from stlc.dynamics.decl_deployment import EventDecl
 from stlc.dynamics.draws import Drawing, Rows
 
 _CONDITION = "holds"

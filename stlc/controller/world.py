@@ -22,7 +22,8 @@ from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.registry import closest
 
 if TYPE_CHECKING:
-    from stlc.dynamics.decl import SystemDecl, WorldRef
+    from stlc.dynamics.decl import SystemDecl
+    from stlc.dynamics.decl_deployment import WorldRef
     from stlc.dynamics.system import System
 
 

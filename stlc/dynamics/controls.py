@@ -7,7 +7,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from stlc.dynamics.decl import ControlDecl
+from stlc.dynamics.decl_model import ControlDecl
 
 EPS = 1e-6
 """Keeps the gradient of an angle finite where both components are 0."""

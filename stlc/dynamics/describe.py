@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from stlc.dynamics.decl import Assign, Situation, SystemDecl
+from stlc.dynamics.decl import SystemDecl
+from stlc.dynamics.decl_init import Situation
+from stlc.dynamics.decl_model import Assign
 from stlc.signature import Column
 
 Row = tuple[str, ...]

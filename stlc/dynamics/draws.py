@@ -14,7 +14,7 @@ from stlc.compile.functions import sampler_names
 from stlc.compile.ops_torch import TORCH
 from stlc.compile.switch import Hard
 from stlc.dynamics.algebra import map_parts
-from stlc.dynamics.decl import Assign
+from stlc.dynamics.decl_model import Assign
 
 _HARD = Hard()
 _SAMPLERS = frozenset(sampler_names())

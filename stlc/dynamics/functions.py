@@ -15,7 +15,9 @@ import numpy as np
 from stlc.compile.interface import Function
 from stlc.compile.ops import Array
 from stlc.diagnostics import Diagnostic, SystemFileError
-from stlc.dynamics.decl import FileDecl, FunctionDecl, SystemDecl
+from stlc.dynamics.decl import SystemDecl
+from stlc.dynamics.decl_init import FileDecl
+from stlc.dynamics.decl_model import FunctionDecl
 from stlc.registry import closest
 
 

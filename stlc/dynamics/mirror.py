@@ -18,7 +18,7 @@ from stlc.compile.switch import Hard
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from stlc.dynamics.decl import Assign, ControlDecl
+    from stlc.dynamics.decl_model import Assign, ControlDecl
 
 HARD = Hard()
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
-from stlc.dynamics.decl import FileDecl, GridDecl
+from stlc.dynamics.decl_init import FileDecl, GridDecl
 from stlc.dynamics.draws import Rows
 from stlc.trace import load_trace
 from stlc.trace_npz import read_npz

@@ -10,7 +10,7 @@ from stlc.compile.arith import Program
 from stlc.compile.ops_torch import TORCH
 from stlc.compile.switch import Hard
 from stlc.diagnostics import Diagnostic, SystemFileError
-from stlc.dynamics.decl import InitDecl, Situation
+from stlc.dynamics.decl_init import InitDecl, Situation
 from stlc.dynamics.draws import Drawing, Rows
 from stlc.dynamics.points import points_of
 

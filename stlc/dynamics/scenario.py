@@ -12,8 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from stlc.diagnostics import Diagnostic, UsageError
-from stlc.dynamics.decl import ScenarioDecl, SystemDecl
-from stlc.dynamics.decl_errors import ErrorsDecl
+from stlc.dynamics.decl import SystemDecl
+from stlc.dynamics.decl_deployment import ErrorsDecl, ScenarioDecl
 from stlc.dynamics.schema import load_system_decl, parse_system
 from stlc.registry import closest
 

@@ -7,7 +7,7 @@ from typing import get_args
 
 from stlc.compile.scope import column_entries, member_entries
 from stlc.compile.signals import MAX_COMPONENTS
-from stlc.dynamics.decl import ControlDecl, Squash
+from stlc.dynamics.decl_model import ControlDecl, Squash
 from stlc.dynamics.schema_expressions import Expressions
 from stlc.dynamics.schema_names import Names, base_name, component_names, read_unit
 from stlc.dynamics.schema_reader import Reader

@@ -9,7 +9,7 @@ from typing import Literal
 from stlc.compile import ir
 from stlc.compile.scope import Known
 from stlc.compile.values import Number
-from stlc.dynamics.decl import EventDecl, TestDecl, WorldRef
+from stlc.dynamics.decl_deployment import EventDecl, TestDecl, WorldRef
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import read_sets
 from stlc.dynamics.schema_names import Names

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from stlc.compile import ir
 from stlc.dynamics.algebra import add, multiply
-from stlc.dynamics.decl import Assign, JumpDecl
+from stlc.dynamics.decl_model import Assign, JumpDecl
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_names import Clockwork, Names, base_name
 from stlc.dynamics.schema_reader import Reader, first_line

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from stlc.compile.scope import External
-from stlc.dynamics.decl import FunctionDecl
+from stlc.dynamics.decl_model import FunctionDecl
 from stlc.dynamics.kinematics import position
 from stlc.dynamics.schema_names import Names
 from stlc.dynamics.schema_reader import Reader

@@ -9,7 +9,8 @@ from stlc.compile import ir
 from stlc.compile.scope import Entry as Name
 from stlc.compile.scope import Known
 from stlc.compile.values import Number, Vector
-from stlc.dynamics.decl import Assign, FileDecl, GridDecl, InitDecl, Situation
+from stlc.dynamics.decl_init import FileDecl, GridDecl, InitDecl, Situation
+from stlc.dynamics.decl_model import Assign
 from stlc.dynamics.schema_expressions import Expressions, in_stored_unit, written
 from stlc.dynamics.schema_flow import state_assigns, states_of
 from stlc.dynamics.schema_names import Names, base_name, component_names

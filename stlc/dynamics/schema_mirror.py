@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from stlc.dynamics.decl import Assign
+from stlc.dynamics.decl_model import Assign
 from stlc.dynamics.schema_expressions import Expressions, written
 from stlc.dynamics.schema_flow import state_assigns
 from stlc.dynamics.schema_names import Names

@@ -16,7 +16,7 @@ from stlc.compile.scope import (
 )
 from stlc.compile.values import Vector
 from stlc.diagnostics import Label, SystemFileError
-from stlc.dynamics.decl import ControlDecl
+from stlc.dynamics.decl_model import ControlDecl
 from stlc.dynamics.schema_expressions import SECOND, Expressions
 from stlc.dynamics.schema_reader import Reader, first_line
 from stlc.dynamics.yaml_nodes import Mapping, Node, Scalar, Sequence

@@ -6,7 +6,8 @@ from collections.abc import Mapping as MappingType
 from dataclasses import replace
 
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.decl import Assign, InitDecl
+from stlc.dynamics.decl_init import InitDecl
+from stlc.dynamics.decl_model import Assign
 from stlc.dynamics.schema_flow import state_assigns
 from stlc.dynamics.schema_names import Names, base_name
 from stlc.dynamics.schema_reader import Reader

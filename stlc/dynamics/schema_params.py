@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from stlc.compile import ir
 from stlc.compile.spread import spread
-from stlc.dynamics.decl import Assign
+from stlc.dynamics.decl_model import Assign
 from stlc.dynamics.schema_columns import add_columns, name_columns, plain_columns
 from stlc.dynamics.schema_expressions import Expressions
 from stlc.dynamics.schema_flow import state_assigns

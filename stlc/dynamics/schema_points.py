@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from stlc.compile import ir
-from stlc.dynamics.decl import FileDecl, GridDecl
+from stlc.dynamics.decl_init import FileDecl, GridDecl
 from stlc.dynamics.schema_expressions import Expressions
 from stlc.dynamics.schema_flow import column_assign, states_of
 from stlc.dynamics.schema_names import Names

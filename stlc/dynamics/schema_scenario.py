@@ -7,8 +7,8 @@ from types import MappingProxyType
 from stlc.compile import ir
 from stlc.compile.scope import Known
 from stlc.compile.values import Number
-from stlc.dynamics.decl import Assign, ScenarioDecl
-from stlc.dynamics.decl_errors import ErrorsDecl
+from stlc.dynamics.decl_deployment import ErrorsDecl, ScenarioDecl
+from stlc.dynamics.decl_model import Assign
 from stlc.dynamics.schema_deploy import read_event, read_world
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import rate_unit, read_sets, states_of

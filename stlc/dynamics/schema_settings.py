@@ -9,7 +9,8 @@ from stlc.compile import ir
 from stlc.compile.scope import Entry, Known
 from stlc.compile.values import Number, Vector
 from stlc.dynamics.algebra import names_in, substitute
-from stlc.dynamics.decl import START, BackupDecl, ObjectiveDecl, PolicyDecl, Term, TrainDecl
+from stlc.dynamics.decl_deployment import BackupDecl
+from stlc.dynamics.decl_learning import START, ObjectiveDecl, PolicyDecl, Term, TrainDecl
 from stlc.dynamics.schema_columns import read_levels
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import component_texts

@@ -9,7 +9,7 @@ from dataclasses import replace
 from stlc.compile import ir
 from stlc.compile.functions import sampler_names
 from stlc.dynamics.algebra import map_parts
-from stlc.dynamics.decl import Assign
+from stlc.dynamics.decl_model import Assign
 
 _SAMPLERS = frozenset(sampler_names())
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 
 from stlc.compile import ir
 from stlc.dynamics.algebra import blend, substitute
-from stlc.dynamics.decl import JumpDecl, SystemDecl
+from stlc.dynamics.decl import SystemDecl
+from stlc.dynamics.decl_model import JumpDecl
 from stlc.dynamics.integrators import INTEGRATORS, State
 
 

@@ -19,7 +19,9 @@ from stlc.compile.timers import Timer
 from stlc.compile.typed import Parameter
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.algebra import add, multiply, names_in
-from stlc.dynamics.decl import START, Assign, ControlDecl, SystemDecl
+from stlc.dynamics.decl import SystemDecl
+from stlc.dynamics.decl_learning import START
+from stlc.dynamics.decl_model import Assign, ControlDecl
 from stlc.dynamics.describe import describe
 from stlc.dynamics.draws import Drawing, Rows
 from stlc.dynamics.functions import load_functions

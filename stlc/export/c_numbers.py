@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from stlc.compile import ir
 from stlc.compile.c_numbers import Leaf, NumberWriter, Untranslatable, literal
 from stlc.controller.task import KEPT, PULL, SHORT, Task
-from stlc.dynamics.decl import START
+from stlc.dynamics.decl_learning import START
 
 if TYPE_CHECKING:
     from stlc.controller.promises import Promise

@@ -15,7 +15,7 @@ from stlc.compile.unrolled import written
 from stlc.controller.prefix import BEYOND, anchored, open_ended
 from stlc.controller.promises import HELD
 from stlc.controller.task import KEPT, PULL, SHORT, TIE, Task
-from stlc.dynamics.decl import START
+from stlc.dynamics.decl_learning import START
 from stlc.export.onnx_rollout import assigned, rolled
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from stlc.controller.policy import PlanNetwork
     from stlc.controller.task import Task
-    from stlc.dynamics.decl import ControlDecl
+    from stlc.dynamics.decl_model import ControlDecl
 
 
 def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Value:

@@ -17,7 +17,7 @@ from stlc.controller.drive import Recorder, Recording, Setting, drive
 from stlc.controller.task import Task
 from stlc.controller.world import world_type
 from stlc.diagnostics import StlcError
-from stlc.dynamics.decl_errors import ErrorsDecl
+from stlc.dynamics.decl_deployment import ErrorsDecl
 from stlc.dynamics.scenario import standard, under
 from stlc.dynamics.schema import parse_system
 from stlc.dynamics.system import System

@@ -1,0 +1,119 @@
+"""How a policy is deployed, as data: its backup, its world and what happens there, and scenarios."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from stlc.compile import ir
+from stlc.dynamics.decl_learning import Term
+from stlc.dynamics.decl_model import Assign
+from stlc.source import Span
+
+
+@dataclass(frozen=True, slots=True)
+class BackupDecl:
+    """Prefixes of `lengths` with `bins` values a control, or the `levels` of its name; `batch` at a time."""
+
+    bins: int = 5
+    lengths: tuple[int, ...] = (1, 2, 3)
+    batch: int = 8192
+    levels: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class EventDecl:
+    """Something that happens between steps and that the planner does not foresee.
+
+    Attributes:
+        name: for messages.
+        when: a state formula; None where the event is timed.
+        edge: fire only where `when` has just become true (`rise`) or false (`fall`).
+        at: step at which it fires once.
+        every: period in steps.
+        sets: new values, in order; later ones read earlier ones.
+    """
+
+    name: str
+    sets: tuple[Assign, ...]
+    when: ir.Formula | None = None
+    edge: Literal["rise", "fall"] | None = None
+    at: int | None = None
+    every: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class WorldRef:
+    """The class of a world, in a Python file beside the system file."""
+
+    path: Path
+    name: str
+    span: Span = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class TestDecl:
+    """A deployment: how long, how many agents, how often they plan, and what happens to them."""
+
+    __test__ = False
+
+    steps: int = 200
+    agents: int = 20
+    replan: int = 1
+    events: tuple[EventDecl, ...] = ()
+    metrics: tuple[str, ...] = ()
+    world: WorldRef | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorsDecl:
+    """How far actuators and sensors are off, as shares.
+
+    Attributes:
+        actuator_gain: of every control each agent gets so much more or less than it commands, all the time;
+            a direction (squash `angle`) is off by this share of a radian instead.
+        actuator_noise: standard deviation of what is added to controls at every step, of half their range.
+        sensor_noise: of what is added to the real states that agents see, of their nominal range; clocks,
+            which are states in seconds, are known.
+    """
+
+    actuator_gain: float = 0.0
+    actuator_noise: float = 0.0
+    sensor_noise: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class ScenarioDecl:
+    """A named overlay of a deployment.
+
+    Attributes:
+        name: as written.
+        doc: one line for people.
+        expect: "nominal", or "ood" where a policy meets what training never drew.
+        constants: other values, as text; they change the model too.
+        override: initial values, drawn after all others.
+        events: that happen beside those of `test`.
+        disturb: what is added to derivatives of the truth, not of the model.
+        noise: what is added to the states that agents see.
+        mismatch: constants of the truth that the model does not know, as text.
+        world: in the place of that of `test`.
+        errors: of actuators and sensors.
+        prefer: performance terms that plans are chosen by, beside those of the objective.
+        backup: in the place of the system's.
+    """
+
+    name: str
+    doc: str = ""
+    expect: str = "nominal"
+    constants: Mapping[str, str] = field(default_factory=dict)
+    override: tuple[Assign, ...] = ()
+    events: tuple[EventDecl, ...] = ()
+    disturb: tuple[Assign, ...] = ()
+    noise: tuple[Assign, ...] = ()
+    mismatch: Mapping[str, str] = field(default_factory=dict)
+    world: WorldRef | None = None
+    errors: ErrorsDecl = field(default_factory=ErrorsDecl)
+    prefer: tuple[Term, ...] = ()
+    backup: BackupDecl | None = None
