@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from stlc import native
+from stlc.controller.backup import Backup
 from stlc.controller.deploy import Guard
 from stlc.controller.prefix import prefix_robustness
 from stlc.controller.task import rank
@@ -110,6 +111,25 @@ def by_torch(path: Path) -> Callable[[Tensor], Answer]:
         return plan, rho, safe, each
 
     return decide
+
+
+def backup_agreement(policy: Mlp, path: Path, *, states: int, seed: int = 11) -> Agreement:
+    """Ask the backup policy and the program in a file, in random states, whether they need it or not.
+
+    Raises:
+        RunError: R105, they disagree.
+    """
+    task = policy.task
+    x = task.sample(states, seed=seed, dtype=torch.float64)
+    with unmoved():
+        module = torch.export.load(path).module()
+    with torch.no_grad():
+        wanted = Backup(task, policy).search(x, policy.plan(x))
+        rows = [module(one[None], policy.plan(one[None])) for one in x]
+    plan, rho, safe, each, source, t0 = (torch.cat(column) for column in zip(*rows, strict=True))
+    if not (bool((source == wanted.source).all()) and bool((t0 == wanted.t0).all())):
+        raise RunError(_disagreement("the backup policy decides by another rule"))
+    return _compared(task, x, wanted.plan, (plan, rho, safe, each))
 
 
 def by_onnx(graphs: Graphs) -> Callable[[Tensor], Answer]:

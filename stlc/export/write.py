@@ -13,9 +13,19 @@ import torch
 from stlc.compile.c_numbers import Untranslatable
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.export import c_weights, emit
+from stlc.export.guarding import recorded_guard
 from stlc.export.onnx_write import Latency, timed, write_onnx
 from stlc.export.programs import recorded
-from stlc.export.verify import Agreement, agreement, by_c, by_onnx, by_torch, kept_agreement, same_verdicts
+from stlc.export.verify import (
+    Agreement,
+    agreement,
+    backup_agreement,
+    by_c,
+    by_onnx,
+    by_torch,
+    kept_agreement,
+    same_verdicts,
+)
 from stlc.files import write_atomic
 from stlc.jsontext import dumps
 from stlc.runtime.facts import read_facts
@@ -85,11 +95,15 @@ Checked: TypeAlias = tuple[Agreement | None, Latency | None]
 
 
 def _torch(run: Run, folder: Path) -> Checked:
-    """`decide.pt2`, and `controller.json` that says what goes in and comes out."""
-    path = folder / "decide.pt2"
+    """`decide.pt2`, `backup.pt2`, and `controller.json` that says what goes in and comes out."""
+    path, backup = folder / "decide.pt2", folder / "backup.pt2"
     torch.export.save(recorded(run.task, run.policy.network), path)
+    torch.export.save(recorded_guard(run.task, run.policy.network), backup)
     (folder / "controller.json").write_text(dumps(_facts(run)) + "\n", encoding="utf-8")
-    return agreement(run.policy, by_torch(path), states=STATES), None
+    fresh = agreement(run.policy, by_torch(path), states=STATES)
+    guarded = backup_agreement(run.policy, backup, states=STATES // 16)
+    off = max(fresh.rho, guarded.rho)
+    return Agreement(STATES, max(fresh.plan, guarded.plan), off, fresh.ties + guarded.ties), None
 
 
 def _onnx(run: Run, folder: Path) -> Checked:
@@ -139,4 +153,5 @@ def _facts(run: Run) -> dict[str, object]:
         "dt": task.dt,
         "horizon": task.horizon,
         "outputs": ["plan", "rho", "safe", "requirements"],
+        "backup_outputs": ["plan", "rho", "safe", "requirements", "source", "t0"],
     }

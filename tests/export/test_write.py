@@ -14,6 +14,7 @@ from exported import run_of
 from stlc import native
 from stlc.cli.app import main
 from stlc.cli.schema import load_schema
+from stlc.controller.backup import Backup
 from stlc.controller.config import TrainConfig
 from stlc.controller.deploy import Guard
 from stlc.controller.launch import Launch, open_folder
@@ -69,9 +70,10 @@ def test_the_c_controller_decides_as_the_guard(spec: str, system: str, tmp_path:
 def test_the_torch_program_needs_nothing_of_stlc(tmp_path: Path) -> None:
     run = run_of("traffic", "car", tmp_path)
     done = export(run, "torch", tmp_path / "out")
-    assert done.files == ("controller.json", "decide.pt2")
+    assert done.files == ("backup.pt2", "controller.json", "decide.pt2")
     with unmoved():
         module = torch.export.load(done.folder / "decide.pt2").module()
+        backup = torch.export.load(done.folder / "backup.pt2").module()
     for count in (1, 70):
         x = run.task.sample(count, seed=9, dtype=torch.float64)
         plan, judged = run.policy.plan_judged(x)
@@ -79,6 +81,10 @@ def test_the_torch_program_needs_nothing_of_stlc(tmp_path: Path) -> None:
         torch.testing.assert_close(mine, plan, rtol=0.0, atol=1e-5)
         torch.testing.assert_close(rho, judged.rho, rtol=0.0, atol=1e-5)
         torch.testing.assert_close(each, judged.requirements, rtol=0.0, atol=1e-5)
+        wanted = Backup(run.task, run.policy).search(x, plan)
+        mine, *_, source, t0 = backup(x, plan)
+        torch.testing.assert_close(mine, wanted.plan, rtol=0.0, atol=1e-5)
+        assert (source.tolist(), t0.tolist()) == (wanted.source.tolist(), wanted.t0.tolist())
 
 
 @compiled
