@@ -96,8 +96,9 @@ class Blamer:
             case typed.Truth():
                 return self._node(formula, wanted, sample)
             case typed.Pred():
-                read = tuple(sorted(columns(self._lowered(formula, wanted))))
-                return replace(self._node(formula, wanted, sample), signals=read)
+                return self._predicate(formula, sample, wanted)
+            case typed.Not(span, body) if span == body.span and span.text:
+                return self._predicate(formula, sample, wanted)  # `not in`: to a reader one predicate
             case typed.Not(_, body):
                 return self.blame(body, sample, wanted=not wanted)
             case typed.Logic():
@@ -171,6 +172,10 @@ class Blamer:
     def _node(self, formula: typed.Formula, wanted: bool, sample: int) -> Blame:
         margin = float(self._margins(formula, wanted, range(sample, sample + 1))[0])
         return Blame(formula, not wanted, sample, margin if wanted else -margin)
+
+    def _predicate(self, formula: typed.Formula, sample: int, wanted: bool) -> Blame:
+        read = tuple(sorted(columns(self._lowered(formula, wanted))))
+        return replace(self._node(formula, wanted, sample), signals=read)
 
     def _least(self, parts: Sequence[tuple[typed.Formula, int, bool]]) -> tuple[typed.Formula, int, bool]:
         """The part that is farthest from what is wanted of it."""

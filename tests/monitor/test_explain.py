@@ -107,6 +107,9 @@ CASES = {
     "two_signals": ("always[0 s, 1 s] x + v * 1 s < 3", {"x": [1, 2], "v": [1, 1.5]}),
     "chain": ("always[0 s, 1 s] 0 <= v < 4", {"v": [1, -1]}),
     "every_line": ("light == green ->\n    always[0 s, 1 s]\n        v < 4", {"light": [1, 1], "v": [1, 8]}),
+    "not_in": ("always[0 s, 1 s] [x, 1 m] not in box([0, 0], [2, 2])", {"x": [9, 1]}),
+    "not_in_range": ("always[0 s, 1 s] x not in [0 m, 2 m]", {"x": [9, 1]}),
+    "not_equal": ("always[0 s, 1 s] light != red", {"light": [1, 0]}),
     "false": ("false", {}),
     "clock": ("always@[1 s, 2 s] v < 4", {"v": [9, 1, 7]}),
 }
