@@ -27,6 +27,7 @@ EDGE = -0.1  # left edge of the first obstacle
 NONE = -1.0  # this level has no goal
 ROUNDING = 1e-9  # heights are sums of steps
 BELOW, ABOVE = 3.0, 6.0  # m of the shaft that a picture shows around the ball
+ASIDE = 2.3  # m beside each shaft, for the numbers of its levels
 TAIL = 20  # frames of a way that are seen
 
 
@@ -97,7 +98,7 @@ class MazeLevels:
         from matplotlib.patches import Circle
 
         balls, (width, high, apart, radius) = scene["balls"], scene["shape"][index]
-        pitch = width + 1.0
+        pitch = width + ASIDE
         who = deciders(scene, index, balls.shape[1])
         for shaft, own in enumerate(scene["levels"][index]):
             draw_shaft(axes, shaft * pitch, own, balls[index, shaft, 1], (width, high, apart, radius))
@@ -106,7 +107,7 @@ class MazeLevels:
         tails(axes, np.where(seen[..., 1:] > -BELOW, seen, np.nan), scene, index, frames=TAIL)
         for at, source in zip(seen[index], who, strict=True):
             axes.add_patch(Circle(at, 0.2, fc=DECIDED[source], ec="white", lw=0.6, zorder=3))
-        axes.set(xlim=(-0.1, len(who) * pitch - 0.9), ylim=(-BELOW, ABOVE), aspect="equal")
+        axes.set(xlim=(-0.3, len(who) * pitch - 0.1), ylim=(-BELOW, ABOVE), aspect="equal")
         axes.set_axis_off()
 
     def _first(self, level: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
@@ -159,7 +160,7 @@ def draw_shaft(
         start, end = max(edge, 0.0), min(edge + length, width)
         block = Rectangle((left + start, top - high), end - start, high, color=WALL, lw=0)
         axes.add_patch(block).set_clip_path(shaft)
-        axes.text(left + width + 0.1, top - high / 2, f"{level}", size=6.5, color=NOTE, va="center")
+        axes.text(left + width + 0.3, top - high / 2, f"level {level}", size=6.5, color=NOTE, va="center")
         if goal > 0:
             place = (left + goal, top - high / 2)
             axes.add_patch(Circle(place, radius, fc="none", ec=GOAL, lw=1.6)).set_clip_path(shaft)

@@ -118,7 +118,7 @@ class River(ABC):
         tails(axes, np.where(turned, np.nan, placed), scene, index, frames=WAKE)
         poses = np.concatenate((placed[index], ships[index, :, 2:]), 1)
         outlines(axes, HULL, poses, deciders(scene, index, ships.shape[1]))
-        axes.set(xlim=(-2.6, FOLD + 0.3), ylim=(-(rows - 0.5) * pitch + 0.5, pitch / 2 - 0.5), aspect="equal")
+        axes.set(xlim=(-3.4, FOLD + 0.5), ylim=(-(rows - 0.5) * pitch + 0.5, pitch / 2 - 0.5), aspect="equal")
         axes.set_axis_off()
 
     # ------------------------------------------------------------- what rivers differ in
@@ -270,4 +270,4 @@ def draw_row(axes: Any, row: int, obstacles: np.ndarray, half: float, pitch: flo
         if -r < x - row * FOLD < FOLD + r:
             stone = axes.add_patch(Circle((x - row * FOLD, middle + y), r, color=STONE, lw=0, zorder=2))
             stone.set_clip_path(water)
-    axes.text(-0.5, middle, f"{row * FOLD:.0f} m", ha="right", va="center", size=7.5, color=NOTE)
+    axes.text(-1.1, middle, f"{row * FOLD:.0f} m", ha="right", va="center", size=7.5, color=NOTE)

@@ -128,7 +128,7 @@ class Stations:
             "shape": np.array([self.size, self.near]),
         }
 
-    KEYS: ClassVar = {"destination": GOAL, "charging station": CHARGE, "wall": WALL}
+    KEYS: ClassVar = {"destination": GOAL, "charging station": CHARGE, "wall": WALL, "battery left": NOTE}
 
     @staticmethod
     def draw(axes: Any, scene: Mapping[str, np.ndarray], index: int) -> None:

@@ -184,7 +184,7 @@ def _driven(order: _Order, name: str | None, *, kept: bool = True) -> Record:
             if mode == order.guard:
                 raise
             show_diagnostics(error.diagnostics)  # only the comparison is missing: the guard may go on
-    return _save(run, order.setting, found, order.record)
+    return _save(run, order, found)
 
 
 def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
@@ -274,13 +274,13 @@ def _deploy(run: Run, setting: Setting, mode: Mode, watching: Watching, record: 
         raise (error.__cause__ or error) from None
 
 
-def _save(run: Run, setting: Setting, found: Mapping[Mode, Deployment], record: Path | None) -> Record:
+def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment]) -> Record:
     """Write trace, scene and figures into the run's folder; returns what was measured."""
     from stlc.controller.archive import RESULT, SCENE, save_scene, save_trace_of
     from stlc.controller.evaluate import as_json
 
     last = list(found.values())[-1]
-    save_trace_of(run, last.recording, setting, record)
+    save_trace_of(run, last.recording, order.setting, order.record)
     save_scene(run.dir.path / SCENE, last.recording.scene)
     world = run.task.system.decl.test.world
     facts = {
@@ -290,8 +290,9 @@ def _save(run: Run, setting: Setting, found: Mapping[Mode, Deployment], record: 
         "world": world.path.name if world is not None else None,
         "scenario": _laid_over(run),
         "trace": f"{run.dir.shown}/trace.npz",
+        "overrides": dict(order.overrides),
     }
-    document = as_json(found, setting, facts)
+    document = as_json(found, order.setting, facts)
     run.dir.write_json(RESULT, document)
     return document
 

@@ -11,7 +11,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from stlc.cli.check_text import signed
+from stlc.cli.check_text import percent, signed
 from stlc.cli.output import table
 from stlc.compile.semantics import TOLERANCE
 from stlc.controller.deploy import SOURCES
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from stlc.controller.oversight import Oversight
     from stlc.monitor.margins import Margin
+    from stlc.signature import Column
 
 REDRAWN = 0.5
 """Seconds between pictures on a terminal."""
@@ -28,6 +29,10 @@ LINES = 10
 """How many lines there are elsewhere."""
 HALF = 10
 """Half the width of a bar: what stands right of its middle is to spare."""
+NARROW = 4
+"""The same where there is little room."""
+FIRST = ("agent", "decided by", "plan", "least margin")
+"""What is said of every agent before its states."""
 
 
 class LiveView:
@@ -93,7 +98,7 @@ class LiveView:
         parts = (
             self._counter(),
             f"guard acted in {self._acted()}",
-            f"least margin {name} {signed(float(worst[1].high[agent]))} ({self._agent(agent)})",
+            f"least margin {name} {_signed(float(worst[1].high[agent]))} ({self._agent(agent)})",
             f"violated by {int(violated.sum())} of {len(violated)}",
         )
         return "  " + "   ".join(parts)
@@ -102,7 +107,7 @@ class LiveView:
         """What the terminal shows at this moment."""
         width, height = self.console.size
         lines = [Text(self.title, style="bold"), Text(f"{self._counter()}   {self._decisions()}"), Text()]
-        lines += self._bars()
+        lines += self._bars(width)
         lines.append(Text())
         lines += self._agents(width, max(height - len(lines) - 2, 3))
         for line in lines:
@@ -113,12 +118,12 @@ class LiveView:
         moment = self.oversight.moment
         assert moment is not None
         step = f"step {moment.step:,} / {moment.steps:,}   t = {self.oversight.time:.6g} s"
-        return f"{step}   decision {1e3 * self._seconds:.1f} ms"
+        return f"{step}   all decided in {1e3 * self._seconds:.1f} ms"
 
     def _decisions(self) -> str:
         total = max(int(self.oversight.counts.sum()), 1)
         shares = zip(SOURCES, self.oversight.counts.tolist(), strict=True)
-        return "   ".join(f"{name} {count / total:.1%}" for name, count in shares if count)
+        return "   ".join(f"{name} {percent(count / total)}" for name, count in shares if count)
 
     def _acted(self) -> str:
         acted, total = int(self.oversight.counts[1:].sum()), int(self.oversight.counts.sum())
@@ -129,36 +134,44 @@ class LiveView:
         several = len(self.oversight.setting.seeds) > 1
         return f"agent {agent}" + (f", seed {self.oversight.setting.seeds[seed]}" if several else "")
 
-    def _bars(self) -> list[Text]:
-        """A line for each requirement: what the worst agent can still have of it."""
+    def _bars(self, width: int) -> list[Text]:
+        """A line for each requirement: what the worst agent can still have of it; bars give way to words."""
         margins = self.oversight.margins
+        told = {name: self._told(margin) for name, margin in margins.items()}
+        wide = [max(len(parts[k]) for parts in told.values()) for k in range(3)]
         label = max(map(len, margins))
+        room = width - label - sum(wide) - len("      │      ")
+        half = min(max(room // 2, NARROW), HALF)
         found = []
-        for name, margin in margins.items():
-            row = int(margin.high.argmin())
-            high, count = float(margin.high[row]), int((margin.violated > 0).sum())
-            open_ = margin.low[row] < margin.high[row]
-            value = f"{'at most ' if open_ else ''}{signed(high)}"
+        for name, (value, agent, violated) in told.items():
+            high = float(margins[name].high.min())
             text = Text(f"  {name:<{label}}  ")
-            text.append(self._bar(name, high), style="red" if high < -TOLERANCE else "green")
-            told = f"  {value:<16}  {self._agent(row)}"
-            text.append(told)
-            if count:
-                text.append(f"   violated by {count} of {len(margin.high)}", style="red")
+            text.append(self._bar(name, high, half), style="red" if high < -TOLERANCE else "green")
+            text.append(f"  {value:<{wide[0]}}  {agent:<{wide[1]}}")
+            text.append(f"  {violated}", style="red")
+            text.rstrip()
             found.append(text)
         return found
 
-    def _bar(self, name: str, value: float) -> str:
+    def _told(self, margin: Margin) -> tuple[str, str, str]:
+        """Of one requirement: its least margin, whose that is, and how many have violated it."""
+        row = int(margin.high.argmin())
+        open_ = margin.low[row] < margin.high[row]
+        count = int((margin.violated > 0).sum())
+        value = f"{'at most ' if open_ else ''}{_signed(float(margin.high[row]))}"
+        return value, self._agent(row), f"violated by {count} of {len(margin.high)}" if count else ""
+
+    def _bar(self, name: str, value: float, half: int = HALF) -> str:
         """A margin left or right of the middle, by the largest one so far."""
         full, empty, middle = ("█", "·", "│") if self._unicode else ("#", ".", "|")
         finite = abs(value) if np.isfinite(value) else 0.0
         scale = self._scales[name] = max(self._scales.get(name, 1e-9), finite)
-        length = HALF if not np.isfinite(value) else round(HALF * abs(value) / scale)
+        length = half if not np.isfinite(value) else round(half * abs(value) / scale)
         length = max(length, 1) if value else 0
-        filled = full * length, empty * (HALF - length)
+        filled = full * length, empty * (half - length)
         if value < 0:
-            return filled[1] + filled[0] + middle + empty * HALF
-        return empty * HALF + middle + filled[0] + filled[1]
+            return filled[1] + filled[0] + middle + empty * half
+        return empty * half + middle + filled[0] + filled[1]
 
     def _agents(self, width: int, most: int) -> list[Text]:
         """A line for each agent of the first seed, the worst of them where there are more than fit."""
@@ -172,16 +185,40 @@ class LiveView:
         decision = moment.decision
         cells = []
         for row in rows:
-            rho = "" if decision is None else signed(float(decision.rho[row]))
+            rho = "" if decision is None else _signed(float(decision.rho[row]))
             name, margin = _worst(oversight.margins, row)
-            first = (str(row), oversight.decided(row) or "", rho, f"{name} {signed(margin)}")
-            cells.append([*first, *(f"{value:.2f}" for value in states[row])])
+            first = (str(row), oversight.decided(row) or "", rho, f"{name} {_signed(margin)}")
+            cells.append([*first, *map(_shown, names, states[row])])
         units = (f"{column.name} {column.unit.text}".strip() for column in names)
-        text = table(cells, header=("agent", "decided by", "plan", "least margin", *units))
-        lines = [Text(line[:width]) for line in text.splitlines()]
+        lines = [Text(line) for line in _fitting(cells, [*FIRST, *units], width).splitlines()]
         for line, row in zip(lines[1:], rows, strict=True):
             line.stylize("red" if least[row] < -TOLERANCE else "")
         return lines
+
+
+def _fitting(cells: list[list[str]], header: list[str], width: int) -> str:
+    """A table with as many whole columns as there is room for, and `…` where some are left out."""
+    for count in range(len(header), len(FIRST), -1):
+        more = ["…"] if count < len(header) else []
+        text = table([[*row[:count], *more] for row in cells], header=[*header[:count], *more])
+        if max(map(len, text.splitlines())) <= width:
+            return text
+    return table([row[: len(FIRST)] for row in cells], header=header[: len(FIRST)])
+
+
+def _shown(column: Column, value: float) -> str:
+    """A state as one reads it: the label of an enum, yes or no, a number."""
+    for label, number in column.labels:
+        if number == value:
+            return label
+    if column.kind == "bool":
+        return "yes" if value > 0.5 else "no"
+    return f"{value:.2f}"
+
+
+def _signed(value: float) -> str:
+    """A margin; rounding around zero is zero."""
+    return "0" if abs(value) <= TOLERANCE else signed(value)
 
 
 def _least(margins: Mapping[str, Margin]) -> NDArray[np.float64]:

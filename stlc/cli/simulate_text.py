@@ -49,7 +49,8 @@ def screen(document: Record) -> Iterator[str]:
     yield f"  {_unsafe(list(guards.values())[-1]['unsafe'], seeds * agents)}"
     foreseen = list(guards.values())[-1]["metrics"].get("foreseen")
     if foreseen and foreseen["mean"] > 0:
-        yield f"  foreseen: the {foreseen['mean']:.0%} of starts from which the world did as the model says"
+        share = _part(foreseen["mean"])
+        yield f"  foreseen: the {share} of starts from which the world did as the model says"
     if document.get("scenarios"):
         yield from compared(document)
 
@@ -146,5 +147,10 @@ def _acted(decisions: Mapping[str, float]) -> str:
         return "0 % of decisions"
     kinds = {name.removeprefix("backup "): share for name, share in decisions.items() if "T0=" in name}
     kinds |= {"polished": decisions["polished"], "longest safe prefix": decisions["safest"]}
-    parts = ", ".join(f"{name} {share / total:.0%}" for name, share in kinds.items() if share)
-    return f"{total:.1%} of decisions ({parts})"
+    parts = ", ".join(f"{name} {_part(share / total)}" for name, share in kinds.items() if share)
+    return f"{100 * total:.1f} % of decisions ({parts})"
+
+
+def _part(share: float) -> str:
+    """Of a whole, in per cent; what is something never reads as nothing, nor as all."""
+    return "< 1 %" if share < 0.005 else "> 99 %" if 0.995 <= share < 1.0 else f"{100 * share:.0f} %"

@@ -23,8 +23,8 @@ GROUND, WALL, STONE, GOAL, WATER, BANK, CHARGE = (
 """What stands around: floors, walls and obstacles in greys, what is to be reached in green."""
 NOTE = "#4a4f57"
 """Of small writing."""
-FADED = 0.5
-"""How strong a path is behind an agent."""
+FADED = 0.75
+"""How strong a path is behind an agent: weaker, the policy's would look like that of a polished plan."""
 
 
 def deciders(scene: Scene, index: int, agents: int) -> NDArray[np.int64]:
@@ -55,7 +55,7 @@ def tails(axes: Any, paths: NDArray[np.float64], scene: Scene, index: int, *, fr
         if mine.any():
             gap = np.full((int(mine.sum()), 2), np.nan)
             stretches = np.stack((begin[mine], end[mine], gap), 1).reshape(-1, 2)
-            axes.plot(*stretches.T, color=color, lw=1.3, alpha=FADED, zorder=2.5, solid_capstyle="round")
+            axes.plot(*stretches.T, color=color, lw=1.1, alpha=FADED, zorder=2.5, solid_capstyle="round")
 
 
 def outlines(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 MOST_PATHS = 200
 """Paths that are drawn; the violating ones come first."""
+CROWDED = 1000
+"""Points of paths from which on they are drawn finer."""
 TAIL = 2.5
 """Seconds of path behind a point of the film."""
 STRONG, FEEBLE = 0.4, 0.1
@@ -176,16 +178,16 @@ def _draw_places(axes: Axes, chart: Chart) -> list[PathPatch]:
     from matplotlib.path import Path
 
     window = (axes.get_xlim(), axes.get_ylim())
-    areas = []
-    for place in chart.plane.places:
-        xs, ys, depth = chart.plane.sampled(place, chart.trace, window)
+    areas, sampled = [], [chart.plane.sampled(place, chart.trace, window) for place in chart.plane.places]
+    for index, (place, (xs, ys, depth)) in enumerate(zip(chart.plane.places, sampled, strict=True)):
         color = chart.color(place)
         outline = Path(np.empty((0, 2)))
         if (depth >= 0).any():
             filled = axes.contourf(xs, ys, depth, levels=[0, 2 * max(float(depth.max()), 1e-9)])
             outline = filled.get_paths()[0]
             filled.remove()
-            row, column = np.unravel_index(int(np.argmax(depth)), depth.shape)
+            others = [other for k, (_, _, other) in enumerate(sampled) if k != index]
+            row, column = _clearest(depth, others)
             _write(axes, place.title, (float(xs[column]), float(ys[row])))
         area = PathPatch(outline, fc=_tint(color, STRONG), ec=color, lw=1.2, zorder=2)
         if place.role == "avoid":
@@ -199,6 +201,13 @@ def _tint(color: str, strength: float) -> tuple[float, float, float, float]:
     from matplotlib.colors import to_rgba
 
     return to_rgba(color, strength)
+
+
+def _clearest(depth: NDArray[np.float64], others: Sequence[NDArray[np.float64]]) -> tuple[int, int]:
+    """Where a name stands: deep in its place and, if that can be, out of the others; (row, column)."""
+    free = np.minimum.reduce([depth, *(-other for other in others)])
+    best = int(np.argmax(free if (free >= 0).any() else depth))
+    return best // depth.shape[1], best % depth.shape[1]
 
 
 def _write(axes: Axes, name: str, at: tuple[float, float]) -> None:
@@ -215,10 +224,11 @@ def _draw_paths(axes: Axes, chart: Chart) -> None:
         if not len(rows):
             continue
         strength = max(0.25, 0.9 - 0.01 * len(rows))
+        width = 0.7 if across[rows].size < CROWDED else 0.45
         xs, ys = _joined(across[rows]), _joined(up[rows])
         count = int((chart.violated == violated).sum())
         word = "violated" if violated else "satisfied"
-        axes.plot(xs, ys, color=color, lw=0.7, alpha=strength, zorder=order, label=f"{word} ({count:,})")
+        axes.plot(xs, ys, color=color, lw=width, alpha=strength, zorder=order, label=f"{word} ({count:,})")
         axes.plot(across[rows, 0], up[rows, 0], "o", mfc="white", mec=color, ms=3, mew=0.7, zorder=5)
         axes.plot(across[rows, -1], up[rows, -1], "o", color=color, ms=2, zorder=5)
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, handlelength=1.4, borderpad=0)

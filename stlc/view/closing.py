@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Mapping
+from typing import Any
 
 from stlc.view.failures import draw_failures
 from stlc.view.held_out import unsolved_text
@@ -11,6 +13,8 @@ from stlc.view.html import classed, el, figure, join
 from stlc.view.material import Material
 from stlc.view.page import Section
 
+USUAL_LIMIT = 0.1
+"""Seconds of a decision of the full guard, where nothing else was said."""
 _TITLES = {
     "spec.stl": "The specification",
     "system.yaml": "The system",
@@ -56,12 +60,11 @@ def _commands(material: Material) -> list[str]:
         if record.get(option) is not None:
             train += [f"--{option}", str(record[option])]
     options = record.get("options") or {}
-    for option in ("method", "plans", "lr", "batch"):
+    for option in ("method", "plans", "lr", "batch", "threads"):
         if options.get(option) not in (None, "guided"):
             train += [f"--{option}", str(options[option])]
-    for name, value in (record.get("overrides") or {}).items():
-        train += ["--set", f"{name}={value}"]
-    commands = [shlex.join(train), _simulate(material)]
+    train += _set(record)
+    commands = [shlex.join(train), shlex.join([*_simulate(material), *_set(material.simulation or {})])]
     if material.trace is not None:
         check = ["stlc", "check", f"{material.run.shown}/trace.npz"]
         if material.outside:
@@ -70,7 +73,13 @@ def _commands(material: Material) -> list[str]:
     return [*commands, f"stlc report {run}"]
 
 
-def _simulate(material: Material) -> str:
+def _set(record: Mapping[str, Any]) -> list[str]:
+    """The options for what was changed in specification and system."""
+    changed = record.get("overrides") or {}
+    return [word for name, value in changed.items() for word in ("--set", f"{name}={value}")]
+
+
+def _simulate(material: Material) -> list[str]:
     """The command of the newest deployment; with the backup where there was none."""
     done = material.simulation or {}
     guard = list(done.get("guards") or {"paper": {}})[-1]
@@ -80,7 +89,21 @@ def _simulate(material: Material) -> str:
     seeds = done.get("seeds") or range(10)
     if list(seeds) != list(range(10)):
         words += ["--seeds", str(len(seeds))] + (["--seed", str(seeds[0])] if seeds[0] else [])
-    return shlex.join(words)
+    for name, usual in (("agents", material.usual.get("agents")), ("steps", material.usual.get("steps"))):
+        if done.get(name) not in (None, usual):
+            words += [f"--{name}", str(done[name])]
+    return words + _limits(done)
+
+
+def _limits(done: Mapping[str, Any]) -> list[str]:
+    """What a guard was told, where that is not the usual."""
+    words = []
+    if "time_limit" in done and done["time_limit"] != USUAL_LIMIT:
+        limit = done["time_limit"]
+        words += ["--time-limit", "none" if limit is None else f"{1000 * float(limit):g}ms"]
+    for name in ("ceiling", "margin"):
+        words += [f"--{name}", str(done[name])] if done.get(name) else []
+    return words
 
 
 _GUARDS = {"none": (), "paper": ("--backup",)}

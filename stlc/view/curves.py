@@ -22,7 +22,7 @@ def draw_curves(rows: Rows) -> Picture | None:
     if len(measured) < 2:
         return None
     with look():
-        figure = new_figure(9, 3.2)
+        figure = new_figure(9, 3.4)
         left, middle, right = figure.subplots(1, 3, width_ratios=[1.35, 1.35, 1])
         _draw_accuracy(left, measured)
         _draw_requirements(middle, measured)
@@ -45,39 +45,54 @@ def _column(rows: Rows, key: str) -> tuple[NDArray[np.float64], NDArray[np.float
     )
 
 
-def _set_share_axis(axes: Axes, values: NDArray[np.float64]) -> None:
-    """Down to the bulk of `values`: the first measurements of a run may fall below the axis."""
-    floor = float(np.quantile(values, 0.08)) if len(values) else 0.0
-    low = max(0.0, np.floor(20 * (floor - 0.02)) / 20)
-    axes.set_ylim(low, 1.0 + 0.012 * (1 - low))
+def _even(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What `values` are without their noise: means over a window, which the ends cut."""
+    reach, count = len(values) // 60, len(values)
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    first = np.maximum(np.arange(count) - reach, 0)
+    last = np.minimum(np.arange(count) + reach + 1, count)
+    return np.asarray((sums[last] - sums[first]) / (last - first))
+
+
+def _set_share_axis(axes: Axes, values: Sequence[NDArray[np.float64]]) -> None:
+    """Down to the bulk of the lowest curve, up to the highest: first measurements may fall below the axis."""
+    low = min((float(np.quantile(curve, 0.08)) for curve in values if len(curve)), default=0.0)
+    high = max((float(curve.max()) for curve in values if len(curve)), default=1.0)
+    low = max(0.0, np.floor(20 * (low - 0.02)) / 20)
+    high = max(min(1.0, np.ceil(20 * high) / 20), low + 0.05)
+    axes.set_ylim(low, high + 0.012 * (high - low))
+
+
+def _draw_share(axes: Axes, seconds: NDArray[np.float64], shares: NDArray[np.float64], **style: Any) -> None:
+    """What was measured, faintly, and above it what it is without noise."""
+    axes.plot(seconds, shares, **{**style, "label": None, "alpha": 0.28, "lw": 0.8})
+    axes.plot(seconds, _even(shares), **style)
+
+
+def _legend(axes: Axes, rows: int) -> None:
+    """The names of the curves beneath them, where no curve can be."""
+    axes.legend(
+        loc="upper left",
+        bbox_to_anchor=(-0.02, -0.17),
+        ncols=-(-len(axes.get_legend_handles_labels()[1]) // rows),
+        handlelength=1.2,
+        columnspacing=1.2,
+        borderaxespad=0,
+        labelcolor=INK,
+    )
 
 
 def _draw_accuracy(axes: Axes, rows: Rows) -> None:
     axes.set_title("plan accuracy")
     seconds, accuracy = _column(rows, "accuracy")
-    axes.plot(seconds, accuracy, color=BLUE, lw=1.8, zorder=3)
-    axes.plot(seconds[-1], accuracy[-1], "o", color=BLUE, ms=4, zorder=4)
-    axes.annotate(
-        f"{accuracy[-1]:.3f}",
-        (seconds[-1], accuracy[-1]),
-        xytext=(0, -20),
-        textcoords="offset points",
-        ha="right",
-        color=BLUE,
-        weight="bold",
-    )
+    label = f"policy  {_even(accuracy)[-1]:.3f}"
+    _draw_share(axes, seconds, accuracy, color=BLUE, lw=1.8, zorder=3, label=label)
     known, feasible = _column(rows, "feasible")
     if len(feasible):
-        axes.plot(known, feasible, color=MUTED, lw=1.1, ls=(0, (4, 2)))
-        axes.annotate(
-            f"known feasible {feasible[-1]:.3f}",
-            (known[-1], feasible[-1]),
-            xytext=(0, 5),
-            textcoords="offset points",
-            ha="right",
-            color=MUTED,
-        )
-    _set_share_axis(axes, accuracy)
+        label = f"known feasible  {_even(feasible)[-1]:.3f}"
+        _draw_share(axes, known, feasible, color=MUTED, lw=1.2, ls=(0, (4, 2)), label=label)
+    _set_share_axis(axes, [accuracy, feasible])
+    _legend(axes, 2)
 
 
 def _draw_requirements(axes: Axes, rows: Rows) -> None:
@@ -86,15 +101,14 @@ def _draw_requirements(axes: Axes, rows: Rows) -> None:
     everything = []
     for index, name in enumerate(names):
         kept = [row for row in rows if name in (row.get("requirements") or {})]
+        seconds = np.array([float(row["seconds"]) for row in kept])
         shares = np.array([float(row["requirements"][name]) for row in kept])
         everything.append(shares)
-        color = SERIES[index % len(SERIES)]
-        label = f"{name}  {shares[-1]:.3f}"
-        style = "-" if index < len(SERIES) else "--"
-        axes.plot([float(row["seconds"]) for row in kept], shares, style, color=color, label=label)
+        color, style = SERIES[index % len(SERIES)], "-" if index < len(SERIES) else "--"
+        _draw_share(axes, seconds, shares, color=color, ls=style, label=f"{name}  {_even(shares)[-1]:.3f}")
     if everything:
-        _set_share_axis(axes, np.concatenate(everything))
-        axes.legend(loc="lower right", handlelength=1.2, labelcolor=INK)
+        _set_share_axis(axes, everything)
+        _legend(axes, 3)
 
 
 def _draw_loss(axes: Axes, rows: Rows) -> None:
@@ -103,7 +117,8 @@ def _draw_loss(axes: Axes, rows: Rows) -> None:
     axes.set_title("loss")
     seconds, loss = _column(rows, "loss")
     if len(loss):
-        axes.plot(seconds, loss, color=INK, lw=1.2)
+        axes.plot(seconds, loss, color=INK, lw=0.7, alpha=0.3)
+        axes.plot(seconds, _even(loss), color=INK, lw=1.2)
         if loss.min() > 0 and loss.max() > 5 * loss.min():
             axes.set_yscale("log")
             axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))

@@ -6,7 +6,7 @@ import base64
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from stlc.view.animate import STILL, current
+from stlc.view.animate import SCENE, STILL, current
 from stlc.view.html import Child, Html, classed, el, figure, join, table, video
 from stlc.view.material import Material
 from stlc.view.page import Section
@@ -54,6 +54,11 @@ SHARES = {
 }
 HOLDS = "holds."
 FORESEEN = "driven safely, where the world did as the model says"
+WORLD = (
+    "The first seed; the colours say who decided. Over time: for how many agents the guard acted, and the "
+    "least margin of each requirement over the agents that the picture names, judged from each instant on "
+    "(red: violated)."
+)
 SOURCES = ("policy", "polished", "backup", "safest", "")
 
 
@@ -80,6 +85,7 @@ def deployment_section(material: Material) -> Section | None:
         return None
     body = join(
         el("p", _setting(material.simulation or {})),
+        _unforeseen(guards),
         _compared("", guards, _share_rows(guards)),
         _compared("Requirements as driven", guards, _requirement_rows(guards)),
         _compared("Progress", guards, _progress_rows(guards)),
@@ -96,10 +102,7 @@ def film_section(material: Material) -> Section | None:
     if found is None:
         return None
     alt = f"Animation of the deployment; a still is in {STILL}."
-    caption = (
-        "The first seed; the colours say who decided. Over time: for how many agents the guard acted, and "
-        "the least margin of each requirement over the agents for which the world did what the model says."
-    )
+    caption = WORLD if (material.run.path / SCENE).exists() else "What was driven, over time."
     path, show = (found.gif, figure) if found.mp4 is None else (found.mp4, video)
     kind = "image/gif" if found.mp4 is None else "video/mp4"
     uri = f"data:{kind};base64," + base64.b64encode(path.read_bytes()).decode()
@@ -123,9 +126,20 @@ def _guards(material: Material) -> dict[str, Record]:
 def _setting(simulation: Record) -> str:
     seeds, agents, steps = simulation.get("seeds") or (), simulation.get("agents"), simulation.get("steps")
     size = f"{count(len(seeds), 'seed')} of {count(agents or 0, 'agent')}, {count(steps or 0, 'step')} each"
-    spread = f", {simulation['interval']}" if simulation.get("interval") else ""
-    return (
-        f"{size}. Means over the seeds with their interval ({spread.lstrip(', ')})." if spread else f"{size}."
+    interval = str(simulation.get("interval") or "").replace(" %", "\N{NO-BREAK SPACE}%")
+    return f"{size}. Means over the seeds with their interval ({interval})." if interval else f"{size}."
+
+
+def _unforeseen(guards: Mapping[str, Record]) -> Html | None:
+    """Why plans can do better than what was driven."""
+    foreseen = _mean(list(guards.values())[-1].get("metrics") or {}, "foreseen")
+    if foreseen is None or foreseen >= 1.0:
+        return None
+    seen = f"from {share(foreseen)} of the starts" if foreseen else "from no start"
+    return el(
+        "p",
+        "Plans are judged as the model foresees them, drives as they were. The world did what the model says "
+        f"through the whole window {seen}; elsewhere a drive holds what no plan could know.",
     )
 
 
@@ -143,8 +157,13 @@ def _share_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
     return [
         (join(label, el("small", meaning)), *_cells(guards, name, _share_cell))
         for name, (label, meaning) in SHARES.items()
-        if name in _names(guards)
+        if name in _names(guards) and (name != "foreseen" or _ever(guards, name))
     ]
+
+
+def _ever(guards: Mapping[str, Record], name: str) -> bool:
+    """Whether a share is more than nothing with any guard."""
+    return any(_mean(guard.get("metrics") or {}, name) for guard in guards.values())
 
 
 def _requirement_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
@@ -196,6 +215,8 @@ def _decision_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
     rows: list[tuple[Child, ...]] = []
     for name in names:
         shares = [(guard.get("decisions") or {}).get(name) for guard in guards.values()]
+        if not any(shares):
+            continue  # a rule that never decided
         rows.append((_decided(name), *(share(value, 2) for value in shares)))
     latencies = [guard.get("latency") or {} for guard in guards.values()]
     for key, label in (("median", "time for one decision, median"), ("p99", "99th percentile")):

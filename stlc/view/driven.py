@@ -19,7 +19,7 @@ from stlc.view.chart import chart_of, draw_chart
 from stlc.view.html import Child, Html, classed, el, figure, join, table
 from stlc.view.material import Material, untagged
 from stlc.view.page import Section
-from stlc.view.signals import DECISIONS, POLICY, acted_in, choose_traces, draw_signals
+from stlc.view.signals import DECISIONS, POLICY, acted_in, choose_traces, draw_signals, left_out
 from stlc.view.words import count, share
 
 TITLE = "What was driven"
@@ -38,7 +38,7 @@ def driven_section(material: Material) -> Section | None:
     try:
         monitor = _monitor(material, trace)
         verdict = monitor.check(trace)
-        margins = monitor.requirement_robustness(trace)
+        margins = margins_of(monitor, verdict, trace)
     except StlcError as error:
         reason = el(
             "p", "The trace could not be judged: ", "; ".join(d.message for d in error.diagnostics), "."
@@ -46,11 +46,11 @@ def driven_section(material: Material) -> Section | None:
         return Section("driven", TITLE, reason)
     names = trace_names(trace)
     choices = choose_traces(_per_trace(verdict), names, acted_in(trace))
-    picture = draw_signals(trace, {name: np.atleast_2d(rho) for name, rho in margins.items()}, choices)
+    picture = draw_signals(trace, margins, choices)
     body = join(
         el("p", _summary(verdict)),
         _verdict_table(verdict, names),
-        figure(picture.data_uri(), picture.alt, _caption(trace)),
+        figure(picture.data_uri(), picture.alt, _caption(trace, judged_once(verdict))),
         causes_of(verdict, names, monitor.spec),
     )
     return Section("driven", TITLE, body, picture)
@@ -68,6 +68,24 @@ def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None) -> M
     spec = replace(parse(source), library=trace.meta.spec_library or None)
     outside = any(isinstance(item, ast.Extern) for item in spec.items)
     return Monitor(spec, system=system if outside and system is not None and system.is_file() else None)
+
+
+def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, NDArray[np.float64]]:
+    """Robustness of each requirement from each sample on, (traces, samples); NaN where it is not defined.
+
+    What is judged once has the value that was judged at every sample: no other counts for its verdict.
+    """
+    once = judged_once(verdict)
+    rows = {name: np.atleast_2d(rho) for name, rho in monitor.requirement_robustness(trace).items()}
+    return {
+        name: np.repeat(rho[:, :1], rho.shape[1], 1) if name in once else rho for name, rho in rows.items()
+    }
+
+
+def judged_once(verdict: Verdict) -> list[str]:
+    """Names of the requirements that speak about the start of a trace alone."""
+    planned = verdict.subject.horizon is not None
+    return [j.name for j in verdict if j.rule.absolute or not (j.rule.windowed and planned)]
 
 
 def _monitor(material: Material, trace: Trace) -> Monitor:
@@ -144,14 +162,22 @@ _KINDS = {"satisfied": "good", "violated": "bad"}
 def _least(judgement: Judgement) -> str:
     values = judgement.high if judgement.overall == "violated" else judgement.low
     least = float(values.min())
-    return f"{least:+.3f}" if np.isfinite(least) else "not limited" if least > 0 else "unknown"
+    if not np.isfinite(least):
+        return "not limited" if least > 0 else "unknown"
+    text = f"{least:+.3f}"
+    return text if judgement.overall == "violated" else text.replace("-0.000", "+0.000")
 
 
-def _caption(trace: Trace) -> Html:
+def _caption(trace: Trace, once: list[str]) -> Html:
     words = (
         "Beneath the signals the robustness of each requirement at every start "
         "(red: violated; large margins are cut). "
     )
+    if once:
+        words += f"Judged once, for the whole trace: {', '.join(once)}. "
+    hidden = left_out(trace)
+    if hidden:
+        words += f"Not shown: {', '.join(hidden)}. "
     acted = acted_in(trace)
     if acted is None or not acted.any():
         return join(words)
@@ -161,7 +187,8 @@ def _caption(trace: Trace) -> Html:
 
 
 def _key(word: str, color: str) -> Html:
-    return join(el("span", attrs={"class": "key", "style": f"background:{color}"}), f"{word}  ")
+    swatch = el("span", attrs={"class": "key", "style": f"background:{color}"})
+    return join(classed("span", "whole", swatch, word), "  ")
 
 
 def causes_of(verdict: Verdict, names: list[str], spec: ast.Spec) -> Html | None:

@@ -53,6 +53,7 @@ def _draw_starts(axes: Axes, held: HeldOut, weakness: Weakness, signature: Signa
     else:
         kinds.append((shown & failing & ~held.known, MUTED, 7, "no plan is known"))
         kinds.append((shown & failing & held.known, RED, 9, f"{name} fails"))
+    kinds = [kind for kind in kinds if kind[0].any()]
     for mask, color, size, label in kinds:
         axes.scatter(
             held.x0[mask, a],

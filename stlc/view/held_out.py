@@ -272,4 +272,6 @@ def unsolved_text(held: HeldOut) -> str:
     text = f"{failing:,} of {len(held.x0):,} starts"
     if held.known is None:
         return text
+    if known == failing:
+        return f"{text}; a satisfying plan is known for each of them"
     return f"{text}; a satisfying plan is known for {known:,} of them, for {failing - known:,} none was found"

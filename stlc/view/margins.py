@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.trace import Trace
-from stlc.view.driven import monitor_of
+from stlc.view.driven import margins_of, monitor_of
 from stlc.view.scene import Scene
 from stlc.view.strip import Strip
 
@@ -37,8 +37,8 @@ def strip_of(scene: Scene, trace: Trace, dt: float, *, system: Path) -> Strip | 
     times = np.arange(frames, dtype=np.float64) * np.float64(dt)
     shown = decisions.shape[1]
     first = {name: values[:shown] for name, values in trace.data.items()}
-    found = monitor_of(trace, system=system).requirement_robustness(replace(trace, data=first, extras={}))
-    rows = {name: np.atleast_2d(rho)[:, :frames] for name, rho in found.items()}
+    monitor, seen = monitor_of(trace, system=system), replace(trace, data=first, extras={})
+    rows = margins_of(monitor, monitor.check(seen), seen)
     counts = as_foreseen(trace, shown)
     every = {name: least(rho) for name, rho in rows.items()}
     if counts is not None:

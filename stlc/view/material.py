@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from stlc.diagnostics import StlcError
+from stlc.dynamics.decl import SystemDecl
+from stlc.dynamics.scenario import under
 from stlc.dynamics.schema import load_system_decl
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
@@ -32,6 +34,7 @@ class Material:
         signature: of the system, for units and labels.
         held_out: starts and how their plans fared.
         simulation: of `eval/simulate.json`.
+        usual: how many agents and steps the system deploys, under the scenario of the deployment.
         trace: the recorded deployment.
     """
 
@@ -43,6 +46,7 @@ class Material:
     signature: Signature | None
     held_out: HeldOut | None
     simulation: Record | None
+    usual: Record
     trace: Trace | None
 
     @property
@@ -68,6 +72,7 @@ def gather(run: RunDir) -> Material:
     Raises:
         RunError: R101, the folder is no run.
     """
+    decl, simulation = _decl(run), _simulation(run)
     texts = {name: text for name in TEXTS if (text := _text(run, name))}
     return Material(
         run=run,
@@ -75,9 +80,10 @@ def gather(run: RunDir) -> Material:
         rows=run.rows(),
         requirements=_requirements(texts.get("spec.stl", "")),
         texts=texts,
-        signature=_signature(run),
+        signature=None if decl is None else decl.signature,
         held_out=load_held_out(run.path / "eval/held_out.npz"),
-        simulation=_simulation(run),
+        simulation=simulation,
+        usual={} if decl is None else _usual(decl, (simulation or {}).get("scenario")),
         trace=_trace(run),
     )
 
@@ -112,11 +118,19 @@ def _items(text: str) -> tuple[ast.Item, ...]:
         return ()
 
 
-def _signature(run: RunDir) -> Signature | None:
+def _decl(run: RunDir) -> SystemDecl | None:
     try:
-        return load_system_decl(run.path / "system.yaml").signature
+        return load_system_decl(run.path / "system.yaml")
     except StlcError:
         return None
+
+
+def _usual(decl: SystemDecl, scenario: object) -> Record:
+    try:
+        test = (decl if scenario is None else under(decl, str(scenario))).test
+    except StlcError:
+        return {}
+    return {"agents": test.agents, "steps": test.steps}
 
 
 def _simulation(run: RunDir) -> Record | None:

@@ -16,7 +16,7 @@ from stlc.view.words import count, interval, number, seconds, share
 def headline(material: Material, tiles: list[tuple[str, str]]) -> Html:
     """What came out, in one sentence and a few numbers; `tiles` adds those of the deployment."""
     record, result = material.record, material.result
-    names = (material.spec, str(record.get("system", "")), f"run {material.run.name}")
+    names = dict.fromkeys((material.spec, str(record.get("system", "")), f"run {material.run.name}"))
     return join(
         classed("p", "eyebrow", " · ".join(name for name in names if name)),
         el("h1", _verdict(material)),
@@ -113,7 +113,8 @@ def training_section(material: Material) -> Section:
 
 _CURVES = (
     "Plan accuracy while training, with the share of starts for which some satisfying plan is known; "
-    "each requirement alone; the loss over the learning rate (shaded)."
+    "each requirement alone; the loss over the learning rate (shaded). Faint what was measured, on a few "
+    "fresh starts each time; strong its running mean, with its last value."
 )
 
 
@@ -125,7 +126,9 @@ def _facts(material: Material) -> list[tuple[str, Child]]:
     steps = record.get("steps")
     taken = f"{steps:,} steps" if isinstance(steps, int) else ""
     if budget:
-        taken += f" (a budget of {budget if isinstance(budget, str) else seconds(float(budget))})"
+        taken += (
+            f" (a budget of {budget if isinstance(budget, str) else seconds(float(budget))}{_clock(record)})"
+        )
     machine = (
         str(hardware.get("processor") or hardware.get("machine") or ""),
         count(int(hardware["cores"]), "core") if hardware.get("cores") else "",
@@ -145,6 +148,11 @@ def _facts(material: Material) -> list[tuple[str, Child]]:
         ("specification", _hashed(record, "spec")),
         ("system", _hashed(record, "system")),
     ]
+
+
+def _clock(record: Mapping[str, Any]) -> str:
+    """What a budget was counted in, where that is not the clock on the wall."""
+    return " of processor time" if (record.get("options") or {}).get("clock") == "processor" else ""
 
 
 def _options(record: Mapping[str, Any]) -> str:

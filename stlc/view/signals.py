@@ -39,7 +39,8 @@ DECISIONS = {
     POLICY: (DECIDERS[POLICY], FAINT),
     **{source: (DECIDERS[source], DECIDED[source]) for source in (BACKUP, SAFEST, POLISHED)},
 }
-MOST_LINES = 8  # panels of numbers; beyond that those that move come first
+MOST_LINES = 10  # panels of numbers; beyond that those that move come first
+MOST_LETTERS = 44  # of a title in one line
 _HEIGHTS = {"line": 0.62, "strip": 0.2, "robustness": 0.5, "decision": 0.2}
 
 
@@ -94,7 +95,7 @@ def draw_signals(trace: Trace, margins: Margins, choices: Sequence[Choice]) -> P
             len(rows), len(choices), squeeze=False, sharex=True, sharey="row", height_ratios=heights
         )
         for column, choice in zip(grid.T, choices, strict=True):
-            column[0].set_title(choice.title, pad=8)
+            column[0].set_title(_in_lines(choice.title), pad=8)
             for axes, (kind, name) in zip(column, rows, strict=True):
                 _draw_row(axes, kind, name, _Agent(trace, margins, choice.index))
             column[-1].set_xlabel("time [s]")
@@ -125,6 +126,17 @@ def _rows(trace: Trace, margins: Margins) -> list[tuple[str, str]]:
     if _decisions(trace) is not None:
         rows.append(("decision", "decision"))
     return rows + [("robustness", name) for name in margins]
+
+
+def _in_lines(title: str) -> str:
+    """What a panel is wide enough for; the name of the trace stands in a line of its own where it is not."""
+    return title if len(title) <= MOST_LETTERS else title.replace(": ", ":\n", 1)
+
+
+def left_out(trace: Trace) -> list[str]:
+    """Names of the numbers that have no panel."""
+    shown = {name for kind, name in _rows(trace, {}) if kind == "line"}
+    return [c.name for c in trace.signature.columns if c.kind in ("real", "int") and c.name not in shown]
 
 
 def _draw_row(axes: Axes, kind: str, name: str, agent: _Agent) -> None:
@@ -239,7 +251,9 @@ def margin_limits(rho: NDArray[np.float64]) -> tuple[float, float]:
     if not len(finite):
         return -1.0, 1.0
     low, high = min(float(finite.min()), 0.0), max(float(np.quantile(finite, 0.95)), 0.0)
-    if low < 0:
+    if low >= -TOLERANCE:
+        low = 0.0  # rounding: nothing to make visible
+    else:
         high = min(high, 4 * -low)
     room = 0.12 * (high - low) or 1.0
     return low - room, high + room

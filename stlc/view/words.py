@@ -44,7 +44,8 @@ def seconds(value: float | None) -> str:
         return f"{1000 * value:.3g} ms"
     if value < 120:
         return f"{value:.3g} s"
-    return f"{int(value // 60)} min {round(value % 60)} s"
+    minutes, rest = divmod(round(value), 60)
+    return f"{minutes} min {rest} s" if rest else f"{minutes} min"
 
 
 def count(many: int, what: str) -> str:

@@ -209,7 +209,7 @@ def test_a_policy_that_gives_no_numbers(broken: RunDir, capsys: pytest.CaptureFi
         assert main(["simulate", str(broken.path), *SMALL, "--guard", guard]) == 0
         captured = capsys.readouterr()
         assert "error[R402]" in captured.err  # of the deployment without a guard
-        assert "guard acted in 100.0% of decisions" in captured.out
+        assert "guard acted in 100.0 % of decisions" in captured.out
         decisions = broken.read_json("eval/simulate.json")["guards"][guard]["decisions"]
         assert decisions["policy"] == 0.0
         checked(broken, 9)

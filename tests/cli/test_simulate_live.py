@@ -10,7 +10,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from stlc.cli.simulate_live import LiveView
+from stlc.cli.simulate_live import LiveView, _fitting, _shown, _signed
 from stlc.controller.deploy import Guard, Mode
 from stlc.controller.drive import Recorder, Setting, drive
 from stlc.controller.oversight import Oversight
@@ -19,6 +19,7 @@ from stlc.controller.world import world_type
 from stlc.dynamics.schema import parse_system
 from stlc.dynamics.system import System
 from stlc.grammar.parser import parse
+from stlc.signature import Column
 from stlc.source import Source
 
 SPEC = """\
@@ -49,7 +50,14 @@ class Away:
         return torch.ones((len(x0), self.horizon, 1), dtype=x0.dtype)
 
 
-def shown(*, terminal: bool, guard: Mode = "none", seeds: int = 1, steps: int = 20, height: int = 30) -> str:
+def shown(
+    *,
+    terminal: bool,
+    guard: Mode = "none",
+    seeds: int = 1,
+    steps: int = 20,
+    size: tuple[int, int] = (110, 30),
+) -> str:
     """What the view of a deployment has written, all pictures after one another."""
     task = Task.of(
         parse(Source("a.stl", SPEC)), System(parse_system(Source("dot.yaml", SYSTEM), Path("dot.yaml")))
@@ -57,7 +65,12 @@ def shown(*, terminal: bool, guard: Mode = "none", seeds: int = 1, steps: int = 
     setting = Setting(tuple(range(seeds)), 6, steps)
     stream = io.StringIO()
     console = Console(
-        file=stream, force_terminal=terminal, width=110, height=height, no_color=True, legacy_windows=False
+        file=stream,
+        force_terminal=terminal,
+        width=size[0],
+        height=size[1],
+        no_color=True,
+        legacy_windows=False,
     )
     oversight, ticks = Oversight(task, setting), iter(range(10_000))
     view = LiveView(oversight, "dot · a title", console, clock=lambda: float(next(ticks)))
@@ -105,11 +118,39 @@ def test_a_terminal_shows_bars_agents_and_who_decided() -> None:
 
 
 def test_of_more_agents_than_fit_the_worst_are_shown() -> None:
-    text = shown(terminal=True, height=12)
+    text = shown(terminal=True, size=(110, 12))
     last = text[text.rindex("decided by") :].splitlines()[1:]
     rows = [line.split() for line in last if line.strip() and line.split()[0].isdigit()]
     assert 3 <= len(rows) < 6
     assert [row[0] for row in rows] == sorted(row[0] for row in rows)
+
+
+def test_little_room_takes_from_bars() -> None:
+    text = shown(terminal=True, size=(66, 30))
+    last = text[text.rindex("step 20 / 20") :].splitlines()
+    bars = [line for line in last if "│" in line]
+    assert all(line.endswith("violated by 6 of 6") and len(line) <= 66 for line in bars)
+    assert {line.count("█") + line.count("·") for line in bars} == {8}
+
+
+def test_columns_are_whole_or_missing() -> None:
+    header = ["agent", "decided by", "plan", "least margin", "x m", "v m/s"]
+    rows = [["0", "policy", "+1.000", "near +1.000", "-10.00", "3.25"]]
+    whole = _fitting(rows, header, 80)
+    assert whole.splitlines()[1].endswith(" 3.25")
+    lines = _fitting(rows, header, max(map(len, whole.splitlines())) - 1).splitlines()
+    assert [line.split()[-1] for line in lines] == ["…", "…"]
+    assert "-10.00" in lines[1]
+    assert "3.25" not in lines[1]
+    assert _fitting(rows, header, 5).splitlines()[0].endswith("least margin")
+
+
+def test_states_read_as_they_are_written() -> None:
+    light = Column("sign", kind="enum", labels=(("stop", 0.0), ("light", 1.0)))
+    assert [_shown(light, value) for value in (0.0, 1.0)] == ["stop", "light"]
+    assert [_shown(Column("ready", kind="bool"), value) for value in (0.0, 1.0)] == ["no", "yes"]
+    assert _shown(Column("x"), -1.005) == "-1.00"
+    assert [_signed(value) for value in (-1.1e-16, 0.25, -2e-6)] == ["0", "+0.250", "-2.0e-06"]
 
 
 def test_an_agent_of_several_seeds_is_named_with_its_seed() -> None:

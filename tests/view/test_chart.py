@@ -8,7 +8,7 @@ from walks import judged, walk
 from stlc.rundir import RunDir
 from stlc.trace import save_trace
 from stlc.view.animate import film_of
-from stlc.view.chart import chart_film, chart_of, draw_chart
+from stlc.view.chart import _clearest, chart_film, chart_of, draw_chart
 from stlc.view.driven import map_section
 from stlc.view.film import save_film
 from stlc.view.material import gather
@@ -40,6 +40,15 @@ def test_the_picture_says_what_it_shows(chart, tmp_path):
     labels = [text.get_text() for text in plot.get_legend().get_texts()]
     assert labels == ["satisfied (2)", "violated (2)"]
     assert picture.save_png(tmp_path / "map.png").stat().st_size > 10_000
+
+
+def test_a_name_stands_in_its_place_and_out_of_others():
+    depth = 5.0 - np.abs(np.arange(11) - 5.0)[None, :]  # deepest in the middle, where another place is
+    other = 2.0 - np.abs(np.arange(11) - 5.0)[None, :]
+    _, column = _clearest(depth, [other])
+    assert other[0, column] <= 0 < depth[0, column]
+    assert _clearest(depth, []) == (0, 5)
+    assert _clearest(depth, [np.full_like(depth, 9.0)]) == (0, 5)  # within another altogether
 
 
 def test_presence_is_a_share_of_the_traces(chart):

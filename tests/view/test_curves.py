@@ -1,5 +1,6 @@
 """Training curves from the rows of a run."""
 
+import numpy as np
 import pytest
 
 from stlc.view.curves import draw_curves
@@ -21,9 +22,30 @@ def test_curves_show_what_the_rows_say(trained):
     assert list(accuracy.lines[2].get_ydata()) == known
     labels = [text.get_text() for text in requirements.get_legend().get_texts()]
     assert [label.split()[0] for label in labels] == list(rows[-1]["requirements"])
+    assert [float(label.split()[-1]) for label in labels] == pytest.approx(
+        [rows[-1]["requirements"][name] for name in rows[-1]["requirements"]], abs=0.01
+    )
     assert list(loss.lines[0].get_ydata()) == [row["loss"] for row in rows]
     assert f"{rows[-1]['accuracy']:.3f}" in picture.alt
     assert rate.get_ylim()[1] > 0
+
+
+def test_curves_are_told_without_their_noise():
+    rng = np.random.default_rng(0)
+    rows = [{"seconds": k, "accuracy": 0.9 + rng.normal(0, 0.02)} for k in range(600)]
+    accuracy, *_ = draw_curves(rows).figure.axes
+    faint, strong = (np.asarray(line.get_ydata()) for line in accuracy.lines)
+    assert np.std(strong) < 0.5 * np.std(faint)
+    assert strong[-1] == pytest.approx(np.mean(faint[-11:]))
+    (label,) = [text.get_text() for text in accuracy.get_legend().get_texts()]
+    assert label == f"policy  {strong[-1]:.3f}"
+
+
+def test_no_legend_covers_a_curve(trained):
+    figure = draw_curves(trained.rows()).figure
+    figure.draw_without_rendering()
+    for axes in figure.axes[:2]:
+        assert axes.get_legend().get_window_extent().y1 < axes.get_window_extent().y0
 
 
 @pytest.mark.parametrize("key", ["loss", "lr", "feasible", "requirements"])

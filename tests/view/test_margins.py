@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from stlc.signature import Signature
+from stlc.signature import Column, Signature
 from stlc.trace import Trace, TraceMeta
+from stlc.view.driven import judged_once, margins_of, monitor_of
 from stlc.view.margins import AS_FORESEEN, as_foreseen, least, strip_of
 
 
@@ -28,6 +29,23 @@ def test_the_agents_of_the_first_seed_are_shown(recording, tmp_path):
     assert strip.words != AS_FORESEEN  # nobody recorded whether it was so
     assert np.isnan(strip.margins["red_light"][-25:]).all()
     assert strip_of({"decision": scene["decision"][1:]}, recording, 0.1, system=tmp_path) is None
+
+
+def test_what_is_judged_once_is_shown_as_it_was_judged():
+    text = (
+        "spec s\nsignal x [m]\nrequire plan: always[0, T] x > 0\n"
+        "require once_only: always[0, 0.2 s] x > 0\nrequire clock: eventually@[0.1 s, 0.3 s] x > 2\n"
+    )
+    meta = TraceMeta(spec_text=text, horizon=2, dt=0.1)
+    x = np.array([[1.0, 2, 3, -4, 5, 6], [7, 7, 7, 7, 7, 7]])
+    trace = Trace(Signature((Column("x"),)), 0.1, {"x": x}, meta=meta)
+    monitor = monitor_of(trace)
+    verdict = monitor.check(trace)
+    found = margins_of(monitor, verdict, trace)
+    assert judged_once(verdict) == ["once_only", "clock"]
+    np.testing.assert_allclose(found["plan"], [[1, -4, -4, -4, np.nan, np.nan], [7] * 4 + [np.nan] * 2])
+    np.testing.assert_allclose(found["once_only"], [[1] * 6, [7] * 6])  # not -4: nobody asks at 0.1 s
+    np.testing.assert_allclose(found["clock"], [[1] * 6, [5] * 6])
 
 
 @pytest.mark.parametrize("right", [0, 1])

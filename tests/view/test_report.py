@@ -14,6 +14,9 @@ import stlc.view
 from stlc.diagnostics import MissingError, RunError
 from stlc.rundir import RunDir
 from stlc.trace import save_trace
+from stlc.view.closing import repeat_section
+from stlc.view.deployment import deployment_section
+from stlc.view.material import gather
 from stlc.view.report import write_report
 
 VOID = {"meta", "img", "br", "hr"}
@@ -177,6 +180,43 @@ def test_every_metric_of_a_deployment_is_shown(deployed):
             else None
         )
         assert (shown or f"{10 + index / 10:.1f} %") in text
+
+
+def part_of(run, section):
+    """The text of a section alone."""
+    return Page(section(gather(run)).html).text
+
+
+def test_a_world_that_no_plan_foresees_is_said(deployed):
+    document = json.loads((deployed.path / "eval/simulate.json").read_text())
+    text = part_of(deployed, deployment_section)
+    assert "from 71.0 % of the starts; elsewhere a drive holds what no plan could know" in text
+    assert "the backup decided" in text
+    assert "as foreseenstarts" in text
+    for guard in document["guards"].values():
+        guard["metrics"]["foreseen"] = {"mean": 0.0, "low": 0.0, "high": 0.0, "values": [0.0, 0.0]}
+        guard["decisions"] |= {"polished": 0.0, "backup": 0.0, "backup T0=1": 0.0}
+    deployed.write_json("eval/simulate.json", document)
+    text = part_of(deployed, deployment_section)
+    assert "from no start; elsewhere" in text
+    assert "as foreseenstarts" not in text  # a row of nothing
+    assert "the backup decided" not in text
+    assert "a polished plan" not in text
+
+
+def test_the_deployment_can_be_repeated_as_it_was(deployed):
+    def commands(**more):
+        deployed.write_json("eval/simulate.json", document | more)
+        return part_of(deployed, repeat_section)
+
+    document = json.loads((deployed.path / "eval/simulate.json").read_text())
+    assert f"stlc simulate {deployed.shown} --backup --seeds 2 --agents 10\n" in commands()
+    told = {"steps": 70, "agents": 20, "time_limit": None, "margin": 0.2, "ceiling": 0}
+    text = commands(**told, scenario="mismatch-20", overrides={"T_red": "3 s"})
+    words = "--backup --scenario mismatch-20 --seeds 2 --steps 70 --time-limit none --margin 0.2"
+    assert f"{words} --set 'T_red=3 s'\n" in text
+    assert "--time-limit" not in commands(time_limit=0.1)
+    assert "--time-limit 25ms" in commands(time_limit=0.025)
 
 
 def test_every_share_of_an_evaluation_has_words():

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stlc.view.signals import choose_traces, draw_signals
+from stlc.signature import Column, Signature
+from stlc.view.signals import choose_traces, draw_signals, left_out, margin_limits
 
 
 @pytest.fixture
@@ -81,6 +82,33 @@ def test_panels_show_signals_decisions_and_robustness(recording, margins, choice
     assert np.nanmax(bad) < 0
     assert shown["first"].get_ylim()[0] < -9 < 0 < shown["first"].get_ylim()[1]
     assert picture.svg()
+
+
+def test_rounding_does_not_set_the_scale_of_margins():
+    assert margin_limits(np.array([-5.6e-17, 0.0, 0.4, 1.0]))[1] > 0.9
+    low, high = margin_limits(np.array([-0.1, 0.0, 0.4, 9.0]))
+    assert low < -0.1
+    assert high < 0.5  # large margins are cut
+
+
+def test_a_long_title_stands_within_its_panel(recording, margins):
+    names = [f"trace {k} (seed 12, agent {k})" for k in range(recording.traces)]
+    acted = np.arange(recording.traces)
+    least = np.nanmin(np.stack(list(margins.values())), axis=(0, 2))
+    figure = draw_signals(recording, margins, choose_traces(least, names, acted)).figure
+    figure.draw_without_rendering()
+    for axes in figure.axes[:2]:
+        title = axes._left_title.get_window_extent()
+        assert title.x1 <= figure.bbox.x1
+        assert title.y1 <= figure.bbox.y1
+
+
+def test_what_has_no_panel_is_named(recording):
+    more = Signature((*recording.signature.columns, *(Column(f"z{k}") for k in range(7))))
+    still = {f"z{k}": np.full_like(recording.data["x"], k) for k in range(7)}
+    wide = replace(recording, signature=more, data={**recording.data, **still})
+    assert left_out(recording) == []
+    assert left_out(wide) == [f"z{k}" for k in range(7)]
 
 
 def test_the_backup_is_marked_in_every_panel(recording, margins, choices):

@@ -13,6 +13,8 @@ from stlc.view.words import count, interval, number, seconds, share, spread
         (1.5, "1.5 s"),
         (61.2, "61.2 s"),
         (312.0, "5 min 12 s"),
+        (300.0, "5 min"),
+        (179.7, "3 min"),
         (None, ""),
     ],
 )
