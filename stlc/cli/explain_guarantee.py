@@ -23,14 +23,14 @@ ASSUMED = (
 
 def explain_guarantee(run: str, runs: Path, overrides: Mapping[str, str], *, as_json: bool) -> None:
     """Print the probabilities for the grid of a run's system, and what they assume."""
-    from stlc.controller.backup import Grid
+    from stlc.controller.backup import grid_of
     from stlc.controller.guarantee import axes_of, chances
     from stlc.controller.run import load_task
     from stlc.rundir import RunDir
 
     folder = RunDir.open(run, runs)
     task = load_task(folder, overrides)
-    grid = Grid.of(task)
+    grid = grid_of(task)
     axes, found = axes_of(task, grid), chances(task, grid)
     if as_json:
         result = {
@@ -55,7 +55,9 @@ def _lines(run: str, axes: Sequence[Axis], found: Sequence[Chance]) -> list[str]
         group = [each for each in found if each.length == length]
         head = (f"T0={length}", f"{group[0].candidates:,}")
         rows.append((*head, "Theorem 1", *(f"{each.bound:.3g}" for each in group)))
-        rows.append(("", "", "exact", *(f"{each.exact:.3g}" for each in group)))
+        rows.append(
+            ("", "", "at least" if group[0].sampled else "exact", *(f"{each.exact:.3g}" for each in group))
+        )
     header = ("", "prefixes", "radius, share of each range", *(f"{radius:.0%}" for radius in radii))
     lines += [table(rows, header=header)]
     lines += ["", *_notes(found)]
@@ -67,7 +69,12 @@ def _notes(found: Sequence[Chance]) -> list[str]:
         "Theorem 1 (Meng & Fan 2023) leaves out the cells at the ends of each range, so it is 0 where a "
         "control has two values; `exact` is the share of prefixes that have a grid point within the radius."
     ]
-    if any(each.theorem > each.exact + 1e-12 for each in found):
+    if any(each.sampled for each in found):
+        notes.append(
+            "Of a grid that has more prefixes than `samples` as many are tried. `at least` counts one "
+            "neighbour of a prefix that works, and that it is tried with the probability of a random sample."
+        )
+    if any(each.theorem > each.exact + 1e-12 and not each.sampled for each in found):
         notes.append(
             "The paper takes the minimum with 1 over the product of all controls, which promises more than "
             "the truth where one control is covered more than once; here it is taken control by control."

@@ -1,16 +1,15 @@
 """The paper's backup policy: sampled prefixes, finished by the policy (section "MPC-based Deployment").
 
-For T0 = 1, 2, … every sequence of T0 actions on a grid of L values a control, M = L^(m T0), is followed from
-the state at hand, and the policy plans on from where it ends. The first T0 with a plan that satisfies phi, or
-else phi_safe, decides; where none has, the plan with the longest safe prefix at the last T0.
+For T0 = 1, 2, … every sequence of T0 actions on a grid of L values a control, M = L^(m T0), or a sample of
+them where they are too many, is followed from the state at hand, and the policy plans on from where it ends.
+The first T0 with a plan that satisfies phi, or else phi_safe, decides; where none has, the plan with the
+longest safe prefix at the last T0.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
-from math import prod
 from typing import TYPE_CHECKING
 
 import torch
@@ -18,42 +17,24 @@ from torch import Tensor
 
 from stlc.compile.semantics import TOLERANCE
 from stlc.controller.prefix import prefix_robustness
+from stlc.runtime.prefixes import Grid
 
 if TYPE_CHECKING:
     from stlc.controller.policy import Policy
     from stlc.controller.task import Task
 
 
-@dataclass(frozen=True, slots=True)
-class Grid:
-    """What is tried: `values` a control, prefixes of each of `lengths`, at most `batch` at a time."""
-
-    values: tuple[tuple[float, ...], ...]
-    lengths: tuple[int, ...]
-    batch: int
-
-    @classmethod
-    def of(cls, task: Task) -> Grid:
-        """The grid that the system declares: `levels` of a control, else evenly spaced over its range."""
-        decl = task.system.decl
-        values = tuple(
-            decl.backup.levels.get(control.name)
-            or control.levels
-            or tuple(torch.linspace(control.low, control.high, decl.backup.bins).tolist())
-            for control in decl.controls
-        )
-        lengths = tuple(length for length in decl.backup.lengths if 0 < length < task.horizon)
-        return cls(values, lengths, decl.backup.batch)
-
-    def count(self, length: int) -> int:
-        """How many prefixes there are, M = L^(m T0)."""
-        return int(prod(len(values) for values in self.values) ** length)
-
-    def prefixes(self, length: int) -> Tensor:
-        """All prefixes, (M, length, m) float64."""
-        actions = torch.tensor(list(product(*self.values)), dtype=torch.float64)
-        index = torch.cartesian_prod(*[torch.arange(len(actions))] * length)
-        return actions[index.reshape(-1, length)]
+def grid_of(task: Task) -> Grid:
+    """What the system declares: the `levels` of its backup, or of a control, else evenly over its range."""
+    decl = task.system.decl
+    values = tuple(
+        decl.backup.levels.get(control.name)
+        or control.levels
+        or tuple(torch.linspace(control.low, control.high, decl.backup.bins).tolist())
+        for control in decl.controls
+    )
+    lengths = tuple(length for length in decl.backup.lengths if 0 < length < task.horizon)
+    return Grid(values, lengths, decl.backup.batch, decl.backup.samples, decl.backup.sampling)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +77,7 @@ class Backup:
 
     def __init__(self, task: Task, policy: Policy, *, grid: Grid | None = None) -> None:
         self.task, self.policy = task, policy
-        self.grid = grid or Grid.of(task)
+        self.grid = grid or grid_of(task)
         self._formulas = [rule.formula for rule in task.compiled.safety]
 
     @torch.no_grad()
@@ -117,7 +98,7 @@ class Backup:
         found = _nothing(plan)
         todo = torch.arange(len(x), device=x.device)
         for length in self.grid.lengths:
-            prefixes = self.grid.prefixes(length).to(x)
+            prefixes = torch.from_numpy(self.grid.prefixes(length)).to(x)
             last = length == self.grid.lengths[-1]
             left = []
             for group in _pieces(todo, max(self.grid.batch // (len(prefixes) + 1), 1)):

@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics import TOLERANCE
-from stlc.controller.backup import Backup, Found, Grid
+from stlc.controller.backup import Backup, Found
 from stlc.controller.policy import Mlp
 from stlc.controller.polish import FullBackup, Limits
 from stlc.controller.prefix import robustness_until
 from stlc.controller.spare import sparing
 from stlc.controller.task import rank
+from stlc.runtime.prefixes import Grid
 
 if TYPE_CHECKING:
     from stlc.controller.policy import Policy

@@ -8,14 +8,14 @@ The backup policy finds it if a grid point lies within `radius` of it in every c
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import prod
+from math import expm1, log1p, prod
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from stlc.controller.backup import Grid
     from stlc.controller.task import Task
+    from stlc.runtime.prefixes import Grid
 
 RADII = (0.01, 0.02, 0.05, 0.1, 0.2, 0.25)
 """Shares of the control ranges."""
@@ -58,11 +58,12 @@ class Chance:
     Attributes:
         radius: share of each control's range.
         length: T0.
-        candidates: prefixes, M = L^(m T0).
+        candidates: prefixes that are tried: M = L^(m T0), or a sample of them.
         theorem: as the paper writes it, min{1, product}.
         bound: the same with the minimum taken control by control. Where a control is covered more than once
             the paper's product counts it more than once, and may exceed the truth.
-        exact: what the grid covers, under the same assumptions.
+        exact: what the grid covers, under the same assumptions; of a sample at least that much.
+        sampled: whether the grid has more prefixes than are tried.
     """
 
     radius: float
@@ -71,6 +72,7 @@ class Chance:
     theorem: float
     bound: float
     exact: float
+    sampled: bool = False
 
 
 def axes_of(task: Task, grid: Grid) -> tuple[Axis, ...]:
@@ -79,22 +81,31 @@ def axes_of(task: Task, grid: Grid) -> tuple[Axis, ...]:
     return tuple(Axis(each.name, each.low, each.high, tuple(sorted(values))) for each, values in controls)
 
 
-def chance(axes: Sequence[Axis], radius: float, length: int) -> Chance:
-    """The probabilities for one radius, a share of each range, and one length of prefixes."""
+def chance(axes: Sequence[Axis], radius: float, length: int, samples: int | None = None) -> Chance:
+    """The probabilities for one radius, a share of each range, and one length of prefixes.
+
+    Of a grid with more than `samples` prefixes as many are drawn, with replacement: a prefix of the grid is
+    among them with probability 1 - (1 - 1 / M)^samples, and at least one that works is if one that does is.
+    """
     radii = [radius * (axis.high - axis.low) for axis in axes]
     bounds = [axis.bound(each) for axis, each in zip(axes, radii, strict=True)]
     covered = [axis.covered(each) for axis, each in zip(axes, radii, strict=True)]
+    size = prod(len(axis.values) for axis in axes) ** length
+    sampled = samples is not None and samples < size
+    tried = samples if samples is not None and sampled else size
+    share = -expm1(tried * log1p(-1.0 / size)) if sampled else 1.0
     return Chance(
         radius,
         length,
-        prod(len(axis.values) for axis in axes) ** length,
+        tried,
         min(1.0, prod(bounds) ** length),
-        prod(min(1.0, each) for each in bounds) ** length,
-        prod(covered) ** length,
+        share * prod(min(1.0, each) for each in bounds) ** length,
+        share * prod(covered) ** length,
+        sampled,
     )
 
 
 def chances(task: Task, grid: Grid, radii: Sequence[float] = RADII) -> list[Chance]:
     """All radii for each length of the grid."""
     axes = axes_of(task, grid)
-    return [chance(axes, radius, length) for length in grid.lengths for radius in radii]
+    return [chance(axes, radius, length, grid.samples) for length in grid.lengths for radius in radii]

@@ -18,9 +18,10 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from stlc.compile.semantics import TOLERANCE
-from stlc.controller.backup import Backup, Found, Grid, finite
+from stlc.controller.backup import Backup, Found, finite, grid_of
 from stlc.controller.savable import Hunt, safely
 from stlc.controller.search import Searcher
+from stlc.runtime.prefixes import Grid
 
 if TYPE_CHECKING:
     from stlc.controller.policy import Policy
@@ -70,7 +71,7 @@ class FullBackup:
     ) -> None:
         self.task = task
         self.limits = limits or Limits()
-        grid = grid or Grid.of(task)
+        grid = grid or grid_of(task)
         few = tuple(length for length in grid.lengths if grid.count(length) <= self.limits.prefixes)
         self.grid = grid
         self.paper = Backup(task, policy, grid=replace(grid, lengths=few or grid.lengths[:1]))
@@ -171,7 +172,7 @@ class FullBackup:
         """The grid's prefixes where they are few, else a low-discrepancy sample of their range."""
         grid = self.grid
         if grid.count(length) <= self.limits.prefixes:
-            return grid.prefixes(length)
+            return torch.from_numpy(grid.prefixes(length))
         low = torch.tensor([values[0] for values in grid.values], dtype=torch.float64)
         high = torch.tensor([values[-1] for values in grid.values], dtype=torch.float64)
         engine = SobolEngine(length * len(low), scramble=True, seed=SEED)  # type: ignore[no-untyped-call]

@@ -10,17 +10,29 @@ from typing import Literal
 from stlc.compile import ir
 from stlc.dynamics.decl_learning import Term
 from stlc.dynamics.decl_model import Assign
+from stlc.runtime.prefixes import SAMPLES, Sampling
 from stlc.source import Span
 
 
 @dataclass(frozen=True, slots=True)
 class BackupDecl:
-    """Prefixes of `lengths` with `bins` values a control, or the `levels` of its name; `batch` at a time."""
+    """What the backup policy tries.
+
+    Attributes:
+        bins: values of a control, evenly over its range.
+        lengths: of prefixes, T0.
+        batch: trajectories at a time.
+        levels: name of a control -> its values, in the place of `bins`.
+        samples: prefixes of one length at most.
+        sampling: which, where there are more.
+    """
 
     bins: int = 5
     lengths: tuple[int, ...] = (1, 2, 3)
     batch: int = 8192
     levels: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    samples: int = SAMPLES
+    sampling: Sampling = "lattice"
 
 
 @dataclass(frozen=True, slots=True)

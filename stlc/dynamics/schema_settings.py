@@ -19,6 +19,7 @@ from stlc.dynamics.schema_names import Names
 from stlc.dynamics.schema_reader import Reader
 from stlc.dynamics.yaml_nodes import Node, Scalar, Sequence, as_int
 from stlc.grammar import ast
+from stlc.runtime.prefixes import SAMPLINGS
 
 OBJECTIVE_KEYS = ("gamma", "smoothing", "lambda", "terms")
 TERM_KEYS = ("name", "weight", "expr")
@@ -26,7 +27,8 @@ POLICY_KEYS = ("type", "hidden", "observe", "mirror")
 POLICIES = ("mlp",)
 TRAIN_KEYS = ("budget", "steps", "seed", "lr", "batch", "samples", "method")
 METHODS = ("guided", "gradient")
-BACKUP_KEYS = ("bins", "levels", "T0", "batch")
+BACKUP_KEYS = ("bins", "levels", "T0", "batch", "samples", "sampling")
+MOST_SAMPLES = 1 << 20
 OUTCOME = {
     "sat": "1 where the trajectory satisfies the specification",
     "rho": "robustness of the trajectory",
@@ -141,11 +143,14 @@ def read_backup(
     lengths = _integers(found.get("T0"), "`T0`", reader) or default.lengths
     if "T0" in found and 0 < horizon < max(lengths):
         reader.report("S103", f"`T0` goes beyond the horizon of {horizon} steps", found["T0"].span)
+    sampling = reader.option(found.get("sampling"), "`sampling`", SAMPLINGS)
     return BackupDecl(
         reader.integer(found.get("bins"), "`bins`", low=2) or default.bins,
         tuple(length for length in lengths if length <= horizon) or (1,),
         reader.integer(found.get("batch"), "`batch`") or default.batch,
         MappingProxyType(_levels(found.get("levels"), reader, names)),
+        reader.integer(found.get("samples"), "`samples`", high=MOST_SAMPLES) or default.samples,
+        next((each for each in SAMPLINGS if each == sampling), default.sampling),
     )
 
 

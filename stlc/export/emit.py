@@ -12,11 +12,12 @@ from stlc.compile.c_numbers import literal
 from stlc.compile.c_parts import declared, in_parts
 from stlc.compile.c_plan import plan_of
 from stlc.compile.emit_c import CHECK, HEAD, passes, state_column
-from stlc.controller.backup import Grid
+from stlc.controller.backup import grid_of
 from stlc.controller.kernel import motion_of
 from stlc.controller.prefix import BEYOND, anchored, open_ended
 from stlc.dynamics.controls import raw_width
 from stlc.export import c_numbers, c_weights
+from stlc.runtime.prefixes import generators
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -65,7 +66,7 @@ class _Template(Template):
 
 def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
     """Sizes, constants and straight-line code."""
-    grid, mirror = Grid.of(task), network.mirror
+    grid, mirror = grid_of(task), network.mirror
     most = max((grid.count(length) for length in grid.lengths), default=0)
     controls = task.system.controls
     return {
@@ -87,6 +88,9 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
         "CHOICES": most + 1,
         "LENGTHS": ", ".join(map(str, grid.lengths)) or "0",
         "LENGTH_COUNT": len(grid.lengths),
+        "SAMPLES": grid.samples,
+        "RANDOM": int(grid.sampling == "random"),
+        "GENERATORS": _generators(len(controls) * max(grid.lengths, default=1)),
         "LEVEL_COUNTS": ", ".join(str(len(values)) for values in grid.values),
         "MOST_LEVELS": max(map(len, grid.values)),
         "LEVELS": ", ".join("{" + ", ".join(map(literal, values)) + "}" for values in grid.values),
@@ -102,6 +106,10 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
         "OVERALL": _block(_overall(task.rules, task.rules)),
         "SAFE": _block(_overall(task.compiled.safety, task.rules)),
     }
+
+
+def _generators(dims: int) -> str:
+    return ", ".join(f"{each}u" for each in generators(dims))
 
 
 def _block(lines: Sequence[str]) -> str:

@@ -14,9 +14,10 @@ import torch
 from torch import Tensor, nn
 
 from stlc.compile.semantics import TOLERANCE
-from stlc.controller.backup import Grid, best, finite
+from stlc.controller.backup import best, finite, grid_of
 from stlc.controller.prefix import prefix_robustness
 from stlc.export.programs import Deciding, judged_openly, unmoved
+from stlc.runtime.prefixes import Grid
 
 if TYPE_CHECKING:
     from torch.export import ExportedProgram
@@ -52,10 +53,10 @@ class Guarding(nn.Module):
     def __init__(self, task: Task, network: PlanNetwork, grid: Grid | None = None) -> None:
         super().__init__()
         self.deciding = Deciding(task, network)
-        self.grid = grid or Grid.of(task)
+        self.grid = grid or grid_of(task)
         self._task = task
         self._formulas = [rule.formula for rule in task.compiled.safety]
-        self._prefixes = [self.grid.prefixes(length) for length in self.grid.lengths]
+        self._prefixes = [torch.from_numpy(self.grid.prefixes(length)) for length in self.grid.lengths]
 
     def forward(self, x: Tensor, plan: Tensor) -> tuple[Tensor, ...]:
         """Choose as `stlc.controller.backup.Backup.search` does."""

@@ -71,7 +71,7 @@ def write_onnx(run: Run, folder: Path) -> None:
 
 def _facts(run: Run) -> dict[str, object]:
     """Names, units, ranges, hashes, and what the backup policy tries."""
-    task, grid = run.task, backup.Grid.of(run.task)
+    task, grid = run.task, backup.grid_of(run.task)
     return {
         "format": FORMAT,
         "stlc": __version__,
@@ -85,7 +85,7 @@ def _facts(run: Run) -> dict[str, object]:
         "requirements": [rule.name for rule in task.rules],
         "dt": task.dt,
         "horizon": task.horizon,
-        "backup": {"values": grid.values, "lengths": grid.lengths, "batch": grid.batch},
+        "backup": asdict(grid),
     }
 
 

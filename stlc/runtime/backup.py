@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,9 +57,7 @@ def search(graphs: Graphs, x: Numbers, plan: Numbers) -> Found:
 def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> Judged:
     """All plans of one T0; the first begins as the policy's own plan does."""
     grid = graphs.facts.grid
-    actions = np.array(list(product(*grid.values)))
-    index = np.indices((len(actions),) * length).reshape(length, -1).T
-    heads = np.concatenate((own[None, :length], actions[index]))
+    heads = np.concatenate((own[None, :length], grid.prefixes(length)))
     parts = []
     for first in range(0, len(heads), grid.batch):
         some = heads[first : first + grid.batch]

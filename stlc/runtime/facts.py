@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from stlc.diagnostics import Diagnostic, RunError, UsageError
+from stlc.runtime.prefixes import SAMPLINGS, Grid
 
 FACTS = "controller.json"
 FORMAT = "stlc-controller/1"
@@ -35,15 +36,6 @@ class Quantity:
     high: float | None
     added: str = ""
     initial: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Grid:
-    """What the backup policy tries: `values` a control, prefixes of each of `lengths`, `batch` at a time."""
-
-    values: tuple[tuple[float, ...], ...]
-    lengths: tuple[int, ...]
-    batch: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +99,6 @@ def read_facts(where: Path | str) -> Facts:
 def _facts(read: Mapping[str, Any], folder: Path) -> Facts:
     if read["format"] != FORMAT:
         raise ValueError(f"its format is {read['format']}, not {FORMAT}")
-    grid = read["backup"]
     return Facts(
         read["spec"],
         read["system"],
@@ -116,9 +107,16 @@ def _facts(read: Mapping[str, Any], folder: Path) -> Facts:
         tuple(read["requirements"]),
         float(read["dt"]),
         int(read["horizon"]),
-        Grid(tuple(map(tuple, grid["values"])), tuple(grid["lengths"]), int(grid["batch"])),
+        _grid(read["backup"]),
         {name: _whole(folder / name, digest) for name, digest in read["files"].items()},
     )
+
+
+def _grid(read: Mapping[str, Any]) -> Grid:
+    if read["sampling"] not in SAMPLINGS:
+        raise ValueError(f"there is no sampling {read['sampling']!r}")
+    values, lengths = tuple(map(tuple, read["values"])), tuple(read["lengths"])
+    return Grid(values, lengths, int(read["batch"]), int(read["samples"]), read["sampling"])
 
 
 def _whole(path: Path, digest: str) -> bytes:

@@ -10,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from stlc.controller.backup import Backup, Grid, best, finite
+from stlc.controller.backup import Backup, best, finite, grid_of
 from stlc.controller.prefix import prefix_robustness
 from stlc.controller.task import Task
+from stlc.runtime.prefixes import Grid
 
 F64 = torch.float64
 
@@ -128,7 +129,7 @@ def test_a_plan_that_is_no_number_is_replaced(car_task: Task) -> None:
 
 
 def test_the_grid_is_that_of_the_system_file(car_task: Task) -> None:
-    g = Grid.of(car_task)
+    g = grid_of(car_task)
     assert g.values == ((-10.0, -5.0, 0.0, 5.0, 10.0),)
     assert g.lengths == car_task.system.decl.backup.lengths
     assert g.prefixes(2).tolist() == [[[a], [b]] for a, b in product(g.values[0], repeat=2)]

@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.controller.backup import Grid
+from stlc.controller.backup import grid_of
 from stlc.controller.guarantee import RADII, Axis, axes_of, chance, chances
 from stlc.controller.task import Task
+from stlc.runtime.prefixes import SAMPLINGS, Grid, Sampling
 
 DRAWN = 20_000
 
@@ -79,10 +80,27 @@ def test_probabilities_are_probabilities(
 
 
 def test_of_a_task(car_task: Task) -> None:
-    grid = Grid.of(car_task)
+    grid = grid_of(car_task)
     (axis,) = axes_of(car_task, grid)
     assert (axis.name, axis.low, axis.high) == ("u", -10.0, 10.0)
     found = chances(car_task, grid)
     assert len(found) == len(RADII) * len(grid.lengths)
     by_length = [[each.exact for each in found if each.length == length] for length in grid.lengths]
     assert all(row == sorted(row) for row in by_length)
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_of_a_sample_at_least_that_much_is_met(sampling: Sampling) -> None:
+    axes = [even("a", -1, 1, 6), even("b", 0, 1, 6)]
+    grid = Grid(tuple(axis.values for axis in axes), (2,), 100, 400, sampling)
+    found = chance(axes, 0.1, 2, grid.samples)
+    assert found.sampled
+    assert found.candidates == 400
+    rng = np.random.default_rng(0)
+    low, high = (np.array([getattr(axis, end) for axis in axes]) for end in ("low", "high"))
+    drawn = rng.uniform(low, high, (20_000, 2, 2))
+    met = np.zeros(len(drawn), dtype=bool)
+    for prefix in grid.prefixes(2):
+        met |= (np.abs(drawn - prefix) <= 0.1 * (high - low)).all((1, 2))
+    assert 0.2 < found.exact < met.mean() + 0.01
+    assert found.exact < chance(axes, 0.1, 2).exact

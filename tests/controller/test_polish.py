@@ -7,11 +7,12 @@ import math
 import pytest
 import torch
 
-from stlc.controller.backup import Backup, Grid
+from stlc.controller.backup import Backup
 from stlc.controller.deploy import SOURCES, Guard
 from stlc.controller.polish import POLISHED, FullBackup, Limits
 from stlc.controller.savable import safely, savable
 from stlc.controller.task import Task
+from stlc.runtime.prefixes import Grid
 from tests.controller.test_backup import F64, Constant, failing, grid
 
 QUICK = Limits(seconds=None, tries=256, prefixes=30, places=2)
@@ -82,7 +83,7 @@ def test_plans_that_are_no_numbers_are_places_too(car_task: Task) -> None:
 
 def test_a_large_grid_is_sampled_and_a_small_one_is_not(car_task: Task) -> None:
     full = FullBackup(car_task, Constant(car_task, 0.0), grid=grid(lengths=(1, 2)), limits=QUICK)
-    assert torch.equal(full._prefixes(1), full.grid.prefixes(1))
+    assert torch.equal(full._prefixes(1), torch.from_numpy(full.grid.prefixes(1)))
     assert len(full.grid.prefixes(2)) == full.grid.count(2) == 25
     full = FullBackup(
         car_task, Constant(car_task, 0.0), grid=Grid(((-2.0, 3.0, 4.0),), (4,), 64), limits=QUICK

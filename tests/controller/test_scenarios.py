@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.controller.backup import Grid
+from stlc.controller.backup import grid_of
 from stlc.controller.deploy import Guard
 from stlc.controller.disturbance import Disturbance
 from stlc.controller.drive import Recorder, Recording, Setting, drive
@@ -264,9 +264,9 @@ def test_scenarios_are_checked_whether_chosen_or_not(old: str, new: str, code: s
 
 def test_a_scenario_brings_a_backup_and_preferences_of_its_own() -> None:
     usual, fragile = task_of("nominal"), task_of("fragile")
-    assert Grid.of(fragile).values == ((-1.0, 0.5),)
-    assert Grid.of(fragile).lengths == (1, 3)
-    assert len(Grid.of(usual).values[0]) == usual.system.decl.backup.bins
+    assert grid_of(fragile).values == ((-1.0, 0.5),)
+    assert grid_of(fragile).lengths == (1, 3)
+    assert len(grid_of(usual).values[0]) == usual.system.decl.backup.bins
     x, u = usual.sample(1, seed=0, dtype=torch.float64), torch.full((1, 4, 1), 0.5, dtype=torch.float64)
     y = usual.rollout(x, u)[0, :, usual.names.index("y")]
     assert float(usual.cost(usual.judge(x, u))) == 0.0

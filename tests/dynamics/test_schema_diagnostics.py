@@ -208,3 +208,14 @@ def test_twice_as_many_findings_take_twice_the_work() -> None:
 
 def test_a_number_that_only_its_unit_makes_too_large() -> None:
     assert "E005" in findings(GOOD.replace("wall: 5 m", "wall: 1e308 km"))
+
+
+@pytest.mark.parametrize("wrong", ["sampling: halton", "samples: 0", "samples: 2000000", "sampling: 3"])
+def test_a_sample_of_prefixes_that_is_none(wrong: str) -> None:
+    assert wrong.split(":")[0] in findings(GOOD.replace("T0: [1, 2]", f"T0: [1, 2], {wrong}"))
+
+
+def test_a_sample_of_prefixes() -> None:
+    text = GOOD.replace("T0: [1, 2]", "T0: [1, 2], samples: 500, sampling: random")
+    backup = parse_system(Source("cart.yaml", text), Path("cart.yaml")).backup
+    assert (backup.samples, backup.sampling) == (500, "random")

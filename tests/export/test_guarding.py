@@ -8,9 +8,10 @@ import pytest
 import torch
 from exported import run_of
 
-from stlc.controller.backup import Backup, Grid
+from stlc.controller.backup import Backup, grid_of
 from stlc.export import guarding
 from stlc.export.guarding import Guarding
+from stlc.runtime.prefixes import Grid
 
 
 @pytest.mark.parametrize("at_once", [guarding.AT_ONCE, 40], ids=["whole", "in pieces"])
@@ -37,7 +38,7 @@ def test_a_grid_without_lengths_hands_the_plan_back(tmp_path: Path) -> None:
     run = run_of("traffic", "car", tmp_path)
     x = run.task.sample(3, seed=5, dtype=torch.float64)
     plan = run.policy.plan(x)
-    grid = Grid(Grid.of(run.task).values, (), 10)
+    grid = Grid(grid_of(run.task).values, (), 10)
     wanted = Backup(run.task, run.policy, grid=grid).search(x, plan)
     with torch.no_grad():
         mine, rho, *_, source, t0 = Guarding(run.task, run.policy.network, grid)(x, plan)

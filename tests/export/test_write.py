@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,7 @@ from stlc.diagnostics import RunError, UsageError
 from stlc.export.programs import unmoved
 from stlc.export.verify import BUILT, agreement, answers
 from stlc.export.write import export, target_of
+from stlc.runtime.prefixes import SAMPLINGS
 
 ROOT = Path(__file__).parents[2]
 compiled = pytest.mark.skipif(native.compiler() is None, reason="needs a C compiler")
@@ -63,6 +65,23 @@ def test_the_c_controller_decides_as_the_guard(spec: str, system: str, tmp_path:
     assert got[:, 0].tolist() == wanted.source.tolist()
     assert got[:, 1].tolist() == wanted.t0.tolist()
     torch.testing.assert_close(got[:, 2], wanted.rho, rtol=0.0, atol=1e-4)
+    torch.testing.assert_close(got[:, 4 + rules :].view_as(wanted.plan), wanted.plan, rtol=0.0, atol=1e-4)
+
+
+@compiled
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_the_c_controller_tries_the_same_sample(sampling: str, tmp_path: Path) -> None:
+    run = run_of("traffic", "car", tmp_path)
+    system = run.task.system
+    backup = replace(system.decl.backup, samples=40, sampling=sampling)
+    system.decl = replace(system.decl, backup=backup)
+    done = export(run, "c", tmp_path / "out")
+    x = run.task.sample(40, seed=5, dtype=torch.float64)
+    wanted = Guard(run.task, run.policy, "paper").decide(x)
+    assert bool(((wanted.source > 0) & (wanted.t0 == 3)).any()), "no state asks for a sample"
+    got = torch.tensor(answers([str(build(done.folder))], x.tolist()), dtype=torch.float64)
+    rules = len(run.task.rules)
+    assert got[:, 1].tolist() == wanted.t0.tolist()
     torch.testing.assert_close(got[:, 4 + rules :].view_as(wanted.plan), wanted.plan, rtol=0.0, atol=1e-4)
 
 

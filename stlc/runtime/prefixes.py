@@ -1,0 +1,96 @@
+"""What the backup policy tries: prefixes of actions, all of a grid, or a sample where those are too many.
+
+A sample is made of 64-bit integers, so that NumPy, torch and the exported C try the same prefixes. Entry d
+of the k-th word of a lattice is k sqrt(p_d) mod 1 with the d-th prime, in fixed point: Richtmyer's sequence,
+of low discrepancy (H. Niederreiter, "Quasi-Monte Carlo methods and pseudo-random numbers", Bull. AMS 84,
+1978). Random words are a hash of their place: splitmix64 (G. L. Steele et al., "Fast splittable pseudorandom
+number generators", OOPSLA 2014).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from math import isqrt, prod
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+Sampling: TypeAlias = Literal["lattice", "random"]
+SAMPLINGS: tuple[Sampling, ...] = get_args(Sampling)
+SAMPLES = 16_384
+"""Prefixes of one length at most, where a system file does not say."""
+GOLDEN, FIRST, SECOND = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
+_WORD = 1 << 64
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """What is tried.
+
+    Attributes:
+        values: of each control.
+        lengths: of prefixes, T0, in the order in which they are tried.
+        batch: trajectories at a time.
+        samples: prefixes of one length at most.
+        sampling: which, where the grid has more.
+    """
+
+    values: tuple[tuple[float, ...], ...]
+    lengths: tuple[int, ...]
+    batch: int
+    samples: int = SAMPLES
+    sampling: Sampling = "lattice"
+
+    def size(self, length: int) -> int:
+        """How many prefixes the grid has, M = L^(m T0)."""
+        return int(prod(len(values) for values in self.values) ** length)
+
+    def count(self, length: int) -> int:
+        """How many of them are tried."""
+        return min(self.size(length), self.samples)
+
+    def prefixes(self, length: int) -> NDArray[np.float64]:
+        """Those that are tried, (M, length, m)."""
+        if self.size(length) > self.samples:
+            return self._sampled(length)
+        actions = np.array(list(product(*self.values)), dtype=np.float64)
+        index = np.indices((len(actions),) * length).reshape(length, -1).T
+        found: NDArray[np.float64] = actions[index]
+        return found
+
+    def _sampled(self, length: int) -> NDArray[np.float64]:
+        levels = np.array([len(values) for values in self.values] * length, dtype=np.uint64)
+        index = below(words(self.sampling, self.samples, len(levels)), levels)
+        index = index.reshape(self.samples, length, len(self.values))
+        columns = [np.array(values)[index[:, :, i]] for i, values in enumerate(self.values)]
+        return np.stack(columns, 2)
+
+
+def generators(dims: int) -> tuple[int, ...]:
+    """The fractional parts of the square roots of the first primes, in units of 2^-64."""
+    primes: list[int] = []
+    number = 2
+    while len(primes) < dims:
+        if all(number % prime for prime in primes):
+            primes.append(number)
+        number += 1
+    return tuple(isqrt(prime << 128) % _WORD for prime in primes)
+
+
+def words(sampling: Sampling, count: int, dims: int) -> NDArray[np.uint64]:
+    """The first `count` points of a sequence in so many dimensions, (count, dims), in units of 2^-64."""
+    if sampling == "lattice":
+        steps = np.array(generators(dims), dtype=np.uint64)
+        return np.arange(1, count + 1, dtype=np.uint64)[:, None] * steps
+    place = np.arange(1, count * dims + 1, dtype=np.uint64).reshape(count, dims)
+    word = place * np.uint64(GOLDEN)
+    word = (word ^ (word >> np.uint64(30))) * np.uint64(FIRST)
+    word = (word ^ (word >> np.uint64(27))) * np.uint64(SECOND)
+    return word ^ (word >> np.uint64(31))
+
+
+def below(word: NDArray[np.uint64], bounds: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """Words as whole numbers from 0 up to `bounds`, exclusive, which are less than 2^32."""
+    return (((word >> np.uint64(32)) * bounds) >> np.uint64(32)).astype(np.int64)
