@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
+from time import perf_counter
 from typing import TYPE_CHECKING
 
 import torch
@@ -66,6 +68,18 @@ class Candidates:
     cost: Tensor
 
 
+class Clock:
+    """When the time of a decision for some agents is over; never without a limit."""
+
+    def __init__(self, seconds: float | None, agents: int) -> None:
+        self._until = inf if seconds is None else perf_counter() + seconds * agents
+
+    @property
+    def over(self) -> bool:
+        """Whether it is."""
+        return perf_counter() >= self._until
+
+
 class Backup:
     """The backup policy of a task.
 
@@ -73,10 +87,13 @@ class Backup:
         task: specification and system.
         policy: who finishes the prefixes.
         grid: what is tried; by default what the system file says.
+        seconds: that a decision may take per agent; then the best that was found counts. None: no limit.
     """
 
-    def __init__(self, task: Task, policy: Policy, *, grid: Grid | None = None) -> None:
-        self.task, self.policy = task, policy
+    def __init__(
+        self, task: Task, policy: Policy, *, grid: Grid | None = None, seconds: float | None = None
+    ) -> None:
+        self.task, self.policy, self.seconds = task, policy, seconds
         self.grid = grid or grid_of(task)
         self._formulas = [rule.formula for rule in task.compiled.safety]
 
@@ -94,33 +111,41 @@ class Backup:
         Returns:
             One plan an agent; `found.source` says by which rank.
         """
+        clock = Clock(self.seconds, len(x))
         plan = finite(plan.to(x.dtype), self.task)
         found = _nothing(plan)
         todo = torch.arange(len(x), device=x.device)
         for length in self.grid.lengths:
             prefixes = torch.from_numpy(self.grid.prefixes(length)).to(x)
-            last = length == self.grid.lengths[-1]
             left = []
             for group in _pieces(todo, max(self.grid.batch // (len(prefixes) + 1), 1)):
-                candidates = self.candidates(x[group], plan[group], prefixes)
+                tried = prefixes[:0] if clock.over else prefixes
+                candidates = self.candidates(x[group], plan[group], tried, clock)
                 done = self._enter(found, candidates, group, length)
+                last = clock.over or length == self.grid.lengths[-1]
                 if last and not bool(done.all()):
                     self._enter_safest(found, _at(candidates, ~done), (x[group[~done]], group[~done]), length)
                 left.append(group[~done])
             todo = torch.cat(left) if left else todo
+            if clock.over:
+                break
         return found
 
-    def candidates(self, x: Tensor, own: Tensor, prefixes: Tensor) -> Candidates:
-        """All plans of one T0 for some agents, judged; at most `grid.batch` trajectories at a time."""
+    def candidates(self, x: Tensor, own: Tensor, prefixes: Tensor, clock: Clock | None = None) -> Candidates:
+        """All plans of one T0 for some agents, judged; at most `grid.batch` trajectories at a time.
+
+        For one agent alone those that there was time for, and at least as many as are judged at a time.
+        """
         agents, (count, length, _) = len(x), prefixes.shape
         heads = torch.cat((own[:, None, :length], prefixes.expand(agents, -1, -1, -1)), 1).flatten(0, 1)
         starts = x.repeat_interleave(count + 1, 0)
-        parts = [
-            self._finish(start, head)
-            for start, head in zip(self._parts(starts), self._parts(heads), strict=True)
-        ]
+        parts = []
+        for start, head in zip(self._parts(starts), self._parts(heads), strict=True):
+            parts.append(self._finish(start, head))
+            if agents == 1 and clock is not None and clock.over:
+                break
         columns = [torch.cat(column) for column in zip(*parts, strict=True)]
-        return Candidates(*(column.view(agents, count + 1, *column.shape[1:]) for column in columns))
+        return Candidates(*(column.view(agents, -1, *column.shape[1:]) for column in columns))
 
     def _finish(self, x: Tensor, head: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Plans that begin with `head` and go on as the policy plans from its end, and their verdicts."""

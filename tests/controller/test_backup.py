@@ -92,6 +92,22 @@ def test_batches_do_not_change_the_choice_and_bound_the_memory(car_task: Task) -
         assert torch.equal(getattr(whole, name), getattr(pieces, name))
 
 
+def test_a_decision_without_time_takes_the_best_of_what_it_has(car_task: Task) -> None:
+    """The clock is looked at after each batch; one of them is always judged."""
+    x, plan = failing(car_task, 10.0, n=60)
+    whole = Backup(car_task, Constant(car_task, 10.0), grid=grid(batch=3)).search(x, plan)
+    backup = Backup(car_task, Constant(car_task, 10.0), grid=grid(batch=3), seconds=0.0)
+    hurried = backup.search(x, plan)
+    assert len(hurried.plan) == len(x)
+    judged = car_task.judge(x, hurried.plan)
+    assert torch.equal(judged.rho, hurried.rho)
+    assert bool((whole.safe.long() >= hurried.safe.long()).all())
+    assert bool((whole.safe & ~hurried.safe).any())
+    assert bool((hurried.t0 == 1).all())
+    calm = Backup(car_task, Constant(car_task, 10.0), grid=grid(batch=3), seconds=1e9).search(x, plan)
+    assert torch.equal(calm.plan, whole.plan)
+
+
 def test_flat_robustness_does_not_make_a_car_brake_for_ever(car_task: Task) -> None:
     """In a queue before a stop sign the deadline cannot be met; the car moves up all the same."""
     names = car_task.names
