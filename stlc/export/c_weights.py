@@ -15,16 +15,16 @@ if TYPE_CHECKING:
 
 
 def weights(network: PlanNetwork) -> str:
-    """`centre` and `scale` of what is observed, and a weight `w0` (in, out) and a bias `b0` per layer."""
+    """`centre` and `scale` of what is observed, and a `weight_0` (in, out) and a `bias_0` per layer."""
     lines = ["/* float32, row by row; generated */"]
     lines += [f"static const float centre[] = {{{_row(network.centre)}}};"]
     lines += [f"static const float spread[] = {{{_row(network.spread)}}};"]
     for number, layer in enumerate(_layers(network)):
         rows = ",\n".join(f"{{{_row(row)}}}" for row in layer.weight.detach().t())
         lines.append(
-            f"static const float w{number}[{layer.in_features}][{layer.out_features}] = {{\n{rows}}};"
+            f"static const float weight_{number}[{layer.in_features}][{layer.out_features}] = {{\n{rows}}};"
         )
-        lines.append(f"static const float b{number}[{layer.out_features}] = {{{_row(layer.bias)}}};")
+        lines.append(f"static const float bias_{number}[{layer.out_features}] = {{{_row(layer.bias)}}};")
     return "\n".join(lines) + "\n"
 
 
@@ -38,7 +38,9 @@ def forward(network: PlanNetwork) -> list[str]:
         last = number == len(layers) - 1
         source, target = f"h{number % 2}", "raw" if last else f"h{(number + 1) % 2}"
         sizes = f"{layer.in_features}, {layer.out_features}"
-        lines.append(f"layer({source}, {target}, &w{number}[0][0], b{number}, {sizes}, {int(not last)});")
+        lines.append(
+            f"layer({source}, {target}, &weight_{number}[0][0], bias_{number}, {sizes}, {int(not last)});"
+        )
     return lines
 
 

@@ -13,6 +13,7 @@ import torch
 from stlc.compile.c_numbers import Untranslatable
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.export import c_weights, emit
+from stlc.export.c_public import public
 from stlc.export.guarding import recorded_guard
 from stlc.export.onnx_write import Latency, timed, write_onnx
 from stlc.export.programs import recorded
@@ -124,9 +125,9 @@ def _c(run: Run, folder: Path) -> Checked:
     except Untranslatable as error:
         finding = Diagnostic("U101", f"this task has no C form: {error}", help=("take --to torch instead",))
         raise UsageError(finding) from error
+    headers = {"stlc_controller.h": text, "stlc_weights.h": c_weights.weights(run.policy.network)}
     texts = {
-        "stlc_controller.h": text,
-        "stlc_weights.h": c_weights.weights(run.policy.network),
+        **public(headers, "STLC_CONTROLLER_H"),
         "main.c": emit.main_of(run.task),
         "Makefile": emit.makefile(),
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -30,22 +31,23 @@ ROOT = Path(__file__).parents[2]
 compiled = pytest.mark.skipif(native.compiler() is None, reason="needs a C compiler")
 
 
+STRICT = ("-Wall", "-Wextra", "-Wshadow", "-pedantic", "-Werror")
+
+
 def build(folder: Path) -> Path:
     using = native.compiler()
     assert using is not None
     target = folder / "controller"
-    command = [
-        using,
-        *BUILT,
-        "-Wall",
-        "-Werror",
-        "-Wno-unused",
-        "-o",
-        str(target),
-        str(folder / "main.c"),
-        "-lm",
-    ]
-    subprocess.run(command, check=True)
+    subprocess.run([using, *BUILT, *STRICT, "-o", str(target), str(folder / "main.c"), "-lm"], check=True)
+    return target
+
+
+def build_in_cpp(folder: Path) -> Path:
+    using = shutil.which("c++")
+    assert using is not None
+    target = folder / "controller++"
+    options = ("-std=c++11", "-O1", "-ffp-contract=off", *STRICT, "-x", "c++")
+    subprocess.run([using, *options, "-o", str(target), str(folder / "main.c"), "-lm"], check=True)
     return target
 
 
@@ -66,6 +68,20 @@ def test_the_c_controller_decides_as_the_guard(spec: str, system: str, tmp_path:
     assert got[:, 1].tolist() == wanted.t0.tolist()
     torch.testing.assert_close(got[:, 2], wanted.rho, rtol=0.0, atol=1e-4)
     torch.testing.assert_close(got[:, 4 + rules :].view_as(wanted.plan), wanted.plan, rtol=0.0, atol=1e-4)
+
+
+@compiled
+@pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler")
+@pytest.mark.parametrize(("spec", "system"), [("traffic", "car"), ("manipulation", "panda")])
+def test_the_header_may_be_included_from_cpp(spec: str, system: str, tmp_path: Path) -> None:
+    run = run_of(spec, system, tmp_path)
+    folder = export(run, "c", tmp_path / "out").folder
+    states = run.task.sample(4, seed=5, dtype=torch.float64).tolist()
+    mine, theirs = (
+        torch.tensor(answers([str(built), "policy"], states), dtype=torch.float64)
+        for built in (build(folder), build_in_cpp(folder))
+    )
+    torch.testing.assert_close(theirs, mine, rtol=0.0, atol=1e-5)
 
 
 @compiled
