@@ -31,9 +31,10 @@ def failures_section(material: Material) -> Section | None:
     if picture is None:
         text = f"None of the plans from {len(material.held_out.x0):,} held-out starts fails a requirement."
         return Section("failures", "Where plans fail", el("p", text))
+    boxed = "; the dashed box is the region named above" if picture.figure.axes[0].patches else ""
     caption = (
-        "Held-out starts over the two columns that tell most about failing; the dashed box is the region "
-        "named above. Right: how far the plans are from failing (counts on a logarithmic scale)."
+        f"Held-out starts over the two columns that tell most about failing{boxed}. "
+        "Right: how far the plans are from failing (counts on a logarithmic scale)."
     )
     body = figure(picture.data_uri(), picture.alt, caption)
     left = el("p", f"Unsolved: {unsolved_text(material.held_out)}.")

@@ -6,7 +6,7 @@ import base64
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from stlc.view.animate import SCENE, STILL, current
+from stlc.view.animate import STILL, current, seen_in
 from stlc.view.html import Child, Html, classed, el, figure, join, table, video
 from stlc.view.material import Material
 from stlc.view.page import Section
@@ -59,6 +59,7 @@ WORLD = (
     "least margin of each requirement over the agents that the picture names, judged from each instant on "
     "(red: violated)."
 )
+BARE = "What was driven, over time."
 SOURCES = ("policy", "polished", "backup", "safest", "")
 
 
@@ -102,7 +103,7 @@ def film_section(material: Material) -> Section | None:
     if found is None:
         return None
     alt = f"Animation of the deployment; a still is in {STILL}."
-    caption = WORLD if (material.run.path / SCENE).exists() else "What was driven, over time."
+    caption = BARE if seen_in(material.run) is None else WORLD
     path, show = (found.gif, figure) if found.mp4 is None else (found.mp4, video)
     kind = "image/gif" if found.mp4 is None else "video/mp4"
     uri = f"data:{kind};base64," + base64.b64encode(path.read_bytes()).decode()

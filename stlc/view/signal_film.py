@@ -9,7 +9,7 @@ import numpy as np
 
 from stlc.trace import Trace
 from stlc.view.film import Film
-from stlc.view.style import FAINT, INK, ORANGE
+from stlc.view.style import BLUE, FAINT, INK
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,7 +53,7 @@ def _panel(axes: Axes, trace: Trace, name: str) -> Callable[[int], None]:
     times = np.broadcast_to(trace.times, values.shape)
     axes.plot(np.hstack([times, gap]).ravel(), np.hstack([values, gap]).ravel(), color=FAINT, lw=0.8)
     (past,) = axes.plot([], [], color=INK, lw=0.8, alpha=0.7)
-    (present,) = axes.plot([], [], "o", color=ORANGE, ms=3)
+    (present,) = axes.plot([], [], "o", color=BLUE, ms=3)
 
     def turn(index: int) -> None:
         until = slice(0, index + 1)

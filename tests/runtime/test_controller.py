@@ -203,21 +203,35 @@ def test_an_unknown_guard_is_told() -> None:
 
 ALONE = """
 import sys
+
+class Bare:  # an environment after `pip install numpy onnxruntime` and `pip install --no-deps .`
+    there = {"stlc", "numpy", "onnxruntime", "google", "flatbuffers", "packaging"}
+
+    def find_spec(self, name, path=None, target=None):
+        top = name.partition(".")[0]
+        if top not in self.there | sys.stdlib_module_names:
+            raise ModuleNotFoundError(f"no {name}", name=name)
+
+sys.meta_path.insert(0, Bare())
 import numpy as np
 from stlc.runtime import Controller
 
 controller = Controller.load(sys.argv[1], guard="paper")
 decision = controller.decide(np.zeros(len(controller.states)))
 print(decision.rule)
-heavy = {"torch", "lark", "typer", "rich", "yaml", "pydantic", "onnx"} & set(sys.modules)
-assert not heavy, heavy
+try:
+    import torch
+except ModuleNotFoundError:
+    print("no torch")
 """
 
 
-def test_nothing_heavy_is_imported() -> None:
+def test_numpy_and_onnxruntime_are_enough() -> None:
     command = [sys.executable, "-c", ALONE, str(exported("traffic", "car")[1])]
     done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT)
-    assert done.stdout.strip() in ("policy", "backup", "safest")
+    rule, torch = done.stdout.splitlines()
+    assert rule in ("policy", "backup", "safest")
+    assert torch == "no torch"
 
 
 def test_the_page_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

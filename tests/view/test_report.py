@@ -84,6 +84,7 @@ def test_a_deployed_run(deployed):
     assert "What failed, and why" in page.text
     assert "before_junction means x < x_inter / 2" in page.text
     assert "stlc check" in page.text
+    assert "What was driven, over time." in page.text  # no world: no colours, no strip to explain
     drawn = {path.name for path in deployed.path.glob("*.png")}
     assert drawn == {"driven.png", "failures.png", "training.png"}
     kinds = [image["src"].partition(";")[0] for image in page.images]
