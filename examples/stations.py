@@ -151,7 +151,8 @@ class Stations:
             axes.add_patch(Circle(at, 0.17, fc=DECIDED[source], ec="white", lw=0.6, zorder=3))
             full = 360 * min(max(left / most, 0.0), 1.0)
             axes.add_patch(Arc(at, 0.62, 0.62, theta1=90 - full, theta2=90, color=NOTE, lw=1.6, zorder=3))
-            axes.text(at[0], at[1] + 0.4, f"{left:.1f} s", size=7.5, ha="center", color=NOTE, zorder=4)
+            high = at[1] + (0.4 if at[1] + 0.8 < size else -0.65)  # on the map
+            axes.text(at[0], high, f"{left:.1f} s", size=7.5, ha="center", color=NOTE, zorder=4)
         axes.set(xlim=(-0.1, size + 0.1), ylim=(-0.1, size + 0.1), aspect="equal")
         axes.set_axis_off()
 

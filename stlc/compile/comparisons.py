@@ -76,7 +76,11 @@ def _above(big: Number, small: Number, strict: bool, span: Span, scope: Scope) -
     """
     if (big.kind, small.kind) == ("int", "int"):
         big = apply("sub" if strict else "add", (big, half(span)), span, scope)
-    return typed.Pred(span, apply("sub", (big, small), span, scope).num, strict=strict)
+    return _pred(span, apply("sub", (big, small), span, scope), strict=strict)
+
+
+def _pred(span: Span, margin: Number, *, strict: bool = False) -> typed.Pred:
+    return typed.Pred(span, margin.num, strict, unit=margin.unit.si)
 
 
 def _refuse_vectors(
@@ -182,7 +186,7 @@ def in_range(
         )
     if scope.product and x.kind != "int":
         sides = apply("sub", (x, low), span, scope), apply("sub", (high, x), span, scope)
-        return typed.Pred(span, apply("mul", sides, span, scope).num, strict=False)
+        return _pred(span, apply("mul", sides, span, scope))
     above = _above(x, low, False, span, scope)
     below = _above(high, x, False, span, scope)
     return typed.Logic(span, "and", (above, below))
@@ -209,7 +213,7 @@ def sweeps(
         message = f"`in` needs a region, this is {noun(region[0][1])}"
         scope.fail(Diagnostic("E205", message, region[0][0].span))
     place = Complement(place) if expr.negated else place
-    return typed.Pred(expr.span, swept_distance(segment.point, place, expr.span, scope).num, strict=False)
+    return _pred(expr.span, swept_distance(segment.point, place, expr.span, scope))
 
 
 def in_region(
@@ -227,4 +231,4 @@ def in_region(
         scope.fail(
             Diagnostic("E205", message, point_expr.span, help=("write the point as a vector: `[x, y]`",))
         )
-    return typed.Pred(span, signed_distance(point, place, span, scope).num, strict=False)
+    return _pred(span, signed_distance(point, place, span, scope))

@@ -13,6 +13,7 @@ from stlc.compile import ir
 from stlc.grammar import ast
 from stlc.signature import Column, Signature
 from stlc.source import Span
+from stlc.units import DIMENSIONLESS, Unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +54,15 @@ class Truth(Node):
 
 @dataclass(frozen=True, slots=True)
 class Pred(Node):
-    """`num > 0` (`strict`) or `num >= 0`; a `guard` decides truth and never limits the margin."""
+    """`num > 0` (`strict`) or `num >= 0`; a `guard` decides truth and never limits the margin.
+
+    `unit` is that of the margin, in SI.
+    """
 
     num: ir.Num
     strict: bool
     guard: bool = False
+    unit: Unit = field(default=DIMENSIONLESS, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,12 @@ def nodes(formula: typed.Formula) -> Iterator[typed.Formula]:
         yield from nodes(part)
 
 
+def margin_unit(formula: typed.Formula) -> str:
+    """The unit of a formula's robustness; "" where its predicates are not all of one."""
+    found = {node.unit.text for node in nodes(formula) if isinstance(node, typed.Pred) and not node.guard}
+    return found.pop() if len(found) == 1 else ""
+
+
 def on_clock(node: typed.Formula) -> TypeGuard[typed.Temporal | typed.Until]:
     """Whether the interval of this operator is on the mission clock."""
     return isinstance(node, (typed.Temporal, typed.Until)) and node.interval.clock == "start"

@@ -162,9 +162,14 @@ class Controller:
         """(agents, n), and whether it is one agent."""
         if elapsed < 0:
             raise _misfit(f"{elapsed} steps since the decision before", "`elapsed` counts from it onwards")
-        if isinstance(state, Mapping):
-            state = np.stack(np.broadcast_arrays(*self._named(state)), -1)
-        given = np.asarray(state, dtype=np.float64)
+        named = self._named(state) if isinstance(state, Mapping) else None
+        try:
+            stacked = state if named is None else np.stack(np.broadcast_arrays(*named), -1)
+            given = np.asarray(stacked, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise _misfit(
+                f"the state is no array of numbers: {error}", "SI units, one row an agent"
+            ) from None
         single, x = given.ndim == 1, np.atleast_2d(given)
         known = len(self.facts.states) - len(self.facts.added)
         if x.ndim != 2 or x.shape[1] not in (known, len(self.facts.states)):

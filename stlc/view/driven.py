@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile.walk import margin_unit
 from stlc.diagnostics import StlcError
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
@@ -46,7 +47,7 @@ def driven_section(material: Material) -> Section | None:
         return Section("driven", TITLE, reason)
     names = trace_names(trace)
     choices = choose_traces(_per_trace(verdict), names, acted_in(trace))
-    picture = draw_signals(trace, margins, choices)
+    picture = draw_signals(trace, margins, choices, units_of(verdict))
     body = join(
         el("p", _summary(verdict)),
         _verdict_table(verdict, names),
@@ -80,6 +81,11 @@ def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, ND
     return {
         name: np.repeat(rho[:, :1], rho.shape[1], 1) if name in once else rho for name, rho in rows.items()
     }
+
+
+def units_of(verdict: Verdict) -> dict[str, str]:
+    """Requirement -> the unit of its robustness, where it has one."""
+    return {j.name: unit for j in verdict if (unit := margin_unit(j.rule.typed.formula))}
 
 
 def judged_once(verdict: Verdict) -> list[str]:
@@ -164,7 +170,7 @@ def _least(judgement: Judgement) -> str:
     least = float(values.min())
     if not np.isfinite(least):
         return "not limited" if least > 0 else "unknown"
-    text = f"{least:+.3f}"
+    text = f"{least:+.3f} {margin_unit(judgement.rule.typed.formula)}".rstrip()
     return text if judgement.overall == "violated" else text.replace("-0.000", "+0.000")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.trace import Trace
-from stlc.view.driven import margins_of, monitor_of
+from stlc.view.driven import margins_of, monitor_of, units_of
 from stlc.view.scene import Scene
 from stlc.view.strip import Strip
 
@@ -38,14 +38,15 @@ def strip_of(scene: Scene, trace: Trace, dt: float, *, system: Path) -> Strip | 
     shown = decisions.shape[1]
     first = {name: values[:shown] for name, values in trace.data.items()}
     monitor, seen = monitor_of(trace, system=system), replace(trace, data=first, extras={})
-    rows = margins_of(monitor, monitor.check(seen), seen)
+    verdict = monitor.check(seen)
+    rows, units = margins_of(monitor, verdict, seen), units_of(verdict)
     counts = as_foreseen(trace, shown)
     every = {name: least(rho) for name, rho in rows.items()}
     if counts is not None:
         margins = {name: least(rho, counts) for name, rho in rows.items()}
         if _known(margins) >= ENOUGH * _known(every):
-            return Strip(times, margins, decisions.astype(np.int64), AS_FORESEEN)
-    return Strip(times, every, decisions.astype(np.int64))
+            return Strip(times, margins, decisions.astype(np.int64), AS_FORESEEN, units)
+    return Strip(times, every, decisions.astype(np.int64), units=units)
 
 
 def as_foreseen(trace: Trace, agents: int) -> Mask | None:

@@ -78,13 +78,16 @@ def acted_in(trace: Trace) -> NDArray[np.int64] | None:
     return None if decisions is None else np.asarray((decisions != POLICY).sum(1))
 
 
-def draw_signals(trace: Trace, margins: Margins, choices: Sequence[Choice]) -> Picture:
+def draw_signals(
+    trace: Trace, margins: Margins, choices: Sequence[Choice], units: Mapping[str, str] | None = None
+) -> Picture:
     """A column of panels per chosen trace.
 
     Args:
         trace: what was recorded.
         margins: requirement -> robustness at every sample, (traces, samples), NaN where undefined.
         choices: the traces to show.
+        units: requirement -> that of its robustness, where it has one.
     """
     rows = _rows(trace, margins)
     heights = [_HEIGHTS[kind] for kind, _ in rows]
@@ -101,7 +104,7 @@ def draw_signals(trace: Trace, margins: Margins, choices: Sequence[Choice]) -> P
             column[-1].set_xlabel("time [s]")
             column[-1].tick_params(labelbottom=True)
         for axes, (kind, name) in zip(grid[:, 0], rows, strict=True):
-            _name_row(axes, kind, name, trace)
+            _name_row(axes, kind, name, trace, units or {})
         grid[0][0].set_xlim(trace.times[0], trace.times[-1])
     shown = " and ".join(choice.title for choice in choices)
     return Picture(figure, f"Signals, decisions and robustness per requirement; {shown}.")
@@ -153,11 +156,13 @@ def _draw_row(axes: Axes, kind: str, name: str, agent: _Agent) -> None:
         _mark_backup(axes, agent)
 
 
-def _name_row(axes: Axes, kind: str, name: str, trace: Trace) -> None:
-    label = name
+def _name_row(axes: Axes, kind: str, name: str, trace: Trace, units: Mapping[str, str]) -> None:
+    unit = ""
     if kind == "line":
         unit = trace.signature[name].unit.text
-        label = f"{name} [{unit}]" if unit not in ("", "1") else name
+    elif kind == "robustness":
+        unit = units.get(name, "")
+    label = f"{name} [{unit}]" if unit not in ("", "1") else name
     axes.set_ylabel(label, rotation=0, ha="right", va="center", labelpad=6)
     axes.yaxis.set_label_coords(-0.085, 0.5)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,12 +34,14 @@ class Strip:
             it is not known.
         decisions: who decided, (frames, agents); None where nobody recorded it.
         words: what the margins are.
+        units: requirement -> that of its margin, where it has one.
     """
 
     times: NDArray[np.float64]
     margins: Mapping[str, NDArray[np.float64]]
     decisions: NDArray[np.int64] | None = None
     words: str = "least margin of all agents, from each instant on"
+    units: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def rows(self) -> list[str]:
@@ -120,10 +122,11 @@ def _draw_margin(strip: Strip, name: str, axes: Axes) -> Mover:
     axes.set_ylim(*margin_limits(rho))
     _name(axes, name)
     value = _value(axes)
+    unit = f" {strip.units[name]}" if strip.units.get(name) else ""
 
     def turn(index: int) -> None:
         now = float(rho[index])
-        value.set_text("" if np.isnan(now) else f"{now:+.2f}".replace("-0.00", "+0.00"))
+        value.set_text("" if np.isnan(now) else f"{now:+.2f}{unit}".replace("-0.00", "+0.00"))
         value.set_color(RED if now < -TOLERANCE else INK)
 
     return Mover(turn, (value,))

@@ -141,6 +141,12 @@ def test_a_plan_is_gone_on_with_after_several_steps() -> None:
         (np.array([[0.0] * 7, [0, np.inf, 0, 0, 0, 0, 0]]), "v is not a finite number"),
         ({"x": 0.0}, "tau"),
         ({**dict.fromkeys(("x", "v", "sign", "tau", "dx", "v_lead", "yielding"), 0.0), "y": 1.0}, "y"),
+        (["fast", 0.0], "no array of numbers"),
+        ([[0.0, 1.0], [0.0]], "no array of numbers"),
+        (
+            {**{key: [0.0, 1.0] for key in ("x", "v", "sign", "tau", "dx", "yielding")}, "v_lead": [0.0] * 3},
+            "no array of numbers",
+        ),
     ],
 )
 def test_a_state_that_does_not_fit_is_told(state: object, why: str) -> None:

@@ -5,7 +5,8 @@ import pytest
 
 from stlc.signature import Column, Signature
 from stlc.trace import Trace, TraceMeta
-from stlc.view.driven import judged_once, margins_of, monitor_of
+from stlc.units import parse_unit
+from stlc.view.driven import judged_once, margins_of, monitor_of, units_of
 from stlc.view.margins import AS_FORESEEN, as_foreseen, least, strip_of
 
 
@@ -46,6 +47,21 @@ def test_what_is_judged_once_is_shown_as_it_was_judged():
     np.testing.assert_allclose(found["plan"], [[1, -4, -4, -4, np.nan, np.nan], [7] * 4 + [np.nan] * 2])
     np.testing.assert_allclose(found["once_only"], [[1] * 6, [7] * 6])  # not -4: nobody asks at 0.1 s
     np.testing.assert_allclose(found["clock"], [[1] * 6, [5] * 6])
+
+
+def test_a_margin_has_the_unit_of_its_predicates():
+    text = (
+        "spec s\nsignal x [m]\nsignal v [km/h]\nsignal on : bool\nconst low = 2 m\n"
+        "require place: always[0, T] (x > low and x < 9 m)\nrequire speed: eventually[0, T] v > 3\n"
+        "require mixed: always[0, T] (x > 1 or v > 1)\nrequire switch: always[0, T] (on or x > 1)\n"
+        "require apart: always[0, T] [x, x] not in circle([0, 0], 1)\n"
+    )
+    names = (("x", "m"), ("v", "km/h"))
+    columns = (*(Column(name, parse_unit(unit)) for name, unit in names), Column("on", kind="bool"))
+    data = {name: np.ones((1, 4)) for name in ("x", "v", "on")}
+    trace = Trace(Signature(columns), 0.1, data, meta=TraceMeta(spec_text=text, horizon=2, dt=0.1))
+    verdict = monitor_of(trace).check(trace)
+    assert units_of(verdict) == {"place": "m", "speed": "m/s", "apart": "m"}
 
 
 @pytest.mark.parametrize("right", [0, 1])

@@ -91,6 +91,13 @@ def test_the_strip_tells_the_present(acted):
     assert orange[1] > 200 > 5 > orange[0]  # the future is veiled
 
 
+def test_margins_have_their_units(acted):
+    margins = {"safe": np.full(FRAMES, 0.25), "mixed": np.full(FRAMES, -0.004)}
+    strip = Strip(TIMES, margins, acted.astype(np.int64), units={"safe": "m"})
+    film = scene_film(scene_of(decision=acted), Staging(draw_field, 0.1, strip=strip))
+    assert {"+0.25 m", "+0.00"} <= set(texts(drawn(film, 3)[0]))
+
+
 def test_the_least_margins_are_kept_where_there_are_many(acted):
     margins = {f"r{k}": np.full(FRAMES, float(k)) for k in range(12)}
     assert strip_of(acted, **margins).rows == [f"r{k}" for k in range(MOST_ROWS)]

@@ -111,6 +111,11 @@ def test_what_has_no_panel_is_named(recording):
     assert left_out(wide) == [f"z{k}" for k in range(7)]
 
 
+def test_margins_are_labelled_with_their_units(recording, margins, choices):
+    shown = panels(draw_signals(recording, margins, choices, {"first": "m"}), 0, 2)
+    assert list(shown)[-2:] == ["first [m]", "second"]
+
+
 def test_the_backup_is_marked_in_every_panel(recording, margins, choices):
     decision = np.zeros((recording.traces, recording.samples - 1), dtype=np.int8)
     decision[7, 10:13], decision[7, 40] = 1, 2
