@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from stlc.controller.streams import seeded
 from stlc.dynamics.decl_deployment import ErrorsDecl
 from stlc.dynamics.draws import Drawing, Rows
+from stlc.dynamics.mistaken import Mistaken
+from stlc.dynamics.uncertain import loosened
 from stlc.units import parse_unit
 
 if TYPE_CHECKING:
@@ -20,7 +23,7 @@ if TYPE_CHECKING:
     from stlc.dynamics.system import System
 
 SECOND = parse_unit("s")
-_GAINS, _PUSHES, _BLURS = range(3)
+_GAINS, _PUSHES, _BLURS, _NUMBERS = range(4)
 """Which stream of a seed is whose: worlds meet the same, whatever is disturbed."""
 
 
@@ -39,10 +42,12 @@ class Disturbance:
         self._pushes = _drawings(scenario.disturb if scenario else ())
         self._noises = _drawings(scenario.noise if scenario else ())
         self._errors = scenario.errors if scenario else ErrorsDecl()
-        own = [[seeded(each.initial_seed(), key) for key in range(3)] for each in generators]
+        own = [[seeded(each.initial_seed(), key) for key in range(4)] for each in generators]
         self._streams = tuple(zip(*own, strict=True))
-        self._factor, self._offset = self._wrong_gains(system)
-        self._reach = 0.5 * (system.control_high - system.control_low).double()
+        self._angle = torch.tensor([control.squash == "angle" for control in system.controls])
+        self._factor, self._offset = self._wrong_gains()
+        half = 0.5 * (system.control_high - system.control_low).double()
+        self._reach = torch.where(self._angle, 1.0, half)
         self._spread = self._errors.sensor_noise * _ranges(system)
 
     def acted(self, action: Tensor) -> Tensor:
@@ -55,17 +60,26 @@ class Disturbance:
             given = given + (self._errors.actuator_noise * self._reach * drawn).to(given)
         return given
 
-    def _wrong_gains(self, system: System) -> tuple[Tensor, Tensor]:
+    def truths(self, truth: System) -> list[System]:
+        """The truth of each seed, from what it is where no number is wrong."""
+        off = self._errors.parameters
+        loose = loosened(truth.decl) if off else None
+        if loose is None or not loose.numbers:
+            return [truth] * len(self._generators)
+        factors = 1.0 + off * self._signs(_NUMBERS, len(loose.numbers))
+        return [Mistaken(loose, each) for each in torch.split(factors, self._agents)]
+
+    def _wrong_gains(self) -> tuple[Tensor, Tensor]:
         """Factors and offsets of controls, (rows, m) each: as much too large as too small, evenly."""
-        off = self._errors.actuator_gain
-        angle = torch.tensor([control.squash == "angle" for control in system.controls])
-        signs = torch.cat(
-            [
-                2.0 * torch.randint(2, (self._agents, len(angle)), generator=each).double() - 1.0
-                for each in self._streams[_GAINS]
-            ]
-        )
+        off, angle = self._errors.actuator_gain, self._angle
+        signs = self._signs(_GAINS, len(angle))
         return torch.where(angle, 1.0, 1.0 + off * signs), torch.where(angle, off * signs, 0.0)
+
+    def _signs(self, stream: int, count: int) -> Tensor:
+        """(rows, count) numbers that are 1 or -1, those of each seed from its own stream."""
+        shape = (self._agents, count)
+        drawn = [torch.randint(2, shape, generator=each) for each in self._streams[stream]]
+        return 2.0 * torch.cat(drawn).double() - 1.0
 
     def _normal(self, stream: int, count: int) -> Tensor:
         """(rows, count) standard normal numbers, those of each seed from its own stream."""
@@ -111,6 +125,16 @@ class Disturbance:
                 if clamped and name in self._clamps:
                     columns[index] = columns[index].clamp(*self._clamps[name])
         return torch.stack(columns, 1)
+
+
+def errors_of(truth: System) -> dict[str, Any]:
+    """What the scenario of a system has wrong, as shares, and which numbers of its dynamics that concerns."""
+    scenario = truth.decl.scenario
+    shares = {} if scenario is None else asdict(scenario.errors)
+    found: dict[str, Any] = {name: share for name, share in shares.items() if share}
+    if "parameters" in found:
+        found["numbers"] = [str(each) for each in loosened(truth.decl).numbers]
+    return found
 
 
 def _drawings(assigns: Sequence[Assign]) -> tuple[Drawing, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -12,11 +12,16 @@ from torch import Tensor
 
 from stlc.controller.disturbance import Disturbance
 from stlc.controller.faults import blamed, require_numbers, scene_of, states_of, wrong
+from stlc.controller.spare import Spare
 from stlc.controller.world import Choosing
 
 if TYPE_CHECKING:
     from stlc.controller.task import Task
     from stlc.controller.world import WorldType
+
+
+SURPRISE = 1e-6
+"""What moves a state further than this is no rounding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +32,7 @@ class Setting:
 
     `limit`: seconds that a decision of the full guard may take per agent; None: as long as it takes.
     `ceiling`: visited states, of all seeds, that are searched for a plan where the followed one fails.
-    `margin`: what a guard asks plans to spare of every safety requirement.
+    `margin`: what a guard asks plans to spare of safety requirements, by their names.
     """
 
     seeds: tuple[int, ...]
@@ -36,7 +41,7 @@ class Setting:
     replan: int = 1
     limit: float | None = 0.1
     ceiling: int = 0
-    margin: float = 0.0
+    margin: Spare = field(default_factory=dict)
 
 
 class Worlds:
@@ -51,11 +56,13 @@ class Worlds:
         self.size = (setting.agents, len(self.names))
         self.seeds = setting.seeds
         self.parts = [setting.agents] * len(setting.seeds)
-        with blamed(make, "__init__", "be made"):
-            self.generators = [torch.Generator().manual_seed(seed) for seed in setting.seeds]
-            real = task.plain.truth
-            self.worlds = [make(real, setting.agents, generator) for generator in self.generators]
+        self.generators = [torch.Generator().manual_seed(seed) for seed in setting.seeds]
         self.disturbance = Disturbance(task.plain, self.generators, setting.agents)
+        self.truths = self.disturbance.truths(task.plain.truth)
+        self.quiet = torch.ones(setting.agents * len(setting.seeds), dtype=torch.bool)
+        with blamed(make, "__init__", "be made"):
+            pairs = zip(self.truths, self.generators, strict=True)
+            self.worlds = [make(real, setting.agents, generator) for real, generator in pairs]
         self._scene: dict[str, NDArray[Any]] | None = None
 
     def reset(self) -> Tensor:
@@ -70,15 +77,19 @@ class Worlds:
     def advance(self, x: Tensor, action: Tensor, step: int) -> Tensor:
         """(rows, n), (rows, m) -> the (rows, n) states after step number `step`.
 
-        Worlds know neither parameters nor timers: those stay, these follow from the true states.
+        Worlds know neither parameters nor timers: those stay, these follow from the true states. Who is
+        `quiet` met nothing: its world did what the truth of its dynamics alone does.
         """
         known = x[:, : self.size[1]]
         before, given = torch.split(known.clone(), self.parts), []
         acts = torch.split(self.disturbance.acted(action.clone()), self.parts)
+        alone = [truth.step(state, act) for truth, state, act in zip(self.truths, before, acts, strict=True)]
         for world, state, act in zip(self.worlds, before, acts, strict=True):
             with blamed(world, "advance", f"take step {step}"):
                 given.append(world.advance(state, act))
-        moved = self.disturbance.pushed(self._checked("advance", given, step), known, step)
+        reached = self._checked("advance", given, step)
+        self.quiet = ((reached - torch.cat(alone)).abs() <= SURPRISE).all(1)
+        moved = self.disturbance.pushed(reached, known, step)
         return torch.cat((moved, self.system.added_later(x)), 1)
 
     def options(self, x: Tensor) -> Tensor | None:

@@ -67,7 +67,11 @@ class WorldRef:
 
 @dataclass(frozen=True, slots=True)
 class TestDecl:
-    """A deployment: how long, how many agents, how often they plan, and what happens to them."""
+    """A deployment: how long, how many agents, how often they plan, and what happens to them.
+
+    `uncertain`: the constants that `parameters` of a scenario's errors makes wrong; None: those that
+    `stlc.dynamics.uncertain` finds.
+    """
 
     __test__ = False
 
@@ -77,6 +81,7 @@ class TestDecl:
     events: tuple[EventDecl, ...] = ()
     metrics: tuple[str, ...] = ()
     world: WorldRef | None = None
+    uncertain: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,12 +91,16 @@ class ErrorsDecl:
     Attributes:
         actuator_gain: of every control each agent gets so much more or less than it commands, all the time;
             a direction (squash `angle`) is off by this share of a radian instead.
-        actuator_noise: standard deviation of what is added to controls at every step, of half their range.
+        parameters: of every number in the dynamics (`stlc.dynamics.uncertain`) the truth of each agent has so
+            much more or less, all the time.
+        actuator_noise: standard deviation of what is added to controls at every step, of half their range;
+            to a direction, of a radian.
         sensor_noise: of what is added to the real states that agents see, of their nominal range; clocks,
             which are states in seconds, are known.
     """
 
     actuator_gain: float = 0.0
+    parameters: float = 0.0
     actuator_noise: float = 0.0
     sensor_noise: float = 0.0
 

@@ -31,8 +31,8 @@ def standard(name: str) -> ScenarioDecl | None:
         return None
     match found[1]:
         case "mismatch":
-            doc = f"actuators give {percent:g} % more or less than they are told"
-            errors = ErrorsDecl(actuator_gain=percent / 100)
+            doc = f"actuators and numbers of the dynamics are {percent:g} % more or less than the model says"
+            errors = ErrorsDecl(actuator_gain=percent / 100, parameters=percent / 100)
         case "disturb":
             doc = f"noise on what actuators give, {percent:g} % of half their range"
             errors = ErrorsDecl(actuator_noise=percent / 100)

@@ -7,8 +7,10 @@ from collections.abc import Mapping as MappingType
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import TypeAlias
 
 from stlc.dynamics.decl import SystemDecl
+from stlc.dynamics.decl_model import Assign, FunctionDecl
 from stlc.dynamics.schema_columns import name_columns, read_controls, read_states
 from stlc.dynamics.schema_deploy import read_test
 from stlc.dynamics.schema_extends import extended
@@ -33,6 +35,9 @@ from stlc.dynamics.yaml_nodes import Node, load_yaml
 from stlc.files import read_source
 from stlc.source import Source
 
+_Named: TypeAlias = (
+    "tuple[Names, Clockwork, dict[str, dict[str, Node]], tuple[Assign, ...], tuple[FunctionDecl, ...]]"
+)
 VERSION = 1
 TOP_KEYS = [
     "stlc",
@@ -111,16 +116,7 @@ def _declaration(
     found: dict[str, Node], reader: Reader, source: Source, path: Path, overrides: MappingType[str, str]
 ) -> SystemDecl:
     """All sections, in the order in which names are declared."""
-    names = Names()
-    read_constants(found.get("const"), reader, names)
-    clock = read_time(found.get("time"), reader, names) if "time" in found else Clockwork()
-    states = read_states(found.get("state"), reader, names)
-    params = read_params(found.get("param"), reader, names)
-    params += read_latches(found.get("jump"), reader, names)
-    name_columns(names, "state")
-    read_controls(found.get("control"), reader, names)
-    functions = read_functions(found.get("functions"), reader, names)
-    read_definitions(found.get("def"), reader, names)
+    names, clock, states, params, functions = _named(found, reader)
     timer_flow, timer_jumps = read_timers(states, reader, names, clock)
     flow = read_flow(found.get("flow"), reader, names, clock)
     spec = reader.text(found.get("spec"), "`spec`")
@@ -159,6 +155,30 @@ def _declaration(
         places=MappingProxyType(names.places),
         warnings=tuple(finding for finding in reader.findings if finding.severity == "warning"),
     )
+
+
+def _named(found: dict[str, Node], reader: Reader) -> _Named:
+    """The sections that declare names, in order; the timers among the states and what is drawn later."""
+    names = Names()
+    read_constants(found.get("const"), reader, names)
+    clock = read_time(found.get("time"), reader, names) if "time" in found else Clockwork()
+    states = read_states(found.get("state"), reader, names)
+    params = read_params(found.get("param"), reader, names)
+    params += read_latches(found.get("jump"), reader, names)
+    name_columns(names, "state")
+    read_controls(found.get("control"), reader, names)
+    functions = read_functions(found.get("functions"), reader, names)
+    read_definitions(found.get("def"), reader, names)
+    return names, clock, states, params, functions
+
+
+def moving_parts(decl: SystemDecl) -> tuple[Names, Clockwork, Node | None, Node | None]:
+    """What a valid declaration was made from: its names, its time, and the sections `flow` and `jump`."""
+    reader = Reader(decl.source)
+    root, _ = extended(load_yaml(decl.source, sink=reader.findings), reader)
+    found = reader.fields(overridden(root, decl.overrides, reader), "a system file", TOP_KEYS)
+    names, clock, *_ = _named(found, reader)
+    return names, clock, found.get("flow"), found.get("jump")
 
 
 def _folder(node: Node, source: Source, path: Path) -> Path:

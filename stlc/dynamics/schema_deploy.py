@@ -12,12 +12,12 @@ from stlc.compile.values import Number
 from stlc.dynamics.decl_deployment import EventDecl, TestDecl, WorldRef
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import read_sets
-from stlc.dynamics.schema_names import Names
+from stlc.dynamics.schema_names import Names, base_name
 from stlc.dynamics.schema_reader import Reader, first_line
 from stlc.dynamics.yaml_nodes import Node, Scalar
 from stlc.grammar import ast
 
-TEST_KEYS = ("steps", "agents", "replan", "events", "metrics", "world")
+TEST_KEYS = ("steps", "agents", "replan", "events", "metrics", "world", "uncertain")
 EVENT_KEYS = ("name", "when", "at", "every", "set")
 METRICS = ("stl_accuracy", "safety", "progress", "latency")
 Edge = Literal["rise", "fall"]
@@ -41,7 +41,18 @@ def read_test(node: Node | None, reader: Reader, names: Names, dt: Fraction) -> 
         tuple(read_event(item, index, here, names, dt) for index, item in enumerate(items)),
         tuple(metric for metric in metrics if metric),
         read_world(found.get("world"), reader),
+        _uncertain(found["uncertain"], reader, names) if "uncertain" in found else None,
     )
+
+
+def _uncertain(node: Node, reader: Reader, names: Names) -> tuple[str, ...]:
+    """Constants, by name; a vector has one."""
+    known = tuple(dict.fromkeys(map(base_name, names.constants)))
+    items = [item for item in reader.items(node, "`uncertain`") if isinstance(item, Scalar)]
+    for item in items:
+        if item.text not in known:
+            reader.unknown(item, "`uncertain`", known)
+    return tuple(item.text for item in items)
 
 
 def read_event(node: Node, index: int, here: Expressions, names: Names, dt: Fraction) -> EventDecl:

@@ -32,7 +32,7 @@ SCENARIO_KEYS = (
     "prefer",
     "backup",
 )
-ERROR_KEYS = ("actuator_gain", "actuator_noise", "sensor_noise")
+ERROR_KEYS = ("actuator_gain", "parameters", "actuator_noise", "sensor_noise")
 EXPECTED = ("nominal", "ood")
 
 

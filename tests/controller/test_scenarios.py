@@ -12,7 +12,7 @@ from torch import Tensor
 
 from stlc.controller.backup import grid_of
 from stlc.controller.deploy import Guard
-from stlc.controller.disturbance import Disturbance
+from stlc.controller.disturbance import Disturbance, errors_of
 from stlc.controller.drive import Recorder, Recording, Setting, drive
 from stlc.controller.task import Task
 from stlc.controller.world import world_type
@@ -46,7 +46,7 @@ scenario:
   current: {disturb: {y: "0.4 m/s * sin(t / 1 s)", p: [0, 1]}}
   blurred: {noise: {x: "normal(0, 0.1)"}}
   drifting: {model_mismatch: {drift: 0.5 m/s}, override: {x: 5}}
-  shaky: {errors: {actuator_gain: 10 %, actuator_noise: 0.05, sensor_noise: 2 %}}
+  shaky: {errors: {actuator_gain: 10 %, parameters: 20 %, actuator_noise: 0.05, sensor_noise: 2 %}}
   fragile:
     backup: {levels: {u: [-1, 0.5]}, T0: [1, 3]}
     prefer: [{name: low, weight: 2, expr: y - 1 m}, {expr: "u^2"}]
@@ -207,7 +207,48 @@ def test_agents_see_states_with_noise_where_a_range_is_known() -> None:
 def test_a_file_may_ask_for_all_of_them() -> None:
     scenario = task_of("shaky").system.decl.scenario
     assert scenario is not None
-    assert scenario.errors == ErrorsDecl(0.1, 0.05, 0.02)
+    assert scenario.errors == ErrorsDecl(0.1, 0.2, 0.05, 0.02)
+
+
+def test_a_direction_has_noise_of_a_radian() -> None:
+    """A full circle has no half that an actuator could give."""
+    text = SYSTEM.replace("u: {unit: m/s, range: [-1, 1]}", "u: {unit: rad, range: [-3, 3], squash: angle}")
+    text = text.replace("y: u + drift", "y: drift")
+    decl = under(parse_system(Source("boat.yaml", text), Path("boat.yaml")), "disturb-20")
+    disturbance = Disturbance(System(decl), [torch.Generator().manual_seed(0)], 4000)
+    given = disturbance.acted(torch.ones(4000, 1, dtype=torch.float64))
+    assert float(given.std()) == pytest.approx(0.2, rel=0.05)
+
+
+def test_numbers_of_the_dynamics_are_wrong_for_each_agent_in_its_way() -> None:
+    found = steady("mismatch-20", 200)[0].states
+    speeds = np.diff(found[:, :, 0], axis=1) / 0.5
+    assert np.ptp(speeds, axis=1).max() < 1e-12  # always
+    assert set(np.round(speeds[:, 0], 9)) == {0.8, 1.2}
+    assert 150 < int((speeds[:, 0] > 1).sum()) < 250
+    moves = np.round(np.diff(found[:, :, 1], axis=1)[:, 0], 9)
+    assert len({*zip(np.round(speeds[:, 0], 9), moves, strict=True)}) == 4  # whatever its gain
+    again = steady("mismatch-20", 200)[0].states
+    assert (found == again).all()
+    model = task_of("mismatch-20").system
+    assert float(model.step(torch.zeros(1, 5), torch.zeros(1, 1))[0, 0]) == 0.5
+
+
+def test_who_meets_nothing_is_quiet_however_wrong_the_model_is(driven: Driven) -> None:
+    quiet = {name: driven(name)[0].quiet for name in ("nominal", "mismatch-20", "disturb", "noise", "called")}
+    for name in ("nominal", "mismatch-20", "disturb", "noise"):
+        assert quiet[name].all(), name  # type: ignore[union-attr]
+    assert quiet["called"].tolist() == [[True, False, True, True]] * 6  # type: ignore[union-attr]
+
+
+def test_what_is_wrong_is_told() -> None:
+    assert errors_of(task_of("mismatch-20").system.truth) == {
+        "actuator_gain": 0.2,
+        "parameters": 0.2,
+        "numbers": ["drift (of y)", "speed (of x)"],
+    }
+    assert errors_of(task_of("noise").system.truth) == {"sensor_noise": 0.005}
+    assert errors_of(task_of("nominal").system.truth) == {}
 
 
 def test_worlds_are_the_same_whatever_is_disturbed() -> None:
