@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from stlc.bench.cells import BENCHMARKS, read_json
+from stlc.controller.asked import Asked, parse_margins
 from stlc.controller.deploy import Guard, Mode
 from stlc.controller.drive import Recorder, Setting, drive
 from stlc.controller.evaluate import decided, feasible_states, measure
@@ -20,10 +21,13 @@ from stlc.controller.polish import Limits
 from stlc.controller.run import SPEC, SYSTEM, Run
 from stlc.controller.savable import savable
 from stlc.controller.world import world_type
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.dynamics.decl_deployment import ErrorsDecl
 from stlc.dynamics.scenario import DISTURBED
 from stlc.files import write_atomic
 from stlc.jsontext import dumps
 from stlc.provenance import git_state, hardware, sha256, versions
+from stlc.registry import closest
 from stlc.rundir import RunDir, now
 
 if TYPE_CHECKING:
@@ -36,8 +40,20 @@ FILE = "disturbed.json"
 NOMINAL = "as it is"
 SCENARIOS = (NOMINAL, *DISTURBED)
 GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
+USUAL = (*GUARDS, "full+auto")
+"""Guards, and behind a `+` what they ask safety requirements to spare; see `stlc.controller.asked`."""
 SHOWN = (
-    *("saved", "savable", "executed_safe", "executed_starts", "executed_safe_starts", "foreseen_safe_starts"),
+    *(
+        "saved",
+        "saved_starts",
+        "savable",
+        "executed_safe",
+        "executed_starts",
+        "executed_safe_starts",
+        "foreseen_safe_starts",
+        "quiet",
+        "quiet_safe_starts",
+    ),
     *("plan_accuracy", "plan_safety", "policy_accuracy", "feasible", "feasible_followed"),
 )
 """The metrics that are kept; see `stlc.controller.evaluate.METRICS`."""
@@ -49,23 +65,21 @@ class Extent:
 
     Attributes:
         scenarios: some of `SCENARIOS`, or others that the systems know.
-        guards: some of `GUARDS`.
+        guards: such as those of `USUAL`.
         seeds: of the deployments.
         agents: in each, at most; None: as many as the system says.
         steps: of each, at most; None: as many as the system says.
         limit: seconds that a decision of the full guard may take per agent.
-        margin: what guards ask plans to spare of every safety requirement.
         ceiling: visited states that are searched for a plan; see `stlc.controller.evaluate.feasible_states`.
         file: that the deployments are kept in.
     """
 
     scenarios: Sequence[str] = SCENARIOS
-    guards: Sequence[Mode] = GUARDS
+    guards: Sequence[str] = USUAL
     seeds: tuple[int, ...] = (0, 1, 2)
     agents: int | None = None
     steps: int | None = None
     limit: float | None = 0.1
-    margin: float = 0.0
     ceiling: int = 0
     file: str = FILE
 
@@ -74,7 +88,7 @@ class Extent:
         test = run.task.system.decl.test
         agents = min(self.agents or test.agents, test.agents)
         steps = min(self.steps or test.steps, test.steps)
-        return Setting(self.seeds, agents, steps, test.replan, self.limit, self.ceiling, margin=self.margin)
+        return Setting(self.seeds, agents, steps, test.replan, self.limit, self.ceiling)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,23 +125,31 @@ def fill(
         for scenario in extent.scenarios:
             laid = Run.open(folder_of_run.path, scenario=None if scenario == NOMINAL else scenario)
             setting = extent.setting(laid)
-            for mode in extent.guards:
-                called = guard_name(mode, setting.margin)
-                name = f"{laid.task.compiled.name}-{scenario.replace(' ', '_')}-{called}"
-                key = _key(laid, scenario, mode, setting)
+            for guard in extent.guards:
+                name = f"{laid.task.compiled.name}-{scenario.replace(' ', '_')}-{guard}"
+                key = _key(laid, scenario, guard, setting)
                 known = (read_json(folder / extent.file).get("deployments") or {}).get(name) or {}
                 if known.get("key") == key:
                     yield Deployed(name, known, kept=True)
                     continue
                 begun(name)
-                found = {"key": key, "scenario": scenario, **_deployed(laid, mode, setting, starts)}
+                found = {"key": key, "scenario": scenario, **_deployed(laid, guard, setting, starts)}
                 _keep(folder / extent.file, name, found)
                 yield Deployed(name, found, kept=False)
 
 
-def guard_name(mode: str, margin: float) -> str:
-    """Such as `full`, or `full+0.2` where it asks for something to spare."""
-    return f"{mode}+{margin:g}" if margin and mode != "none" else mode
+def guard_of(name: str) -> tuple[Mode, Asked]:
+    """The guard of a name such as `full`, `full+0.2` or `full+auto`, and what it asks.
+
+    Raises UsageError (U101) where there is none.
+    """
+    mode, _, margin = name.partition("+")
+    for known in GUARDS:
+        if mode == known:
+            return known, parse_margins([margin] if margin else [])
+    near = closest(name, USUAL)
+    help_ = (f"did you mean `{near}`?",) if near else (", ".join(USUAL),)
+    raise UsageError(Diagnostic("U101", f"there is no guard `{name}`", help=help_))
 
 
 @dataclass(slots=True)
@@ -147,10 +169,12 @@ class _Starts:
         return self.found[-1]
 
 
-def _deployed(run: Run, mode: Mode, setting: Setting, starts: _Starts) -> dict[str, Any]:
+def _deployed(run: Run, name: str, setting: Setting, starts: _Starts) -> dict[str, Any]:
     """Drive, and measure what was driven."""
-    guard = Guard(run.task, run.policy, mode, limits=Limits(seconds=setting.limit, margin=setting.margin))
     recorder, begin = Recorder(setting.agents), perf_counter()
+    mode, asked = guard_of(name)
+    margin = asked.of(run.task, run.policy, mode, setting.replan)
+    guard = Guard(run.task, run.policy, mode, limits=Limits(seconds=setting.limit, margin=margin))
     drive(guard, world_type(run.task.system.decl), setting, recorder)
     recording = recorder.recording()
     assert recording is not None
@@ -162,7 +186,8 @@ def _deployed(run: Run, mode: Mode, setting: Setting, starts: _Starts) -> dict[s
         "spec": run.task.compiled.name,
         "run": run.dir.name,
         "policy": policy_of(run.dir),
-        "guard": guard_name(mode, setting.margin),
+        "guard": name,
+        **({"margin": dict(margin)} if margin else {}),
         "seeds": list(setting.seeds),
         **{"agents": setting.agents, "steps": setting.steps, "replan": setting.replan},
         "time_limit": setting.limit if mode == "full" else None,
@@ -189,19 +214,27 @@ def _plain(found: Interval) -> dict[str, Any]:
     return {"mean": found.mean, "low": found.low, "high": found.high, "values": list(found.values)}
 
 
-def _key(run: Run, scenario: str, mode: Mode, setting: Setting) -> str:
+def _key(run: Run, scenario: str, guard: str, setting: Setting) -> str:
     """All that a deployment depends on, in a few digits."""
     folder, world = run.dir.path, run.task.system.decl.test.world
     texts = [(folder / name).read_text(encoding="utf-8") for name in (SPEC, SYSTEM, "ckpt/last.json")]
     texts += [world.path.read_text(encoding="utf-8")] if world is not None else []
+    mode, asked_for = guard_of(guard)
     limit = setting.limit if mode == "full" else None
     asked = [
         scenario,
-        guard_name(mode, setting.margin),
+        guard,
         *map(str, (setting.seeds, setting.agents, setting.steps, setting.replan, limit)),
     ]
     asked += [str(setting.ceiling)] if setting.ceiling else []
+    asked += [str(each) for each in (asked_for.share, _errors_of(run)) if each is not None]
     return sha256("\0".join([*texts, *asked]))[:16]
+
+
+def _errors_of(run: Run) -> ErrorsDecl | None:
+    """What the scenario of a run has wrong with actuators, numbers and sensors; None for nothing."""
+    scenario = run.task.system.decl.scenario
+    return scenario.errors if scenario is not None and scenario.errors != ErrorsDecl() else None
 
 
 def _keep(path: Path, name: str, found: Mapping[str, Any]) -> None:

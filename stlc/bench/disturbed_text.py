@@ -7,35 +7,67 @@ from collections.abc import Mapping, Sequence
 from textwrap import wrap
 from typing import Any
 
-from stlc.bench.disturbed import Row, disturbed_rows
+from stlc.bench.disturbed import NOMINAL, Row, disturbed_rows
 from stlc.bench.results import WIDTH, commit_of, markdown
+from stlc.controller.asked import AUTO
 
 _HEAD = """\
 Written by `stlc bench disturbed` from `bench/disturbed.json`. Each policy is driven as it is and in worlds
-that are not as its model says (the scenarios of every system), from the same starts, without a guard, with
-the paper's backup policy and with the full guard. `safe` is the share of the agents that can be saved which
-were driven safely, `satisfied` the share of starts from which what was driven satisfies the specification.
-Means over deployment seeds with half of their 95 % intervals (Student's t; of few seeds they are wide).
+that are not as its model says (the scenarios of every system), from the same starts: without a guard, with
+the paper's backup policy, with the full guard, and with a full guard that asks safety requirements for the
+margin that is measured there (`--margin auto`). `safe agents` is the share of the agents that can be saved
+which were safe all the time, `safe starts` the share of their instants from which what was driven was safe
+through the window, `satisfied` that of all instants from which it satisfied the specification. Means over
+deployment seeds with half of their 95 % intervals (Student's t).
 """
+_QUIET = """\
+Where agents are driven unsafely though the model is right and the full guard acts, the world does what no
+plan foresees. Of the starts through whose window it did nothing but what the truth of the dynamics does:
+"""
+MOST = 0.95
+"""Share of safe starts below which a world is to blame where the model is right."""
 _TITLES = {"none": "no guard", "paper": "paper's", "full": "full"}
 _TRAINED = (("accuracy", 3), ("seconds", 0))
-_COLUMNS = {"safe": "saved", "satisfied": "executed_starts"}
+COLUMNS = {"safe agents": "saved", "safe starts": "saved_starts", "satisfied": "executed_starts"}
+"""What the table shows of each guard."""
 
 
 def disturbed_section(documents: Sequence[Mapping[str, Any]]) -> str:
     """A table of all deployments, and what they were made with."""
     rows = disturbed_rows(documents)
     guards = sorted({guard for row in rows for guard in row.guards}, key=_order)
-    header = ("", "scenario", *(f"{what}, {_title(guard)}" for what in _COLUMNS for guard in guards))
+    header = ("", "scenario", *(f"{what}, {_title(guard)}" for what in COLUMNS for guard in guards))
     lines = [_HEAD]
     cells, last = [], ""
     for row in rows:
-        metrics = (row.metric(guard, name) for name in _COLUMNS.values() for guard in guards)
+        metrics = (row.metric(guard, name) for name in COLUMNS.values() for guard in guards)
         first = "" if row.spec == last else f"{row.spec}, {_size(row)}"
         cells.append((first, row.scenario, *map(spread, metrics)))
         last = row.spec
+    lines += [*markdown(header, cells), "", *_quiet_table(rows, guards)]
     policies = dict.fromkeys(policy_line(each) for row in rows for each in row.guards.values())
-    return "\n".join([*lines, *markdown(header, cells), "", *policies, *made(documents)])
+    return "\n".join([*lines, *policies, *made(documents)])
+
+
+def _quiet_table(rows: Sequence[Row], guards: Sequence[str]) -> list[str]:
+    """Safe starts without what no plan foresees, where that matters: lines, the last one empty."""
+    loud = [row.spec for row in rows if row.scenario == NOMINAL and _lost_to_the_world(row)]
+    cells = []
+    for row in rows:
+        if row.spec in loud:
+            share = row.metric("none", "quiet")
+            metrics = (row.metric(guard, "quiet_safe_starts") for guard in guards)
+            cells.append((row.spec, row.scenario, *map(spread, (share, *metrics))))
+    if not cells:
+        return []
+    header = ("", "scenario", "share of starts", *(f"safe, {_title(guard)}" for guard in guards))
+    return [_QUIET, *markdown(header, cells), ""]
+
+
+def _lost_to_the_world(row: Row) -> bool:
+    """Whether the world makes what was driven unsafe: the model is right, and the full guard acts."""
+    every, quiet = row.metric("full", "saved_starts"), row.metric("full", "quiet_safe_starts")
+    return every is not None and quiet is not None and float(every["mean"]) < min(float(quiet["mean"]), MOST)
 
 
 def policy_line(document: Mapping[str, Any]) -> str:
@@ -47,14 +79,15 @@ def policy_line(document: Mapping[str, Any]) -> str:
     return f"- {document['spec']}: run {document['run']}, {told}, plan accuracy {accuracy} on held-out starts"
 
 
-def _order(guard: str) -> tuple[int, float]:
+def _order(guard: str) -> tuple[int, str]:
     mode, _, margin = guard.partition("+")
-    return [*_TITLES].index(mode), float(margin or 0)
+    return [*_TITLES].index(mode), margin
 
 
 def _title(guard: str) -> str:
     mode, _, margin = guard.partition("+")
-    return _TITLES[mode] + (f", {margin} to spare" if margin else "")
+    spared = "margin" if margin == AUTO else f"{margin} to spare"
+    return _TITLES[mode] + (f" with {spared}" if margin else "")
 
 
 def _size(row: Row) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stlc.cli.bench_options import OutOption, PageOption, SeedsOption, chosen
+from stlc.cli.bench_options import OutOption, PageOption, SeedsOption
 from stlc.cli.options import JsonOption
 from stlc.cli.output import emit, emit_json, say, table
 from stlc.cli.ranges import parse_limit, parse_seeds
@@ -26,14 +26,16 @@ ScenariosOption = Annotated[
     str | None,
     typer.Option("--scenarios", metavar="NAMES", help="Such as noise,mismatch-20; the usual ones if none."),
 ]
-GuardsOption = Annotated[str, typer.Option("--guards", metavar="NAMES", help="Some of none,paper,full.")]
+GuardsOption = Annotated[
+    str,
+    typer.Option(
+        "--guards", metavar="NAMES", help="Of none,paper,full; +0.2 or +auto behind one asks for a margin."
+    ),
+]
 AgentsOption = Annotated[int | None, typer.Option("--agents", min=1, help="In each deployment, at most.")]
 StepsOption = Annotated[int | None, typer.Option("--steps", min=1, help="Of each deployment, at most.")]
 LimitOption = Annotated[
     str, typer.Option("--time-limit", metavar="TIME", help="Of a decision of the full guard, or `none`.")
-]
-MarginOption = Annotated[
-    float, typer.Option("--margin", min=0.0, help="What guards ask safety requirements to spare.")
 ]
 TrainedOption = Annotated[
     Path, typer.Option("--runs", metavar="DIR", help="Where `stlc bench paper` has left its runs.")
@@ -43,30 +45,28 @@ TrainedOption = Annotated[
 def disturbed(
     runs: RunsArgument = None,
     scenarios: ScenariosOption = None,
-    guards: GuardsOption = "none,paper,full",
-    seeds: SeedsOption = "0..2",
+    guards: GuardsOption = "none,paper,full,full+auto",
+    seeds: SeedsOption = "0..9",
     agents: AgentsOption = None,
     steps: StepsOption = None,
     time_limit: LimitOption = "100ms",
-    margin: MarginOption = 0.0,
     out: OutOption = Path("bench"),
     trained: TrainedOption = Path("runs/bench"),
     page: PageOption = Path("docs/worlds.md"),
     as_json: JsonOption = False,
 ) -> None:
     """Drive what has not been driven yet, and write the table into the page."""
-    from stlc.bench.disturbed import GUARDS, SCENARIOS, Extent, disturbed_rows, fill, guard_name, kept_in
-    from stlc.bench.disturbed_text import disturbed_section
+    from stlc.bench.disturbed import SCENARIOS, Extent, disturbed_rows, fill, guard_of, kept_in
+    from stlc.bench.disturbed_text import COLUMNS, disturbed_section
     from stlc.bench.results import write_section
 
     extent = Extent(
         tuple(name.strip() for name in scenarios.split(",")) if scenarios else SCENARIOS,
-        [mode for mode in GUARDS if mode in chosen(guards, GUARDS, "guard")],
+        [name for name in map(str.strip, guards.split(",")) if guard_of(name)],
         parse_seeds(seeds),
         agents,
         steps,
         parse_limit(time_limit),
-        margin,
     )
     found, kept = [], 0
     for each in fill(folders_of(runs, out, trained), extent, out, lambda name: say(f"deploying {name}")):
@@ -79,13 +79,12 @@ def disturbed(
         result = {"what": "disturbed", "page": str(page), "driven": len(found) - kept, "kept": kept}
         emit_json("bench/1", ok=True, exit_code=0, result={**result, "rows": [row_json(row) for row in rows]})
         return
-    called = [guard_name(mode, margin) for mode in extent.guards]
     header = (
         "",
         "scenario",
-        *(f"{name}: {what}" for what in ("safe", "satisfied") for name in called),
+        *(f"{name}: {what}" for what in COLUMNS for name in extent.guards),
     )
-    emit(table([_cells(row, called) for row in rows], header=header, indent=""))
+    emit(table([_cells(row, extent.guards) for row in rows], header=header, indent=""))
     say(f"written: {page}, {out}")
 
 
@@ -110,9 +109,9 @@ def folders_of(names: Sequence[str] | None, out: Path, trained: Path) -> list[Ru
 
 
 def _cells(row: Row, guards: Sequence[str]) -> tuple[str, ...]:
-    from stlc.bench.disturbed_text import spread
+    from stlc.bench.disturbed_text import COLUMNS, spread
 
-    metrics = (row.metric(guard, name) for name in ("saved", "executed_starts") for guard in guards)
+    metrics = (row.metric(guard, name) for name in COLUMNS.values() for guard in guards)
     return (row.spec, row.scenario, *map(spread, metrics))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from stlc.cli.simulate_watch import Watching
+    from stlc.controller.asked import Asked
     from stlc.controller.deploy import Mode
     from stlc.controller.drive import Setting
     from stlc.controller.evaluate import Deployment
@@ -41,7 +42,11 @@ LimitOption = Annotated[
 ]
 
 MarginOption = Annotated[
-    float, typer.Option(min=0.0, help="What a guard asks plans to spare of each safety requirement.")
+    list[str] | None,
+    typer.Option(
+        metavar="M|NAME=M|auto",
+        help="What a guard asks safety requirements to spare; repeatable. `auto` measures it.",
+    ),
 ]
 RecordOption = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Write the trace there too (.npz or .csv).")
@@ -91,7 +96,7 @@ def simulate(
     ceiling: Annotated[
         int, typer.Option(min=0, help="Visited states to search for a plan, where the followed one fails.")
     ] = 0,
-    margin: MarginOption = 0.0,
+    margin: MarginOption = None,
     seeds: Annotated[int, typer.Option(min=1, help="How many deployments.")] = 10,
     seed: Annotated[int, typer.Option(min=0, max=2**62, help="Seed of the first; the others follow.")] = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Of each; by default the system's.")] = None,
@@ -127,9 +132,9 @@ def simulate(
     test, which = opened.task.system.decl.test, tuple(range(seed, seed + seeds))
     limit = parse_limit(time_limit)
     size = agents or test.agents, steps or test.steps
-    setting = Setting(which, *size, test.replan, limit, ceiling, margin)
+    setting = Setting(which, *size, test.replan, limit, ceiling)
     several = _several(opened, scenario)
-    order = _Order(opened, chosen, setting, record, live, margins, parse_overrides(set_))
+    order = _Order(opened, chosen, setting, record, live, margins, parse_overrides(set_), _asked(margin))
     document = _all(order, several) if several else _driven(order, scenario)
     code = 1 if fail_under is not None and _accuracy(document, chosen) < fail_under else 0
     if not json:
@@ -162,6 +167,7 @@ class _Order:
     live: bool
     margins: str | None
     overrides: Mapping[str, str]
+    asked: Asked
 
 
 def _driven(order: _Order, name: str | None, *, kept: bool = True) -> Record:
@@ -174,17 +180,19 @@ def _driven(order: _Order, name: str | None, *, kept: bool = True) -> Record:
     run, found = order.run, {}
     if name is not None:
         run = Run.open(run.dir.path, overrides=order.overrides, scenario=name)
+    margin = order.asked.of(run.task, run.policy, order.guard, order.setting.replan)
+    setting = replace(order.setting, margin=margin)
     for mode in GUARDS[order.guard]:
         title = " · ".join((run.task.compiled.name, TITLES[mode], *([name] if name else [])))
         last = kept and mode == order.guard
         watching = Watching(title, order.live, order.margins if last else None)
         try:
-            found[mode] = _deploy(run, order.setting, mode, watching, order.record)
+            found[mode] = _deploy(run, setting, mode, watching, order.record)
         except RunError as error:
             if mode == order.guard:
                 raise
             show_diagnostics(error.diagnostics)  # only the comparison is missing: the guard may go on
-    return _save(run, order, found)
+    return _save(run, replace(order, setting=setting), found)
 
 
 def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
@@ -244,6 +252,12 @@ def _print(lines: Iterator[str], printed: Callable[[str], None]) -> None:
         printed(line)
 
 
+def _asked(margins: list[str] | None) -> Asked:
+    from stlc.controller.asked import parse_margins
+
+    return parse_margins(margins or ())
+
+
 def _guard(backup: bool | None, guard: str | None) -> Mode:
     if guard not in (None, *GUARDS):
         raise UsageError(
@@ -277,6 +291,7 @@ def _deploy(run: Run, setting: Setting, mode: Mode, watching: Watching, record: 
 def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment]) -> Record:
     """Write trace, scene and figures into the run's folder; returns what was measured."""
     from stlc.controller.archive import RESULT, SCENE, save_scene, save_trace_of
+    from stlc.controller.disturbance import errors_of
     from stlc.controller.evaluate import as_json
 
     last = list(found.values())[-1]
@@ -289,6 +304,7 @@ def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment]) -> Record:
         "run": run.dir.name,
         "world": world.path.name if world is not None else None,
         "scenario": _laid_over(run),
+        "errors": errors_of(run.task.plain.truth),
         "trace": f"{run.dir.shown}/trace.npz",
         "overrides": dict(order.overrides),
     }

@@ -11,6 +11,13 @@ if TYPE_CHECKING:
 Record: TypeAlias = "dict[str, Any]"
 
 MOST_LISTED = 12
+ERRORS = {
+    "actuator_gain": "wrong: gains of actuators",
+    "parameters": "wrong: numbers of the dynamics",
+    "actuator_noise": "noise: what actuators give",
+    "sensor_noise": "noise: what agents see",
+}
+"""Errors of a scenario, in words."""
 TITLES = {"none": "no guard", "paper": "paper's guard", "full": "full guard"}
 COMPARED = {"plan accuracy": "plan_accuracy", "savable": "savable", "saved": "saved"}
 """What scenarios are compared by."""
@@ -41,6 +48,10 @@ def screen(document: Record) -> Iterator[str]:
     world = document["world"] or f"{document['system']} and its events"
     scenario = [f"scenario {document['scenario']}"] if document["scenario"] else []
     yield " · ".join((document["spec"], f"run {document['run']}", f"world {world}", *scenario, size))
+    yield from _wrong(document.get("errors", {}))
+    if document.get("margin"):
+        spared = ", ".join(f"{name} {margin:.3g}" for name, margin in document["margin"].items())
+        yield f"  the guard asks for a margin: {spared}"
     header = ("", *(TITLES[name] for name in guards))
     yield table([*_shares(guards), *_progress(guards), *_times(guards)], header=header)
     for name, guard in guards.items():
@@ -53,6 +64,16 @@ def screen(document: Record) -> Iterator[str]:
         yield f"  foreseen: the {share} of starts from which the world did as the model says"
     if document.get("scenarios"):
         yield from compared(document)
+
+
+def _wrong(errors: Mapping[str, Any]) -> Iterator[str]:
+    """What the truth has otherwise than the model, on a line for each kind."""
+    for name, what in ERRORS.items():
+        if name in errors:
+            numbers = errors.get("numbers", []) if name == "parameters" else []
+            which = f": {', '.join(numbers)}" if numbers else ""
+            if name != "parameters" or numbers:
+                yield f"  {what} by {100 * errors[name]:.3g} %{which}"
 
 
 def compared(document: Record) -> Iterator[str]:

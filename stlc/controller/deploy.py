@@ -10,6 +10,7 @@ from torch import Tensor
 
 from stlc.compile.semantics import TOLERANCE
 from stlc.controller.backup import Backup, Found
+from stlc.controller.closest import Closest
 from stlc.controller.policy import Mlp
 from stlc.controller.polish import FullBackup, Limits
 from stlc.controller.prefix import robustness_until
@@ -101,16 +102,18 @@ class Guard:
         limits: Limits | None = None,
     ) -> None:
         self.task, self.mode = task, mode
-        self.strict = sparing(task, 0.0 if mode == "none" or limits is None else limits.margin)
+        self.strict = sparing(task, {} if mode == "none" or limits is None else limits.margin)
         self.policy = policy
         if isinstance(policy, Mlp) and self.strict is not task:
             self.policy = Mlp(
                 self.strict, policy.network
             )  # of its plans it takes one with that much to spare
-        self.backup: Backup | FullBackup | None = None
+        self.backup: Backup | FullBackup | Closest | None = None
         match mode:
             case "paper":
                 self.backup = Backup(self.strict, self.policy, grid=grid)
+            case "full" if self.strict is not task and limits is not None:
+                self.backup = Closest(task, self.strict, self.policy, grid=grid, limits=limits)
             case "full":
                 self.backup = FullBackup(self.strict, self.policy, grid=grid, limits=limits)
 
@@ -150,19 +153,19 @@ class Guard:
         return replace(decision, rho=taken.rho, safe=taken.safe >= -TOLERANCE, policy_rho=policy_rho)
 
     @torch.no_grad()
-    def endangered(self, x: Tensor, begun: Decision, steps: int) -> Tensor:
+    def endangered(self, x: Tensor, begun: Decision, steps: int | Tensor) -> Tensor:
         """Who would, by the model, violate the safety requirements with the next steps of a begun plan.
 
         Args:
             x: (agents, n) states.
             begun: what is left of the decision before.
-            steps: until everybody plans anew.
+            steps: how many count, one number or (agents,).
 
         Returns:
             (agents,) booleans; nobody without the full guard: the paper's looks at plans as they are made.
         """
         formulas = [rule.formula for rule in self.strict.compiled.safety]
-        if not isinstance(self.backup, FullBackup) or not formulas:
+        if self.mode != "full" or not formulas:
             return torch.zeros(len(x), dtype=torch.bool)
         columns = self.strict.system.rollout_columns(x.to(torch.float64), begun.plan.to(torch.float64))
         return ~(robustness_until(formulas, columns, steps) >= -TOLERANCE)

@@ -40,6 +40,8 @@ class Recording:
         progress: of each seed.
         units: of entries of `progress`.
         scene: snapshots of the first seed, stacked over time, and `decision` (frames, agents).
+        quiet: (rows, steps), whether the world did nothing but what the truth of the dynamics does; None
+            where nobody has looked.
         options: (rows, steps, k, n), among which agents chose; None where the world leaves no choice.
     """
 
@@ -55,6 +57,7 @@ class Recording:
     units: Mapping[str, str]
     scene: Mapping[str, NDArray[Any]]
     options: NDArray[np.float64] | None = None
+    quiet: NDArray[np.bool_] | None = None
 
     @property
     def steps(self) -> int:
@@ -72,6 +75,7 @@ class Recorder:
     decisions: list[Decision] = field(default_factory=list)
     frames: list[Frame] = field(default_factory=list)
     options: list[Tensor] = field(default_factory=list)
+    quiet: list[Tensor] = field(default_factory=list)
     progress: tuple[Mapping[str, float], ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
 
@@ -113,6 +117,7 @@ class Recorder:
             units=self.units,
             scene=scene,
             options=torch.stack(self.options[:steps], 1).numpy(force=True) if self.options else None,
+            quiet=torch.stack(self.quiet[:steps], 1).numpy(force=True) if len(self.quiet) >= steps else None,
         )
 
 
@@ -153,11 +158,12 @@ class _Pilot:
     def due(self, x: Tensor, seen: Tensor, step: int) -> Tensor:
         """Who plans now, (k,) rows: everybody every `replan` steps, and whom the world told something.
 
-        So does whom the full guard sees run into danger before the others plan again.
+        So does whom the full guard sees run into danger with what is left of its plan. Where a plan is used
+        up before the others plan again, its last action counts until then.
         """
         if self.decision is None or step % self.replan == 0:
             return torch.arange(len(x))
-        left = self.replan - step % self.replan
+        left = (self.guard.task.horizon - self.age).clamp(min=self.replan - step % self.replan)
         danger = self.guard.endangered(seen, self.decision.later(self.age), left)
         return torch.nonzero((x != self.before)[:, self.told].any(1) | danger).squeeze(1)
 
@@ -212,6 +218,7 @@ def drive(
             watch(Moment(step, setting.steps, x, decision, len(due), seconds))
         x = worlds.advance(x, action, step + 1)
         recorder.step(decision, action, x, worlds.snapshot())
+        recorder.quiet.append(worlds.quiet)
         recorder.progress = worlds.progress()
     if watch is not None:
         watch(Moment(setting.steps, setting.steps, x, None))

@@ -39,11 +39,14 @@ METRICS = {
     "executed_safe": "share of agents that satisfied the safety requirements at every start",
     "savable": "share of agents that were driven safely, or from whose start a search finds a safe plan",
     "saved": "share of those that were driven safely",
+    "saved_starts": "share of the starts of those from which what was driven satisfies them",
     "executed_starts": "share of starts from which what was driven satisfies it",
     "executed_safe_starts": "share of starts from which it satisfies the safety requirements",
     "foreseen": "share of starts from which the world did as the model says, through the window",
     "foreseen_starts": "share of those from which what was driven satisfies the specification",
     "foreseen_safe_starts": "share of those from which it satisfies the safety requirements",
+    "quiet": "share of starts from which the world did nothing but what the truth of the dynamics does",
+    "quiet_safe_starts": "share of those from which what was driven satisfies the safety requirements",
 }
 """What the shares mean; one of nothing is left out."""
 
@@ -184,12 +187,16 @@ def _of_seed(recording: Recording, executed: Executed, seed: int) -> dict[str, f
         "executed_safe": executed.agents(safety)[rows],
         "savable": executed.savable[rows],
         "saved": executed.agents(safety)[rows][executed.savable[rows]],
+        "saved_starts": safe_starts[:, executed.savable[rows]],
         "executed_starts": starts,
         "executed_safe_starts": safe_starts,
         "foreseen": foreseen,
         "foreseen_starts": starts[foreseen],
         "foreseen_safe_starts": safe_starts[foreseen],
     }
+    if executed.quiet is not None:
+        quiet = executed.quiet[:, rows]
+        shares |= {"quiet": quiet, "quiet_safe_starts": safe_starts[quiet & executed.savable[rows]]}
     shares |= {f"holds.{name}": held[:, rows] for name, held in executed.rules.items()}
     found = {name: float(mask.mean()) if mask.size else math.nan for name, mask in shares.items()}
     return found | {name: float(value) for name, value in recording.progress[seed].items()}
@@ -243,7 +250,7 @@ def as_json(
         "replan": setting.replan,
         "time_limit": setting.limit,
         "ceiling": setting.ceiling,
-        "margin": setting.margin,
+        "margin": dict(setting.margin),
         "interval": "95 %, Student's t over the deployment seeds",
         "guards": {
             name: {

@@ -18,6 +18,7 @@ from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.semantics import TOLERANCE
 from stlc.compile.simplify import simplify
 from stlc.controller.savable import savable as search_safe
+from stlc.controller.worlds import SURPRISE
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import Rule
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from stlc.controller.task import Task
 
 Mask = NDArray[np.bool_]
-SURPRISE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +36,8 @@ class Executed:
         rules: requirement -> (starts, rows), whether it holds there; one start where it does not mention T.
         safety: names of the requirements that are tagged `@safety`.
         foreseen: (starts, rows), whether the world did as the model says all through the window from there.
+        quiet: (starts, rows), whether the world did nothing through the window but what the truth of the
+            dynamics does, however wrong the model is; None where that was not recorded.
         savable: (rows,), who was driven safely, or could have been from its first state by a known plan.
     """
 
@@ -43,6 +45,7 @@ class Executed:
     safety: tuple[str, ...]
     foreseen: Mask
     savable: Mask
+    quiet: Mask | None = None
 
     def agents(self, names: Sequence[str]) -> Mask:
         """(rows,), who satisfies all of `names` at all starts."""
@@ -69,7 +72,9 @@ def judge_executed(task: Task, recording: Recording, *, savable: Mask | None = N
     found = savable
     if found is None:
         found = search_safe(task, torch.from_numpy(recording.states[:, 0])).numpy()
-    executed = Executed(rules, safety, _foreseen(task, recording, starts), found)
+    quiet = None if recording.quiet is None else _throughout(recording.quiet, task, starts)
+    foreseen = _throughout(as_foreseen(task, recording), task, starts)
+    executed = Executed(rules, safety, foreseen, found, quiet)
     return replace(executed, savable=found | executed.agents(safety))
 
 
@@ -108,9 +113,8 @@ def as_foreseen(task: Task, recording: Recording) -> Mask:
     return np.asarray((np.abs(predicted - recording.states[:, 1:]) <= SURPRISE).all(-1))
 
 
-def _foreseen(task: Task, recording: Recording, starts: int) -> Mask:
-    """Where the model predicted every sample of the window, (starts, rows)."""
-    right = as_foreseen(task, recording).T
-    so_far = np.concatenate([np.zeros((1, right.shape[1]), dtype=int), np.cumsum(right, 0)])
+def _throughout(right: Mask, task: Task, starts: int) -> Mask:
+    """Where it was so at every step of the window: (rows, steps) -> (starts, rows)."""
+    so_far = np.concatenate([np.zeros((1, len(right)), dtype=int), np.cumsum(right.T, 0)])
     whole: Mask = so_far[task.horizon : task.horizon + starts] - so_far[:starts] == task.horizon
     return whole

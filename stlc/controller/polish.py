@@ -9,7 +9,7 @@ climbed from. Where not even phi_safe is in sight, climbs from plans at the ends
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -21,6 +21,7 @@ from stlc.compile.semantics import TOLERANCE
 from stlc.controller.backup import Backup, Found, finite, grid_of
 from stlc.controller.savable import Hunt, safely
 from stlc.controller.search import Searcher
+from stlc.controller.spare import Spare
 from stlc.runtime.prefixes import Grid
 
 if TYPE_CHECKING:
@@ -44,8 +45,8 @@ class Limits:
         prefixes: prefixes of one length at most; where the grid has more, a low-discrepancy sample of them.
         places: of the plans that prefixes gave, how many are climbed from.
         rescue: whether phi_safe alone is hunted for, without the policy, where nothing else was safe.
-        margin: what a plan must have to spare of every safety requirement before the guard lets it pass, in
-            the requirement's unit; of the paper's guard too.
+        margin: what a plan must have to spare of safety requirements before the guard lets it pass, by their
+            names, in their units; of the paper's guard too.
     """
 
     seconds: float | None = 0.1
@@ -53,7 +54,7 @@ class Limits:
     prefixes: int = 1000
     places: int = 8
     rescue: bool = True
-    margin: float = 0.0
+    margin: Spare = field(default_factory=dict)
 
 
 class FullBackup:

@@ -52,14 +52,16 @@ def anchored(formula: ir.Formula) -> ir.Formula:
             return formula
 
 
-def robustness_until(formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor], last: int) -> Tensor:
+def robustness_until(
+    formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor], last: int | Tensor
+) -> Tensor:
     """The least robustness of formulas on the samples 0 to `last`, whatever comes after them: (batch,).
 
-    `columns`: name -> (time, batch), as long as the formulas look.
+    `columns`: name -> (time, batch), as long as the formulas look. `last`: one number, or (batch,).
     """
     like = next(iter(columns.values()))
-    beyond = torch.where(torch.arange(len(like), device=like.device) > last, 1.0, -1.0).to(like.dtype)
-    env = {**columns, BEYOND: beyond[:, None].expand(like.shape)}
+    index = torch.arange(len(like), device=like.device)[:, None].expand(like.shape)
+    env = {**columns, BEYOND: torch.where(index > last, 1.0, -1.0).to(like.dtype)}
     margins = evaluate([open_ended(formula) for formula in formulas], env, ops=TORCH)
     return torch.stack([margin[0].expand(like.shape[1]) for margin in margins]).amin(0)
 

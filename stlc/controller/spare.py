@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, assert_never
+from typing import TYPE_CHECKING, TypeAlias, assert_never
 
 from stlc.compile import ir
 from stlc.controller.task import Task
@@ -13,14 +14,18 @@ if TYPE_CHECKING:
     from stlc.compile.pipeline import Rule
 
 
-def sparing(task: Task, margin: float) -> Task:
-    """The same task, in which the robustness of every safety requirement is less by `margin`.
+Spare: TypeAlias = Mapping[str, float]
+"""How much plans must have to spare: safety requirement -> robustness, in its own unit; none if left out."""
 
-    In the requirement's own unit; time tests and constants, which never limit a robustness, stay.
+
+def sparing(task: Task, margin: Spare) -> Task:
+    """The same task, in which the robustness of each safety requirement is less by its `margin`.
+
+    Time tests and constants, which never limit a robustness, stay.
     """
-    if not margin:
+    if not any(margin.values()):
         return task
-    safe = {rule.name: _tightened(rule, margin) for rule in task.compiled.safety}
+    safe = {rule.name: _tightened(rule, margin.get(rule.name, 0.0)) for rule in task.compiled.safety}
     rules = tuple(safe.get(rule.name, rule) for rule in task.rules)
     return Task(replace(task.compiled, requirements=rules), task.plain)
 

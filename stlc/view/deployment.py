@@ -51,6 +51,18 @@ SHARES = {
         "of those starts, the share that satisfies the specification",
     ),
     "foreseen_safe_starts": ("executed safely, as foreseen", "the same for what is tagged @safety"),
+    "saved_starts": (
+        "driven safely, savable starts",
+        "of the starts of savable agents, those from which the drive satisfies what is tagged @safety",
+    ),
+    "quiet": (
+        "quiet",
+        "starts from which the world did nothing but what the truth of the dynamics does",
+    ),
+    "quiet_safe_starts": (
+        "driven safely, quiet",
+        "of those of savable agents, the share that satisfies what is tagged @safety",
+    ),
 }
 HOLDS = "holds."
 FORESEEN = "driven safely, where the world did as the model says"

@@ -14,7 +14,7 @@ from documents import misfits
 from stlc.bench import disturbed
 from stlc.bench.cells import BENCHMARKS, read_json
 from stlc.bench.disturbed import FILE, NOMINAL, SCENARIOS, Row, _Starts, disturbed_rows
-from stlc.bench.disturbed_text import disturbed_section, spread
+from stlc.bench.disturbed_text import COLUMNS, disturbed_section, spread
 from stlc.bench.worlds_text import wholly_savable
 from stlc.cli.app import main
 from stlc.cli.schema import load_schema
@@ -74,7 +74,8 @@ def test_what_was_driven_is_kept(
     assert misfits(first, {"$defs": published["$defs"], **published["$defs"]["disturbed"]}) == []
     page = (tmp_path / "page.md").read_text()
     assert f"| {name}, 2 x 4 x 12 | as it is |" in page
-    assert "| safe, no guard | safe, paper's | satisfied, no guard | satisfied, paper's |" in page
+    columns = [f"{what}, {guard}" for what in COLUMNS for guard in ("no guard", "paper's")]
+    assert f"| {' | '.join(columns)} |" in page
 
     monkeypatch.setattr(disturbed, "drive", lambda *_: pytest.fail("driven twice"))
     assert bench(run, tmp_path, *some, "--json") == 0
@@ -101,6 +102,22 @@ def test_guards_and_scenarios_begin_alike_and_end_otherwise(run: RunDir, tmp_pat
     assert safe[NOMINAL, "full"] >= safe[NOMINAL, "none"]
     acted = {each["guard"]: each["acted"] for each in found if each["scenario"] == NOMINAL}
     assert acted["none"] == 0.0
+
+
+def test_a_margin_is_measured_under_each_scenario(run: RunDir, tmp_path: Path) -> None:
+    some = ["--scenarios", "as it is,mismatch-20", "--guards", "full,full+0.1,full+auto"]
+    assert bench(run, tmp_path, *some) == 0
+    kept = read_json(tmp_path / FILE)
+    published = load_schema("bench/1")
+    assert misfits(kept, {"$defs": published["$defs"], **published["$defs"]["disturbed"]}) == []
+    found = {(each["scenario"], each["guard"]): each for each in kept["deployments"].values()}
+    assert "margin" not in found["mismatch-20", "full"]
+    assert "margin" not in found[NOMINAL, "full+auto"]
+    assert found[NOMINAL, "full+auto"]["metrics"] == found[NOMINAL, "full"]["metrics"]
+    assert found["mismatch-20", "full+0.1"]["margin"] == {"near": 0.1}
+    assert 0.0 < found["mismatch-20", "full+auto"]["margin"]["near"] < 0.3
+    titles = "safe starts, full | safe starts, full with 0.1 to spare | safe starts, full with margin"
+    assert titles in (tmp_path / "page.md").read_text()
 
 
 def test_starts_are_searched_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -192,10 +209,31 @@ def test_rows_are_in_order_and_guards_side_by_side() -> None:
     ]
     assert set(rows[1].guards) == {"none", "full"}
     section = disturbed_section(documents)
-    assert "| traffic, 2 x 4 x 12 | mismatch-5 | .500 ± .250 |  |" in section
-    assert "|  | noise | .500 ± .250 | .500 ± .250 |" in section
+    assert "| traffic, 2 x 4 x 12 | mismatch-5 | .500 ± .250 |  |  |  |  |  |" in section
+    assert "|  | noise | .500 ± .250 | .500 ± .250 |  |  |  |  |" in section
     assert "6 deployments" in section
     assert section.count("- traffic: run 0001-a-b, method guided, seed 0, ? s of training") == 1
+
+
+def test_where_the_world_is_to_blame_quiet_starts_are_told() -> None:
+    def driven(spec: str, scenario: str, guard: str, every: float, quiet: float) -> dict[str, Any]:
+        shares = {"saved_starts": every, "quiet_safe_starts": quiet, "quiet": 0.4}
+        metrics = {
+            name: {"mean": mean, "low": mean, "high": mean, "values": []} for name, mean in shares.items()
+        }
+        return {**document(spec, scenario, guard), "metrics": metrics}
+
+    documents = [
+        driven(spec, scenario, guard, every, quiet)
+        for spec, every, quiet in (("traffic", 0.5, 1.0), ("navigation", 1.0, 1.0), ("maze", 0.5, 0.5))
+        for scenario in (NOMINAL, "noise")
+        for guard in ("none", "full")
+    ]
+    section = disturbed_section(documents)
+    assert "| traffic | noise | .400 ± .000 | 1.000 ± .000 | 1.000 ± .000 |" in section
+    assert section.count("| .400 ± .000 |") == 2  # the others have nothing to explain, or no explanation
+    assert "did nothing but" in section
+    assert "did nothing but" not in disturbed_section(documents[4:])
 
 
 def test_shares_are_short() -> None:

@@ -116,6 +116,24 @@ def test_all_scenarios_are_driven_and_compared(there: RunDir, capsys: pytest.Cap
     assert there.read_json("eval/simulate.json")["scenario"] is None
 
 
+def test_margins_are_measured_and_what_is_wrong_is_told(
+    there: RunDir, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["simulate", *SMALL, "--scenario", "mismatch-20", "--guard", "full", "--margin", "auto"]
+    assert main([*command, "--margin", "give_way=0.25"]) == 0
+    text = capsys.readouterr().out
+    assert "wrong: gains of actuators by 20 %" in text
+    assert "numbers of the dynamics" not in text  # a car has none
+    told = there.read_json("eval/simulate.json")
+    assert told["margin"]["give_way"] == 0.25
+    assert set(told["margin"]) <= {"no_collision", "give_way", "red_light"}
+    assert 0.0 < told["margin"]["red_light"] < 1.0
+    assert f"give_way 0.25, red_light {told['margin']['red_light']:.3g}" in text
+    assert told["errors"] == {"actuator_gain": 0.2, "parameters": 0.2, "numbers": []}
+    assert main([*command, "--json"]) == 0
+    assert misfits(json.loads(capsys.readouterr().out), load_schema("simulate/1")) == []
+
+
 @pytest.mark.usefixtures("there")
 def test_fail_under_is_exit_code_1() -> None:
     assert main(["simulate", *SMALL, "--fail-under", "1.01"]) == 1
@@ -133,6 +151,8 @@ def test_fail_under_is_exit_code_1() -> None:
         (["--margins", "-", "--json"], "both want the standard output"),
         (["--margins", "nowhere/m.jsonl"], "cannot write"),
         (["--scenario", "mismatch-200"], "every system has mismatch-5"),
+        (["--margin", "wide"], "`wide` is no margin"),
+        (["--guard", "full", "--margin", "gap=1"], "safety requirements: no_collision, give_way, red_light"),
         (["--agents", "63"], "63 cars"),
         (["--seeds", "0"], "seeds"),
     ],

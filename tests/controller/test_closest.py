@@ -1,0 +1,92 @@
+"""Where no plan has as much to spare as is asked for, a safe one with the most is followed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from stlc.controller.closest import Closest
+from stlc.controller.deploy import Decision, Guard
+from stlc.controller.polish import POLISHED, FullBackup, Limits
+from stlc.controller.spare import sparing
+from stlc.controller.task import Task
+from stlc.dynamics.schema import parse_system
+from stlc.dynamics.system import System
+from stlc.grammar.parser import parse
+from stlc.source import Source
+
+SYSTEM = """\
+stlc: 1
+name: cart
+time: {dt: 0.5 s, horizon: 6 steps}
+state: {p: {unit: m, range: [-4, 4]}, w: {unit: m/s, range: [-2, 2]}}
+control: {u: {unit: m/s^2, range: [-2, 2]}}
+flow: {p: w, w: u}
+init: {mixture: [{draw: {p: "uniform(-2, 2)", w: "uniform(-2, 2)"}}]}
+backup: {bins: 5, T0: [1, 2], batch: 256}
+"""
+SPEC = """\
+signal p, w
+@safety
+require clear: always[0, T] p <= 2
+@safety
+require behind: always[0, T] p >= -2
+require quick: eventually[0, T] w >= 0.1
+"""
+LIMITS = Limits(seconds=None, margin={"clear": 0.6, "behind": 0.6})
+
+
+def cart() -> Task:
+    decl = parse_system(Source("cart.yaml", SYSTEM), Path("cart.yaml"))
+    return Task.of(parse(Source("a.stl", SPEC)), System(decl))  # type: ignore[arg-type]
+
+
+class Onward:
+    """Speeds up."""
+
+    def plan(self, x0: Tensor) -> Tensor:
+        return torch.ones((len(x0), 6, 1), dtype=x0.dtype)
+
+
+def decided(task: Task, x: Tensor) -> Decision:
+    return Guard(task, Onward(), "full", limits=LIMITS).decide(x)
+
+
+def test_what_is_beside_the_wall_stays_as_far_from_it_as_it_is() -> None:
+    task, x = cart(), torch.tensor([[1.9, 0.0], [1.7, -0.2]], dtype=torch.float64)
+    found = decided(task, x)
+    assert found.safe.all()
+    assert found.source.tolist() == [POLISHED, POLISHED]
+    spare = task.judge(x, found.plan).requirements[:, 0]
+    torch.testing.assert_close(spare, 2.0 - x[:, 0], rtol=0, atol=0.01)
+
+
+def test_whom_the_plain_guard_can_save_is_saved_with_a_margin_too() -> None:
+    task = cart()
+    x = task.sample(60, seed=1, dtype=torch.float64)
+    plain = FullBackup(task, Onward(), limits=Limits(seconds=None)).search(x, Onward().plan(x))
+    found = decided(task, x)
+    strict = sparing(task, LIMITS.margin)
+    assert 10 < int(plain.safe.sum()) < 60
+    assert bool((found.safe | ~plain.safe).all())
+    enough = strict.judge(x, found.plan).safe >= -1e-6
+    assert 10 < int(enough.sum()) < int(found.safe.sum())
+    lost = ~found.safe
+    assert (found.source[lost] == 2).all()  # the longest safe prefix
+
+
+def test_it_spares_more_than_a_guard_that_asks_for_nothing() -> None:
+    task = cart()
+    x = task.sample(60, seed=2, dtype=torch.float64)
+    strict = sparing(task, LIMITS.margin)
+    guard = Closest(task, strict, Onward(), limits=LIMITS)
+    found = guard.search(x, Onward().plan(x))
+    plain = FullBackup(task, Onward(), limits=Limits(seconds=None)).search(x, Onward().plan(x))
+    short = plain.safe & ~found.safe
+    assert int(short.sum()) > 5
+    spare, other = (task.judge(x, each.plan).safe[short] for each in (found, plain))
+    assert (spare >= -1e-6).all()
+    assert float(spare.mean()) > float(other.mean())
+    torch.testing.assert_close(found.rho, strict.judge(x, found.plan).rho)
