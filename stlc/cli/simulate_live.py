@@ -14,6 +14,7 @@ from rich.text import Text
 from stlc.cli.check_text import percent, signed
 from stlc.cli.output import table
 from stlc.compile.semantics import TOLERANCE
+from stlc.compile.walk import margin_unit
 from stlc.controller.deploy import SOURCES
 
 if TYPE_CHECKING:
@@ -137,7 +138,8 @@ class LiveView:
     def _bars(self, width: int) -> list[Text]:
         """A line for each requirement: what the worst agent can still have of it; bars give way to words."""
         margins = self.oversight.margins
-        told = {name: self._told(margin) for name, margin in margins.items()}
+        units = {rule.name: margin_unit(rule.typed.formula) for rule in self.oversight.task.rules}
+        told = {name: self._told(margin, units.get(name, "")) for name, margin in margins.items()}
         wide = [max(len(parts[k]) for parts in told.values()) for k in range(3)]
         label = max(map(len, margins))
         room = width - label - sum(wide) - len("      │      ")
@@ -153,12 +155,12 @@ class LiveView:
             found.append(text)
         return found
 
-    def _told(self, margin: Margin) -> tuple[str, str, str]:
-        """Of one requirement: its least margin, whose that is, and how many have violated it."""
+    def _told(self, margin: Margin, unit: str) -> tuple[str, str, str]:
+        """Of one requirement: its least margin in its unit, whose that is, and how many have violated it."""
         row = int(margin.high.argmin())
         open_ = margin.low[row] < margin.high[row]
         count = int((margin.violated > 0).sum())
-        value = f"{'at most ' if open_ else ''}{_signed(float(margin.high[row]))}"
+        value = f"{'at most ' if open_ else ''}{_signed(float(margin.high[row]))} {unit}".rstrip()
         return value, self._agent(row), f"violated by {count} of {len(margin.high)}" if count else ""
 
     def _bar(self, name: str, value: float, half: int = HALF) -> str:

@@ -61,7 +61,8 @@ def screen(document: Record) -> Iterator[str]:
     foreseen = list(guards.values())[-1]["metrics"].get("foreseen")
     if foreseen and foreseen["mean"] > 0:
         share = _part(foreseen["mean"])
-        yield f"  foreseen: the {share} of starts from which the world did as the model says"
+        beyond = "; others hold what no plan could know" if foreseen["mean"] < 1 else ""
+        yield f"  foreseen: the {share} of starts from which the world did as the model says{beyond}"
     if document.get("scenarios"):
         yield from compared(document)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 
 import pytest
@@ -108,7 +109,7 @@ def test_a_terminal_shows_bars_agents_and_who_decided() -> None:
     assert "backup" in last.splitlines()[0]
     bars = {line.split()[0]: line for line in last.splitlines() if "│" in line}
     assert set(bars) == {"near", "back"}
-    assert all("█" in line and "agent" in line for line in bars.values())
+    assert all("█" in line and "agent" in line and re.search(r"\d m +agent", line) for line in bars.values())
     header = next(line for line in last.splitlines() if "decided by" in line)
     assert "p m" in header
     assert "w m/s" in header
