@@ -206,16 +206,16 @@ def _share_cell(metric: Record | None) -> Child:
     if metric is None:
         return ""
     half = _half(metric)
-    return join(
-        share(metric["mean"]), classed("span", "quiet", f" ± {100 * half:.1f}") if half is not None else ""
-    )
+    mean = classed("span", "whole", share(metric["mean"]))
+    return mean if half is None else join(mean, " ", classed("span", "quiet whole", f"± {100 * half:.1f}"))
 
 
 def _number_cell(metric: Record | None, unit: str) -> Child:
     if metric is None:
         return ""
     mean, half = spread(metric["mean"], _half(metric))
-    return join(mean, classed("span", "quiet", f" ± {half}") if half else "", f" {unit}" if unit else "")
+    more = [classed("span", "quiet", f"± {half} ")] if half else []
+    return join(f"{mean} ", classed("span", "whole", *more, unit)) if more or unit else mean
 
 
 def _half(metric: Record) -> float | None:

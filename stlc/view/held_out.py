@@ -270,8 +270,10 @@ def unsolved_text(held: HeldOut) -> str:
     """How many starts are left, and for how many of them it is known that something can be done."""
     failing, known = held.unsolved
     text = f"{failing:,} of {len(held.x0):,} starts"
-    if held.known is None:
+    if held.known is None or not failing:
         return text
+    if not known:
+        return f"{text}; no satisfying plan is known for any of them"
     if known == failing:
         return f"{text}; a satisfying plan is known for each of them"
     return f"{text}; a satisfying plan is known for {known:,} of them, for {failing - known:,} none was found"

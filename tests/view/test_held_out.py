@@ -153,6 +153,8 @@ def test_starts_without_a_known_plan_are_told_apart():
         f"for {left - known} none was found"
     )
     assert unsolved_text(data) == f"{left} of 4,000 starts"
+    lost = replace(data, known=np.zeros(len(data.x0), dtype=bool))
+    assert unsolved_text(lost).endswith(" starts; no satisfying plan is known for any of them")
     solvable = replace(data, known=np.ones(len(data.x0), dtype=bool))
     assert unsolved_text(solvable).endswith("; a satisfying plan is known for each of them")
     (legend,) = [axes.get_legend() for axes in draw_failures(solvable).figure.axes if axes.get_legend()]
