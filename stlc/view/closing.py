@@ -102,9 +102,9 @@ def _limits(done: Mapping[str, Any]) -> list[str]:
     if "time_limit" in done and done["time_limit"] != USUAL_LIMIT:
         limit = done["time_limit"]
         words += ["--time-limit", "none" if limit is None else f"{1000 * float(limit):g}ms"]
-    for name in ("ceiling", "margin"):
-        words += [f"--{name}", str(done[name])] if done.get(name) else []
-    return words
+    words += ["--ceiling", str(done["ceiling"])] if done.get("ceiling") else []
+    asked = done.get("margin") or {}
+    return words + [word for name in asked for word in ("--margin", f"{name}={asked[name]:.6g}")]
 
 
 _GUARDS = {"none": (), "paper": ("--backup",)}
