@@ -20,7 +20,9 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "horizon": (int,),
     "dt": (int, float),
     "spec_library": (dict,),
+    "spec_set": (dict,),
 }
+_TEXTS = ("spec_library", "spec_set")
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +34,7 @@ class TraceMeta:
         spec_path: its path as the user gave it.
         spec_text: its whole text, so that `stlc check` needs no other file.
         spec_library: texts of the files that it imports, by key (`stlc.compile.modules`).
+        spec_set: constants that were set to something else than the text says, as texts.
         spec_hash: SHA-256 of those texts, hexadecimal.
         system_name: name of the system.
         system_path: its path as the user gave it.
@@ -49,6 +52,7 @@ class TraceMeta:
     spec_path: str = ""
     spec_text: str = ""
     spec_library: Mapping[str, str] = field(default_factory=dict)
+    spec_set: Mapping[str, str] = field(default_factory=dict)
     spec_hash: str = ""
     system_name: str = ""
     system_path: str = ""
@@ -88,11 +92,12 @@ def meta_array(meta: TraceMeta, signature: Signature) -> NDArray[Any]:
 def _meta_of(written: Mapping[str, Any]) -> TraceMeta:
     known = {f.name: written[f.name] for f in fields(TraceMeta) if f.name in written}
     for name, value in known.items():
-        optional = name in _KINDS and value is None and name != "spec_library"
+        optional = name in _KINDS and value is None and name not in _TEXTS
         if not optional and (not isinstance(value, _KINDS.get(name, (str,))) or isinstance(value, bool)):
             raise ValueError(f"`{name}` is {value!r:.40}")
-    if not all(isinstance(text, str) for text in known.get("spec_library", {}).values()):
-        raise ValueError("`spec_library` does not hold texts")
+    for name in _TEXTS:
+        if not all(isinstance(text, str) for text in known.get(name, {}).values()):
+            raise ValueError(f"`{name}` does not hold texts")
     return TraceMeta(**known)
 
 

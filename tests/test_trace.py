@@ -37,7 +37,7 @@ def a_trace(x: np.ndarray | None = None) -> Trace:
     x = np.linspace(-1, 1, 12).reshape(2, 6) if x is None else x
     data = {"x": x, "sign": np.ones_like(x), "q[0]": -x}
     meta = TraceMeta(
-        "traffic", spec_text="spec traffic □", spec_hash="ab", run="r", seed=3, horizon=25, dt=0.1
+        "traffic", spec_text="spec traffic □", spec_set={"D": "1.5 m"}, run="r", seed=3, horizon=25, dt=0.1
     )
     return Trace(SIGNATURE, 0.1, data, 0.5, {"decision": np.array([[0, 1, 2]])}, meta, "unnamed")
 
@@ -293,6 +293,8 @@ def test_a_truncated_file(tmp_path: Path, cut: int) -> None:
         np.array('{"seed": "x"}'),
         np.array('{"horizon": true}'),
         np.array('{"spec_text": 3}'),
+        np.array('{"spec_set": null}'),
+        np.array('{"spec_set": {"D": 1.5}}'),
         np.array('{"signals": {"x": {"kind": "tensor"}}}'),
         np.array('{"signals": {"x": {"unit": "[["}}}'),
         np.array(3.0),

@@ -34,10 +34,11 @@ def register(app: typer.Typer) -> None:
             "stlc check specs/traffic.stl drive.csv --require give_way",
             "stlc check specs/traffic.stl drives/*.parquet --jobs 0 --junit checks.xml",
             "stlc check specs/traffic.stl bag.mcap --resample 0.1s --map dx=lead.gap",
-            note="A trace is looked up as given, then in the newest run. It carries its specification; a "
-            "specification before it, or --spec, is taken instead. With - the samples come from the standard "
-            "input, as a table with a header or as JSON, one a line. A file that is larger than memory is "
-            "judged in pieces. Exit code: 0 all satisfied, 1 violated, 4 a trace is too short to say.",
+            note="A trace is looked up as given, then in the newest run. It carries its specification, "
+            "and constants that were set; a specification before it, or --spec, is taken instead. "
+            "With - the samples come from the standard input, as a table with a header or as "
+            "JSON, one a line. A file that is larger than memory is judged in pieces. Exit code: "
+            "0 all satisfied, 1 violated, 4 a trace is too short to say.",
         ),
     )(check)
 

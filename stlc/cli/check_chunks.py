@@ -37,7 +37,7 @@ def outcome_in_chunks(path: Path, work: Work) -> Outcome:
     first = next(read)
     head = Recording(str(path), (), meta=first.meta)
     source, note = specification(head, question.spec)
-    monitor = given or monitor_of(source, question, first.meta.spec_library)
+    monitor = given or monitor_of(source, question, first.meta)
     at = instant_of(question.at, str(path), first.dt, first.t0, None)
     how = How(at, question.end, question.tolerance, first.t0, reasons=True)
     online = monitor.online(how, require=question.require, like=first)

@@ -25,7 +25,7 @@ def write_robustness(path: Path, result: Checked, question: Question) -> None:
     from stlc.trace import Trace, save_trace
 
     trace = result.trace
-    monitor = monitor_of(result.source, question, result.trace.meta.spec_library)
+    monitor = monitor_of(result.source, question, result.trace.meta)
     end: Literal["strict", "truncate"] = "truncate" if question.end == "truncate" else "strict"
     values = monitor.requirement_robustness(trace, end=end, semantics=question.semantics)
     chosen = {judgement.name for judgement in result.verdict}

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from stlc.monitor.instants import At
     from stlc.monitor.verdict import Monitor
     from stlc.trace import Reading, Trace
+    from stlc.trace_meta import TraceMeta
     from stlc.trace_recording import Recording
 
 End = Literal["open", "strict", "truncate"]
@@ -112,7 +113,7 @@ def judged(path: Path, question: Question) -> tuple[Checked, list[str]]:
 
     recording = read_recording(path)
     source, note = specification(recording, question.spec)
-    monitor = monitor_of(source, question, recording.meta.spec_library)
+    monitor = monitor_of(source, question, recording.meta)
     trace = laid_out(recording, monitor, question)
     del recording  # what was converted is not kept twice
     verdict = monitor.check(
@@ -166,22 +167,29 @@ def specification(recording: Recording, spec: Path | None) -> tuple[Source, str]
     if not meta.spec_text:
         raise usage(f"`{name}` carries no specification", f"stlc check SPEC {name}", "elsewhere: --spec SPEC")
     source = Source(meta.spec_path or f"{meta.spec_name or 'specification'} in {name}", meta.spec_text)
+    changed = ", ".join(f"{constant} = {text}" for constant, text in meta.spec_set.items())
+    told = f"with {changed}, as it was recorded" if changed else ""
     if meta.spec_path and Path(meta.spec_path).is_file() and read_source(meta.spec_path).text != source.text:
-        return source, (
+        since = (
             f"{meta.spec_path} has changed since; judging by the text in {name} "
             f"(--spec {meta.spec_path} takes the new one)"
         )
-    return source, ""
+        told = f"{since}; {told}" if told else since
+    return source, told
 
 
-def monitor_of(source: Source, question: Question, library: Mapping[str, str] | None = None) -> Monitor:
+def monitor_of(source: Source, question: Question, carried: TraceMeta | None = None) -> Monitor:
     """The monitor for a specification; the same for every trace that carries the same one.
 
-    `library` holds the texts that a trace keeps of imported files; where the specification was given as a
-    file they are read.
+    `carried` is what a trace keeps of imported files and of constants that were set; where the specification
+    was given as a file, only the question counts.
     """
-    kept = tuple(library.items()) if library and question.spec is None else ()
-    return _monitor((source.name, source.text, kept), question.system, tuple(question.overrides.items()))
+    library: Mapping[str, str] = {}
+    changed = question.overrides
+    if carried is not None and question.spec is None:
+        library, changed = carried.spec_library, {**carried.spec_set, **changed}
+    spec = source.name, source.text, tuple(library.items())
+    return _monitor(spec, question.system, tuple(changed.items()))
 
 
 @lru_cache(maxsize=8)

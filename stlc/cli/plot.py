@@ -70,7 +70,7 @@ def plot(
     question = Question(spec, system, names_of(map_), resample=grid, overrides=parse_overrides(set_))
     recording = read_recording(path)
     source, note = specification(recording, question.spec)
-    monitor = monitor_of(source, question, recording.meta.spec_library)
+    monitor = monitor_of(source, question, recording.meta)
     recorded = laid_out(recording, monitor, question)
     if places:
         shown = list(range(recorded.traces)) if trace is None else [trace]

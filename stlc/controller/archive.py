@@ -13,6 +13,9 @@ from stlc.compile.modules import spec_sha256
 from stlc.controller.executed import as_foreseen
 from stlc.controller.run import SPEC, SYSTEM, read_library
 from stlc.files import atomic_path, read_source
+from stlc.grammar import ast
+from stlc.grammar.parser import parse
+from stlc.source import Source
 from stlc.trace import Trace, TraceMeta, save_trace
 from stlc.version import __version__
 
@@ -73,6 +76,7 @@ def _meta(run: Run, setting: Setting) -> TraceMeta:
         spec_path=str(record.get("spec_path", "")),
         spec_text=spec,
         spec_library=library,
+        spec_set=_set_in(spec, run),
         spec_hash=spec_sha256(spec, library),
         system_name=run.task.system.name,
         system_path=str(record.get("system_path", "")),
@@ -85,6 +89,13 @@ def _meta(run: Run, setting: Setting) -> TraceMeta:
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         stlc_version=__version__,
     )
+
+
+def _set_in(spec: str, run: Run) -> dict[str, str]:
+    """Constants of the specification that the run, its scenario or the deployment changed."""
+    own = {item.name for item in parse(Source(SPEC, spec)).items if isinstance(item, (ast.Const, ast.Param))}
+    changed = run.task.system.decl.overrides.items()
+    return {name: text for name, text in changed if name in own and name not in run.task.names}
 
 
 def save_scene(path: Path, scene: Mapping[str, NDArray[Any]]) -> None:

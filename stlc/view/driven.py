@@ -68,7 +68,8 @@ def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None) -> M
     source = Source("spec.stl", trace.meta.spec_text or text)
     spec = replace(parse(source), library=trace.meta.spec_library or None)
     outside = any(isinstance(item, ast.Extern) for item in spec.items)
-    return Monitor(spec, system=system if outside and system is not None and system.is_file() else None)
+    used = system if outside and system is not None and system.is_file() else None
+    return Monitor(spec, system=used, overrides=trace.meta.spec_set)
 
 
 def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, NDArray[np.float64]]:

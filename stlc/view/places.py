@@ -192,7 +192,7 @@ def _judge_of(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | None:
         formula=replace(node, item=_point(node), negated=False),
     )
     try:
-        judge = Monitor(replace(spec, items=(*declared, alone)), dt=trace.dt)
+        judge = Monitor(replace(spec, items=(*declared, alone)), dt=trace.dt, overrides=trace.meta.spec_set)
         return judge if judge.compiled.requirements else None
     except StlcError:
         return None

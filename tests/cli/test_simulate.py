@@ -65,6 +65,29 @@ def test_the_newest_run_is_simulated_with_and_without_guard(
     assert (there.path / "scene.npz").exists()
 
 
+def test_a_trace_is_judged_by_the_constants_it_was_driven_with(
+    there: RunDir, capsys: pytest.CaptureFixture[str]
+) -> None:
+    many = ["--seeds", "1", "--agents", "20", "--steps", "50", "--no-pictures", "--json"]
+    assert main(["simulate", *many, "--set", "x_inter=-19 m", "--set", "vmax=9"]) == 0
+    metrics = json.loads(capsys.readouterr().out)["result"]["guards"]["none"]["metrics"]
+    driven = metrics["holds.give_way"]["mean"]
+    trace = str(there.path / "trace.npz")
+    assert load_trace(Path(trace)).meta.spec_set == {"x_inter": "-19 m"}  # the other is the system's
+
+    def share(*options: str) -> float:
+        main(["check", trace, "--json", *options])
+        requirements = json.loads(capsys.readouterr().out)["result"]["requirements"]
+        return next(float(r["satisfied_share"]) for r in requirements if r["name"] == "give_way")
+
+    assert driven < 1.0
+    assert share() == pytest.approx(driven)
+    assert share("--set", "x_inter=19 m") > driven
+    assert share("--spec", str(ROOT / "specs/traffic.stl")) > driven
+    main(["check", trace])
+    assert "with x_inter = -19 m, as it was recorded" in capsys.readouterr().err
+
+
 def test_without_backup_nothing_is_guarded(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", there.name, *SMALL, "--seed", "5", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
