@@ -14,6 +14,7 @@ from stlc.cli.output import emit, emit_json, say
 from stlc.diagnostics import Diagnostic, StlcError, UsageError
 
 if TYPE_CHECKING:
+    from stlc.grammar import ast
     from stlc.monitor.verdict import Monitor
     from stlc.trace import Trace
     from stlc.view.signals import Choice, Margins
@@ -61,6 +62,7 @@ def plot(
     from stlc.cli.judge import Question, laid_out, monitor_of, names_of, specification, time_step
     from stlc.trace import read_recording
     from stlc.view import require_drawing
+    from stlc.view.driven import margins_of, units_of
     from stlc.view.signals import draw_signals
 
     require_drawing()
@@ -76,9 +78,11 @@ def plot(
         shown = list(range(recorded.traces)) if trace is None else [trace]
         picture = _map(monitor, _one(recorded, trace), require or [])
     else:
-        margins = _margins(monitor, recorded, require or [])
+        verdict = monitor.check(recorded, require=require or [])
+        margins, units = margins_of(monitor, verdict, recorded), units_of(verdict)
         choices = _choices(recorded, margins, trace)
-        picture, shown = draw_signals(recorded, margins, choices), [choice.index for choice in choices]
+        picture = draw_signals(_with_units(recorded, monitor.spec), margins, choices, units)
+        shown = [choice.index for choice in choices]
     _save(picture, target)
     if as_json:
         result = {"trace": str(path), "picture": str(target), "shown": shown}
@@ -123,17 +127,19 @@ def _target(output: Path | None, trace: Path) -> Path:
     return target
 
 
-def _margins(monitor: Monitor, trace: Trace, wanted: list[str]) -> Margins:
-    """Requirement -> robustness at every sample, (traces, samples)."""
-    import numpy as np
+def _with_units(trace: Trace, spec: ast.Spec) -> Trace:
+    """The trace with the units that the specification declares, where the file has none."""
+    from stlc.grammar import ast
+    from stlc.signature import Signature
+    from stlc.units import parse_unit
 
-    from stlc.monitor.judgement import unknown_requirement
-
-    for name in wanted:
-        if name not in monitor.requirements:
-            raise unknown_requirement(name, list(monitor.requirements))
-    found = monitor.requirement_robustness(trace)
-    return {name: np.atleast_2d(rho) for name, rho in found.items() if not wanted or name in wanted}
+    signals = [item for item in spec.items if isinstance(item, ast.Signal) and item.unit]
+    declared = {item.column or item.name: parse_unit(item.unit) for item in signals}
+    columns = (
+        replace(c, unit=declared[c.name]) if not c.unit.text and c.name in declared else c
+        for c in trace.signature.columns
+    )
+    return replace(trace, signature=Signature(tuple(columns)))
 
 
 def _one(trace: Trace, wanted: int | None) -> Trace:

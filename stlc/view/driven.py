@@ -73,15 +73,16 @@ def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None) -> M
 
 
 def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, NDArray[np.float64]]:
-    """Robustness of each requirement from each sample on, (traces, samples); NaN where it is not defined.
+    """Robustness of each judged requirement from each sample on, (traces, samples); NaN where it has none.
 
     What is judged once has the value that was judged at every sample: no other counts for its verdict.
     """
     once = judged_once(verdict)
-    rows = {name: np.atleast_2d(rho) for name, rho in monitor.requirement_robustness(trace).items()}
-    return {
-        name: np.repeat(rho[:, :1], rho.shape[1], 1) if name in once else rho for name, rho in rows.items()
-    }
+    found = monitor.requirement_robustness(trace)
+    rows = {judgement.name: np.atleast_2d(found[judgement.name]) for judgement in verdict}
+    for name in once:
+        rows[name] = np.repeat(verdict[name].least[:, None], rows[name].shape[1], 1)
+    return rows
 
 
 def units_of(verdict: Verdict) -> dict[str, str]:

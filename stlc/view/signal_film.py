@@ -49,7 +49,7 @@ def _panel(axes: Axes, trace: Trace, name: str) -> Callable[[int], None]:
     values = trace.data[name][:MOST_AGENTS]
     gap = np.full((len(values), 1), np.nan)
     unit = trace.signature[name].unit.text
-    axes.set_ylabel(f"{name} [{unit}]" if unit not in ("", "1") else name)
+    axes.set_ylabel(f"{name}\n[{unit}]" if unit not in ("", "1") else name)
     times = np.broadcast_to(trace.times, values.shape)
     axes.plot(np.hstack([times, gap]).ravel(), np.hstack([values, gap]).ravel(), color=FAINT, lw=0.8)
     (past,) = axes.plot([], [], color=INK, lw=0.8, alpha=0.7)
