@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from stlc.controller.task import Task
 
 AUTO = "auto"
-FORMS = "--margin 0.2, --margin NAME=0.2, --margin auto, or auto:99 to cover 99 % of plans"
+FORMS = "--margin 0.2, --margin NAME=0.2, --margin auto, or auto:95 to cover 95 % of plans, not 99"
 
 
 @dataclass(frozen=True, slots=True)

@@ -159,11 +159,12 @@ class _Pilot:
         """Who plans now, (k,) rows: everybody every `replan` steps, and whom the world told something.
 
         So does whom the full guard sees run into danger with what is left of its plan. Where a plan is used
-        up before the others plan again, its last action counts until then.
+        up before the others plan again, its last action counts until then. The last sample of a plan does
+        not: `sweep` looks from there to where nobody has planned to go.
         """
         if self.decision is None or step % self.replan == 0:
             return torch.arange(len(x))
-        left = (self.guard.task.horizon - self.age).clamp(min=self.replan - step % self.replan)
+        left = (self.guard.task.horizon - 1 - self.age).clamp(min=self.replan - step % self.replan)
         danger = self.guard.endangered(seen, self.decision.later(self.age), left)
         return torch.nonzero((x != self.before)[:, self.told].any(1) | danger).squeeze(1)
 

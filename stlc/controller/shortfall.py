@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from stlc.controller.spare import Spare
     from stlc.controller.task import Task
 
-SHARE = 0.95
+SHARE = 0.99
 """Of plans whose loss a margin covers."""
-STARTS = 1000
+STARTS = 4000
 SEED = 20_251
 
 

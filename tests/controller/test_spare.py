@@ -133,16 +133,50 @@ def test_a_margin_makes_up_for_a_mistaken_model() -> None:
     assert passed[0.9] <= 2.0
 
 
+def test_what_nobody_has_planned_is_no_danger() -> None:
+    """As the model says, a safe plan stays safe to its end, also where `sweep` looks beyond that."""
+    decl = parse_system(Source("cart.yaml", SYSTEM), Path("cart.yaml"))
+    spec = "signal p, w\n@safety\nrequire clear: always[0, T] sweep([p, 0]) not in box([2.2, -1], [9, 1])\n"
+    task, planned = Task.of(parse(Source("a.stl", spec)), System(decl)), []  # type: ignore[arg-type]
+
+    class Faster(Onward):
+        def plan(self, x0: Tensor) -> Tensor:
+            return torch.full((len(x0), self.horizon, 1), 0.4, dtype=x0.dtype)
+
+    guard = Guard(task, Faster(task.horizon), "full", limits=Limits(seconds=None))
+    recorder = Recorder(8)
+    watch = lambda moment: planned.append(moment.planned)  # noqa: E731
+    drive(guard, world_type(decl), Setting((0,), 8, 4, 4), recorder, watch)
+    assert planned == [8, 0, 0, 0, 0]
+    x = torch.from_numpy(recorder.recording().states[:, 3])  # type: ignore[union-attr]
+    rest = recorder.decisions[0].later(3)
+    assert guard.endangered(x, rest, 3).any()  # of the sample at the end of the plan
+
+
 def test_the_full_guard_looks_at_all_that_is_left_of_a_plan() -> None:
-    """A plan that will be unsafe after the next planning is given up at once."""
-    assert driven("paper", 0.0, "mismatch-50").states[:, :, 0].max() > 2.0
-    assert driven("full", 0.0, "mismatch-50").states[:, :, 0].max() <= 2.0
+    """Who will be unsafe after the next planning alone, by what is planned now, plans at once."""
+    task = task_of("disturb-50")
+    guard, recorder = Guard(task, Onward(task.horizon), "full", limits=Limits(seconds=None)), Recorder(8)
+    planned: list[int] = []
+    drive(
+        guard,
+        world_type(task.system.decl),
+        Setting((1,), 8, 2, 4),
+        recorder,
+        lambda moment: planned.append(moment.planned),
+    )
+    rest = recorder.decisions[0].later(1)
+    later, soon = (int(guard.endangered(recorder.states[1], rest, last).sum()) for last in (4, 3))
+    assert planned[:2] == [8, later]
+    assert later > soon == 0
+
+
+def test_so_many_steps_count_for_each_agent() -> None:
     task = task_of()
     guard, x = Guard(task, Onward(task.horizon), "full"), torch.tensor([[0.0, 0.0], [1.2, 0.3]])
     begun = Guard(task, Onward(task.horizon), "none").decide(x.double())
-    left = torch.tensor([6, 2])
     assert guard.endangered(x, begun, 6).tolist() == [False, True]
-    assert guard.endangered(x, begun, left).tolist() == [False, False]
+    assert guard.endangered(x, begun, torch.tensor([6, 2])).tolist() == [False, False]
 
 
 def test_who_runs_into_danger_plans_before_the_others() -> None:
