@@ -37,8 +37,8 @@ ORIGINS = np.array(  # from one joint to the next, then the flange
     ]
 )
 ROLLS = np.radians([0, -90, 90, 90, -90, 90, 90])  # about x, joint by joint
-SIDE = 2.2  # m from the view from above to the one from the side
-REACH, LOW = 1.05, -0.95  # m that a picture shows
+REACH, PITCH = 0.95, 2.0  # m that a picture shows around an arm, and from one to the next
+ABOVE = -1.35  # m from the floor of the views from the side to the middle of those from above
 TAIL = 10  # frames of a way that are seen
 MESHES = {  # of the links, among those that come with PyBullet
     f"panda_link{link}": f"franka_panda/meshes/{'visual' if 0 < link < 7 else 'collision'}/link{link}.obj"
@@ -123,24 +123,32 @@ class Goals:
 
     @staticmethod
     def draw(axes: Any, scene: Mapping[str, np.ndarray], index: int) -> None:
-        """One frame: all arms from above, and from the side beside it, coloured by who decided."""
+        """One frame: arms side by side, from the side and from above, coloured by who decided."""
         from matplotlib.patches import Circle
 
         arms, goals, post = scene["arms"], scene["goals"][index], scene["post"][index]
         who = deciders(scene, index, arms.shape[1])
-        for left, title, (across, up) in ((0.0, "from above", (0, 1)), (SIDE, "from the side", (0, 2))):
-            level = 0.0 if up == 2 else LOW
-            axes.plot((left - REACH, left + REACH), (level, level), color=NOTE, lw=0.6, alpha=0.4, zorder=0)
-            at = (left + post[across], post[up])
-            axes.add_patch(Circle(at, post[3], color=STONE, lw=0, alpha=0.55))
-            tails(axes, arms[:, :, -1, [across, up]] + (left, 0.0), scene, index, frames=TAIL)
-            for arm, goal, source in zip(arms[index], goals, who, strict=True):
-                color, place = DECIDED[source], (left + goal[across], goal[up])
-                axes.plot(left + arm[:, across], arm[:, up], color=color, lw=2.6, alpha=0.85, zorder=3)
-                axes.plot(left + arm[-1, across], arm[-1, up], "o", color=color, ms=5, mec="white")
-                axes.add_patch(Circle(place, post[4], fc="none", ec=GOAL, lw=1.4, zorder=2))
-            axes.text(left, REACH + 0.12, title, ha="center", size=8, color=NOTE)
-        axes.set(xlim=(-REACH, SIDE + REACH), ylim=(LOW, REACH + 0.3), aspect="equal")
+        bases = PITCH * np.arange(arms.shape[1])
+        for floor, up in ((0.0, 2), (ABOVE, 1)):
+            seen = arms[..., [0, up]] + np.stack((bases, np.full_like(bases, floor)), -1)[:, None]
+            tails(axes, seen[:, :, -1], scene, index, frames=TAIL)
+            for base, arm, goal, source in zip(bases, seen[index], goals, who, strict=True):
+                color = DECIDED[source]
+                axes.add_patch(
+                    Circle((base + post[0], floor + post[up]), post[3], color=STONE, lw=0, alpha=0.55)
+                )
+                axes.plot(*arm.T, color=color, lw=2.2, alpha=0.85, zorder=3, solid_joinstyle="round")
+                axes.plot(*arm[-1], "o", color=color, ms=4, mec="white", mew=0.6, zorder=4)
+                place = (base + goal[0], floor + goal[up])
+                axes.add_patch(Circle(place, post[4], fc="none", ec=GOAL, lw=1.2, zorder=2))
+        for number, base in enumerate(bases):
+            axes.plot((base - REACH, base + REACH), (0, 0), color=NOTE, lw=0.6, alpha=0.4, zorder=0)
+            axes.text(base, ABOVE - REACH, f"arm {number}", ha="center", va="top", size=7.5, color=NOTE)
+        for height, words in ((0.5 * REACH, "from the side"), (ABOVE, "from above")):
+            axes.text(
+                -REACH - 0.15, height, words, rotation=90, ha="center", va="center", size=7.5, color=NOTE
+            )
+        axes.set(xlim=(-REACH - 0.3, bases[-1] + REACH), ylim=(ABOVE - REACH - 0.25, 1.25), aspect="equal")
         axes.set_axis_off()
 
     @staticmethod

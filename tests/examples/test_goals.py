@@ -79,3 +79,19 @@ def test_an_arm_in_the_post_stands_still(system: System) -> None:
     assert (went[inside] == 0.0).all()
     assert went[~inside] == pytest.approx(0.001)
     assert world.progress()["arms_struck"] >= inside.sum()
+
+
+def test_arms_are_drawn_side_by_side_within_the_picture(system: System) -> None:
+    axes = pytest.importorskip("matplotlib.figure").Figure().add_subplot()
+    world = make(system, 3)
+    scene = {name: np.stack([value, value]) for name, value in world.snapshot().items()}
+    world.draw(axes, scene | {"decision": np.array([[0, 1, 3]] * 2)}, 1)
+    assert [text.get_text() for text in axes.texts][:3] == ["arm 0", "arm 1", "arm 2"]
+    thick = [np.asarray(line.get_data()) for line in axes.lines if line.get_linewidth() > 2]
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    assert len(thick) == 6  # each from the side, and from above
+    for across, up in thick:
+        assert left <= across.min() <= across.max() <= right
+        assert low <= up.min() <= up.max() <= high
+    bases = sorted(across[0] for across, _ in thick)
+    assert np.diff(bases)[[1, 3]] == pytest.approx(2.0)
