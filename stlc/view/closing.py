@@ -27,7 +27,7 @@ def failures_section(material: Material) -> Section | None:
     """Where in the initial set the policy's plans fail."""
     if material.held_out is None:
         return None
-    picture = draw_failures(material.held_out, material.signature)
+    picture = draw_failures(material.held_out, material.signature, material.units)
     if picture is None:
         text = f"None of the plans from {len(material.held_out.x0):,} held-out starts fails a requirement."
         return Section("failures", "Where plans fail", el("p", text))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,8 +24,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def draw_failures(held: HeldOut, signature: Signature | None = None) -> Picture | None:
-    """The worst requirement over the two columns that tell most; None if nothing fails."""
+def draw_failures(
+    held: HeldOut, signature: Signature | None = None, units: Mapping[str, str] | None = None
+) -> Picture | None:
+    """The worst requirement over the two columns that tell most; None if nothing fails.
+
+    Args:
+        held: starts and how their plans fared.
+        signature: of the system, for units and labels of states.
+        units: requirement -> that of its robustness, where it has one.
+    """
     weakness = find_weakness(held)
     if weakness is None:
         return None
@@ -32,7 +41,7 @@ def draw_failures(held: HeldOut, signature: Signature | None = None) -> Picture 
         figure = new_figure(9, 3.4)
         left, right = figure.subplots(1, 2, width_ratios=[1.6, 1])
         _draw_starts(left, held, weakness, signature)
-        _draw_margins(right, held, weakness)
+        _draw_margins(right, held, weakness, units or {})
     name = held.requirements[weakness.requirement]
     return Picture(figure, f"{name} {weakness_text(weakness, held, signature)}.")
 
@@ -97,7 +106,7 @@ def _extent(conditions: tuple[Condition, ...], column: int, x0: NDArray[np.float
     return low, high
 
 
-def _draw_margins(axes: Axes, held: HeldOut, weakness: Weakness) -> None:
+def _draw_margins(axes: Axes, held: HeldOut, weakness: Weakness, units: Mapping[str, str]) -> None:
     from matplotlib.ticker import StrMethodFormatter
 
     name = held.requirements[weakness.requirement]
@@ -115,7 +124,8 @@ def _draw_margins(axes: Axes, held: HeldOut, weakness: Weakness) -> None:
     axes.set_ylim(bottom=0)
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     axes.set_title(f"robustness of {name}")
-    axes.set_xlabel("robustness of the plan")
+    unit = f" [{units[name]}]" if units.get(name) else ""
+    axes.set_xlabel(f"robustness of the plan{unit}")
     axes.set_ylabel("starts", color=MUTED)
     axes.grid(visible=False, axis="x")
 

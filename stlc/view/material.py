@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from stlc.compile.walk import margin_unit
 from stlc.diagnostics import StlcError
 from stlc.dynamics.decl import SystemDecl
 from stlc.dynamics.scenario import under
 from stlc.dynamics.schema import load_system_decl
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
+from stlc.monitor.verdict import Monitor
 from stlc.rundir import RunDir
 from stlc.signature import Signature
 from stlc.source import Source, Span
@@ -34,6 +36,7 @@ class Material:
         signature: of the system, for units and labels.
         held_out: starts and how their plans fared.
         simulation: of `eval/simulate.json`.
+        units: requirement -> the unit of its robustness, where it has one.
         usual: how many agents and steps the system deploys, under the scenario of the deployment.
         trace: the recorded deployment.
     """
@@ -46,6 +49,7 @@ class Material:
     signature: Signature | None
     held_out: HeldOut | None
     simulation: Record | None
+    units: Mapping[str, str]
     usual: Record
     trace: Trace | None
 
@@ -83,6 +87,7 @@ def gather(run: RunDir) -> Material:
         signature=None if decl is None else decl.signature,
         held_out=load_held_out(run.path / "eval/held_out.npz"),
         simulation=simulation,
+        units={} if decl is None else _units(texts.get("spec.stl", ""), decl),
         usual={} if decl is None else _usual(decl, (simulation or {}).get("scenario")),
         trace=_trace(run),
     )
@@ -123,6 +128,15 @@ def _decl(run: RunDir) -> SystemDecl | None:
         return load_system_decl(run.path / "system.yaml")
     except StlcError:
         return None
+
+
+def _units(text: str, decl: SystemDecl) -> dict[str, str]:
+    try:
+        monitor = Monitor(parse(Source("spec.stl", text)), dt=decl.dt, horizon=decl.horizon * decl.dt)
+        rules = monitor.compiled.requirements
+    except StlcError:
+        return {}
+    return {rule.name: unit for rule in rules if (unit := margin_unit(rule.typed.formula))}
 
 
 def _usual(decl: SystemDecl, scenario: object) -> Record:

@@ -128,6 +128,9 @@ def test_picture_shows_every_start_of_the_region(trained, signature):
     assert shown == int((data.x0[:, 2] == 0).sum())
     assert starts.get_xlabel() == "x [m]"
     assert "stop_sign" in margins.get_title(loc="left")
+    assert margins.get_xlabel() == "robustness of the plan"
+    told = draw_failures(data, signature, {"stop_sign": "s", "give_way": "m"}).figure.axes[1]
+    assert told.get_xlabel() == "robustness of the plan [s]"
     assert picture.svg()
 
 

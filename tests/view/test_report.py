@@ -71,6 +71,12 @@ def test_a_trained_run(trained):
     assert (trained.path / "system.yaml").read_text() in page.text
 
 
+def test_units_of_robustness_are_those_of_the_specification(trained):
+    assert gather(trained).units == {"no_collision": "m"}  # the others compare more than one kind of thing
+    (trained.path / "spec.stl").write_text("require (")
+    assert gather(trained).units == {}
+
+
 def test_a_deployed_run(deployed):
     html = write_report(deployed).read_text(encoding="utf-8")
     page = Page(html)
