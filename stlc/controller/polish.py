@@ -1,9 +1,11 @@
-"""The guard in full: polish the policy's plan, then search from better places, and stop at a time limit.
+"""The guard in full: mend the policy's plan, then search from other places, and stop at a time limit.
 
 The paper's backup policy tries a grid of prefixes and lets the policy finish them. Most plans that the
-monitor rejects are nearly right, and a hill climb that starts at them mends them within a millisecond. What
-it cannot mend is started anew from prefixes, few enough to be judged in time, and the best of those are
-climbed from. Where not even phi_safe is in sight, climbs from plans at the ends of the controls come before.
+monitor rejects are nearly right: gradient steps on a batch of plans around them mend most, and a hill climb
+from the best of these many of the others. What is still unsafe is hunted for from plans at the ends of the
+controls. Where a plan is safe and no more, plans that begin anew with a few actions and that the policy
+finishes come before it: what satisfies nothing now should at least lead back to where the policy knows its
+way.
 """
 
 from __future__ import annotations
@@ -15,10 +17,11 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-from torch.quasirandom import SobolEngine
 
 from stlc.compile.semantics import TOLERANCE
+from stlc.controller.ascent import Ascent
 from stlc.controller.backup import Backup, Found, finite, grid_of
+from stlc.controller.beginnings import Beginnings
 from stlc.controller.savable import Hunt, safely
 from stlc.controller.search import Searcher
 from stlc.controller.spare import Spare
@@ -41,9 +44,12 @@ class Limits:
 
     Attributes:
         seconds: per agent; the best plan so far is taken when they are over. None: no limit.
-        tries: plans that a climb tries per place that it starts from.
-        prefixes: prefixes of one length at most; where the grid has more, a low-discrepancy sample of them.
+        tries: plans that a climb tries per place that polishing starts from.
+        prefixes: of one length, at most, that the paper's rule tries where nothing safe was found.
+        drawn: prefixes of one length, at most, that plans are begun anew with; where the grid has more, a
+            sample of them.
         places: of the plans that prefixes gave, how many are climbed from.
+        again: plans that each of these climbs tries.
         rescue: whether phi_safe alone is hunted for, without the policy, where nothing else was safe.
         margin: what a plan must have to spare of safety requirements before the guard lets it pass, by their
             names, in their units; of the paper's guard too.
@@ -52,7 +58,9 @@ class Limits:
     seconds: float | None = 0.1
     tries: int = 2000
     prefixes: int = 1000
+    drawn: int = 256
     places: int = 8
+    again: int = 2000
     rescue: bool = True
     margin: Spare = field(default_factory=dict)
 
@@ -74,10 +82,11 @@ class FullBackup:
         self.limits = limits or Limits()
         grid = grid or grid_of(task)
         few = tuple(length for length in grid.lengths if grid.count(length) <= self.limits.prefixes)
-        self.grid = grid
+        self.beginnings = Beginnings(task, policy, grid, self.limits.drawn)
         self.paper = Backup(task, policy, grid=replace(grid, lengths=few or grid.lengths[:1]))
         self._generator = torch.Generator().manual_seed(SEED)
         enough = TO_SPARE * task.system.decl.objective.gamma
+        self._ascent = Ascent(task, torch.Generator().manual_seed(SEED), enough=enough)
         self._whole = Searcher(task, self._generator, enough=enough)
         self._safe = self._whole
         self._hunt = Hunt(safely(task) if task.compiled.safety else task)
@@ -97,88 +106,75 @@ class FullBackup:
             One plan an agent: one that satisfies phi if any was found in time, else phi_safe, else the one
             with the longest safe prefix that the paper's backup knows.
         """
-        until = None if self.limits.seconds is None else perf_counter() + self.limits.seconds * len(x)
+        until = math.inf if self.limits.seconds is None else perf_counter() + self.limits.seconds * len(x)
         plan = finite(plan.to(x.dtype), self.task)
         places = [plan] if rest is None else [plan, finite(rest.to(x.dtype), self.task)]
-        found = self._polished(x, torch.stack(places, 1))
+        found = self._polished(x, torch.stack(places, 1), until)
         lost = (~found.safe).nonzero()[:, 0]
         if len(lost) and self.limits.rescue:
             _improve(found, lost, self._rescued(x[lost], until))
-        for length in self.grid.lengths:
-            todo = (found.rho < -TOLERANCE).nonzero()[:, 0]
-            if len(todo) == 0 or (until is not None and perf_counter() >= until):
-                break
-            begun = self._begun_anew(x[todo], plan[todo], length)
-            _improve(found, todo, begun)
+        hopeful = found.safe if self.limits.rescue else torch.ones_like(found.safe)
+        todo = (hopeful & (found.rho < -TOLERANCE)).nonzero()[:, 0]
+        if len(todo) and perf_counter() < until and len(self.beginnings.heads):
+            anew = self._begun_anew(x[todo])
+            safe = anew.safe.nonzero()[:, 0]
+            _put(found, todo[safe], _of(anew, safe))
         lost = (~found.safe).nonzero()[:, 0]
         if len(lost):
             _put(found, lost, self.paper.search(x[lost], plan[lost]))
         return found
 
-    def _polished(self, x: Tensor, places: Tensor) -> Found:
-        """The best that climbs reach from `places`, (agents, places, T, m)."""
-        found = self._climbed(x, places, self._whole)
+    def _polished(self, x: Tensor, places: Tensor, until: float) -> Found:
+        """The best that gradient steps and then climbs reach from `places`, (agents, places, T, m)."""
+        tries = self.limits.tries
+        raised = self._ascent.rise(x, places, 0.5 * (perf_counter() + until))
+        found = self._judged(x, raised[:, 0])
+        left = (found.rho < self._whole.enough).nonzero()[:, 0]
+        if len(left):
+            _improve(found, left, self._climbed(x[left], raised[left], self._whole, tries)[0])
         unsafe = (~found.safe).nonzero()[:, 0]
         if len(unsafe) and self._safe is not self._whole:
-            _improve(found, unsafe, self._climbed(x[unsafe], found.plan[unsafe][:, None], self._safe))
+            places = found.plan[unsafe][:, None]
+            _improve(found, unsafe, self._climbed(x[unsafe], places, self._safe, tries)[0])
         return found
 
-    def _rescued(self, x: Tensor, until: float | None) -> Found:
+    def _rescued(self, x: Tensor, until: float) -> Found:
         """Plans for phi_safe that have nothing to do with the policy."""
-        plans, _ = self._hunt.plans(x, math.inf if until is None else until)
-        judged = self.task.judge(x, plans)
+        return self._judged(x, self._hunt.plans(x, until)[0])
+
+    def _judged(self, x: Tensor, plans: Tensor) -> Found:
+        """Plans (agents, T, m) as polished ones."""
+        judged = self.task.judge(x, plans, states=False)
         number = torch.zeros(len(x), dtype=torch.int64, device=x.device)
         return Found(plans, number + POLISHED, number, judged.rho, judged.safe >= -TOLERANCE)
 
-    def _climbed(self, x: Tensor, places: Tensor, searcher: Searcher) -> Found:
-        """The best plan an agent of climbs from each of its places, as polished ones."""
+    def _climbed(self, x: Tensor, places: Tensor, searcher: Searcher, tries: int) -> tuple[Found, Tensor]:
+        """The best plan an agent of climbs from each of its places, as polished ones, and which place."""
         agents, count = places.shape[:2]
         starts = x.repeat_interleave(count, 0)
-        climb = searcher.begin(
-            starts,
-            places.flatten(0, 1),
-            places.new_zeros(0, *places.shape[2:]),
-            tries=self.limits.tries,
-            threads=torch.get_num_threads(),
-        )
-        plans = climb.result().plans
-        judged = self.task.judge(starts, plans)
+        plans = searcher.at_once(starts, places.flatten(0, 1), tries=tries).plans.to(x.device)
+        judged = self.task.judge(starts, plans, states=False)
         value = _value(judged.rho, judged.safe >= -TOLERANCE, judged.safe).view(agents, count)
-        pick = value.argmax(1) + count * torch.arange(agents, device=x.device)
-        number = torch.zeros(agents, dtype=torch.int64, device=x.device)
-        return Found(
-            plans[pick], number + POLISHED, number, judged.rho[pick], judged.safe[pick] >= -TOLERANCE
-        )
+        place = value.argmax(1)
+        pick = place + count * torch.arange(agents, device=x.device)
+        number = torch.zeros_like(place)
+        safe = judged.safe[pick] >= -TOLERANCE
+        return Found(plans[pick], number + POLISHED, number, judged.rho[pick], safe), place
 
-    def _begun_anew(self, x: Tensor, plan: Tensor, length: int) -> Found:
-        """Plans from prefixes of one length, the best of them climbed from."""
-        candidates = self.paper.candidates(x, plan, self._prefixes(length).to(x))
-        value = _value(candidates.rho, candidates.safe, candidates.rho)
+    def _begun_anew(self, x: Tensor) -> Found:
+        """Plans from sampled beginnings, the best of them climbed from."""
+        begun = self.beginnings.finished(x)
+        value = _value(begun.rho, begun.safe >= -TOLERANCE, begun.rho)
         picked = value.topk(min(self.limits.places, value.shape[1]), 1).indices
-        rows = torch.arange(len(x), device=x.device)[:, None]
-        found = self._climbed(x, candidates.plans[rows, picked], self._whole)
-        first, row = picked[:, 0], rows[:, 0]
-        number = torch.full((len(x),), length, dtype=torch.int64, device=x.device)
-        head = Found(
-            candidates.plans[row, first],
-            torch.ones_like(number),
-            number,
-            candidates.rho[row, first],
-            candidates.safe[row, first],
-        )
-        _improve(head, torch.arange(len(x), device=x.device), found)
-        return replace(head, source=torch.ones_like(number), t0=number)
-
-    def _prefixes(self, length: int) -> Tensor:
-        """The grid's prefixes where they are few, else a low-discrepancy sample of their range."""
-        grid = self.grid
-        if grid.count(length) <= self.limits.prefixes:
-            return torch.from_numpy(grid.prefixes(length))
-        low = torch.tensor([values[0] for values in grid.values], dtype=torch.float64)
-        high = torch.tensor([values[-1] for values in grid.values], dtype=torch.float64)
-        engine = SobolEngine(length * len(low), scramble=True, seed=SEED)  # type: ignore[no-untyped-call]
-        unit = engine.draw(self.limits.prefixes, dtype=torch.float64).view(-1, length, len(low))
-        return low + (high - low) * unit
+        rows = torch.arange(len(x), device=x.device)
+        best = picked[:, 0]
+        ones = torch.ones_like(best)
+        safe = begun.safe[rows, best] >= -TOLERANCE
+        found = Found(begun.plans[rows, best], ones, begun.length[best], begun.rho[rows, best], safe)
+        plans = begun.plans[rows[:, None], picked]
+        climbed, place = self._climbed(x, plans, self._whole, self.limits.again)
+        _improve(found, rows, replace(climbed, source=ones, t0=begun.length[picked[rows, place]]))
+        return found
 
 
 def _value(rho: Tensor, safe: Tensor, margin: Tensor) -> Tensor:
@@ -192,8 +188,11 @@ def _improve(found: Found, rows: Tensor, other: Found) -> None:
     """Take over what is better in `other`, the plans of `rows`."""
     now = _value(found.rho[rows], found.safe[rows], found.rho[rows])
     better = (_value(other.rho, other.safe, other.rho) > now).nonzero()[:, 0]
-    picked = Found(*(getattr(other, name)[better] for name in Found.__slots__))
-    _put(found, rows[better], picked)
+    _put(found, rows[better], _of(other, better))
+
+
+def _of(found: Found, rows: Tensor) -> Found:
+    return Found(*(getattr(found, name)[rows] for name in Found.__slots__))
 
 
 def _put(found: Found, rows: Tensor, other: Found) -> None:

@@ -21,6 +21,8 @@ from stlc.controller.kernel import Effort
 from stlc.controller.task import FLOAT32_SLACK
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from stlc.controller.task import Task
 
 THOROUGH = 4000
@@ -94,21 +96,36 @@ class Searcher:
 
         The native kernel leaves what it found on the processor.
         """
-        native = self.task.native
-        if native is not None:
-            seed = int(torch.randint(2**62, (), generator=self.generator))
-            x0, plans, bank = (part.to("cpu", copy=True) for part in (x0, plans, bank))
-            effort = Effort(-(-tries // LANES), self.enough, seed, threads or idle_cores())
-
-            def climb() -> Repaired:
-                best, _ = native.climb(x0, plans, bank, effort)
-                rho = self.task.judge(x0, best, states=False).rho
-                return Repaired(x0, best, rho)
-
-            return self._aside.submit(climb)
+        if self.task.native is not None:
+            return self._aside.submit(self._climbing(x0, plans, bank, tries, threads or idle_cores()))
         done: Future[Repaired] = Future()
         done.set_result(self._climb(x0, plans, bank, tries))
         return done
+
+    @torch.no_grad()
+    def at_once(self, x0: Tensor, plans: Tensor, *, tries: int) -> Repaired:
+        """`repair` without a bank on the caller's own thread, as many threads of the kernel as torch has."""
+        bank = plans.new_zeros(0, *plans.shape[1:])
+        if self.task.native is None:
+            return self._climb(x0, plans, bank, tries)
+        return self._climbing(x0, plans, bank, tries, torch.get_num_threads())()
+
+    def _climbing(
+        self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int, threads: int
+    ) -> Callable[[], Repaired]:
+        """A native climb that is ready to go; it has its own copies and its own random numbers."""
+        native = self.task.native
+        assert native is not None
+        seed = int(torch.randint(2**62, (), generator=self.generator))
+        x0, plans, bank = (part.to("cpu", copy=True) for part in (x0, plans, bank))
+        effort = Effort(-(-tries // LANES), self.enough, seed, threads)
+
+        def climb() -> Repaired:
+            best, _ = native.climb(x0, plans, bank, effort)
+            rho = self.task.judge(x0, best, states=False).rho
+            return Repaired(x0, best, rho)
+
+        return climb
 
     def _climb(self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int) -> Repaired:
         """The same in torch."""

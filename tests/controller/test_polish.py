@@ -6,16 +6,17 @@ import math
 
 import pytest
 import torch
+from torch import Tensor
 
+from stlc.controller.ascent import Ascent
 from stlc.controller.backup import Backup
 from stlc.controller.deploy import SOURCES, Guard
 from stlc.controller.polish import POLISHED, FullBackup, Limits
 from stlc.controller.savable import safely, savable
 from stlc.controller.task import Task
-from stlc.runtime.prefixes import Grid
 from tests.controller.test_backup import F64, Constant, failing, grid
 
-QUICK = Limits(seconds=None, tries=256, prefixes=30, places=2)
+QUICK = Limits(seconds=None, tries=256, drawn=30, places=2)
 
 
 @pytest.mark.parametrize("action", [10.0, -10.0])
@@ -47,7 +48,7 @@ def test_the_rest_of_a_plan_is_a_place_to_start_from(car_task: Task) -> None:
     good = (known.rho >= 0.05).nonzero()[:, 0]
     assert len(good) > 10
     lazy = FullBackup(
-        car_task, Constant(car_task, 10.0), grid=grid(), limits=Limits(seconds=0.0, tries=16, prefixes=1)
+        car_task, Constant(car_task, 10.0), grid=grid(), limits=Limits(seconds=0.0, tries=16, drawn=1)
     )
     found = lazy.search(x[good], plan[good], known.plan[good])
     assert (found.rho >= -1e-6).all()
@@ -55,17 +56,48 @@ def test_the_rest_of_a_plan_is_a_place_to_start_from(car_task: Task) -> None:
 
 def test_no_time_still_gives_an_answer_of_the_papers_rule(car_task: Task) -> None:
     x, plan = failing(car_task, 10.0, 100)
-    limits = Limits(seconds=0.0, tries=16, prefixes=30)
+    limits = Limits(seconds=0.0, tries=16, drawn=30)
     found = FullBackup(car_task, Constant(car_task, 10.0), grid=grid(), limits=limits).search(x, plan)
     assert set(found.source[found.safe & (found.rho < -1e-6)].tolist()) <= {1, POLISHED}
     assert set(found.source[~found.safe].tolist()) <= {2}
     assert torch.isfinite(found.plan).all()
 
 
-def test_whoever_can_be_saved_is_saved(car_task: Task) -> None:
+def test_gradient_steps_mend_what_a_short_climb_does_not(
+    car_task: Task, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x, plan = failing(car_task, 10.0, 100)
+    limits = Limits(seconds=None, tries=16, drawn=1, places=1, again=16)
+    policy, few = Constant(car_task, 10.0), grid(lengths=(1,))
+    found = FullBackup(car_task, policy, grid=few, limits=limits).search(x, plan)
+    monkeypatch.setattr(Ascent, "rise", _as_they_are)
+    climbed = FullBackup(car_task, policy, grid=few, limits=limits).search(x, plan)
+    assert (found.rho >= -1e-6).sum() > (climbed.rho >= -1e-6).sum() + 5
+    assert (found.source[found.rho >= -1e-6] == POLISHED).all()
+
+
+def _as_they_are(_ascent: Ascent, _x: Tensor, places: Tensor, _until: float) -> Tensor:
+    return places
+
+
+def test_without_a_kernel_it_finds_as_much(car_task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
+    x, plan = failing(car_task, 10.0, 40)
+    x, plan = x[:12], plan[:12]
+    policy, limits = Constant(car_task, 10.0), Limits(seconds=None, tries=64, drawn=5, places=1, again=64)
+    found = FullBackup(car_task, policy, grid=grid(), limits=limits).search(x, plan)
+    bare = Task(car_task.compiled, car_task.plain)
+    monkeypatch.setitem(bare.__dict__, "native", None)
+    slow = FullBackup(bare, policy, grid=grid(), limits=limits).search(x, plan)
+    assert torch.isfinite(slow.plan).all()
+    assert (slow.rho >= -1e-6).sum() >= (found.rho >= -1e-6).sum() - 1
+    assert (found.rho >= -1e-6).any()
+
+
+def test_whoever_can_be_saved_is_saved(car_task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Ascent, "rise", _as_they_are)
     x, plan = failing(car_task, 10.0, 300)
     can = savable(car_task, x)
-    poor = {"seconds": None, "tries": 16, "prefixes": 1, "places": 1}
+    poor = {"seconds": None, "tries": 16, "drawn": 1, "places": 1, "again": 16}
     policy, few = Constant(car_task, 10.0), grid(lengths=(1,))
     alone = FullBackup(car_task, policy, grid=few, limits=Limits(**poor, rescue=False)).search(x, plan)
     missed = (can & ~alone.safe).sum()
@@ -79,20 +111,6 @@ def test_plans_that_are_no_numbers_are_places_too(car_task: Task) -> None:
     found = FullBackup(car_task, Constant(car_task, 0.0), grid=grid(), limits=QUICK).search(x, plan)
     assert torch.isfinite(found.plan).all()
     assert found.safe.double().mean() > 0.9
-
-
-def test_a_large_grid_is_sampled_and_a_small_one_is_not(car_task: Task) -> None:
-    full = FullBackup(car_task, Constant(car_task, 0.0), grid=grid(lengths=(1, 2)), limits=QUICK)
-    assert torch.equal(full._prefixes(1), torch.from_numpy(full.grid.prefixes(1)))
-    assert len(full.grid.prefixes(2)) == full.grid.count(2) == 25
-    full = FullBackup(
-        car_task, Constant(car_task, 0.0), grid=Grid(((-2.0, 3.0, 4.0),), (4,), 64), limits=QUICK
-    )
-    drawn = full._prefixes(4)
-    assert drawn.shape == (30, 4, 1)
-    assert (drawn >= -2.0).all()
-    assert (drawn <= 4.0).all()
-    assert len(drawn.unique()) > 100
 
 
 def test_phi_safe_alone_is_a_task(car_task: Task) -> None:
