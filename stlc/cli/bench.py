@@ -9,6 +9,7 @@ from stlc.cli.bench_disturbed import disturbed
 from stlc.cli.bench_family import family
 from stlc.cli.bench_latency import latency
 from stlc.cli.bench_paper import paper
+from stlc.cli.bench_polish import polish
 from stlc.cli.bench_robustness import robustness
 from stlc.cli.bench_step import step
 from stlc.cli.bench_worlds import worlds
@@ -91,6 +92,14 @@ def _register_others(group: typer.Typer) -> None:
             "of 100 ms a decision.",
         )
     )(latency)
+    group.command(
+        help=describe(
+            "Count what mends the plans that the monitor rejects, and time it.",
+            "stlc bench polish",
+            "stlc bench polish runs/ship_track/latest --scenario shifted --page docs/benchmarks.md",
+            note="Gradient steps, climbs, both, and the whole guard, on the same states of a deployment.",
+        )
+    )(polish)
     group.command(
         help=describe(
             "Deploy policies in their worlds, without a guard and with each, and write the table.",
