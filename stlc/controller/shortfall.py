@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from stlc.compile.semantics import TOLERANCE
 from stlc.controller.disturbance import Disturbance
 from stlc.controller.streams import seeded
 
@@ -55,7 +56,7 @@ def measured_margin(task: Task, policy: Policy, steps: int = 1, share: float = S
         for index, rule in enumerate(task.rules)
         if rule.name in safety and len(lost)
     }
-    return {name: loss for name, loss in found.items() if loss > 0.0}
+    return {name: loss for name, loss in found.items() if loss > TOLERANCE}
 
 
 def _followed(task: Task, disturbance: Disturbance, plans: tuple[Tensor, Tensor], steps: int) -> Tensor:

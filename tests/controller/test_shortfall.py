@@ -101,6 +101,15 @@ def test_without_a_safe_plan_nothing_is_measured() -> None:
     assert measured_margin(task_of("windy"), Away()) == {}
 
 
+def test_where_nothing_is_wrong_nothing_is_lost_but_digits(car_task: Task) -> None:
+    class Anyhow:
+        def plan(self, x0: Tensor) -> Tensor:
+            drawn = torch.rand((len(x0), car_task.horizon, 1), generator=torch.Generator().manual_seed(0))
+            return 12.0 * drawn.to(x0) - 9.0
+
+    assert measured_margin(car_task, Anyhow()) == {}
+
+
 def test_margins_are_asked_for_by_number_by_name_or_measured() -> None:
     assert parse_margins([]) == Asked()
     assert parse_margins(["0.2", "p_low=0.5", "0.3"]) == Asked(0.3, {"p_low": 0.5})
