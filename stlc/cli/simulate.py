@@ -38,7 +38,11 @@ GuardOption = Annotated[
     typer.Option(metavar="none|paper|full", help="What guards the policy; `full` polishes plans first."),
 ]
 LimitOption = Annotated[
-    str, typer.Option(metavar="TIME", help="Of a decision of the full guard, per agent; or `none`.")
+    str | None,
+    typer.Option(
+        metavar="TIME",
+        help="Of a guard's decision, per agent, or `none`; 100ms for the full guard if not given.",
+    ),
 ]
 
 MarginOption = Annotated[
@@ -92,7 +96,7 @@ def simulate(
         bool | None, typer.Option("--backup/--no-backup", help="The paper's backup policy.")
     ] = None,
     guard: GuardOption = None,
-    time_limit: LimitOption = "100ms",
+    time_limit: LimitOption = None,
     ceiling: Annotated[
         int, typer.Option(min=0, help="Visited states to search for a plan, where the followed one fails.")
     ] = 0,
@@ -130,9 +134,8 @@ def simulate(
     if window:
         require_robots(opened)
     test, which = opened.task.system.decl.test, tuple(range(seed, seed + seeds))
-    limit = parse_limit(time_limit)
     size = agents or test.agents, steps or test.steps
-    setting = Setting(which, *size, test.replan, limit, ceiling)
+    setting = _hurried(Setting(which, *size, test.replan, ceiling=ceiling), time_limit)
     several = _several(opened, scenario)
     order = _Order(opened, chosen, setting, record, live, margins, parse_overrides(set_), _asked(margin))
     document = _all(order, several) if several else _driven(order, scenario)
@@ -250,6 +253,14 @@ def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Record:
 def _print(lines: Iterator[str], printed: Callable[[str], None]) -> None:
     for line in lines:
         printed(line)
+
+
+def _hurried(setting: Setting, given: str | None) -> Setting:
+    """With the time limit that is given; the paper's guard has none of its own."""
+    if given is None:
+        return setting
+    limit = parse_limit(given)
+    return replace(setting, limit=limit, paper_limit=limit)
 
 
 def _asked(margins: list[str] | None) -> Asked:

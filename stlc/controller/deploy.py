@@ -111,7 +111,8 @@ class Guard:
         self.backup: Backup | FullBackup | Closest | None = None
         match mode:
             case "paper":
-                self.backup = Backup(self.strict, self.policy, grid=grid)
+                seconds = None if limits is None else limits.paper
+                self.backup = Backup(self.strict, self.policy, grid=grid, seconds=seconds)
             case "full" if self.strict is not task and limits is not None:
                 self.backup = Closest(task, self.strict, self.policy, grid=grid, limits=limits)
             case "full":

@@ -110,7 +110,8 @@ def deploy(
         SystemFileError: S206, the world cannot be loaded.
     """
     make = world_type(task.system.decl)
-    guarded = Guard(task, policy, guard, limits=Limits(seconds=setting.limit, margin=setting.margin))
+    limits = Limits(seconds=setting.limit, margin=setting.margin, paper=setting.paper_limit)
+    guarded = Guard(task, policy, guard, limits=limits)
     recorder = Recorder(setting.agents)
     try:
         drive(guarded, make, setting, recorder, watch)
@@ -249,6 +250,7 @@ def as_json(
         "steps": setting.steps,
         "replan": setting.replan,
         "time_limit": setting.limit,
+        "paper_time_limit": setting.paper_limit,
         "ceiling": setting.ceiling,
         "margin": dict(setting.margin),
         "interval": "95 %, Student's t over the deployment seeds",

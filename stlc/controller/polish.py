@@ -53,6 +53,7 @@ class Limits:
         rescue: whether phi_safe alone is hunted for, without the policy, where nothing else was safe.
         margin: what a plan must have to spare of safety requirements before the guard lets it pass, by their
             names, in their units; of the paper's guard too.
+        paper: seconds per agent of the paper's guard, which nobody hurries by default.
     """
 
     seconds: float | None = 0.1
@@ -63,6 +64,7 @@ class Limits:
     again: int = 2000
     rescue: bool = True
     margin: Spare = field(default_factory=dict)
+    paper: float | None = None
 
 
 class FullBackup:

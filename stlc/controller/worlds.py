@@ -31,6 +31,7 @@ class Setting:
     An agent that the world tells something new (a signal of role `env` has changed) plans at once.
 
     `limit`: seconds that a decision of the full guard may take per agent; None: as long as it takes.
+    `paper_limit`: the same of the paper's guard.
     `ceiling`: visited states, of all seeds, that are searched for a plan where the followed one fails.
     `margin`: what a guard asks plans to spare of safety requirements, by their names.
     """
@@ -42,6 +43,7 @@ class Setting:
     limit: float | None = 0.1
     ceiling: int = 0
     margin: Spare = field(default_factory=dict)
+    paper_limit: float | None = None
 
 
 class Worlds:

@@ -99,7 +99,8 @@ def _simulate(material: Material) -> list[str]:
 def _limits(done: Mapping[str, Any]) -> list[str]:
     """What a guard was told, where that is not the usual."""
     words = []
-    if "time_limit" in done and done["time_limit"] != USUAL_LIMIT:
+    hurried = done.get("paper_time_limit") is not None
+    if hurried or ("time_limit" in done and done["time_limit"] != USUAL_LIMIT):
         limit = done["time_limit"]
         words += ["--time-limit", "none" if limit is None else f"{1000 * float(limit):g}ms"]
     words += ["--ceiling", str(done["ceiling"])] if done.get("ceiling") else []

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 from documents import misfits
@@ -106,6 +107,23 @@ def test_the_same_seed_gives_the_same_trace(there: RunDir) -> None:
         assert main(["simulate", "--guard", "paper", *SMALL, "--record", name]) == 0
         found.append(load_trace(there.path.parents[2] / name))
     assert all((found[0].data[signal] == found[1].data[signal]).all() for signal in found[0].data)
+
+
+def test_the_papers_guard_is_hurried_only_where_that_is_asked_for(
+    there: RunDir, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def told(*words: str) -> dict[str, Any]:
+        assert main(["simulate", there.name, *SMALL, "--guard", "paper", *words, "--json"]) == 0
+        document = json.loads(capsys.readouterr().out)
+        assert misfits(document, load_schema("simulate/1")) == []
+        result: dict[str, Any] = document["result"]
+        return result
+
+    calm, hurried = told(), told("--time-limit", "0.001ms")
+    assert (calm["time_limit"], calm["paper_time_limit"]) == (0.1, None)
+    assert hurried["paper_time_limit"] == pytest.approx(1e-6)
+    decided = hurried["guards"]["paper"]["decisions"]
+    assert {rule for rule, share in decided.items() if share and "T0" in rule} == {"backup T0=1"}
 
 
 def test_the_full_guard_is_shown_beside_none(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:

@@ -224,6 +224,7 @@ def test_the_deployment_can_be_repeated_as_it_was(deployed):
     assert f"{words} --set 'T_red=3 s'\n" in text
     assert "--time-limit" not in commands(time_limit=0.1)
     assert "--time-limit 25ms" in commands(time_limit=0.025)
+    assert "--time-limit 100ms" in commands(time_limit=0.1, paper_time_limit=0.1)
 
 
 def test_every_share_of_an_evaluation_has_words():
