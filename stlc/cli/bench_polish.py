@@ -23,8 +23,8 @@ TEXT = """## Mending a plan
 Written by `stlc bench polish`: states of deployments under the paper's guard in which neither the policy's
 plan nor what is left of the one before satisfies the specification. `mended` are those for which a way finds
 a plan that does, of those for which any way or a search finds one; `saved` the same for what is tagged
-`@safety`. Milliseconds for one agent on one thread. A climb tries 2,000 plans from each of the two, a long
-one 32,000.
+`@safety`. Milliseconds of processor time for one agent on one thread. A climb tries 2,000 plans from each of
+the two, a long one 32,000.
 """
 
 
@@ -32,7 +32,12 @@ def polish(
     runs: Annotated[
         list[str] | None, typer.Argument(metavar="RUN…", help="Runs; the newest one if none.")
     ] = None,
-    scenario: Annotated[str, typer.Option("--scenario", metavar="NAME", help="Of the system.")] = "",
+    scenario: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--scenario", metavar="NAME", help="One to try besides the system as it is; repeatable."
+        ),
+    ] = None,
     samples: Annotated[int, typer.Option("--samples", min=1, help="States a policy.")] = 300,
     seeds: SeedsOption = "100,101",
     page: Annotated[
@@ -47,7 +52,8 @@ def polish(
 
     folders = [RunDir.open(name) for name in runs or ["latest"]]
     rows = []
-    for row in mended_rows(folders, scenario=scenario, samples=samples, seeds=parse_seeds(seeds)):
+    scenarios = ("", *(scenario or ()))
+    for row in mended_rows(folders, scenarios=scenarios, samples=samples, seeds=parse_seeds(seeds)):
         say(f"{row.benchmark}, {row.way}: {row.mended} of {row.solvable} mended")
         rows.append(row)
     if page is not None:
