@@ -41,10 +41,10 @@ class Journal:
         if self.writes:
             self.folder.update(facts)
 
-    def back_to(self, step: int) -> None:
-        """Drop the rows past a step."""
+    def before(self, look: int) -> None:
+        """Keep the rows of looks before the one at step `look`, which is still to come."""
         if self.writes:
-            self.folder.keep_rows(lambda row: row.get("step", 0) <= step)
+            self.folder.keep_rows(lambda row: row.get("step", 0) < look)
 
     def row(self, row: Mapping[str, Any]) -> None:
         """Append a row to `train.jsonl`."""

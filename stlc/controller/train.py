@@ -162,7 +162,7 @@ def resume(
             )
         )
     journal = Journal(folder, writes=ranks.first)
-    journal.back_to(trainer.step)
+    journal.before(trainer.next_look)
     journal.note({"status": "running", "steps": trainer.steps})
     before = max((row.get("seconds", 0.0) for row in folder.rows()), default=0.0)
     return _Session(journal, trainer, watch or Watch(), begun - before).finish()
@@ -222,17 +222,15 @@ class _Session:
         self.watch.begun({**chosen, "by_torch": torch_does})
         saved = time.perf_counter()
         self._revise()
-        value = math.nan
         while trainer.step < trainer.steps:
             if trainer.step >= trainer.next_look:
                 self._revise()
                 pace = (self.now() - sat_down) / max(1, trainer.step - first)
                 look = trainer.look()
-                self._row(look, value, pace)
+                self._row(look, pace)
                 if self._hopeless(look):
                     break
-            value = trainer.advance()
-            if not math.isfinite(value):
+            if not math.isfinite(trainer.advance()):
                 raise self._broken()
             due = trainer.step % SAVE_EVERY == 0 or time.perf_counter() - saved > SAVE_SECONDS
             if trainer.ranks.any(due):
@@ -280,14 +278,14 @@ class _Session:
     def _save(self) -> None:
         self.journal.checkpoint(self.trainer.tensors(), self.trainer.facts(), step=self.trainer.step)
 
-    def _row(self, look: Look, value: float, pace: float) -> None:
+    def _row(self, look: Look, pace: float) -> None:
         trainer = self.trainer
         names = [rule.name for rule in trainer.task.rules]
         row = {
             "step": trainer.step,
             "steps": trainer.steps,
             "seconds": self.now() - self.begun,
-            "loss": value,
+            "loss": trainer.loss,
             "accuracy": look.accuracy,
             "requirements": dict(zip(names, look.requirements, strict=True)),
             "feasible": look.feasible,

@@ -85,6 +85,7 @@ class Trainer:
         self.searcher = self._searcher(MARGIN_SHARE * self.margin)
         self.repairing: Future[Repaired] | None = None
         self.accuracy = 0.0
+        self.loss = math.nan
         self.learnt = torch.empty(0, len(task.names), device=device)
 
     def advance(self) -> float:
@@ -105,7 +106,8 @@ class Trainer:
             pairs = zip(self.average.parameters(), self.network.parameters(), strict=True)
             for averaged, current in pairs:
                 averaged.lerp_(current, 1.0 - decay)
-        return float(value)
+        self.loss = float(value)
+        return self.loss
 
     @property
     def rate(self) -> float:
@@ -277,7 +279,8 @@ class Trainer:
 
     def facts(self) -> dict[str, float | int]:
         """The plain numbers that go with `tensors`."""
-        return {
+        last = {"loss": self.loss} if math.isfinite(self.loss) else {}
+        return last | {
             "step": self.step,
             "steps": self.steps,
             "margin": self.margin,
@@ -291,7 +294,7 @@ class Trainer:
         tensors, facts = self._restored(tensors, facts)
         self.step, self.steps = int(facts["step"]), int(facts["steps"])
         self.margin, self.next_look = float(facts["margin"]), int(facts["next_look"])
-        self.accuracy = float(facts["accuracy"])
+        self.accuracy, self.loss = float(facts["accuracy"]), float(facts.get("loss", math.nan))
         self.objective = self._objective()
         self.searcher = self._searcher(MARGIN_SHARE * self.margin)
         if known := _below(tensors, "repairing"):

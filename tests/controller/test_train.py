@@ -77,6 +77,23 @@ def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(
     assert [row["step"] for row in first.rows()] == [row["step"] for row in whole.run.dir.rows()]
 
 
+@pytest.mark.parametrize("written", [False, True])
+def test_a_run_that_ends_at_a_look_repeats_it(car_task: Task, tmp_path: Path, *, written: bool) -> None:
+    """The checkpoint of step 50 is older than the row of the look there, written or not."""
+    config = TrainConfig(held_out=50, method="gradient", steps=60, seed=3, batch=16)
+    whole = train(car_task, config, _folder(car_task, tmp_path / "a", config)).run.dir.rows()
+    count = []
+    first = _folder(car_task, tmp_path / "b", config)
+    train(car_task, config, first, Watch(stop=lambda: bool(count.append(1)) or len(count) == 50))
+    assert first.rows() == []
+    if written:
+        first.append_row(whole[0])
+    resume(first)
+    rows, same = ([{**row, "seconds": 0, "s_per_step": 0} for row in each] for each in (whole, first.rows()))
+    assert rows == same
+    assert [row["step"] for row in rows] == [50]
+
+
 def test_a_resumed_run_has_the_threads_it_was_started_with(
     car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
