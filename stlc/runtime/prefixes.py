@@ -57,8 +57,7 @@ class Grid:
             return self._sampled(length)
         actions = np.array(list(product(*self.values)), dtype=np.float64)
         index = np.indices((len(actions),) * length).reshape(length, -1).T
-        found: NDArray[np.float64] = actions[index]
-        return found
+        return np.ascontiguousarray(actions[index])  # which is laid out as the index is
 
     def _sampled(self, length: int) -> NDArray[np.float64]:
         levels = np.array([len(values) for values in self.values] * length, dtype=np.uint64)
