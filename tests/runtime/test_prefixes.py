@@ -31,7 +31,11 @@ def test_a_grid_that_fits_is_tried_whole_and_in_order() -> None:
     actions = list(product(*found.values))
     assert found.prefixes(2).tolist() == [list(map(list, pair)) for pair in product(actions, repeat=2)]
     assert (found.size(2), found.count(2)) == (36, 36)
-    assert found.prefixes(2).flags.c_contiguous  # what is not, torch.export keeps with a warning
+
+
+def test_prefixes_of_one_control_lie_in_memory_in_order() -> None:
+    """What does not, torch.export keeps with a warning."""
+    assert grid([5]).prefixes(2).flags.c_contiguous
 
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)
