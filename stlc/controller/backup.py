@@ -57,6 +57,15 @@ class Found:
     rho: Tensor
     safe: Tensor
 
+    def of(self, rows: Tensor) -> Found:
+        """Those of some agents, (k,) indices."""
+        return Found(*(getattr(self, name)[rows] for name in Found.__slots__))
+
+    def put(self, rows: Tensor, other: Found) -> None:
+        """Take over what `other` has for some agents, (k,) indices."""
+        for name in Found.__slots__:
+            getattr(self, name)[rows] = getattr(other, name)
+
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
@@ -113,7 +122,7 @@ class Backup:
         """
         clock = Clock(self.seconds, len(x))
         plan = finite(plan.to(x.dtype), self.task)
-        found = _nothing(plan)
+        found = nothing(plan)
         todo = torch.arange(len(x), device=x.device)
         for length in self.grid.lengths:
             prefixes = torch.from_numpy(self.grid.prefixes(length)).to(x)
@@ -209,7 +218,8 @@ def _pieces(rows: Tensor, size: int) -> list[Tensor]:
     return [rows[at : at + size] for at in range(0, len(rows), size)]
 
 
-def _nothing(plan: Tensor) -> Found:
+def nothing(plan: Tensor) -> Found:
+    """Plans (agents, T, m) that nobody has judged."""
     agents = len(plan)
     number = torch.zeros(agents, dtype=torch.int64, device=plan.device)
     return Found(

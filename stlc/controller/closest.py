@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics import TOLERANCE
-from stlc.controller.backup import Found, finite
+from stlc.controller.backup import Found, finite, nothing
 from stlc.controller.polish import POLISHED, SEED, FullBackup, Limits
 from stlc.controller.prefix import robustness_until
 from stlc.controller.savable import safely
@@ -69,7 +69,7 @@ class Closest:
         far = (~lacking).nonzero()[:, 0]
         if len(far):
             strict = self._strict.search(x[far], plan[far], rest[far])
-            _put(found, far, strict)
+            found.put(far, strict)
             short = far[~strict.safe]
             close = self._closer(found, short, x, rest[short])
             self._closer(found, close, x, self._plain.search(x[close], plan[close]).plan)
@@ -82,11 +82,11 @@ class Closest:
 
     def _plain_found(self, x: Tensor, plan: Tensor, rest: Tensor, lacking: Tensor) -> Found:
         """For those who lack a margin now what is found without one, and comes closer; nothing for others."""
-        found = _nothing(plan)
+        found = nothing(plan)
         rows = lacking.nonzero()[:, 0]
         if len(rows):
             plain = self._plain.search(x[rows], plan[rows], rest[rows])
-            _put(found, rows, plain)
+            found.put(rows, plain)
             found.rho[rows] = self.task.judge(x[rows], plain.plan, states=False).rho
             found.safe[rows] = False
             safe = rows[plain.safe]
@@ -97,25 +97,10 @@ class Closest:
         """Climb from `start`, (rows, T, m), and enter what is safe; returns the rows where it is not."""
         if not len(rows):
             return rows
-        bank = start.new_zeros(0, *start.shape[1:])
-        threads = torch.get_num_threads()
-        climb = self._searcher.begin(x[rows], start, bank, tries=self.limits.tries, threads=threads)
-        climbed = climb.result().plans.to(x.dtype)
+        climbed = self._searcher.at_once(x[rows], start, tries=self.limits.tries).plans.to(x.dtype)
         safe = self._plain.task.judge(x[rows], climbed, states=False).safe >= -TOLERANCE
         done = rows[safe]
         found.plan[done] = climbed[safe]
         found.rho[done] = self.task.judge(x[done], climbed[safe], states=False).rho
         found.source[done], found.t0[done] = POLISHED, 0
         return rows[~safe]
-
-
-def _nothing(plan: Tensor) -> Found:
-    """Plans that nobody has looked at."""
-    number = torch.zeros(len(plan), dtype=torch.int64, device=plan.device)
-    never = torch.zeros(len(plan), dtype=torch.bool, device=plan.device)
-    return Found(plan.clone(), number, number.clone(), torch.full_like(plan[:, 0, 0], -torch.inf), never)
-
-
-def _put(found: Found, rows: Tensor, other: Found) -> None:
-    for name in Found.__slots__:
-        getattr(found, name)[rows] = getattr(other, name)

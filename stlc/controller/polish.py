@@ -120,10 +120,10 @@ class FullBackup:
         if len(todo) and perf_counter() < until and len(self.beginnings.heads):
             anew = self._begun_anew(x[todo])
             safe = anew.safe.nonzero()[:, 0]
-            _put(found, todo[safe], _of(anew, safe))
+            found.put(todo[safe], anew.of(safe))
         lost = (~found.safe).nonzero()[:, 0]
         if len(lost):
-            _put(found, lost, self.paper.search(x[lost], plan[lost]))
+            found.put(lost, self.paper.search(x[lost], plan[lost]))
         return found
 
     def _polished(self, x: Tensor, places: Tensor, until: float) -> Found:
@@ -190,13 +190,4 @@ def _improve(found: Found, rows: Tensor, other: Found) -> None:
     """Take over what is better in `other`, the plans of `rows`."""
     now = _value(found.rho[rows], found.safe[rows], found.rho[rows])
     better = (_value(other.rho, other.safe, other.rho) > now).nonzero()[:, 0]
-    _put(found, rows[better], _of(other, better))
-
-
-def _of(found: Found, rows: Tensor) -> Found:
-    return Found(*(getattr(found, name)[rows] for name in Found.__slots__))
-
-
-def _put(found: Found, rows: Tensor, other: Found) -> None:
-    for name in Found.__slots__:
-        getattr(found, name)[rows] = getattr(other, name)
+    found.put(rows[better], other.of(better))
