@@ -237,6 +237,11 @@ def made_here() -> str:
     )
 
 
+def table_section(text: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A section of a page: what it is about, a table, and the machine that it was measured on."""
+    return "\n".join([text, *markdown(header, rows), "", made_here()])
+
+
 def _counted(count: int, what: str) -> str:
     """Such as `1 core`."""
     return f"{count} {what if count != 1 else what.removesuffix('s')}"

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.bench_options import SeedsOption
+from stlc.cli.bench_options import MaybePageOption, SeedsOption, SomeRunsArgument
 from stlc.cli.options import JsonOption
 from stlc.cli.output import emit, emit_json, say, table
 from stlc.cli.ranges import parse_seeds
@@ -28,19 +26,15 @@ begun as well, the choice where the world leaves one (of five stations), and wha
 
 
 def latency(
-    runs: Annotated[
-        list[str] | None, typer.Argument(metavar="RUN…", help="Runs; the newest one if none.")
-    ] = None,
+    runs: SomeRunsArgument = None,
     samples: Annotated[int, typer.Option("--samples", min=2, help="States a policy.")] = 600,
     seeds: SeedsOption = "100,101",
-    page: Annotated[
-        Path | None, typer.Option("--page", metavar="FILE", help="A page that takes the table.")
-    ] = None,
+    page: MaybePageOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Print the table; write it where a page is named."""
     from stlc.bench.latency import rows_of
-    from stlc.bench.results import write_section
+    from stlc.bench.results import table_section, write_section
     from stlc.rundir import RunDir
 
     folders = [RunDir.open(name) for name in runs or ["latest"]]
@@ -48,20 +42,14 @@ def latency(
     for row in rows_of(folders, samples=samples, seeds=parse_seeds(seeds)):
         say(f"{row.benchmark}, {row.guard}: {_cell(row.every, 'median')} ms")
         rows.append(row)
+    cells = [_cells(row) for row in rows]
     if page is not None:
-        write_section(page, "latency", _section(rows))
+        write_section(page, "latency", table_section(TEXT, HEADER, cells))
     if as_json:
         result = {"what": "latency", "rows": [asdict(row) for row in rows]}
         emit_json("bench/1", ok=True, exit_code=0, result=result)
         return
-    emit(table([_cells(row) for row in rows], header=HEADER, indent=""))
-
-
-def _section(rows: Sequence[Row]) -> str:
-    """The table as Markdown, with the machine behind it."""
-    from stlc.bench.results import made_here, markdown
-
-    return "\n".join([TEXT, *markdown(HEADER, [_cells(row) for row in rows]), "", made_here()])
+    emit(table(cells, header=HEADER, indent=""))
 
 
 def _cells(row: Row) -> tuple[str, ...]:

@@ -49,6 +49,12 @@ ThreadsOption = Annotated[int, typer.Option("--threads", min=1, help="Threads of
 HeldOutOption = Annotated[int, typer.Option("--held-out", min=1, help="Held-out states of the verdicts.")]
 OutOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the results.")]
 RunsOption = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Folder of the runs behind them.")]
+SomeRunsArgument = Annotated[
+    list[str] | None, typer.Argument(metavar="RUN…", help="Runs; the newest one if none.")
+]
+MaybePageOption = Annotated[
+    Path | None, typer.Option("--page", metavar="FILE", help="A page that takes the table.")
+]
 PageOption = Annotated[Path, typer.Option("--page", metavar="FILE", help="The page that shows them.")]
 
 

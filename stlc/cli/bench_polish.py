@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.bench_options import SeedsOption
+from stlc.cli.bench_options import MaybePageOption, SeedsOption, SomeRunsArgument
 from stlc.cli.options import JsonOption
 from stlc.cli.output import emit, emit_json, say, table
 from stlc.cli.ranges import parse_seeds
@@ -29,9 +27,7 @@ the two, a long one 32,000.
 
 
 def polish(
-    runs: Annotated[
-        list[str] | None, typer.Argument(metavar="RUN…", help="Runs; the newest one if none.")
-    ] = None,
+    runs: SomeRunsArgument = None,
     scenario: Annotated[
         list[str] | None,
         typer.Option(
@@ -40,14 +36,12 @@ def polish(
     ] = None,
     samples: Annotated[int, typer.Option("--samples", min=1, help="States a policy.")] = 300,
     seeds: SeedsOption = "100,101",
-    page: Annotated[
-        Path | None, typer.Option("--page", metavar="FILE", help="A page that takes the table.")
-    ] = None,
+    page: MaybePageOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Print the table; write it where a page is named."""
     from stlc.bench.polish import mended_rows
-    from stlc.bench.results import write_section
+    from stlc.bench.results import table_section, write_section
     from stlc.rundir import RunDir
 
     folders = [RunDir.open(name) for name in runs or ["latest"]]
@@ -56,20 +50,14 @@ def polish(
     for row in mended_rows(folders, scenarios=scenarios, samples=samples, seeds=parse_seeds(seeds)):
         say(f"{row.benchmark}, {row.way}: {row.mended} of {row.solvable} mended")
         rows.append(row)
+    cells = [_cells(row) for row in rows]
     if page is not None:
-        write_section(page, "polish", _section(rows))
+        write_section(page, "polish", table_section(TEXT, HEADER, cells))
     if as_json:
         result = {"what": "polish", "rows": [asdict(row) for row in rows]}
         emit_json("bench/1", ok=True, exit_code=0, result=result)
         return
-    emit(table([_cells(row) for row in rows], header=HEADER, indent=""))
-
-
-def _section(rows: Sequence[Mended]) -> str:
-    """The table as Markdown, with the machine behind it."""
-    from stlc.bench.results import made_here, markdown
-
-    return "\n".join([TEXT, *markdown(HEADER, [_cells(row) for row in rows]), "", made_here()])
+    emit(table(cells, header=HEADER, indent=""))
 
 
 def _cells(row: Mended) -> tuple[str, ...]:
