@@ -1,15 +1,13 @@
-"""The budget: a file is one idea, a function one step of it."""
+"""The budget: a file is one idea, whole; branching in a function is limited by the linter (complexity 10)."""
 
 from __future__ import annotations
 
-import ast
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-FILE_LINES = 400
-FUNCTION_LINES = 60
+FILE_LINES = 800
 SYSTEM_LINES = 150
 
 CODE = sorted(path for folder in ("stlc", "tools", "examples") for path in (ROOT / folder).rglob("*.py"))
@@ -20,18 +18,6 @@ NAMES = [str(path.relative_to(ROOT)) for path in CODE]
 def test_a_file_fits(path):
     count = len(path.read_text(encoding="utf-8").splitlines())
     assert count <= FILE_LINES, f"{count} lines"
-
-
-@pytest.mark.parametrize("path", CODE, ids=NAMES)
-def test_a_function_fits(path):
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    long = [
-        f"{node.name}: {(node.end_lineno or 0) - node.lineno + 1} lines"
-        for node in ast.walk(tree)
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-        and (node.end_lineno or 0) - node.lineno + 1 > FUNCTION_LINES
-    ]
-    assert not long, "; ".join(long)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.yaml")), ids=lambda path: path.name)
