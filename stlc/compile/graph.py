@@ -34,7 +34,7 @@ MAX_VALUES = 1 << 27
 """The same over all traces: a gigabyte."""
 
 
-def evaluate(  # noqa: PLR0913 - the instants and the end of the trace belong to the question
+def evaluate(
     formulas: Sequence[ir.Formula],
     env: Mapping[str, Array],
     *,

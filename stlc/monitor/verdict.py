@@ -99,7 +99,7 @@ class Monitor:
 
     # -------------------------------------------------------------------- judging
 
-    def check(  # noqa: PLR0913 - one question, by name
+    def check(
         self,
         signals: Subject,
         *,
