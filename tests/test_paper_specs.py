@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from stlc.compile.pipeline import compile_spec
 from stlc.dynamics.schema import load_system_decl
 from stlc.grammar.format import format_text
 from stlc.grammar.parser import parse
+from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 
 ROOT = Path(__file__).parent.parent
@@ -39,3 +41,13 @@ def test_a_benchmark_is_whole(name: str) -> None:
     assert compiled.warnings == ()
     assert compiled.safety
     assert format_text(source) == source.text
+
+
+def test_a_leader_that_turns_off_is_no_collision() -> None:
+    monitor = Monitor(ROOT / "specs/traffic.stl")
+    signals = {name: np.zeros(60) for name in ("x", "v", "sign", "tau", "v_lead", "yielding")}
+    dx = np.linspace(5.0, 2.0, 60)
+    dx[20:] = -1.0  # the sentinel: from here on there is no leading car
+    assert monitor.check(signals | {"dx": dx})["no_collision"].satisfied
+    dx[15] = 0.9
+    assert not monitor.check(signals | {"dx": dx})["no_collision"].satisfied

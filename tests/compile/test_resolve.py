@@ -63,12 +63,12 @@ def test_the_predicates_of_traffic_are_those_of_the_paper(x, tau, sign, yielding
         return reference.number(node.num, row)
 
     collision = rules["no_collision"]
-    assert isinstance(collision, typed.Logic)
-    guard, always = collision.items
-    assert isinstance(always, typed.Temporal)
-    assert (always.interval.lo, always.interval.hi) == (Time(), Time(horizons=Fraction(1)))
+    assert isinstance(collision, typed.Temporal)
+    assert (collision.interval.lo, collision.interval.hi) == (Time(), Time(horizons=Fraction(1)))
+    assert isinstance(collision.body, typed.Logic)
+    guard, apart = collision.body.items
     assert value(guard) == pytest.approx(x + 0.5)
-    assert value(always.body) == pytest.approx(x - 1)
+    assert value(apart) == pytest.approx(x - 1)
 
     give_way = rules["give_way"]
     assert isinstance(give_way, typed.Logic)

@@ -48,11 +48,11 @@ def test_a_requirement_says_its_horizon_and_its_comment(traffic):
 
 @pytest.mark.parametrize("inside", [0, 3, 6, 8, 12])
 def test_an_interval_in_seconds_and_steps(traffic, inside):
-    assert "[0 s, 2.5 s] = samples 0..25" in say(traffic, "always[0, T] dx", inside)
+    assert "[0 s, 2.5 s] = samples 0..25" in say(traffic, "always[0, T] (dx", inside)
 
 
 def test_the_horizon(traffic):
-    assert "2.5 s = 25 steps" in say(traffic, "T] dx")
+    assert "2.5 s = 25 steps" in say(traffic, "T] (dx")
 
 
 def test_the_inner_of_two_intervals(write):

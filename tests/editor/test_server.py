@@ -134,12 +134,12 @@ def test_rename(session, project, spec):
 
 
 def test_formatting(session, project, spec):
-    untidy = spec.replace("always[0, T] dx > gap", "G [0,T]   dx>gap")
+    untidy = spec.replace("always[0, T] (dx > -0.5 m -> dx > gap)", "G [0,T]   (dx > -0.5 m -> dx>gap)")
     session.open(uri(project), untidy)
     options = {"tabSize": 4, "insertSpaces": True}
     document = {"textDocument": {"uri": uri(project)}, "options": options}
     (edit,) = session.request("textDocument/formatting", document)
-    assert "always[0, T] dx > gap" in edit["newText"]
+    assert "always[0, T] (dx > -0.5 m -> dx > gap)" in edit["newText"]
     session.change(uri(project), edit["newText"])
     assert not session.request("textDocument/formatting", document)
     session.change(uri(project), spec + "require")
