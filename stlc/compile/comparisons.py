@@ -11,7 +11,18 @@ from stlc.compile.regions import signed_distance
 from stlc.compile.scope import Scope
 from stlc.compile.sorts import Need, as_formula, as_number, loose_number
 from stlc.compile.swept import swept_distance
-from stlc.compile.values import REGION_TYPES, Box, Complement, Number, Region, Swept, Value, Vector, noun
+from stlc.compile.values import (
+    REGION_TYPES,
+    Box,
+    Complement,
+    Number,
+    Region,
+    Swept,
+    Value,
+    Vector,
+    is_formula,
+    noun,
+)
 from stlc.compile.values import Label as Member
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
@@ -100,7 +111,7 @@ def _equality(
     """`==` on whole numbers, truth values and enums; its margin is 1/2 - |a - b|."""
     whole, place = spans
     _refuse_vectors(left, right, "==", scope)
-    if any(isinstance(value, typed.Node) for _, value in (left, right)):
+    if any(is_formula(value) for _, value in (left, right)):
         need = Need("`==` between truth values", "the other side")
         sides = [as_formula(value, expr, need, scope) for expr, value in (left, right)]
         return typed.Logic(whole, "<->", (sides[0], sides[1]))

@@ -22,7 +22,7 @@ from stlc.compile.operations import OPERATIONS
 from stlc.compile.outside import outside
 from stlc.compile.scope import TIME_WORDS, Definition, External, Failed, Scope, reserved
 from stlc.compile.sorts import Need, as_formula, as_number, loose_number
-from stlc.compile.values import Number, Origin, Value, Vector, at, literal
+from stlc.compile.values import Number, Origin, Value, Vector, at, is_formula, literal
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
 from stlc.source import Span
@@ -48,7 +48,9 @@ def _is_written_twice(expr: ast.Expr, value: Value) -> bool:
     match expr:
         case ast.Logic(op="<->" | "xor") | ast.Until(op="unless"):
             return True
-        case ast.IfThenElse() | ast.Compare():
+        case ast.IfThenElse():
+            return is_formula(value)
+        case ast.Compare():
             return isinstance(value, typed.Logic)
         case ast.Call():
             return isinstance(value, typed.Edge)
@@ -343,7 +345,7 @@ def _held(number: Number, name: str, expr: ast.Freeze, bindings: list[tuple[str,
         return number
     key = f"{name}#{expr.span.start}@{expr.span.source.name}"
     bindings.append((key, number.num))
-    return replace(number, num=ir.Held(key), origin=None)
+    return replace(number, num=ir.Held(key), formula=None, origin=None)
 
 
 def _domain(expr: ast.Quantifier, scope: Scope) -> Iterator[Number]:

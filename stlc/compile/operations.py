@@ -13,11 +13,11 @@ from typing import Any
 from stlc.compile import comparisons, moments, typed
 from stlc.compile.algebra import too_large
 from stlc.compile.calls import unsupported
-from stlc.compile.choices import choose_formula, choose_number
+from stlc.compile.choices import choose
 from stlc.compile.functions import OPERATORS
 from stlc.compile.scope import Scope
 from stlc.compile.sorts import Need, as_number
-from stlc.compile.values import Moment, Number, Swept, Value, Vector, is_formula, literal
+from stlc.compile.values import Moment, Number, Swept, Value, Vector, literal
 from stlc.compile.vectors import broadcast, negate
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
@@ -162,7 +162,6 @@ def _member_parts(expr: ast.Member) -> Sequence[ast.Expr]:
 
 def _if(expr: ast.IfThenElse, values: Sequence[Value], scope: Scope) -> Value:
     cond, yes, no = values
-    choose = choose_formula if is_formula(yes) or is_formula(no) else choose_number
     return choose(expr, (cond, yes, no), scope)
 
 

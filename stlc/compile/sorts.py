@@ -65,6 +65,8 @@ def loose_number(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> Numb
 def as_formula(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> typed.Formula:
     """The value as a formula; a bool signal holds where it is above 1/2. Raises Failed (E201)."""
     match value:
+        case Number(formula=formula) if formula is not None:
+            return formula
         case Number(kind="bool") as number:
             margin = apply("sub", (replace(number, kind="real"), half(expr.span)), expr.span, scope)
             return typed.Pred(expr.span, margin.num, strict=False)

@@ -45,10 +45,15 @@ def _shifted(value: Value, steps: int, places: tuple[ast.Expr, Span], name: str,
         case Number() if value.kind != "bool":
             return replace(value, num=later(value.num, steps), origin=None)
         case Vector(items):
-            moved = tuple(replace(item, num=later(item.num, steps)) for item in items)
-            return Vector(moved, span)
+            return Vector(tuple(_later(item, steps, span) for item in items), span)
         case _:
             return typed.Shift(span, steps, as_formula(value, expr, Need(name), scope))
+
+
+def _later(number: Number, steps: int, span: Span) -> Number:
+    """A component `steps` samples later; of a choice between bools the formula as well."""
+    formula = None if number.formula is None else typed.Shift(span, steps, number.formula)
+    return replace(number, num=later(number.num, steps), formula=formula)
 
 
 def _delta(value: Value, expr: ast.Expr, span: Span, scope: Scope) -> Value:

@@ -34,6 +34,7 @@ class Number:
         exact: the value of a constant that is rational.
         kind: `bool` stands for 0/1 and is a formula too; `enum` is one of `labels`.
         labels: (label, value) pairs of an enum.
+        formula: of a choice between bools: the choice between formulas, with their margins.
         span: where it is written.
         origin: where its name was declared.
     """
@@ -45,6 +46,7 @@ class Number:
     exact: Fraction | None = None
     kind: Kind = "real"
     labels: Labels = ()
+    formula: typed.Formula | None = None
     span: Span | None = field(default=None, compare=False, repr=False)
     origin: Origin | None = field(default=None, compare=False, repr=False)
 
@@ -157,8 +159,8 @@ Value: TypeAlias = Number | Vector | Swept | Label | Moment | Region | typed.For
 
 
 def is_formula(value: Value) -> bool:
-    """Whether it is true or false as it stands (a bool signal is not yet a formula)."""
-    return isinstance(value, typed.Node)
+    """Whether it has margins of its own (the margin of a bool signal is always a half)."""
+    return isinstance(value, typed.Node) or (isinstance(value, Number) and value.formula is not None)
 
 
 def literal(value: Fraction | float | int, span: Span | None = None) -> Number:

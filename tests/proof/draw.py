@@ -53,6 +53,7 @@ class Taste:
         plain: comparisons of x, y and z alone, written as every tool reads them.
         past: operators that look back.
         steps: `next`, `prev`, `rise`, `fall`.
+        bools: choices between bools, which are numbers as well.
         depth: how deep operators nest.
     """
 
@@ -64,6 +65,7 @@ class Taste:
     plain: bool = False
     past: bool = True
     steps: bool = True
+    bools: bool = False
     depth: int = 4
 
 
@@ -127,7 +129,19 @@ class Drawing:
         return Edge(self.rng.choice(["rise", "fall"]), self._below(depth))
 
     def _choice(self, depth: int) -> Formula:
+        if self.taste.bools and self.rng.random() < 0.5:
+            return self._between_bools(depth)
         return Choice(self._below(depth), self._below(depth), self._below(depth))
+
+    def _between_bools(self, depth: int) -> Formula:
+        """A choice between bools, or between such choices."""
+        if depth > 1 and self.rng.random() < 0.3:
+            return Choice(self._below(depth), self._between_bools(depth - 1), self._bool())
+        return Choice(self._below(depth), self._bool(), self._bool())
+
+    def _bool(self) -> Formula:
+        name = self.rng.choice(["flag", "lamp"])
+        return Atom(name, lambda row: row[name] - 0.5, False)
 
     def _freeze(self, depth: int) -> Formula:
         """One or two numbers, if what is below reads them."""
@@ -413,6 +427,7 @@ def trace(rng: random.Random, *, longest: int = 18, generic: bool = False) -> di
         "flag": source.integers(0, 2, size=samples).astype(float),
         "mode": source.choice(list(MODES.values()), size=samples).astype(float),
         "q": numbers(samples, 3),
+        "lamp": source.integers(0, 2, size=samples).astype(float),
     }
 
 

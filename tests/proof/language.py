@@ -58,7 +58,7 @@ class Pair:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """`if cond then yes else no`."""
+    """`if cond then yes else no`: `(cond and yes) or (not cond and no)`."""
 
     cond: Formula
     yes: Formula

@@ -142,9 +142,9 @@ class Sets:
             case Pair():
                 return self._pair(formula, truth)
             case Choice(cond, yes, no):
-                first = _joined([self.of(cond, not truth), self.of(yes, truth)], every=not truth)
-                second = _joined([self.of(cond, truth), self.of(no, truth)], every=not truth)
-                return _joined([first, second], every=truth)
+                first = _joined([self.of(cond, truth), self.of(yes, truth)], every=truth)
+                second = _joined([self.of(cond, not truth), self.of(no, truth)], every=truth)
+                return _joined([first, second], every=not truth)
             case Over():
                 return self._over(formula, truth)
             case Meet():

@@ -29,7 +29,7 @@ ENDS = ("truncate", "lower", "upper")
 @pytest.mark.parametrize("numbers", seeds(FULL))
 def test_every_value_is_the_definition(numbers: range) -> None:
     for seed in numbers:
-        case = Case(seed)
+        case = Case(seed, Taste(bools=seed % 3 == 0))
         monitor = case.monitor()
         wanted = {end: np.array(robustness(case.formula, case.record(end))) for end in ENDS}
         low, high = monitor.bounds(case.signals)
@@ -83,7 +83,7 @@ def test_the_other_evaluator_says_the_same(numbers: range) -> None:
 @pytest.mark.parametrize("numbers", seeds(FULL))
 def test_truth_is_boolean_and_agrees_with_the_sign(numbers: range) -> None:
     for seed in numbers:
-        case = Case(seed)
+        case = Case(seed, Taste(bools=seed % 3 == 0))
         monitor = case.monitor()
         check_truth(case, monitor, "all")
         check_truth(case, monitor, seed % case.samples)
@@ -120,7 +120,7 @@ def check_truth(case: Case, monitor: Monitor, at: Any) -> None:
 def test_the_mission_clock(numbers: range) -> None:
     """Absolute intervals anywhere: judged once, at the first sample, whatever stands around them."""
     for seed in numbers:
-        case = Case(seed, Taste(absolute=True, constants=False, depth=3), longest=30)
+        case = Case(seed, Taste(absolute=True, constants=False, bools=seed % 2 == 0, depth=3), longest=30)
         monitor = case.monitor()
         cut, least, most = (robustness(case.formula, case.record(end))[0] for end in ENDS)
         case.same(monitor.robustness(case.signals, end="truncate", at=0), cut, "truncate")
@@ -139,7 +139,7 @@ def test_on_the_mission_clock_the_end_is_the_last_sample() -> None:
 def test_planning_windows(numbers: range) -> None:
     """Where `T` and `end` are both meant, `end` is the end of each planning window."""
     for seed in numbers:
-        case = Case(seed, Taste(windows=True, constants=False, depth=3))
+        case = Case(seed, Taste(windows=True, constants=False, bools=seed % 2 == 0, depth=3))
         monitor = case.monitor()
         (rule,) = monitor.compiled.requirements
         low, high = monitor.bounds(case.signals)

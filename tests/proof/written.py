@@ -40,6 +40,7 @@ enum Mode { idle = 0, go = 1, halt = 3 }
 signal x, y, z
 signal n : int
 signal flag : bool
+signal lamp : bool
 signal mode : Mode
 signal q : real[3]
 
