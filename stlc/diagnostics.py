@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -132,6 +133,19 @@ class MissingError(StlcError):
     exit_code = 5
 
 
+class Notice(UserWarning):
+    """Something about the machine that changes no result; the command line shows the finding, once."""
+
+    def __init__(self, finding: Diagnostic) -> None:
+        super().__init__(": ".join((finding.code, "; ".join((finding.message, *finding.help)))))
+        self.finding = finding
+
+
+def notice(finding: Diagnostic) -> None:
+    """Warn of something about the machine."""
+    warnings.warn(Notice(finding), stacklevel=3)
+
+
 CODES: dict[str, str] = {
     # reading
     "E001": "a character that is not of the language",
@@ -226,6 +240,8 @@ CODES: dict[str, str] = {
     "R402": "a policy whose plan is not a number",
     "R403": "a process of a training that is gone",
     "R404": "requirements that no plan satisfies",
+    "W701": "a cache folder, or a file in it, that others could have changed",
+    "W702": "a C compiler that fails or hangs",
     "U101": "a command line that cannot be understood",
     "U102": "a file that does not exist",
     # the tool itself

@@ -1,17 +1,17 @@
-"""C text -> a loaded function: built by the system's compiler on first use, cached by content.
+"""C text -> a loaded library: built by the system's compiler on first use, kept in the cache folder.
 
-Where there is no compiler, or it fails, there is no kernel and the caller goes on without.
+Where there is no compiler, or it fails or hangs, there is no kernel and the caller goes on without. A kept
+library is named after what it was built from and by (text, compiler, its version, flags, processor) and after
+its own content; one that is not what its name says is not loaded.
 """
 
 from __future__ import annotations
 
 import ctypes
 import hashlib
-import os
 import platform
-import shutil
-import subprocess
 import sys
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +19,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stlc.diagnostics import MissingError
-from stlc.files import atomic_path
+from stlc import cache
+from stlc.cache import Cache
+from stlc.diagnostics import Diagnostic, notice
+from stlc.toolchain import CompilerError, compiled, compiler, failure, remember, trouble, version
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,18 +38,6 @@ SMALL = 512
 """Rows below which a second thread costs more than it saves."""
 
 Doubles = "NDArray[np.float64]"
-
-
-def cache_folder() -> Path:
-    """Where built kernels lie: `$XDG_CACHE_HOME/stlc`, else `~/.cache/stlc`."""
-    home = os.environ.get("XDG_CACHE_HOME")
-    return (Path(home) if home else Path.home() / ".cache") / "stlc"
-
-
-def compiler() -> str | None:
-    """The system's C compiler: `$CC`, `cc`, `gcc` or `clang`; None where there is none."""
-    names = (os.environ.get("CC"), "cc", "gcc", "clang")
-    return next((found for name in names if name and (found := shutil.which(name))), None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +64,7 @@ class Climb:
 class Kernel:
     """A built `judge` and `climb`; see `stlc.compile.emit_c`."""
 
-    def __init__(self, path: Path, *, states: int, rules: int, steps: int) -> None:
-        library = ctypes.CDLL(str(path))
+    def __init__(self, library: ctypes.CDLL, *, states: int, rules: int, steps: int) -> None:
         self._judge, self._climb = library.judge, library.climb
         self._judge.argtypes = [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 4
         self._climb.argtypes = [
@@ -162,8 +151,8 @@ class Outcome:
 class Adjoint:
     """A built `pull`; see `stlc.compile.c_adjoint`."""
 
-    def __init__(self, path: Path) -> None:
-        self._pull = ctypes.CDLL(str(path)).pull
+    def __init__(self, library: ctypes.CDLL) -> None:
+        self._pull = library.pull
         self._pull.argtypes = [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 5 + [ctypes.c_double]
 
     def pull(
@@ -214,41 +203,116 @@ def _share(rows: Callable[[int, int], int], batch: int, threads: int) -> None:
         raise MemoryError
 
 
-def build(text: str) -> Path | None:
-    """The shared library of a C text, built if it is not in the cache; None where that cannot be done."""
+def load(text: str) -> ctypes.CDLL | None:
+    """The library of a C text, built if it is not in the cache; None where that cannot be done."""
     using = compiler()
     if using is None:
         return None
-    key = hashlib.sha256("\0".join((text, using, *FLAGS, *VECTOR_FLAGS, _processor())).encode()).hexdigest()[
-        :32
-    ]
-    path = cache_folder() / f"kernel-{key}.so"
-    if path.exists():
-        return path
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(path) as beside:
-            source = beside.with_suffix(".c")
-            source.write_text(text)
-            try:
-                _compile(using, source, beside)
-            finally:
-                source.unlink(missing_ok=True)
-    except (OSError, subprocess.SubprocessError, MissingError):
+        return _loaded(text, using)
+    except CompilerError as error:
+        said = f"the C compiler `{using}` {error.why}; the same is done without it, slower"
+        notice(Diagnostic("W702", said, help=("`stlc doctor` tries it again",)))
         return None
-    return path
 
 
-def _compile(using: str, source: Path, target: Path) -> None:
+def why_none(text: str) -> str:
+    """Why `load` gave None for a text, in words that follow "because"."""
+    using = compiler()
+    if using is None:
+        return "there is no C compiler"
+    try:
+        why = trouble(_key(text, using))
+    except CompilerError as error:
+        why = error.why
+    return f"the C compiler {why or 'fails'}"
+
+
+def _loaded(text: str, using: str) -> ctypes.CDLL | None:
+    """The library, kept or built. Raises CompilerError."""
+    key = _key(text, using)
+    kept = cache.lasting()
+    places = [place for place in (kept, _made.get("here")) if place is not None]
+    for place in places:
+        library = _kept(place, key)
+        if library is not None:
+            return library
+    why = trouble(key)
+    if why:
+        raise CompilerError(why)
+    data = _built(text, using, key)
+    if data is None:
+        return None
+    name = f"kernel-{key}-{hashlib.sha256(data).hexdigest()[:32]}.so"
+    if kept is None:
+        why = cache.why_not()
+    elif not kept.keep(name, data):
+        why = f"`{kept.shown}` cannot be written to"
+    elif (library := _opened(kept, name)) is not None:
+        return library
+    else:
+        why = f"programs cannot be loaded from `{kept.shown}`"
+    here = _made["here"] = cache.temporary()
+    if here is None or not here.keep(name, data):
+        raise CompilerError("has no folder to write to")
+    notice(Diagnostic("W701", f"{why}; kernels in C are built anew in every process"))
+    return _opened(here, name)
+
+
+_made: dict[str, Cache | None] = {}
+"""The temporary folder, once it was needed."""
+
+
+def _key(text: str, using: str) -> str:
+    """What a library is built from and by. Raises CompilerError."""
+    parts = (text, using, version(using), *FLAGS, *VECTOR_FLAGS, _processor())
+    return hashlib.sha256("\0".join(parts).encode(errors="surrogateescape")).hexdigest()[:32]
+
+
+def _kept(place: Cache, key: str) -> ctypes.CDLL | None:
+    """A library that was built before, if its content is what it was then."""
+    for name in place.names(f"kernel-{key}-"):
+        data = place.read(name)
+        if data is None:
+            continue
+        if name != f"kernel-{key}-{hashlib.sha256(data).hexdigest()[:32]}.so":
+            place.refuse(name, "is not what was written there")
+        elif (library := _opened(place, name)) is not None:
+            return library
+    return None
+
+
+def _opened(place: Cache, name: str) -> ctypes.CDLL | None:
+    """A library in memory; None where the system refuses, such as from a disk without programs."""
+    try:
+        return ctypes.CDLL(str(place.folder / name))
+    except OSError:
+        return None
+
+
+def _built(text: str, using: str, key: str) -> bytes | None:
+    """The bytes of a library; None where there is no room to build. Raises CompilerError."""
+    try:
+        with tempfile.TemporaryDirectory(prefix="stlc-") as folder:
+            source, target = Path(folder) / "kernel.c", Path(folder) / "kernel.so"
+            source.write_text(text, encoding="utf-8")
+            _compile(using, source, target, key)
+            return target.read_bytes()
+    except OSError:
+        return None
+
+
+def _compile(using: str, source: Path, target: Path, key: str) -> None:
     """Build with vector forms of sine and the like where the C library has them, without elsewhere."""
     fast = [[*VECTOR_FLAGS, "-lmvec"]] if sys.platform == "linux" and platform.machine() == "x86_64" else []
     level = "-O3" if source.stat().st_size < LONG else "-O2"
     for attempt in (*fast, []):
-        command = [using, level, *FLAGS, str(source), "-o", str(target), *attempt, "-lm"]
-        done = subprocess.run(command, check=False, capture_output=True, timeout=120)
-        if done.returncode == 0:
+        done = compiled(using, [level, *FLAGS, str(source), "-o", str(target), *attempt, "-lm"])
+        if done.code == 0 and target.is_file():
             return
-    done.check_returncode()
+    why = failure(done)
+    remember(key, why)
+    raise CompilerError(why)
 
 
 def _processor() -> str:

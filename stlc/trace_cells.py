@@ -83,12 +83,11 @@ def read_lines(lines: Lines) -> list[Array] | None:
 @cache
 def _library() -> ctypes.CDLL | None:
     """The built `cells.c`; None where there is no compiler for it."""
-    from stlc.native import build
+    from stlc.native import load
 
-    path = build(_SOURCE.read_text(encoding="utf-8"))
-    if path is None:
+    library = load(_SOURCE.read_text(encoding="utf-8"))
+    if library is None:
         return None
-    library = ctypes.CDLL(str(path))
     library.read_cells.argtypes = [ctypes.c_void_p] * 4
     library.read_cells.restype = ctypes.c_int64
     return library

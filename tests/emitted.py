@@ -20,7 +20,7 @@ from stlc.compile.lower import lower
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.ops_torch import TORCH
 from stlc.compile.simplify import simplify
-from stlc.native import Adjoint, Kernel, Outcome, build
+from stlc.native import Adjoint, Kernel, Outcome, load
 
 T = TypeVar("T")
 
@@ -43,16 +43,16 @@ def follower(steps: int = STEPS) -> Motion:
 
 def kernel_of(motion: Motion, rules: Sequence[ir.Formula]) -> Kernel:
     """The built kernel."""
-    path = build(emit(motion, rules))
-    assert path is not None
-    return Kernel(path, states=len(motion.states), rules=len(rules), steps=motion.steps)
+    library = load(emit(motion, rules))
+    assert library is not None
+    return Kernel(library, states=len(motion.states), rules=len(rules), steps=motion.steps)
 
 
 def adjoint_of(motion: Motion, rules: Sequence[ir.Formula], *, fixed: Sequence[str] = ()) -> Adjoint:
     """The built gradient."""
-    path = build(emit_adjoint(motion, rules, fixed=fixed))
-    assert path is not None
-    return Adjoint(path)
+    library = load(emit_adjoint(motion, rules, fixed=fixed))
+    assert library is not None
+    return Adjoint(library)
 
 
 def gathered(

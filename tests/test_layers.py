@@ -35,7 +35,7 @@ ROOMS = (
     {"diagnostics"},
     {"registry", "units", "words", "jsontext"},
     {"signature"},
-    {"rundir", "files", "provenance", "native", "trace", *TRACE_FORMATS},
+    {"rundir", "files", "provenance", "cache", "toolchain", "native", "trace", *TRACE_FORMATS},
     {"grammar"},
     {"compile"},
     {"runtime"},

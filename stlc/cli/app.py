@@ -42,7 +42,7 @@ from stlc.cli.coercion import HELP_NAMES, spare_adapters
 from stlc.cli.errors import INTERRUPTED, TERMINATED
 from stlc.cli.errors import report as report_error
 from stlc.cli.options import describe, only_help
-from stlc.cli.output import COLOR, ColorMode, emit, silence
+from stlc.cli.output import COLOR, ColorMode, emit, noticing, silence
 from stlc.version import __version__
 
 app = typer.Typer(
@@ -94,7 +94,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     front, rest = _split(sys.argv[1:] if argv is None else argv)
     stopped: list[int] = []
     try:
-        with _stoppable() as stopped:
+        with _stoppable() as stopped, noticing():
             command = typer.main.get_command(_asked(rest[0] if rest else ""))
             spare_adapters(command)
             code = command.main(args=[*front, *rest], prog_name="stlc", standalone_mode=False)

@@ -130,44 +130,54 @@ def _devices(*, quick: bool) -> Iterator[Finding]:
 
 
 def _tools() -> Iterator[Finding]:
-    from stlc.grammar.parser_tables import cache_file
-
-    path = cache_file("")
-    folder = None if path is None else path.parent
-    writable = folder is not None and os.access(_existing(folder), os.W_OK)
-    advice = str(folder) if writable else "no place for it; starting takes 0.1 s longer"
-    yield Finding("cache", "ok" if writable else "off", advice)
+    yield _cache()
     yield _compiler()
     installed = _completion()
     yield Finding("completion", "ok" if installed else "off", installed or "stlc --install-completion")
 
 
+def _cache() -> Finding:
+    """Where kernels and the tables of the parser are kept between commands."""
+    from stlc.cache import Unusable, opened, why_not
+
+    try:
+        kept = opened()
+    except Unusable:
+        return Finding("cache", "off", f"{why_not()}; starting takes 0.1 s longer, kernels are built anew")
+    count, size = kept.size()
+    if not os.access(kept.folder, os.W_OK):
+        return Finding("cache", "off", f"{kept.shown} cannot be written to; new kernels are not kept")
+    return Finding(
+        "cache", "ok", f"{kept.shown}: {count} file{'' if count == 1 else 's'}, {size / 1e6:.1f} MB"
+    )
+
+
 def _compiler() -> Finding:
-    """Whether plans are judged and searched for as C, or by torch."""
-    from stlc.native import build, compiler
+    """Whether plans are judged and searched for as C, or by torch; and what was remembered of failures."""
+    from stlc.toolchain import compiler, remembered, works
 
     found = compiler()
     if found is None:
         return Finding("compiler", "off", f"no C compiler (cc, gcc, clang, $CC); {_SLOWER}")
-    if build("int works(void) { return 1; }\n") is None:
-        return Finding("compiler", "off", f"{found} fails to build a library; {_SLOWER}")
-    return Finding("compiler", "ok", f"{found}; training, search and backup run as C")
-
-
-def _existing(folder: Path) -> Path:
-    """The folder, or the nearest one above it that is there."""
-    return next((path for path in (folder, *folder.parents) if path.exists()), Path("/"))
+    before = remembered()
+    why = works(found)
+    if why:
+        return Finding("compiler", "off", f"{found} {why}; {_SLOWER}")
+    detail = f"{found}; training, search and backup run as C"
+    if before:
+        detail += f" (a short while ago it {before[0]}; it is tried again from now on)"
+    return Finding("compiler", "ok", detail)
 
 
 def _completion() -> str:
     """The file that completes commands in the user's shell; "" if there is none."""
     try:
         home = Path.home()
-    except RuntimeError:
+    except (RuntimeError, OSError):
         return ""
     places = (
         home / ".bash_completions/stlc.sh",
         home / ".zfunc/_stlc",
         home / ".config/fish/completions/stlc.fish",
     )
-    return next((str(path) for path in places if path.is_file()), "")
+    return next((str(path) for path in places if os.path.isfile(path)), "")  # noqa: PTH113 - False where it may not be seen

@@ -55,7 +55,7 @@ def export(
         emit_json("export/1", ok=True, exit_code=0, result={**result, "checked": checked, "latency": latency})
         return
     if found is None:
-        say("not checked: there is no C compiler")
+        say(f"not checked: {done.unchecked}")
     else:
         say(
             f"checked in {found.states} random states: plans within {found.plan:.1e} of a range, "

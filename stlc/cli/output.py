@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Literal, TextIO
+from typing import TYPE_CHECKING, Any, Literal, TextIO
 
-from stlc.diagnostics import Diagnostic
+from stlc.diagnostics import Diagnostic, Notice
 from stlc.jsontext import dumps, plain
 
 if TYPE_CHECKING:
@@ -71,6 +72,25 @@ def show_diagnostics(diagnostics: Sequence[Diagnostic]) -> None:
 
     if diagnostics:
         say(render_text(tuple(diagnostics), color=wants_color(sys.stderr)).rstrip("\n"))
+
+
+@contextmanager
+def noticing() -> Iterator[None]:
+    """Show what is noticed about the machine (`stlc.diagnostics.notice`), each thing once."""
+    said: set[str] = set()
+    others = warnings.showwarning
+
+    def show(message: Warning | str, *rest: Any, **options: Any) -> None:
+        if not isinstance(message, Notice):
+            others(message, *rest, **options)
+        elif str(message) not in said:
+            said.add(str(message))
+            show_diagnostics([message.finding])
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", Notice)
+        warnings.showwarning = show
+        yield
 
 
 def wants_color(stream: TextIO) -> bool:

@@ -109,8 +109,4 @@ def _library(dtype: torch.dtype, vector: int) -> ctypes.CDLL | None:
     """The kernel for a dtype and a width of vectors in bytes; None where it cannot be built or loaded."""
     real, index = _TYPES[dtype]
     defined = f"#define REAL {real}\n#define INDEX {index}\n#define BYTES {vector}\n"
-    path = native.build(defined + _SOURCE.read_text(encoding="utf-8"))
-    try:
-        return None if path is None else ctypes.CDLL(str(path))
-    except OSError:
-        return None
+    return native.load(defined + _SOURCE.read_text(encoding="utf-8"))

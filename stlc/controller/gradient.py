@@ -14,7 +14,7 @@ from torch import Tensor
 from stlc.compile.c_adjoint import emit_adjoint
 from stlc.compile.c_numbers import Untranslatable
 from stlc.controller.kernel import NativeJudge, motion_of
-from stlc.native import Adjoint, Outcome, build
+from stlc.native import Adjoint, Outcome, load
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -41,10 +41,10 @@ class NativeGradient:
             return None
         fixed = [timer.name for timer in task.system.timers]
         try:
-            path = build(emit_adjoint(motion_of(task), [rule.formula for rule in task.rules], fixed=fixed))
+            library = load(emit_adjoint(motion_of(task), [rule.formula for rule in task.rules], fixed=fixed))
         except Untranslatable:
             return None
-        return None if path is None else cls(task.native, Adjoint(path))
+        return None if library is None else cls(task.native, Adjoint(library))
 
     def __call__(self, x0: Tensor, u: Tensor, *, slope: float) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Robustness per requirement (B, R) and states (T+1, B) by name, differentiable by `u`.

@@ -14,7 +14,7 @@ import torch
 
 from stlc.compile.c_numbers import Untranslatable
 from stlc.compile.emit_c import Motion, emit
-from stlc.native import Climb, Kernel, build
+from stlc.native import Climb, Kernel, load
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -69,12 +69,12 @@ class NativeJudge:
     def of(cls, task: Task) -> NativeJudge | None:
         """The kernel of a task, built if need be; None where torch has to do its work."""
         try:
-            path = build(emit(motion_of(task), [rule.formula for rule in task.rules]))
+            library = load(emit(motion_of(task), [rule.formula for rule in task.rules]))
         except Untranslatable:
             return None
-        if path is None:
+        if library is None:
             return None
-        return cls(Kernel(path, states=len(task.names), rules=len(task.rules), steps=task.horizon), task)
+        return cls(Kernel(library, states=len(task.names), rules=len(task.rules), steps=task.horizon), task)
 
     def judge(self, x0: Tensor, u: Tensor, *, columns: bool) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Robustness per requirement (B, R), and the states (T+1, B) by name where they are wanted.

@@ -9,7 +9,8 @@ from stlc.compile.c_adjoint import emit_adjoint
 from stlc.compile.c_numbers import Untranslatable
 from stlc.compile.emit_c import emit
 from stlc.controller.kernel import motion_of
-from stlc.native import compiler
+from stlc.native import why_none
+from stlc.toolchain import compiler
 
 if TYPE_CHECKING:
     from stlc.controller.config import Engine
@@ -40,7 +41,6 @@ def _reason(text: Callable[[], str]) -> str:
     if compiler() is None:
         return "there is no C compiler"
     try:
-        text()
+        return why_none(text())
     except Untranslatable as why:
         return f"{why} has no C form"
-    return "the C compiler fails"

@@ -18,6 +18,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from stlc.cache import Unusable, private
 from stlc.controller.sweep import TAIL, Errand, Returned, document_of, start
 from stlc.files import atomic_path, write_atomic
 from stlc.rundir import RECORD, RUNS, RunDir, every_run
@@ -195,8 +196,11 @@ def claimed(count: int) -> Iterator[frozenset[int]]:
     except ImportError:  # not on Windows
         yield frozenset(everything)
         return
-    folder = Path(tempfile.gettempdir()) / f"stlc-cores-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
+    try:
+        folder = private(Path(tempfile.gettempdir()) / f"stlc-cores-{os.getuid()}").folder
+    except Unusable:  # nothing is written where others may write too
+        yield frozenset(everything)
+        return
     held = {}
     try:
         for core in everything:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import torch
 from torch import Tensor
 
-from stlc import native
+from stlc import toolchain
 from stlc.controller.backup import Backup
 from stlc.controller.deploy import Guard
 from stlc.controller.prefix import prefix_robustness
@@ -187,20 +186,34 @@ def same_verdicts(task: Task, graphs: Graphs, *, states: int, seed: int = 7) -> 
     return off
 
 
-def by_c(folder: Path, task: Task, built: Path) -> Callable[[Tensor], Answer] | None:
-    """The example program of a folder, compiled to `built`; None without a compiler.
+class Unchecked(Exception):  # noqa: N818 - an answer, caught by who asks
+    """Why an export was not checked; `why` follows "not checked: "."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(why)
+        self.why = why
+
+
+def by_c(folder: Path, task: Task, built: Path) -> Callable[[Tensor], Answer]:
+    """The example program of a folder, compiled to `built`.
 
     Raises:
+        Unchecked: there is no compiler that works.
         RunError: R105, it cannot be compiled.
     """
-    using = native.compiler()
+    using = toolchain.compiler()
     if using is None:
-        return None
-    command = [using, *BUILT, "-o", str(built), str(folder / "main.c"), "-lm"]
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    if done.returncode:
+        raise Unchecked("there is no C compiler")
+    try:
+        done = toolchain.compiled(using, [*BUILT, "-o", str(built), str(folder / "main.c"), "-lm"])
+    except toolchain.CompilerError as error:
+        raise Unchecked(f"the C compiler `{using}` {error.why}") from error
+    if done.code:
+        broken = toolchain.works(using)
+        if broken:
+            raise Unchecked(f"the C compiler `{using}` {broken}")
         raise RunError(
-            Diagnostic("R105", "the exported C does not compile", note=tuple(done.stderr.splitlines()[:5]))
+            Diagnostic("R105", "the exported C does not compile", note=tuple(done.said.splitlines()[:5]))
         )
     rules, shape = len(task.rules), (task.horizon, len(task.system.controls))
 
@@ -213,7 +226,16 @@ def by_c(folder: Path, task: Task, built: Path) -> Callable[[Tensor], Answer] | 
 
 
 def answers(command: Sequence[str], states: Sequence[Sequence[float]]) -> list[list[float]]:
-    """What the example program prints for states: source, t0, rho, safe, requirements, plan."""
+    """What the example program prints for states: source, t0, rho, safe, requirements, plan.
+
+    Raises:
+        RunError: R105, it fails or does not end.
+    """
     asked = "\n".join(" ".join(map(repr, state)) for state in states)
-    done = subprocess.run(command, input=asked, check=True, capture_output=True, text=True)
-    return [[float(word) for word in line.split()] for line in done.stdout.splitlines()]
+    try:
+        done = toolchain.run(command, given=asked)
+    except toolchain.HangsError as hangs:
+        raise RunError(_disagreement(f"the example program {hangs.why}")) from hangs
+    if done.code:
+        raise RunError(_disagreement(f"the example program {toolchain.failure(done)}"))
+    return [[float(word) for word in line.split()] for line in done.out.splitlines()]

@@ -19,6 +19,7 @@ from stlc.export.onnx_write import Latency, timed, write_onnx
 from stlc.export.programs import recorded
 from stlc.export.verify import (
     Agreement,
+    Unchecked,
     agreement,
     backup_agreement,
     by_c,
@@ -50,12 +51,14 @@ class Exported:
         files: names in it.
         agreement: with the run; None where there is no compiler to check with.
         latency: of a decision in the Python runtime, where it was measured.
+        unchecked: why there is no agreement.
     """
 
     folder: Path
     files: tuple[str, ...]
     agreement: Agreement | None
     latency: Latency | None = None
+    unchecked: str = ""
 
 
 def target_of(word: str) -> Target:
@@ -83,12 +86,15 @@ def export(run: Run, target: Target, folder: Path) -> Exported:
     """
     with tempfile.TemporaryDirectory() as name:
         beside = Path(name)
-        found, latency = _WRITERS[target](run, beside)
+        try:
+            (found, latency), unchecked = _WRITERS[target](run, beside), ""
+        except Unchecked as why:
+            found, latency, unchecked = None, None, why.why
         files = tuple(sorted(path.name for path in beside.iterdir() if path.name != BUILT))
         folder.mkdir(parents=True, exist_ok=True)
         for each in files:
             write_atomic(folder / each, (beside / each).read_bytes())
-    return Exported(folder, files, found, latency)
+    return Exported(folder, files, found, latency, unchecked)
 
 
 BUILT = "checked"
@@ -134,7 +140,7 @@ def _c(run: Run, folder: Path) -> Checked:
     for name, content in texts.items():
         (folder / name).write_text(content, encoding="utf-8")
     decide = by_c(folder, run.task, folder / BUILT)
-    return None if decide is None else agreement(run.policy, decide, states=STATES), None
+    return agreement(run.policy, decide, states=STATES), None
 
 
 _WRITERS: Mapping[Target, Callable[[Run, Path], Checked]] = {"torch": _torch, "c": _c, "onnx": _onnx}

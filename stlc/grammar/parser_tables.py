@@ -1,29 +1,25 @@
 """`stl.lark` -> a Lark parser, once per process, its tables kept between processes.
 
 Building the LALR tables takes a tenth of a second, reading them back a fifth of that. They are kept as JSON
-(never a pickle) in the user's cache folder, under a name that changes with the grammar, with Lark and with
-Python. A cache that is missing, damaged or not writable costs that time and nothing else.
+(never a pickle) in the cache folder (`stlc.cache`), under a name that changes with the grammar, with Lark and
+with Python. A cache that is missing, damaged or not writable costs that time and nothing else.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import re
 import sys
-from contextlib import suppress
 from functools import cache
 from hashlib import sha256
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 import lark
 from lark.grammar import Rule
 from lark.lexer import TerminalDef
 
-from stlc.diagnostics import StlcError
-from stlc.files import write_atomic
+from stlc.cache import lasting
 from stlc.grammar.words import PATTERNS
 
 _DAMAGED = (ValueError, TypeError, LookupError, AttributeError, AssertionError, lark.exceptions.LarkError)
@@ -33,13 +29,12 @@ _DAMAGED = (ValueError, TypeError, LookupError, AttributeError, AssertionError, 
 def load_parser() -> lark.Lark:
     """The parser of the language, with the start rules `start` and `expr`."""
     grammar = grammar_text()
-    path = cache_file(grammar)
-    parser = None if path is None else _read(path)
+    kept, name = lasting(), cache_name(grammar)
+    parser = None if kept is None else _read(kept.read(name))
     if parser is None:
         parser = build_parser(grammar)
-        if path is not None:
-            with suppress(StlcError):
-                write_atomic(path, _dumped(parser))
+        if kept is not None:
+            kept.keep(name, _dumped(parser).encode())
     return parser
 
 
@@ -61,15 +56,10 @@ def build_parser(grammar: str) -> lark.Lark:
     )
 
 
-def cache_file(grammar: str) -> Path | None:
-    """Where the tables of this grammar are kept; None if there is no folder for them."""
-    folder = os.environ.get("XDG_CACHE_HOME", "")
-    try:
-        root = Path(folder) if folder else Path.home() / ".cache"
-    except RuntimeError:
-        return None
+def cache_name(grammar: str) -> str:
+    """Under which name the tables of this grammar are kept."""
     key = f"{lark.__version__} {sys.version_info[:2]} {grammar}"
-    return root / "stlc" / f"grammar-{sha256(key.encode()).hexdigest()[:16]}.json"
+    return f"grammar-{sha256(key.encode()).hexdigest()[:16]}.json"
 
 
 def _dumped(parser: lark.Lark) -> str:
@@ -77,11 +67,13 @@ def _dumped(parser: lark.Lark) -> str:
     return json.dumps([data, memo], separators=(",", ":"))
 
 
-def _read(path: Path) -> lark.Lark | None:
+def _read(text: bytes | None) -> lark.Lark | None:
+    if text is None:
+        return None
     try:
-        data, memo = json.loads(path.read_text(encoding="utf-8"), object_hook=_with_numbers)
+        data, memo = json.loads(text, object_hook=_with_numbers)
         parser: lark.Lark = lark.Lark._load_from_dict(data, memo)  # type: ignore[no-untyped-call]
-    except (OSError, *_DAMAGED):
+    except _DAMAGED:
         return None
     return parser
 

@@ -18,6 +18,7 @@ from stlc.cli.app import main
 from stlc.cli.pages import FOLDER, Example, read_page
 from stlc.controller.config import TrainConfig
 from stlc.diagnostics import CODES, RunError
+from stlc.grammar.parser_tables import load_parser
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = {code: read_page(code) for code in CODES}
@@ -187,10 +188,30 @@ def no_number(policy, x0):
 
 
 @pytest.fixture
-def arranged(monkeypatch):
+def machine(monkeypatch, tmp_path):
+    """What a wrong example needs that is about the machine."""
+
+    def arrange(code: str) -> None:
+        if code == "W701":
+            monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+            load_parser.cache_clear()
+            (tmp_path / "cache/stlc").mkdir(parents=True)
+            (tmp_path / "cache/stlc").chmod(0o770)
+        elif code == "W702":
+            (tmp_path / "cc").write_text("#!/bin/sh\necho error: no licence\nexit 1\n")
+            (tmp_path / "cc").chmod(0o755)
+            monkeypatch.setenv("CC", str(tmp_path / "cc"))
+            monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+    return arrange
+
+
+@pytest.fixture
+def arranged(monkeypatch, machine):
     """What a wrong example of a code needs."""
 
     def arrange(code: str) -> None:
+        machine(code)
         match code:
             case "R202":
                 shutil.copy("trace.npz", "huge.npz")
@@ -229,9 +250,10 @@ def test_a_command(code, example, arranged, capsys):
         main([*words[1:], *extra])
     said = capsys.readouterr().err
     if "wrong" in example.notes:
-        assert f"error[{code}]" in said
+        assert f"{'warning' if code[0] == 'W' else 'error'}[{code}]" in said
     else:
         assert "error[" not in said
+        assert f"[{code}]" not in said
 
 
 @pytest.mark.parametrize(("code", "example"), examples("python"))

@@ -13,6 +13,7 @@ from stlc.controller.config import TrainConfig, decide
 from stlc.controller.natives import by_torch
 from stlc.controller.objective import guided_objective, loss
 from stlc.controller.task import Task
+from stlc.diagnostics import Notice
 from stlc.dynamics.system import System
 from stlc.grammar.parser import parse
 from stlc.source import Source
@@ -53,7 +54,7 @@ def test_a_function_in_python_leaves_the_work_to_torch_with_the_same_results() -
 
 
 def test_the_paper_s_objective_a_device_and_a_missing_compiler(
-    car_task: Task, monkeypatch: pytest.MonkeyPatch
+    car_task: Task, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     engine = decide(car_task, TrainConfig())
     assert by_torch(car_task, engine, "cpu") == {"verdicts": "", "search": "", "gradient": ""}
@@ -66,10 +67,11 @@ def test_the_paper_s_objective_a_device_and_a_missing_compiler(
     assert set(by_torch(fresh, engine, "cpu").values()) == {"there is no C compiler"}
     monkeypatch.undo()
     fresh = Task(car_task.compiled, System(car_task.system.decl))
-    monkeypatch.setattr("stlc.native._compile", _fails)
-    monkeypatch.setenv("XDG_CACHE_HOME", "/nowhere")
-    assert set(by_torch(fresh, engine, "cpu").values()) == {"the C compiler fails"}
-
-
-def _fails(*_: object) -> None:
-    raise OSError
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    compiler = tmp_path / "cc"
+    compiler.write_text("#!/bin/sh\ntest $1 = --version || { echo fatal error: no room; exit 4; }\n")
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CC", str(compiler))
+    with pytest.warns(Notice, match="W702: the C compiler `.*/cc` fails with exit code 4"):
+        reasons = by_torch(fresh, engine, "cpu")
+    assert set(reasons.values()) == {"the C compiler fails with exit code 4: fatal error: no room"}

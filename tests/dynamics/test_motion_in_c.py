@@ -13,7 +13,7 @@ from dynamics.test_vectors import ARM
 from stlc.compile.emit_c import Motion, emit
 from stlc.dynamics.step import build_step
 from stlc.dynamics.system import System
-from stlc.native import Kernel, build, compiler
+from stlc.native import Kernel, compiler, load
 
 Make = Callable[..., System]
 pytestmark = pytest.mark.skipif(compiler() is None, reason="there is no C compiler here")
@@ -39,9 +39,9 @@ def agree(system: System) -> None:
     u = system.control_low + span * torch.rand(
         300, system.horizon, 2, generator=generator, dtype=torch.float64
     )
-    path = build(emit(motion, []))
-    assert path is not None
-    kernel = Kernel(path, states=len(motion.states), rules=0, steps=motion.steps)
+    library = load(emit(motion, []))
+    assert library is not None
+    kernel = Kernel(library, states=len(motion.states), rules=0, steps=motion.steps)
     _, columns = kernel.judge(x0.numpy(), u.numpy(), columns=True)
     assert columns is not None
     expected = system.rollout(x0, u).permute(2, 1, 0).numpy()

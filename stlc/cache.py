@@ -1,0 +1,285 @@
+"""The cache folder: what can be made anew is kept between processes, where nobody else can have changed it.
+
+Code is loaded from here, so the folder is used only if it belongs to the user, is no link, and nobody else
+may write to it; every file in it that is read is held to the same. Otherwise, and where there is no place for
+such a folder, a temporary folder of the process takes its place (`temporary`), or nothing is kept.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import stat
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from stlc.diagnostics import Diagnostic, notice
+
+MOST_BYTES = 256_000_000
+"""What the cache may hold; the files that were not used for the longest time go first."""
+MOST_DAYS = 60
+"""Files that were not used for so long go."""
+KINDS = ("kernel-", "grammar-", "trouble-")
+"""How names of files in the cache begin; nothing else in the folder is ever removed."""
+
+_OTHERS = stat.S_IWGRP | stat.S_IWOTH
+_DAY = 86_400.0
+_UNFINISHED = ".new-"
+_OPEN_FOLDERS = Path("/proc/self/fd")
+
+
+class Unusable(Exception):  # noqa: N818 - an answer, caught by who asks
+    """Why a folder is not used.
+
+    Attributes:
+        why: said after the name of the folder.
+        distrusted: somebody else could have changed what is in it.
+    """
+
+    def __init__(self, why: str, *, distrusted: bool = False) -> None:
+        super().__init__(why)
+        self.why = why
+        self.distrusted = distrusted
+
+
+@dataclass(frozen=True, slots=True)
+class Cache:
+    """A folder of the user's alone.
+
+    Attributes:
+        shown: where it is.
+        folder: the same, through the open folder where the system has names for such: what stands above it
+            may be renamed or replaced, and this stays the folder that was looked at.
+    """
+
+    shown: Path
+    folder: Path
+
+    def read(self, name: str) -> bytes | None:
+        """The content of a file; None where there is none, or where somebody else may have written it."""
+        flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+        path = self.folder / name
+        try:
+            if stat.S_ISLNK(path.lstat().st_mode):
+                raise Unusable("is a symbolic link", distrusted=True)
+            with open(os.open(path, flags), "rb") as file:  # noqa: PTH123 - of a descriptor
+                found = os.fstat(file.fileno())
+                _require_own(found, stat.S_ISREG(found.st_mode), "is no regular file")
+                data = file.read()
+        except OSError:
+            return None
+        except Unusable as refused:
+            self.refuse(name, refused.why)
+            return None
+        if time.time() - found.st_mtime > _DAY:
+            with suppress(OSError):
+                os.utime(path)  # files are pruned by when they were last used
+        return data
+
+    def refuse(self, name: str, why: str) -> None:
+        """Remove a file that cannot be trusted, and say so."""
+        with suppress(OSError):
+            (self.folder / name).unlink()
+        _tell(f"`{self.shown / name}` {why}", "it is made anew")
+
+    def keep(self, name: str, data: bytes) -> bool:
+        """Write a file beside and rename it; gives whether that could be done."""
+        beside = self.folder / f"{_UNFINISHED}{os.urandom(8).hex()}"
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0)
+        try:
+            with open(os.open(beside, flags, 0o600), "wb") as file:  # noqa: PTH123 - of a descriptor
+                file.write(data)
+            beside.replace(self.folder / name)
+        except OSError:
+            with suppress(OSError):
+                beside.unlink(missing_ok=True)
+            return False
+        _pruned(self)
+        return True
+
+    def names(self, start: str) -> list[str]:
+        """The files whose names begin so."""
+        try:
+            return sorted(entry.name for entry in os.scandir(self.folder) if entry.name.startswith(start))
+        except OSError:
+            return []
+
+    def size(self) -> tuple[int, int]:
+        """How many files there are, and how many bytes."""
+        sizes = [found.st_size for _, found in _entries(self)]
+        return len(sizes), sum(sizes)
+
+
+def _require_own(found: os.stat_result, right_kind: bool, otherwise: str) -> None:
+    """Raises Unusable where a file or folder could have been changed by others than the user."""
+    if not right_kind:
+        raise Unusable(otherwise, distrusted=True)
+    if os.name != "posix":
+        return
+    if found.st_uid != os.geteuid():
+        raise Unusable(f"belongs to another user ({found.st_uid})", distrusted=True)
+    if found.st_mode & _OTHERS:
+        raise Unusable(f"may be written by others (mode {found.st_mode & 0o777:o})", distrusted=True)
+
+
+def _tell(what: str, instead: str) -> None:
+    notice(Diagnostic("W701", f"{what}; {instead}"))
+
+
+# ---------------------------------------------------------------------- the lasting one
+
+
+def place() -> Path:
+    """Where the cache belongs: `$XDG_CACHE_HOME/stlc`, else `~/.cache/stlc`. Raises Unusable."""
+    home = os.environ.get("XDG_CACHE_HOME", "")
+    if home and Path(home).is_absolute():  # relative ones are to be ignored, says the XDG specification
+        return Path(home) / "stlc"
+    try:
+        home = str(Path.home())
+    except (RuntimeError, OSError):
+        home = ""
+    if not os.environ.get("HOME", home) or not Path(home).is_absolute():
+        raise Unusable("there is no home directory")
+    return Path(home) / ".cache" / "stlc"
+
+
+def lasting() -> Cache | None:
+    """The user's cache folder, made if it is not there; None where it cannot be used.
+
+    A folder that somebody else could have changed is told about, once a command.
+    """
+    try:
+        return opened()
+    except Unusable as refused:
+        if refused.distrusted:
+            advice = "remove it, or set `XDG_CACHE_HOME` to a folder of your own"
+            said = f"the cache folder `{place()}` {refused.why}; it is not used"
+            notice(Diagnostic("W701", said, help=(advice,)))
+        return None
+
+
+def why_not() -> str:
+    """Why there is no lasting cache; "" where there is one."""
+    try:
+        opened()
+    except Unusable as refused:
+        with suppress(Unusable):
+            return f"`{place()}` {refused.why}"
+        return refused.why
+    return ""
+
+
+def opened() -> Cache:
+    """The user's cache folder. Raises Unusable."""
+    return private(place())
+
+
+_held: dict[Path, int] = {}
+"""Open folders: their names below `_OPEN_FOLDERS` are good for as long as the process lives."""
+
+
+def private(path: Path) -> Cache:
+    """A folder that belongs to the user alone, made if it is not there.
+
+    Raises:
+        Unusable: it cannot be made, or somebody else could have changed what is in it.
+    """
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with suppress(FileExistsError):
+            path.mkdir(mode=0o700)
+        if stat.S_ISLNK(path.lstat().st_mode):
+            raise Unusable("is a symbolic link", distrusted=True)
+        if os.name != "posix":
+            return Cache(path, path)
+        return Cache(path, _looked_at(path))
+    except OSError as error:
+        raise Unusable(f"cannot be used: {(error.strerror or type(error).__name__).lower()}") from error
+    except ValueError as error:  # a zero byte in the name
+        raise Unusable("cannot be used: it is no name of a folder") from error
+
+
+def _looked_at(path: Path) -> Path:
+    """The folder as it is named from now on, after its owner and mode were looked at."""
+    held = _held.get(path)
+    fresh = held is None or not os.path.samestat(os.fstat(held), path.lstat())
+    folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW) if fresh else held
+    assert folder is not None
+    try:
+        found = os.fstat(folder)
+        _require_own(found, stat.S_ISDIR(found.st_mode), "is no folder")
+        if found.st_mode & 0o077:
+            os.fchmod(folder, 0o700)
+    except BaseException:
+        if fresh:
+            os.close(folder)
+        raise
+    if not _OPEN_FOLDERS.is_dir():
+        if fresh:
+            os.close(folder)
+        return path
+    if fresh:
+        if held is not None:
+            os.close(held)
+        _held[path] = folder
+    return _OPEN_FOLDERS / str(folder)
+
+
+# ---------------------------------------------------------------------- the one of this process
+
+
+def temporary() -> Cache | None:
+    """A folder of this process, removed when it ends; None where there is no room for one."""
+    return _temporary(os.getpid())
+
+
+@cache
+def _temporary(process: int) -> Cache | None:
+    import shutil
+    import tempfile
+
+    try:
+        folder = tempfile.mkdtemp(prefix="stlc-")  # 0700
+        made = private(Path(folder).resolve())
+    except (OSError, Unusable):
+        return None
+
+    def clear() -> None:
+        if os.getpid() == process:  # not in a process that was forked off
+            shutil.rmtree(folder, ignore_errors=True)
+
+    atexit.register(clear)
+    return made
+
+
+# ---------------------------------------------------------------------- pruning
+
+
+@cache
+def _pruned(kept: Cache) -> None:
+    """Remove what is old or too much, once a process."""
+    prune(kept)
+
+
+def prune(kept: Cache, *, most_bytes: int = MOST_BYTES, most_days: float = MOST_DAYS) -> None:
+    """Remove files that were not used for `most_days`, then the oldest ones beyond `most_bytes`."""
+    now, left = time.time(), most_bytes
+    for name, found in sorted(_entries(kept), key=lambda entry: entry[1].st_mtime, reverse=True):
+        days = (now - found.st_mtime) / _DAY
+        left -= found.st_size
+        if left < 0 or days > (1 if name.startswith(_UNFINISHED) else most_days):
+            with suppress(OSError):
+                (kept.folder / name).unlink()
+
+
+def _entries(kept: Cache) -> Iterator[tuple[str, os.stat_result]]:
+    """The files of the cache that are stlc's own."""
+    with suppress(OSError), os.scandir(kept.folder) as entries:
+        for entry in entries:
+            if entry.name.startswith((*KINDS, _UNFINISHED)):
+                with suppress(OSError):
+                    yield entry.name, entry.stat(follow_symlinks=False)

@@ -1,0 +1,263 @@
+"""The system's C compiler: found, asked for its version, and never waited for without end.
+
+A compiler that hangs is ended with all that it started, and not asked again: by this process, and for a while
+not by others of the same user either (`REMEMBERED`).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+
+from stlc import cache
+from stlc.cache import Cache
+
+IDLE = 10.0
+"""Seconds in which a program that was started must use the processor, or it hangs."""
+BUSY = 40.0
+"""Seconds of the processor after which a program is given up; of the clock where that is not known."""
+REMEMBERED = 600.0
+"""Seconds for which other processes do not try again what failed."""
+_GRACE = 2.0
+"""Seconds from being asked to end until being ended."""
+_PROBE = "#include <math.h>\nint works(void) { return 1; }\n"
+
+
+class CompilerError(Exception):
+    """The compiler cannot be used; `why` is said after its name."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(why)
+        self.why = why
+
+
+class HangsError(Exception):
+    """A program did not end within the limits, and was ended."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(why)
+        self.why = why
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """What a program gave: its exit code, and what it wrote."""
+
+    code: int
+    out: str
+    said: str
+
+
+def compiler() -> str | None:
+    """The system's C compiler: `$CC`, `cc`, `gcc` or `clang`; None where there is none."""
+    names = (os.environ.get("CC"), "cc", "gcc", "clang")
+    return next((found for name in names if name and (found := shutil.which(name))), None)
+
+
+def compiled(using: str, arguments: Sequence[str]) -> Done:
+    """Run a compiler.
+
+    Raises:
+        CompilerError: it hangs, did so a short while ago, or cannot be started.
+    """
+    key = _identity(using)
+    why = trouble(key)
+    if why:
+        raise CompilerError(why)
+    try:
+        return run([using, *arguments])
+    except HangsError as hangs:
+        remember(key, hangs.why)
+        raise CompilerError(hangs.why) from hangs
+    except OSError as error:
+        raise CompilerError(f"cannot be started: {(error.strerror or str(error)).lower()}") from error
+
+
+_versions: dict[str, str] = {}
+
+
+def version(using: str) -> str:
+    """What a compiler says of itself, with the date and size of its file. Raises CompilerError."""
+    key = _identity(using)
+    why = trouble(key)
+    if why:
+        raise CompilerError(why)
+    if key not in _versions:
+        _versions[key] = compiled(using, ["--version"]).out
+    return f"{key}\0{_versions[key]}"
+
+
+def _identity(using: str) -> str:
+    """A compiler's name among what is remembered: changes as its file does."""
+    try:
+        found = Path(using).stat()
+        facts = f"{using} {found.st_size} {found.st_mtime_ns} {found.st_ino}"
+    except OSError:
+        facts = using
+    return sha256(facts.encode(errors="surrogateescape")).hexdigest()[:32]
+
+
+def works(using: str) -> str:
+    """Why a compiler cannot build a library, "" where it can; what is remembered is forgotten."""
+    forget()
+    try:
+        version(using)
+        with tempfile.TemporaryDirectory(prefix="stlc-") as folder:
+            source = Path(folder) / "works.c"
+            source.write_text(_PROBE, encoding="utf-8")
+            done = compiled(using, ["-shared", "-fPIC", str(source), "-o", f"{folder}/works.so", "-lm"])
+    except OSError as error:
+        return f"has no room to work: {(error.strerror or str(error)).lower()}"
+    except CompilerError as error:
+        return error.why
+    return "" if done.code == 0 else failure(done)
+
+
+def failure(done: Done) -> str:
+    """What went wrong, in a line."""
+    lines = [line.strip() for line in (done.said or done.out).splitlines() if line.strip()]
+    told = next((line for line in lines if "error" in line.lower()), lines[0] if lines else "")
+    return f"fails with exit code {done.code}" + (f": {told[:160]}" if told else "")
+
+
+# ---------------------------------------------------------------------- remembered
+
+_TROUBLE = "trouble-"
+_known: dict[str, str] = {}
+
+
+def trouble(key: str) -> str:
+    """Why something failed lately, in this process or another; "" where it did not."""
+    if key in _known:
+        return _known[key]
+    kept = cache.lasting()
+    return "" if kept is None else _recorded(kept, _file(key))
+
+
+def _recorded(kept: Cache, name: str) -> str:
+    with suppress(ValueError, TypeError, KeyError):
+        record = json.loads(kept.read(name) or b"")
+        if 0 <= time.time() - record["at"] <= REMEMBERED:
+            return str(record["why"])
+    return ""
+
+
+def remember(key: str, why: str) -> None:
+    """Keep in mind that something failed."""
+    _known[key] = why
+    kept = cache.lasting()
+    if kept is not None:
+        kept.keep(_file(key), json.dumps({"at": time.time(), "why": why}).encode())
+
+
+def remembered() -> list[str]:
+    """Why commands do without the compiler at present."""
+    kept = cache.lasting()
+    found = [] if kept is None else [_recorded(kept, name) for name in kept.names(_TROUBLE)]
+    return list(dict.fromkeys(filter(None, [*_known.values(), *found])))
+
+
+def forget() -> None:
+    """Let everything be tried again."""
+    _known.clear()
+    _versions.clear()
+    kept = cache.lasting()
+    if kept is not None:
+        for name in kept.names(_TROUBLE):
+            with suppress(OSError):
+                (kept.folder / name).unlink()
+
+
+def _file(key: str) -> str:
+    return f"{_TROUBLE}{key}.json"
+
+
+# ---------------------------------------------------------------------- run
+
+
+def run(command: Sequence[str], *, given: str = "") -> Done:
+    """Run a program in a session of its own, and end it with all that it started if it hangs.
+
+    Whatever interrupts the wait, no process is left.
+
+    Args:
+        command: the program and its arguments.
+        given: on its standard input.
+
+    Raises:
+        HangsError: it used no processor time for `IDLE` seconds, or more than `BUSY`.
+        OSError: it cannot be started.
+    """
+    # files, not pipes: whoever holds the other end of a pipe could keep us waiting
+    with tempfile.TemporaryFile() as into, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as said:
+        into.write(given.encode())
+        into.seek(0)
+        process = subprocess.Popen(command, stdin=into, stdout=out, stderr=said, start_new_session=True)
+        try:
+            _await(process)
+        except BaseException:
+            _end(process)
+            raise
+        texts = []
+        for file in (out, said):
+            file.seek(0)
+            texts.append(file.read().decode(errors="replace"))
+    return Done(process.returncode, *texts)
+
+
+def _await(process: subprocess.Popen[bytes]) -> None:
+    """Wait for a process. Raises HangsError."""
+    begun = since = time.monotonic()
+    used = 0.0
+    while True:
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(min(IDLE / 4, 0.5))
+            return
+        now, found = time.monotonic(), _processor_time(process.pid)
+        if found is None:
+            used, since = now - begun, now
+        elif found > used:
+            used, since = found, now
+        if now - since >= IDLE:
+            raise HangsError(f"did nothing for {IDLE:g} s and was ended")
+        if used >= BUSY:
+            raise HangsError(f"did not end within {BUSY:g} s and was ended")
+
+
+def _processor_time(session: int) -> float | None:
+    """Seconds that the processes of a session, and those of them that ended, have used; None if unknown."""
+    ticks, known = 0, False
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError, ValueError, IndexError):
+            words = path.read_text(errors="replace").rpartition(")")[2].split()
+            if int(words[3]) == session:
+                ticks, known = ticks + sum(map(int, words[11:15])), True
+    return ticks / os.sysconf("SC_CLK_TCK") if known else None
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Ask all processes of a session to end, then end them."""
+    if os.name != "posix":
+        process.kill()
+        process.wait()
+        return
+    with suppress(OSError):
+        os.killpg(process.pid, signal.SIGTERM)
+    try:
+        process.wait(_GRACE)
+    except subprocess.TimeoutExpired:
+        pass
+    finally:
+        with suppress(OSError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
