@@ -1,7 +1,7 @@
 """Cells of a table -> numbers: one at a time, or all of a large file in little more than their memory.
 
-`cells.c` reads large texts where there is a C compiler (`stlc.native`), else NumPy's reader does, a stretch
-at a time. Both leave what is unusual to others.
+`cells.c` reads large texts where there is a C compiler (`stlc.native`), else Arrow does where it is installed,
+else NumPy's reader, a stretch at a time. All leave what is unusual to others, and give the same numbers.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,10 @@ NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf|
 _WORDS = {"true": 1.0, "false": 0.0}
 _ANY = re.compile(r"\S")
 _SOURCE = Path(__file__).with_name("cells.c")
-_STRETCH = 1 << 18
-"""Bytes that NumPy's reader is given at a time."""
+STRETCH = 1 << 18
+"""Bytes, or characters, that NumPy's reader is given at a time."""
+_PLAIN = bytes({*range(32, 127), *b"\t\n\r"} - {*b'"('})
+"""What Arrow reads as it is meant: no quotes, no `nan(1)`, no other letters."""
 _DOUBTS = 32
 """One cell in so many may be unusual."""
 _TOO_MANY = -2
@@ -58,9 +61,20 @@ def value_of(text: str) -> float | None:
 
 
 def load(body: str, delimiter: str, columns: Sequence[int] | None = None) -> Array | None:
-    """The numbers of these columns, (lines, columns); None where something is none, or nothing is there."""
+    """The numbers of these columns, (lines, columns); None where something is none, or nothing is there.
+
+    Empty cells are NaN, truth values 0 and 1; quotes around a number are taken off.
+    """
     if not _ANY.search(body):
         return None
+    values = _loaded(body, delimiter, columns)
+    if values is not None:
+        return values
+    mended = _mended(body.replace("\r\n", "\n").replace("\r", "\n"), delimiter)
+    return _loaded(mended, delimiter, columns) if mended else None
+
+
+def _loaded(body: str, delimiter: str, columns: Sequence[int] | None) -> Array | None:
     lines = io.TextIOWrapper(io.BytesIO(body.encode()), "utf-8")  # a StringIO is four times as large
     try:
         with lines:
@@ -71,13 +85,57 @@ def load(body: str, delimiter: str, columns: Sequence[int] | None = None) -> Arr
         return None
 
 
+@dataclass(frozen=True, slots=True)
+class _Repair:
+    """What stands for a number in a cell that is not written as one."""
+
+    empty: re.Pattern[str]
+    quoted: re.Pattern[str]
+    truth: re.Pattern[str]
+    gap: re.Pattern[str]
+
+
+@cache
+def _repair(delimiter: str) -> _Repair:
+    mark = re.escape(delimiter)
+    blank, ends = "[ ]" if delimiter == "\t" else "[ \t]", f"(?={mark}|$)"
+    return _Repair(
+        re.compile(rf"^[ \t{mark}]*\n|^[ \t{mark}]+\Z", re.MULTILINE),
+        re.compile(rf'(^|{mark}){blank}*"([^"\n{mark}]*)"{blank}*{ends}', re.MULTILINE),
+        re.compile(rf"(^|{mark}){blank}*(true|false){blank}*{ends}", re.MULTILINE | re.IGNORECASE | re.ASCII),
+        re.compile(rf"(?<={mark}){blank}*{ends}|^{blank}*(?={mark})", re.MULTILINE),
+    )
+
+
+def _mended(body: str, delimiter: str) -> str:
+    """The lines that are not empty, with numbers in empty cells, in those of truth values and within quotes."""
+    repair = _repair(delimiter)
+    body = repair.empty.sub("", body)
+    if '"' in body:
+        body = repair.quoted.sub(lambda found: found[1] + (found[2].strip() or "nan"), body)
+    if any(letter in body for letter in "tTfF"):
+        body = repair.truth.sub(lambda found: found[1] + ("1" if found[2].lower() == "true" else "0"), body)
+    if " " in body or "\t" in body:
+        return repair.gap.sub("nan", body)
+    for _ in range(2):  # of `,,,` the second is found once the first has got its number
+        body = body.replace(delimiter * 2, f"{delimiter}nan{delimiter}")
+    body = body.replace(f"{delimiter}\n", f"{delimiter}nan\n").replace(f"\n{delimiter}", f"\nnan{delimiter}")
+    return f"{'nan' * body.startswith(delimiter)}{body}{'nan' * body.endswith(delimiter)}"
+
+
 def read_lines(lines: Lines) -> list[Array] | None:
     """The columns of a table of numbers; None where a line or a cell is not what it should be.
 
     Lines may end in any way. Lines of empty cells are left out; an empty cell beside others is NaN.
     """
     library = _library()
-    return _by_numpy(lines) if library is None else _by_kernel(library, lines)
+    if library is not None:
+        return _by_kernel(library, lines)
+    found = _by_arrow(lines)
+    return _by_numpy(lines) if found is None else found
+
+
+# ----------------------------------------------------------------------------- the kernel
 
 
 @cache
@@ -123,6 +181,43 @@ def _doubted(cell: bytes) -> float | None:
         return None
 
 
+# ------------------------------------------------------------------------ without a compiler
+
+
+@cache
+def _arrow() -> Any:
+    """Arrow's reader of tables; None where it is not installed."""
+    try:
+        return import_module("pyarrow.csv")
+    except ImportError:
+        return None
+
+
+def _by_arrow(lines: Lines) -> list[Array] | None:
+    """All lines with Arrow's reader, whose numbers are correctly rounded, too; None where one is unusual."""
+    csv = _arrow()
+    if csv is None or lines.data[lines.start :].translate(None, _PLAIN):
+        return None
+    arrow = import_module("pyarrow")
+    names = [str(i) for i in range(lines.width)]
+    try:
+        table = csv.read_csv(
+            arrow.py_buffer(lines.data).slice(lines.start),
+            read_options=csv.ReadOptions(column_names=names),
+            parse_options=csv.ParseOptions(delimiter=lines.delimiter, quote_char=False),
+            convert_options=csv.ConvertOptions(
+                column_types=dict.fromkeys(names, arrow.float64()), null_values=[""], check_utf8=False
+            ),
+        )
+    except (arrow.ArrowException, ValueError, OverflowError, MemoryError):
+        return None
+    columns = [np.asarray(column, dtype=np.float64) for column in table.columns]
+    if all(column.null_count for column in table.columns):  # some lines may have nothing in them
+        told = ~np.logical_and.reduce([np.asarray(column.is_null()) for column in table.columns])
+        columns = [column[told] for column in columns]
+    return columns if len(columns[0]) else None
+
+
 def _by_numpy(lines: Lines) -> list[Array] | None:
     """A stretch after the other; every column is put together, and its stretches are let go."""
     parts: list[list[Array]] = [[] for _ in range(lines.width)]
@@ -145,6 +240,6 @@ def _by_numpy(lines: Lines) -> list[Array] | None:
 def _stretches(lines: Lines) -> Iterator[bytes]:
     data, begin = lines.data, lines.start
     while begin < len(data):
-        end = data.find(b"\n", begin + _STRETCH) + 1 or len(data)
+        end = data.find(b"\n", begin + STRETCH) + 1 or len(data)
         yield data[begin:end]
         begin = end

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.files import write_atomic
 from stlc.source import Source, Span
-from stlc.trace_cells import NUMBER, Lines, bare, load, read_lines, value_of
+from stlc.trace_cells import NUMBER, STRETCH, Lines, bare, load, read_lines, value_of
 from stlc.trace_npz import unreadable
 from stlc.trace_table import Table, is_unit
 
@@ -35,7 +35,6 @@ _HEAD_BYTES = 1 << 16
 _END = re.compile(rb"\r\n|\r|\n")
 _HEAD = re.compile(r"(?P<name>[^\[\]]*[^\[\]\s](?:\[\d+\])?)\s*(?:\[(?P<unit>[^\]]*)\])?")
 _ROUND = re.compile(r"(?P<name>.*[^\s(])\s*\((?P<unit>[^()]+)\)")
-_ANY = re.compile(r"\S")
 _FILLED = re.compile(r"[^\n]*\S[^\n]*")
 _COMMA = re.compile(r"(?<!\d),|,(?!\d)")
 """A comma that is not within a number."""
@@ -72,10 +71,7 @@ def table_of_text(path: Path, data: bytes) -> Table:
     sheet = _sheet(path, data)
     names, units = _read_header(sheet)
     texts = _text_columns(sheet, len(names))
-    columns = _read_fast(sheet, len(names), texts)
-    if columns is None:
-        columns = _read_strict(sheet, len(names), texts)
-    return Table(dict(zip(names, columns, strict=True)), units)
+    return Table(dict(zip(names, _read_body(sheet, len(names), texts), strict=True)), units)
 
 
 def _read(path: Path) -> bytes:
@@ -184,15 +180,32 @@ def _text_columns(sheet: _Sheet, width: int) -> frozenset[int]:
     return frozenset(words)
 
 
-def _read_fast(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array] | None:
-    """All lines at once with NumPy's reader; None if anything about them is unusual."""
-    body = sheet.source.text[sheet.body_at :]
-    if not _ANY.search(body) or '"' in body or len(texts) == width:
+def _read_body(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array]:
+    """The columns, a stretch of lines after the other: what is unusual is read cell by cell."""
+    findings: list[Diagnostic] = []
+    parts: list[list[Array]] = [[] for _ in range(width)]
+    text, begin = sheet.source.text, sheet.body_at
+    while begin < len(text) and len(findings) < _MAX_FINDINGS:
+        end = text.find("\n", begin + STRETCH) + 1 or len(text)
+        columns = _read_fast(sheet, text[begin:end], width, texts)
+        if columns is None:
+            columns = _read_strict(sheet, (begin, end), (width, texts), findings)
+        for part, column in zip(parts, columns, strict=True):
+            part.append(column)
+        begin = end
+    if findings:
+        raise TraceError(*findings)
+    if not any(map(len, parts[0])):
+        raise unreadable(sheet.source.name, "no line of numbers follows the header")
+    return [np.concatenate(part) for part in parts]
+
+
+def _read_fast(sheet: _Sheet, body: str, width: int, texts: frozenset[int]) -> list[Array] | None:
+    """Whole lines at once with NumPy's reader; None if anything about them is unusual."""
+    if len(texts) == width or (texts and '"' in body):
         return None
     numbers = [i for i in range(width) if i not in texts]
     values = load(body, sheet.delimiter, numbers if texts else None)
-    if values is None:
-        values = load(_without_gaps(body, sheet.delimiter), sheet.delimiter, numbers if texts else None)
     words = [line.split(sheet.delimiter) for line in body.split("\n") if texts and _told(line, sheet)]
     if values is None or values.shape[1] != len(numbers) or any(len(cells) != width for cells in words):
         return None
@@ -201,36 +214,29 @@ def _read_fast(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array] 
     return [columns[i] for i in range(width)]
 
 
-def _without_gaps(body: str, delimiter: str) -> str:
-    """The lines with `nan` in empty cells, without those that hold nothing else."""
-    mark = re.escape(delimiter)
-    kept = re.sub(rf"^[ {mark}]*\n|^[ {mark}]+\Z", "", body, flags=re.MULTILINE)
-    return re.sub(rf"(?<={mark}) *(?={mark}|$)|^ *(?={mark})", "nan", kept, flags=re.MULTILINE)
-
-
 def _told(line: str, sheet: _Sheet) -> bool:
     """Whether any cell of a line is filled."""
     return bool(line.strip(f" \t{sheet.delimiter}"))
 
 
-def _read_strict(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array]:
-    """Cell by cell, with the place of everything that is wrong."""
-    findings: list[Diagnostic] = []
+def _read_strict(
+    sheet: _Sheet, ends: tuple[int, int], shape: tuple[int, frozenset[int]], findings: list[Diagnostic]
+) -> list[Array]:
+    """The lines of a stretch cell by cell, with the place of everything that is wrong."""
+    width, texts = shape
     rows: list[list[float | str]] = []
-    start = sheet.body_at
-    for line in sheet.source.text[sheet.body_at :].split("\n"):
+    start, end = ends
+    for line in sheet.source.text[start:end].removesuffix("\n").split("\n"):
         if _told(line, sheet):
             cells = list(_cells(sheet.source, start, line, sheet.delimiter))
-            rows.append(_read_row(sheet, cells, (width, texts), findings))
+            rows.append(_read_row(sheet, cells, shape, findings))
         start += len(line) + 1
         if len(findings) >= _MAX_FINDINGS:
             break
-    if findings:
-        raise TraceError(*findings)
-    if not rows:
-        raise unreadable(sheet.source.name, "no line of numbers follows the header")
-    kinds = [str if i in texts else np.float64 for i in range(width)]
-    return [np.array([row[i] for row in rows], dtype=kind) for i, kind in enumerate(kinds)]
+    whole = [] if findings else rows
+    return [
+        np.array([row[i] for row in whole], dtype=str if i in texts else np.float64) for i in range(width)
+    ]
 
 
 def _read_row(

@@ -43,10 +43,14 @@ NUMBERS = st.one_of(
 DAMAGE = st.sampled_from([*"\0\r\n\t ,;\"'.eE+-_x0", "\ufeff", "\x0b", "\x85", "1e", "0x1", "stop", ",,"])
 
 
-@pytest.fixture(params=["kernel", "numpy"])
+@pytest.fixture(params=["kernel", "arrow", "numpy"])
 def reader(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both ways of reading many lines."""
+    """Every way of reading many lines."""
+    if request.param == "arrow":
+        pytest.importorskip("pyarrow.csv")
     if request.param == "numpy":
+        monkeypatch.setattr(trace_cells, "_arrow", lambda: None)
+    if request.param != "kernel":
         monkeypatch.setattr(trace_cells, "_library", lambda: None)
     elif native.compiler() is None:
         pytest.skip("there is no C compiler here")
@@ -116,8 +120,8 @@ def test_usual_files_need_no_careful_reader(
     monkeypatch: pytest.MonkeyPatch, choose: Callable[[int], None], start: bytes, end: bytes
 ) -> None:
     choose(ALWAYS)
-    monkeypatch.setattr(trace_csv, "_read_fast", None)
-    monkeypatch.setattr(trace_cells, "_STRETCH", 64)
+    monkeypatch.setattr(trace_csv, "_read_body", None)
+    monkeypatch.setattr(trace_cells, "STRETCH", 64)
     rows = [b"%d,%r,-1.5e-3, nan ,1e300" % (k, k / 7) for k in range(40)]
     table = table_of_text(NAME, start + end.join([b"t [s],a,b,c,d", *rows, b"", b"7,1,2,3,4"]))
     assert table.units["t"] == "s"
@@ -135,8 +139,8 @@ def test_what_does_not_fit_is_left_to_the_careful_reader(line: bytes) -> None:
 
 def test_empty_cells_and_lines(reader: None) -> None:  # noqa: ARG001 - both ways
     columns = read_lines(Lines(b"head\n1,2\n\n , \t\n" + b"3,4\n" * 3, 5, 2, ","))
-    if columns is not None:  # NumPy's reader leaves empty cells to the careful one
-        assert [column.tolist() for column in columns] == [[1, 3, 3, 3], [2, 4, 4, 4]]
+    assert columns is not None
+    assert [column.tolist() for column in columns] == [[1, 3, 3, 3], [2, 4, 4, 4]]
 
 
 @pytest.mark.usefixtures("reader")
