@@ -203,9 +203,21 @@ def find_trace(name: str, runs: Path = Path("runs")) -> Path:
     folders = [Path(), runs / "latest"]
     for folder in folders:
         path = folder / name
-        if path.is_file():
+        if path.is_file() or _is_bag(path):
             return path
     raise UsageError(_no_such("trace", name, folders))
+
+
+def _is_bag(path: Path) -> bool:
+    """Whether a path is the folder of a bag of ROS 2."""
+    with suppress(OSError):
+        return path.is_dir() and ((path / "metadata.yaml").is_file() or any(map(is_stored, path.iterdir())))
+    return False
+
+
+def is_stored(path: Path) -> bool:
+    """Whether a path is a file of a bag of ROS 2, packed or not."""
+    return path.name.lower().removesuffix(".zstd").endswith((".db3", ".mcap")) and path.is_file()
 
 
 def _no_such(kind: str, name: str, folders: Sequence[Path]) -> Diagnostic:

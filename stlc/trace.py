@@ -1,4 +1,4 @@
-"""Recorded signals: a signature, a time step and arrays; `.npz` and `.csv` in and out, never a pickle.
+"""Recorded signals: a signature, a time step, arrays; `.npz`, `.csv` and `.mcap` in and out, never a pickle.
 
 An `.npz` trace holds `t` (samples,) in seconds, one array (samples,) or (traces, samples) per signal, arrays
 `extra.NAME` of any shape, and `meta`, a JSON text that says what was recorded, with which specification.
@@ -41,7 +41,7 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 RESERVED = ("t", "meta")
-WRITTEN = (".npz", ".csv")
+WRITTEN = (".npz", ".csv", ".mcap")
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,8 +126,9 @@ AS_IT_IS = Reading()
 def load_trace(path: Path | str, reading: Reading = AS_IT_IS) -> Trace:
     """Read a trace; the format follows the suffix.
 
-    It is one of `.csv`, `.tsv`, `.parquet`, `.mat` and `.mcap`; everything else is an `.npz`.
-    Values may be NaN or infinite here: the monitor refuses them where a requirement needs them.
+    It is one of `.csv`, `.tsv`, `.parquet`, `.mat`, `.mcap`, `.bag` and `.db3`, or the folder of a bag;
+    everything else is an `.npz`. Values may be NaN or infinite here: the monitor refuses them where a
+    requirement needs them.
 
     Raises:
         UsageError: U102, no such file.
@@ -185,10 +186,11 @@ def _trace(recording: Recording, t0: float, dt: float, data: dict[str, Floats]) 
 
 
 def save_trace(path: Path | str, trace: Trace) -> None:
-    """Write a trace; the format follows the suffix. A `.csv` holds the signals alone.
+    """Write a trace; the format follows the suffix. A `.csv` holds the signals alone, an `.mcap` no extras.
 
     Raises:
-        UsageError: U101, the suffix is neither `.npz` nor `.csv`.
+        UsageError: U101, the suffix is none of `.npz`, `.csv` and `.mcap`.
+        MissingError: R301, an `.mcap` needs a package that is not installed.
         TraceError: E605, a signal has a name that the format reserves.
         MissingError: R201, no room or no permission; an old file stays as it was.
     """
@@ -199,17 +201,23 @@ def save_trace(path: Path | str, trace: Trace) -> None:
     if Path(path).suffix.lower() == ".csv":
         _to_csv(path, trace)
         return
+    meta = meta_array(replace(trace.meta, dt=trace.dt), trace.signature)
+    if Path(path).suffix.lower() == ".mcap":
+        from stlc.trace_mcap import Written, write_mcap
+
+        write_mcap(path, Written(trace.times, trace.data, trace.signature, meta, trace.meta.origin))
+        return
     arrays: dict[str, NDArray[Any]] = {"t": trace.times}
     arrays |= trace.data
     arrays |= {f"{EXTRA}{name}": np.asarray(values) for name, values in trace.extras.items()}
-    arrays["meta"] = meta_array(replace(trace.meta, dt=trace.dt), trace.signature)
+    arrays["meta"] = meta
     write_npz(path, arrays)
 
 
 def check_writable(path: Path | str) -> None:
     """Raise UsageError (U101) where the suffix of a file is none that traces are written with."""
     if Path(path).suffix.lower() not in WRITTEN and not Path(path).is_char_device():
-        message = f"`{path}`: a trace is written as {' or '.join(WRITTEN)}"
+        message = f"`{path}`: a trace is written as {', '.join(WRITTEN[:-1])} or {WRITTEN[-1]}"
         raise UsageError(
             Diagnostic("U101", message, help=(f"e.g. {Path(path).stem or 'trace'}{WRITTEN[0]}",))
         )

@@ -1,7 +1,8 @@
 """Cells of a table -> numbers: one at a time, or all of a large file in little more than their memory.
 
-`cells.c` reads large texts where there is a C compiler (`stlc.native`), else Arrow does where it is installed,
-else NumPy's reader, a stretch at a time. All leave what is unusual to others, and give the same numbers.
+`cells.c` reads large texts where there is a C compiler (`stlc.native`), else Arrow does where it is
+installed, else NumPy's reader, a stretch at a time. All leave what is unusual to others, and give the same
+numbers.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ def _repair(delimiter: str) -> _Repair:
 
 
 def _mended(body: str, delimiter: str) -> str:
-    """The lines that are not empty, with numbers in empty cells, in those of truth values and within quotes."""
+    """The lines that are not empty, with numbers for empty cells, truth values and what is within quotes."""
     repair = _repair(delimiter)
     body = repair.empty.sub("", body)
     if '"' in body:

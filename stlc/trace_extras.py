@@ -7,7 +7,12 @@ from typing import Any
 
 from stlc.diagnostics import Diagnostic, MissingError
 
-_EXTRAS = {"pyarrow": "parquet", "h5py": "mat", "mcap": "mcap", "mcap_ros2": "mcap"}
+_EXTRAS = {
+    **{"pyarrow": "parquet", "h5py": "mat", "mcap": "mcap", "google": "mcap"},
+    **{"rosbags": "bag", "lz4": "bag", "zstandard": "bag"},
+}
+_PACKAGES = {"google": "protobuf"}
+"""Names of packages that differ from those of their modules."""
 
 
 def needed(module: str) -> Any:
@@ -21,5 +26,6 @@ def needed(module: str) -> Any:
     except ImportError:
         package = module.partition(".")[0]
         extra = _EXTRAS.get(package, "all")
-        message = f"this needs the package `{package.replace('_', '-')}`, which is not installed"
+        named = _PACKAGES.get(package, package)
+        message = f"this needs the package `{named}`, which is not installed"
         raise MissingError(Diagnostic("R301", message, help=(f"pip install 'stlc[{extra}]'",))) from None

@@ -16,14 +16,17 @@ from stlc.trace_table import of_table
 Reader = Callable[[Path], Recording]
 
 TABLES = (".csv", ".tsv")
-SUFFIXES = (".npz", *TABLES, ".parquet", ".pq", ".mat", ".mcap")
+SUFFIXES = (".npz", *TABLES, ".parquet", ".pq", ".mat", ".mcap", ".bag", ".db3")
 
 _LAZY: Mapping[str, str] = {
     ".parquet": "stlc.trace_parquet:read_parquet",
     ".pq": "stlc.trace_parquet:read_parquet",
     ".mat": "stlc.trace_mat:read_mat",
     ".mcap": "stlc.trace_mcap:read_mcap",
+    ".bag": "stlc.trace_bag:read_bag",
+    ".db3": "stlc.trace_bag:read_bag2",
 }
+_FOLDER = "stlc.trace_bag:read_bag2"
 
 
 def read_recording(path: Path) -> Recording:
@@ -37,9 +40,10 @@ def read_recording(path: Path) -> Recording:
     suffix = path.suffix.lower()
     if suffix in TABLES:
         return of_table(path, read_csv(path))
-    if suffix not in _LAZY:
+    where = _FOLDER if path.is_dir() else _LAZY.get(suffix)
+    if where is None:
         return _from_npz(path)
-    module, _, function = _LAZY[suffix].partition(":")
+    module, _, function = where.partition(":")
     reader: Reader = getattr(import_module(module), function)
     return reader(path)
 

@@ -1,7 +1,8 @@
 """Variables in a MATLAB `.mat` file: version 5 is read here, version 7.3 is HDF5 (extra `mat`).
 
 Numeric and logical arrays are signals, with `t` as the clock; the fields of a structure `s` are called `s.x`.
-A column of a matrix (samples, k) is a component of a vector. Texts, cells and objects are left out.
+A column of a matrix (samples, k) is a component of a vector. Texts, cells and objects are left out. Complex
+numbers are no signal: where one is asked for, that is said.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from stlc.trace_recording import Recording, of_arrays
 Array = NDArray[Any]
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
+_COMPLEX = ("real", "imag")
 _RATIO = 1100
 """More than deflate can shrink anything."""
 
@@ -75,8 +77,16 @@ def _read_hdf5(path: Path) -> dict[str, Array]:
             if size > room or size > _RATIO * dataset.id.get_storage_size() + 1024:
                 raise unreadable(path, f"`{name}` declares {size / 1e9:.3g} GB that the file does not hold")
             room -= size
-            found[name] = np.asarray(dataset[()]).T
+            found[name] = _real(np.asarray(dataset[()]).T)
     return found
+
+
+def _real(values: Array) -> Array:
+    """Pairs of real and imaginary parts as complex numbers; real ones where all of the latter are 0."""
+    if values.dtype.names is None:
+        return values
+    real, turned = (values[part].astype(np.float64) for part in _COMPLEX)
+    return real + 1j * turned if turned.any() else real
 
 
 def _datasets(path: Path, group: Any, prefix: str, depth: int) -> Iterator[tuple[str, Any]]:
@@ -96,6 +106,7 @@ def _datasets(path: Path, group: Any, prefix: str, depth: int) -> Iterator[tuple
 
 def _plain(dataset: Any) -> bool:
     kind = dataset.attrs.get("MATLAB_class", b"double")
-    is_numbers = dataset.dtype.kind in "biuf" and kind not in (b"char", b"cell", b"function_handle")
+    numeric = dataset.dtype.kind in "biuf" or dataset.dtype.names == _COMPLEX
+    is_numbers = numeric and kind not in (b"char", b"cell", b"function_handle")
     empty = dataset.attrs.get("MATLAB_empty", 0)
     return bool(is_numbers and not empty and not dataset.is_virtual and not dataset.external)

@@ -27,7 +27,7 @@ _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8
 _STRUCT = 2
 _NUMERIC = range(6, 16)
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
-_LOGICAL = 0x02
+_LOGICAL, _COMPLEX = 0x02, 0x08
 _DEEPEST = 16
 
 
@@ -43,6 +43,8 @@ class _Element:
 
 def read_mat5(path: Path) -> dict[str, Array]:
     """Numeric and logical arrays by name; the fields of a 1 x 1 structure `s` are `s.field`.
+
+    An array is complex where an imaginary part is not 0.
 
     Raises:
         TraceError: E603, damaged, or larger than it may be.
@@ -102,6 +104,7 @@ class _Matrix:
 
     kind: int
     logical: bool
+    imaginary: bool
     shape: tuple[int, ...]
     parts: tuple[_Element, ...]
 
@@ -114,7 +117,7 @@ def _named(data: memoryview, order: str) -> tuple[str, _Matrix]:
         if len(parts) > MAX_ARRAYS:
             raise _DamageError("too many parts")
     if not parts:
-        return "", _Matrix(6, False, (0,), ())
+        return "", _Matrix(6, False, False, (0,), ())
     if len(parts) < 3 or len(parts[0].data) < 8:
         raise _DamageError("an array without a head")
     flags = struct.unpack_from(f"{order}I", parts[0].data)[0]
@@ -122,7 +125,8 @@ def _named(data: memoryview, order: str) -> tuple[str, _Matrix]:
     if not shape or min(shape) < 0:
         raise _DamageError("an array without dimensions")
     name = bytes(parts[2].data).decode("latin-1").rstrip("\0")
-    return name, _Matrix(flags & 0xFF, bool(flags >> 8 & _LOGICAL), shape, tuple(parts[3:]))
+    bits = flags >> 8
+    return name, _Matrix(flags & 0xFF, bool(bits & _LOGICAL), bool(bits & _COMPLEX), shape, tuple(parts[3:]))
 
 
 def _add(found: dict[str, Array], name: str, matrix: _Matrix, order: str, depth: int) -> None:
@@ -133,12 +137,20 @@ def _add(found: dict[str, Array], name: str, matrix: _Matrix, order: str, depth:
         for field, inner in _fields(matrix, order):
             _add(found, f"{name}.{field}", inner, order, depth + 1)
     elif matrix.kind in _NUMERIC and matrix.parts:
-        values = _numbers(matrix.parts[0], order)
-        if len(values) != math.prod(matrix.shape):
-            shown = " x ".join(map(str, matrix.shape))
-            raise _DamageError(f"`{name}` declares {shown} values, {len(values)} follow")
         dtype = "?" if matrix.logical else _CLASSES[matrix.kind]
-        found[name] = values.astype(dtype).reshape(matrix.shape, order="F")
+        values = _part(name, matrix, 0, order).astype(dtype)
+        if matrix.imaginary and (turned := _part(name, matrix, 1, order)).any():
+            values = values + 1j * turned
+        found[name] = values.reshape(matrix.shape, order="F")
+
+
+def _part(name: str, matrix: _Matrix, index: int, order: str) -> Array:
+    """The real parts of an array, or the imaginary ones."""
+    values = _numbers(matrix.parts[index], order) if index < len(matrix.parts) else np.zeros(0)
+    if len(values) != math.prod(matrix.shape):
+        shown = " x ".join(map(str, matrix.shape))
+        raise _DamageError(f"`{name}` declares {shown} values, {len(values)} follow")
+    return values
 
 
 def _fields(matrix: _Matrix, order: str) -> Iterator[tuple[str, _Matrix]]:

@@ -1,43 +1,50 @@
-"""ROS 2 bags in `.mcap` files (extra `mcap`), read without a ROS installation.
+"""Logs in `.mcap` files (extra `mcap`), in and out: messages of ROS 1 and 2, JSON and Protocol Buffers.
 
-Every number in a message is a signal: `/odom` with `twist.twist.linear.x` gives `odom.twist.twist.linear.x`;
-a message that holds nothing but `data` is called by its topic. Times are those at which a message was logged,
-in seconds since the first one. Every topic has a clock of its own, so most bags are read with `--resample`.
+What stlc writes is JSON with a schema, as Foxglove plots it: a topic a trace, a message a sample. A record of
+the file says what the signals mean, so that reading it back gives the same trace.
 """
 
 from __future__ import annotations
 
-import io
+import json
 import math
-from array import array
-from collections.abc import Iterator
+import re
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, UsageError
-from stlc.signature import Column
+from stlc.files import atomic_path
+from stlc.signature import Signature
 from stlc.trace_extras import needed
+from stlc.trace_messages import (
+    DEEPEST,
+    HEADER,
+    LONGEST,
+    STAMPS,
+    DamageError,
+    Decode,
+    Log,
+    Number,
+    Room,
+    mapped,
+    numbers_of,
+)
+from stlc.trace_meta import read_meta
 from stlc.trace_npz import unreadable
 from stlc.trace_parquet import damage
 from stlc.trace_recording import Recording, Strand
+from stlc.trace_ros import decoder
 
-MAX_BYTES = 2_000_000_000
-MAX_VALUES = 500_000_000
+Floats = NDArray[np.float64]
 
-_LONGEST = 64
-"""Arrays of more numbers than this are data (images, scans), not signals."""
-
-_DEEPEST = 12
-
-
-@dataclass(slots=True)
-class _Topic:
-    times: list[int] = field(default_factory=list)
-    values: dict[str, list[float]] = field(default_factory=dict)
-    held: set[str] = field(default_factory=set)
+OURS = "stlc"
+"""The record of a file that says what its signals mean."""
+_READ = "read are JSON, Protocol Buffers, and ROS 1 and 2"
 
 
 def read_mcap(path: Path) -> Recording:
@@ -45,86 +52,243 @@ def read_mcap(path: Path) -> Recording:
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
-        MissingError: R301, `mcap` or `mcap-ros2-support` is not installed.
+        MissingError: R301, `mcap`, or what an encoding needs, is not installed.
         TraceError: E603, another format, damaged, or without numbers.
     """
-    try:
-        with path.open("rb") as file:
-            raw = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        reason = (error.strerror or type(error).__name__).lower()
-        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: {reason}")) from None
-    if len(raw) > MAX_BYTES:
-        raise unreadable(path, f"it is larger than {MAX_BYTES / 1e9:.0f} GB", advice="split it")
+    log = Log(path)
     with damage(path):
-        topics = _topics(path, raw)
-    strands: list[Strand] = []
-    columns: dict[str, Column] = {}
-    origin = min((topic.times[0] for topic in topics.values()), default=0)
-    for topic in topics.values():
-        whole = {n: x for n, x in topic.values.items() if len(x) == len(topic.times)}
-        clock = (np.array(topic.times, dtype=np.int64) - origin).astype(np.float64) * 1e-9
-        strands.append(Strand({n: np.array(x, dtype=np.float64) for n, x in whole.items()}, clock))
-        columns |= {n: Column(n, kind="int") for n in topic.held if n in whole}
-    if not any(strand.arrays for strand in strands):
-        raise unreadable(path, "it holds no message with numbers")
-    return Recording(str(path), tuple(strands), columns)
+        ours = add_mcap(log, path)
+        found = None if ours is None else _as_written(log, ours)
+    return log.recording() if found is None else found
 
 
-def _topics(path: Path, raw: bytes) -> dict[str, _Topic]:
-    reader = needed("mcap.reader").make_reader(io.BytesIO(raw))
-    factory = needed("mcap_ros2.decoder").DecoderFactory()
-    decoders: dict[int, Any] = {}
-    topics: dict[str, _Topic] = {}
-    total = 0
-    for schema, channel, message in reader.iter_messages():
-        if channel.id not in decoders:
-            decoders[channel.id] = factory.decoder_for(channel.message_encoding, schema)
-        decode = decoders[channel.id]
-        if decode is None:  # not a message of ROS 2
-            continue
-        topic = topics.setdefault(channel.topic, _Topic())
-        topic.times.append(message.log_time)
-        total += _append(topic, channel.topic.strip("/").replace("/", "."), decode(message.data))
-        if total > MAX_VALUES:
-            raise unreadable(path, f"it holds more than {MAX_VALUES:,} numbers", advice="split it")
-    return topics
+@dataclass(slots=True)
+class _File:
+    """What has been met of a file so far."""
+
+    log: Log
+    room: Room
+    schemas: dict[int, Any] = field(default_factory=dict)
+    channels: dict[int, Any] = field(default_factory=dict)
+    decoders: dict[int, Decode | None] = field(default_factory=dict)
+
+    def take(self, record: Any) -> None:
+        """A record that stands in a chunk or outside of one."""
+        match type(record).__name__:
+            case "Schema":
+                self.schemas.setdefault(record.id, record)
+            case "Channel":
+                self.channels.setdefault(record.id, record)
+            case "Message":
+                self.message(record)
+
+    def message(self, message: Any) -> None:
+        channel = self.channels.get(message.channel_id)
+        if channel is None:
+            raise DamageError("a message of an unknown channel")
+        if channel.id not in self.decoders:
+            self.decoders[channel.id] = self.decoder(channel)
+        decode = self.decoders[channel.id]
+        if decode is not None:
+            self.log.add(channel.topic, message.log_time, decode(self.room.whole(message.data)))
+
+    def decoder(self, channel: Any) -> Decode | None:
+        """The reader of a channel's messages; None, and a reason, where nothing reads them."""
+        schema, encoding = self.schemas.get(channel.schema_id), channel.message_encoding
+        described = "" if schema is None else schema.encoding
+        try:
+            if encoding == "json":
+                return _of_json
+            if encoding == "protobuf" and described == "protobuf":
+                return _protobuf(schema)
+            if schema and (encoding, described) in (("cdr", "ros2msg"), ("ros1", "ros1msg")):
+                return decoder(schema.data.decode("utf-8", "replace"), encoding)
+        except DamageError as error:
+            self.log.unread[channel.topic] = str(error)
+            return None
+        shown = f"`{encoding[:40]}`" + (f" by `{described[:40]}`" if described else "")
+        self.log.unread[channel.topic] = f"its messages are written as {shown} ({_READ})"
+        return None
 
 
-def _append(topic: _Topic, name: str, content: Any) -> int:
-    """Add a message to its topic; how many numbers it has."""
-    count = 0
-    for signal, value in _numbers(name, content, 0):
-        topic.values.setdefault(signal, []).append(float(value))
-        if isinstance(value, int):
-            topic.held.add(signal)
-        count += 1
-    return count
+def add_mcap(log: Log, path: Path) -> Mapping[str, str] | None:
+    """Add the messages of a file to a log; what stlc has noted in it about its own."""
+    reader = needed("mcap.stream_reader").StreamReader
+    ours: Mapping[str, str] | None = None
+    with mapped(path) as data:
+        size, room = len(data), Room(path, len(data))
+        file = _File(log, room)
+        stream = cast("IO[bytes]", data)
+        for record in reader(stream, emit_chunks=True, record_size_limit=size).records:
+            if type(record).__name__ == "Chunk":
+                inner = room.unpacked(record.compression, record.data, record.uncompressed_size)
+                if record.uncompressed_crc and zlib.crc32(inner) != record.uncompressed_crc:
+                    raise DamageError("the content of a chunk is not what was written")
+                parts = needed("mcap.records").Chunk(
+                    compression="",
+                    data=inner,
+                    message_end_time=0,
+                    message_start_time=0,
+                    uncompressed_crc=0,
+                    uncompressed_size=len(inner),
+                )
+                for part in needed("mcap.stream_reader").breakup_chunk(parts):
+                    file.take(part)
+            elif type(record).__name__ == "Metadata" and record.name == OURS:
+                ours = record.metadata
+            else:
+                file.take(record)
+    return ours
 
 
-def _numbers(name: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
-    """All numbers in a message, by path; stamps are left to the clock."""
-    if isinstance(value, (int, float)):
-        yield name, value
-    elif isinstance(value, (str, bytes)) or value is None or depth > _DEEPEST:
+# ------------------------------------------------------------------------------ encodings
+
+
+def _of_json(data: bytes) -> Iterable[Number]:
+    return numbers_of(json.loads(data))
+
+
+def _protobuf(schema: Any) -> Decode:
+    """The reader of a message by the descriptors that the file holds."""
+    pool = needed("google.protobuf.descriptor_pool").DescriptorPool()
+    files = needed("google.protobuf.descriptor_pb2").FileDescriptorSet.FromString(schema.data)
+    left = {each.name: each for each in files.file}
+    while left:
+        ready = [each for each in left.values() if not left.keys() & set(each.dependency)]
+        if not ready:
+            raise DamageError("descriptors that need each other")
+        for each in ready:
+            pool.Add(left.pop(each.name))
+    kind = needed("google.protobuf.message_factory").GetMessageClass(pool.FindMessageTypeByName(schema.name))
+
+    def decode(data: bytes) -> Iterator[Number]:
+        message = kind.FromString(data)
+        fields = message.DESCRIPTOR.fields
+        if [each.name for each in fields] == ["data"]:
+            return _proto_field("", message, fields[0], 0)
+        return _proto_fields("", message, 0)
+
+    return decode
+
+
+def _proto_fields(name: str, message: Any, depth: int) -> Iterator[Number]:
+    fields = message.DESCRIPTOR.fields
+    if {each.name for each in fields} in STAMPS:
+        seconds, parts = (getattr(message, each.name) for each in fields)
+        yield Number(name, seconds + 1e-9 * parts)
         return
-    elif isinstance(value, (list, tuple, array)):
-        if len(value) <= _LONGEST:
+    for each in fields:
+        if each.name != HEADER:
+            yield from _proto_field(f"{name}.{each.name}" if name else each.name, message, each, depth)
+
+
+def _proto_field(name: str, message: Any, each: Any, depth: int) -> Iterator[Number]:
+    value = getattr(message, each.name)
+    if each.is_repeated:
+        is_map = each.message_type is not None and each.message_type.GetOptions().map_entry
+        if not is_map and len(value) <= LONGEST:
             for i, item in enumerate(value):
-                yield from _numbers(f"{name}[{i}]", item, depth + 1)
-    else:
-        yield from _fields(name, value, depth)
+                yield from _proto_value(f"{name}[{i}]", item, each, depth)
+    elif not each.has_presence or message.HasField(each.name):
+        yield from _proto_value(name, value, each, depth)
 
 
-def _fields(name: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
-    fields = [f for f in getattr(value, "__slots__", ()) if not f.startswith("_")]
-    if {*fields} in ({"sec", "nanosec"}, {"secs", "nsecs"}):
-        seconds, nanoseconds = (getattr(value, f) for f in fields)
-        total = seconds + 1e-9 * nanoseconds
-        if math.isfinite(total):
-            yield name, float(total)
-        return
-    for part in fields:
-        if part != "header":
-            inner = name if depth == 0 and fields == ["data"] else f"{name}.{part}"
-            yield from _numbers(inner, getattr(value, part), depth + 1)
+def _proto_value(name: str, value: Any, each: Any, depth: int) -> Iterator[Number]:
+    if each.message_type is not None:
+        if depth <= DEEPEST:
+            yield from _proto_fields(name, value, depth + 1)
+    elif isinstance(value, (int, float)):
+        yield Number(name, float(value), isinstance(value, int))
+
+
+# ---------------------------------------------------------------------------- stlc's own
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """A trace as it is written.
+
+    Attributes:
+        times: in seconds, (samples,).
+        data: signal -> (traces, samples).
+        signature: what they mean.
+        meta: where they come from; `origin` is the time of day at time 0.
+    """
+
+    times: Floats
+    data: Mapping[str, Floats]
+    signature: Signature
+    meta: NDArray[np.str_]
+    origin: int | None
+
+
+def write_mcap(path: Path | str, trace: Written) -> None:
+    """Write signals as messages of JSON: topic `/NAME` of a file `NAME.mcap`, or `/NAME/0`, `/NAME/1`, ….
+
+    Raises:
+        MissingError: R301, `mcap` is not installed; R201, no room or no permission; an old file stays as it
+            was.
+    """
+    writers = needed("mcap.writer")
+    traces = len(next(iter(trace.data.values())))
+    base = "/" + (re.sub(r"[^\w.-]+", "_", Path(path).stem) or "trace")
+    topics = [base] if traces == 1 else [f"{base}/{k}" for k in range(traces)]
+    first = math.floor(float(trace.times[0]) * 1e9)
+    origin = max(trace.origin or 0, -first)
+    stamps = [origin + round(float(t) * 1e9) for t in trace.times]
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        writer = writers.Writer(file)
+        writer.start(profile="", library="stlc")
+        schema = writer.register_schema(base[1:], "jsonschema", json.dumps(_schema(trace)).encode())
+        channels = [writer.register_channel(topic, "json", schema) for topic in topics]
+        rows = {name: values.T.tolist() for name, values in trace.data.items()}
+        for k, stamp in enumerate(stamps):
+            for i, channel in enumerate(channels):
+                cells = ", ".join(
+                    f"{json.dumps(name)}: {_cell(values[k][i])}" for name, values in rows.items()
+                )
+                writer.add_message(channel, stamp, f"{{{cells}}}".encode(), stamp, sequence=k)
+        writer.add_metadata(
+            OURS, {"topics": json.dumps(topics), "origin": str(origin), "meta": str(trace.meta)}
+        )
+        writer.finish()
+
+
+def _cell(value: float) -> str:
+    """A number of JSON; null for NaN, and one that no float can hold for what is infinite."""
+    if math.isnan(value):
+        return "null"
+    return repr(value) if math.isfinite(value) else "1e999" if value > 0 else "-1e999"
+
+
+def _schema(trace: Written) -> dict[str, object]:
+    units = {column.name: column.unit.text for column in trace.signature.columns}
+    properties = {
+        name: {"type": "number"} | ({"description": units[name]} if units.get(name) else {})
+        for name in trace.data
+    }
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "type": "object",
+        "properties": properties,
+    }
+
+
+def _as_written(log: Log, ours: Mapping[str, str]) -> Recording | None:
+    """The trace that stlc wrote; None where the file has been changed since."""
+    topics, origin = json.loads(ours.get("topics", "[]")), int(ours.get("origin", "0"))
+    if not isinstance(topics, list) or not topics or not all(isinstance(topic, str) for topic in topics):
+        return None
+    found = [log.topic(topic) for topic in topics]
+    times, first = found[0]
+    alike = all(
+        np.array_equal(times, others) and arrays.keys() == first.keys() for others, arrays in found[1:]
+    )
+    if not alike or not first:
+        return None
+    if not -(2**63) < origin < 2**63:
+        raise unreadable(log.path, f"its time 0 is {origin} ns, which is no time")
+    clock = np.array([(t - origin) * 1e-9 for t in times.tolist()], dtype=np.float64)
+    data = {name: np.stack([arrays[name] for _, arrays in found]) for name in first}
+    meta, columns = read_meta(log.path, np.array(ours.get("meta", "{}")))
+    return Recording(str(log.path), (Strand(data, clock),), columns, meta)

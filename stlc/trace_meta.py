@@ -19,6 +19,7 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "seed": (int,),
     "horizon": (int,),
     "dt": (int, float),
+    "origin": (int,),
     "spec_library": (dict,),
     "spec_set": (dict,),
 }
@@ -44,6 +45,7 @@ class TraceMeta:
         seed: of the recording.
         horizon: planning horizon T in steps.
         dt: time step in seconds.
+        origin: the time 0 in ns since 1970, of what was logged with the time of day.
         created: ISO 8601 time.
         stlc_version: of the recorder.
     """
@@ -62,6 +64,7 @@ class TraceMeta:
     seed: int | None = None
     horizon: int | None = None
     dt: float | None = None
+    origin: int | None = None
     created: str = ""
     stlc_version: str = ""
 

@@ -24,6 +24,11 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.files import atomic_path
 
+try:
+    from lzma import LZMAError
+except ImportError:  # a Python without it: `zipfile` says so
+    LZMAError = zlib.error  # type: ignore[misc, assignment]
+
 Array = NDArray[Any]
 
 MAX_BYTES = 4_000_000_000
@@ -50,6 +55,7 @@ _DAMAGE = (
     struct.error,
     tokenize.TokenError,
     zlib.error,
+    LZMAError,
     zipfile.BadZipFile,
 )
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.signature import Kind
 from stlc.trace_recording import Recording, Strand, fit
+from stlc.trace_time import require_step
 
 Array = NDArray[Any]
 Floats = NDArray[np.float64]
@@ -52,9 +53,11 @@ def resampled(recording: Recording, dt: float, kinds: Mapping[str, Kind]) -> tup
         kinds: signal -> what its numbers mean, where the caller knows better than the file.
 
     Raises:
-        TraceError: E601, a strand has no clock; E602, times decrease, or have no stretch in common;
-            E604, a time that is not finite; E605, arrays that do not fit, or too many samples.
+        TraceError: E601, a strand has no clock; E602, times decrease, or have no stretch in common, or `dt`
+            is no time step; E604, a time that is not finite; E605, arrays that do not fit, or too many
+            samples.
     """
+    require_step(recording.name, dt)
     strands = [_timed(recording, strand, kinds) for strand in recording.strands if strand.arrays]
     if not strands:
         raise TraceError(Diagnostic("E601", f"trace `{recording.name}` has no signals"))

@@ -18,6 +18,9 @@ TOLERANCE = 0.05
 
 RESAMPLE = "--resample 0.1s  puts them on one grid (bool, int and enum held, real ones interpolated)"
 
+SHORTEST, LONGEST = 1e-15, 1e12
+"""Time steps in seconds: nothing is sampled faster than each femtosecond, or less than each 30,000 years."""
+
 _SNAP = 1e-6
 
 
@@ -36,8 +39,8 @@ def read_clock(
     Raises:
         TraceError: E601, neither times nor a step; E602, times that are not uniform; E605, no samples.
     """
-    if dt is not None and not (np.isfinite(dt) and dt > 0):
-        raise TraceError(Diagnostic("E602", f"the time step of `{name}` is {dt:g} s"))
+    if dt is not None:
+        require_step(name, dt)
     if clock is None:
         if dt is None:
             help_ = ("add an array `t` with the time of every sample in seconds, or name it: --map t=NAME",)
@@ -58,7 +61,16 @@ def read_clock(
                 Diagnostic("E602", f"trace `{name}` has one sample, so its time step is unknown")
             )
         return float(times[0]), dt, 1
-    return float(times[0]), _step(name, times, dt), len(times)
+    step = _step(name, times, dt)
+    require_step(name, step)
+    return float(times[0]), step, len(times)
+
+
+def require_step(name: str, dt: float) -> None:
+    """Raise TraceError (E602) for a time step that is none, or far from everything that is sampled."""
+    if not SHORTEST <= dt <= LONGEST:
+        help_ = (f"time is in seconds, and a step at least {SHORTEST:g} s and at most {LONGEST:g} s",)
+        raise TraceError(Diagnostic("E602", f"the time step of `{name}` is {dt:g} s", help=help_))
 
 
 def _check_finite(name: str, times: Floats) -> None:

@@ -1,4 +1,7 @@
-"""Words in a trace -> numbers: members of an enum and truth values, as the specification declares them."""
+"""Words in a trace -> numbers: members of an enum and truth values, as the specification declares them.
+
+What is no number of any kind, words and complex numbers, is set aside, and refused where a signal needs it.
+"""
 
 from __future__ import annotations
 
@@ -31,17 +34,18 @@ def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
             that is not among them is of no interest: where it holds words it is set aside.
 
     Raises:
-        TraceError: E603, words where numbers are needed, or one that the signal does not have.
+        TraceError: E603, words or complex numbers where numbers are needed, or a word that the signal does
+            not have.
     """
     strands = tuple(
         replace(
             strand,
             arrays={
-                name: _numbers(recording.name, name, values, words[name]) if _is_text(values) else values
+                name: _numbers(recording.name, name, values, words[name]) if _is_odd(values) else values
                 for name, values in strand.arrays.items()
-                if name in words or not _is_text(values)
+                if name in words or not _is_odd(values)
             },
-            clock=_seconds(recording.name, strand) if _is_text(strand.clock) else strand.clock,
+            clock=_seconds(recording.name, strand) if _is_odd(strand.clock) else strand.clock,
         )
         for strand in recording.strands
     )
@@ -49,7 +53,7 @@ def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
         name: values
         for strand in recording.strands
         for name, values in strand.arrays.items()
-        if name not in words and _is_text(values)
+        if name not in words and _is_odd(values)
     }
     return replace(recording, strands=strands, extras={**recording.extras, **aside})
 
@@ -57,17 +61,25 @@ def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
 def wordless(recording: Recording) -> Recording:
     """The recording, its words set aside. Raises TraceError (E603) where all signals are words."""
     signals = [values for strand in recording.strands for values in strand.arrays.values()]
-    none_left = all(map(_is_text, signals))
+    none_left = all(map(_is_odd, signals))
     return in_numbers(recording, {name: {} for name in recording.signals} if none_left else {})
 
 
-def _is_text(values: NDArray[Any] | None) -> bool:
-    return values is not None and values.dtype.kind == "U"
+def _is_odd(values: NDArray[Any] | None) -> bool:
+    """Whether an array holds words, or complex numbers."""
+    return values is not None and values.dtype.kind in "Uc"
+
+
+def _refuse_complex(trace: str, name: str, values: NDArray[Any]) -> None:
+    if values.dtype.kind == "c":
+        advice = (f"save the parts that are meant, e.g.  re = real({name});  im = imag({name});",)
+        raise TraceError(Diagnostic("E603", f"`{name}` in `{trace}` holds complex numbers", help=advice))
 
 
 def _seconds(trace: str, strand: Strand) -> NDArray[np.float64]:
     """Dates and times (ISO 8601) as seconds since the first."""
     assert strand.clock is not None
+    _refuse_complex(trace, strand.named, strand.clock)
     written = np.char.rstrip(strand.clock, "Zz")
     try:
         instants = written.astype("datetime64[ns]")
@@ -81,6 +93,7 @@ def _seconds(trace: str, strand: Strand) -> NDArray[np.float64]:
 
 
 def _numbers(trace: str, name: str, values: NDArray[Any], words: Words) -> NDArray[np.float64]:
+    _refuse_complex(trace, name, values)
     found, places = np.unique(values, return_inverse=True)
     worth = [_worth(str(word), words) for word in found]
     if None in worth:

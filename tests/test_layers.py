@@ -15,6 +15,7 @@ PACKAGE = ROOT / "stlc"
 
 TRACE_FORMATS = (
     *(
+        "trace_bag",
         "trace_cells",
         "trace_chunks",
         "trace_csv",
@@ -23,9 +24,18 @@ TRACE_FORMATS = (
         "trace_mat",
         "trace_mat5",
         "trace_mcap",
+        "trace_messages",
         "trace_meta",
     ),
-    *("trace_npz", "trace_parquet", "trace_recording", "trace_resample", "trace_table", "trace_time"),
+    *(
+        "trace_npz",
+        "trace_parquet",
+        "trace_recording",
+        "trace_resample",
+        "trace_ros",
+        "trace_table",
+        "trace_time",
+    ),
     "trace_words",
 )
 
@@ -92,12 +102,12 @@ HOMES = {
     ),
     "onnx": ("stlc.export",),
     "onnxruntime": ("stlc.runtime",),
-    "pyarrow": ("stlc.trace_parquet",),
+    "pyarrow": ("stlc.trace_parquet", "stlc.trace_cells"),
     "h5py": ("stlc.trace_mat",),
     "mcap": ("stlc.trace_mcap",),
     "tensorboardX": ("stlc.controller.logbook",),
     "ray": ("stlc.controller.cluster",),
-    "mcap_ros2": ("stlc.trace_mcap",),
+    "rosbags": ("stlc.trace_bag",),
     "pickle": (),
     "marshal": (),
     "shelve": (),

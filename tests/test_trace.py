@@ -311,6 +311,18 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
             load_trace(path)
 
 
+def test_a_packed_array_that_is_damaged(tmp_path: Path) -> None:
+    for method in (zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
+        with zipfile.ZipFile(tmp_path / "a.npz", "w", method) as archive:
+            for name in ("t", "x"):
+                archive.writestr(f"{name}.npy", header((200,)) + np.arange(200.0).tobytes())
+        assert load_trace(tmp_path / "a.npz").samples == 200
+        raw = (tmp_path / "a.npz").read_bytes()
+        for at in range(36, 120, 7):
+            (tmp_path / "b.npz").write_bytes(raw[:at] + bytes([raw[at] ^ 255]) + raw[at + 1 :])
+            assert outcome(tmp_path / "b.npz") in ("read", "E603", "E602", "E601")
+
+
 # -------------------------------------------------------------- shapes and times
 
 
@@ -358,6 +370,17 @@ def test_the_step_is_the_fraction_that_was_meant(tmp_path: Path, dt: float) -> N
     trace = load_trace(npz(tmp_path / "a.npz", t=times, x=np.zeros(1000)))
     assert trace.dt == pytest.approx(dt, rel=1e-12)
     assert as_fraction(trace.dt).denominator <= 1_000_000
+
+
+@pytest.mark.parametrize("dt", [1e-300, 5e-324, 1e-16, 1e13, 1e308])
+def test_a_step_that_nothing_is_sampled_with(tmp_path: Path, dt: float) -> None:
+    path = npz(tmp_path / "a.npz", x=np.zeros(5), meta=np.array(f'{{"dt": {dt!r}}}'))
+    assert (code_of(path), message_of(path)[:17]) == ("E602", "the time step of ")
+    if 1e-300 <= dt <= 1e300:
+        path = npz(tmp_path / "b.npz", x=np.zeros(5), t=np.arange(5) * dt)
+        assert (code_of(path), message_of(path)[:17]) == ("E602", "the time step of ")
+    with pytest.raises(TraceError, match="E602: the time step of"):
+        load_trace(npz(tmp_path / "c.npz", x=np.zeros(5), t=np.arange(5)), Reading(resample=dt))
 
 
 def test_fractions_of_steps() -> None:
@@ -550,7 +573,7 @@ def test_other_suffixes_are_listed(tmp_path: Path) -> None:
     assert load_trace(tmp_path / "a.bin").samples == a_trace().samples
     assert load_trace(csv(tmp_path / "a.tsv", "t\tx\n0\t1\n1\t2\n")).samples == 2
     for path in ("a.txt", "a"):
-        with pytest.raises(UsageError, match=r"written as \.npz or \.csv"):
+        with pytest.raises(UsageError, match=r"written as \.npz, \.csv or \.mcap"):
             save_trace(tmp_path / path, a_trace())
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import struct
+import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +21,10 @@ parquet = pytest.importorskip("pyarrow.parquet")
 scipy_io = pytest.importorskip("scipy.io")
 h5py = pytest.importorskip("h5py")
 mcap_writer = pytest.importorskip("mcap_ros2.writer")
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+
+import robot_logs  # noqa: E402
 
 N = 21
 T = np.arange(N) * 0.1
@@ -218,6 +223,29 @@ def test_mat_of_no_version(tmp_path: Path) -> None:
     assert code_of(tmp_path / "none.mat") == "U102"
 
 
+@pytest.mark.parametrize("version", ["5", "7.3"])
+def test_complex_numbers_are_refused_where_a_signal_needs_them(tmp_path: Path, version: str) -> None:
+    path, columns = tmp_path / "a.mat", {"t": T, "x": X, "flat": X + 0j, "z": X + 1j * T}
+    if version == "5":
+        scipy_io.savemat(path, columns)
+    else:
+        pair = np.dtype([("real", "f8"), ("imag", "f8")])
+        with h5py.File(path, "w") as file:
+            for name, values in columns.items():
+                made = np.array(list(zip(values.real, values.imag, strict=True)), dtype=pair)
+                file[name] = made if values.dtype.kind == "c" else values
+                file[name].attrs["MATLAB_class"] = np.bytes_("double")
+    trace = load_trace(path, Reading(words={"x": {}, "flat": {}}))
+    assert set(trace.data) == {"x", "flat"}
+    np.testing.assert_array_equal(trace.data["flat"][0], X)
+    np.testing.assert_array_equal(trace.extras["z"].imag.ravel(), T)
+    with pytest.raises(TraceError, match=r"`z` in .* holds complex numbers") as caught:
+        load_trace(path, Reading({"y": "z"}, words={"y": {}}))
+    assert caught.value.diagnostics[0].help[0].endswith("re = real(z);  im = imag(z);")
+    with pytest.raises(TraceError, match="complex"):
+        load_trace(path, Reading({"t": "z"}))
+
+
 # ------------------------------------------------------------------------------- bags
 
 
@@ -316,6 +344,11 @@ def a_csv(path: Path) -> Path:
     return path
 
 
+def made(path: Path, maker: Callable[[list[float]], bytes]) -> Path:
+    path.write_bytes(maker(X.tolist()))
+    return path
+
+
 MAKERS: dict[str, Callable[[Path], Path]] = {
     "npz": a_npz,
     "csv": a_csv,
@@ -323,6 +356,9 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "mat": a_mat5,
     "v73.mat": a_mat73,
     "mcap": a_bag,
+    "json.mcap": lambda path: made(path, robot_logs.json_mcap),
+    "bag": lambda path: made(path, robot_logs.bag),
+    "db3": lambda path: made(path, robot_logs.bag2),
 }
 
 
@@ -369,7 +405,9 @@ def test_damaged_files_give_traces_or_diagnostics(form: str, tmp_path: Path) -> 
 @pytest.mark.parametrize("form", MAKERS)
 def test_a_missing_package_is_named(form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = MAKERS[form](tmp_path / f"a.{form}")
-    package = {"parquet": "pyarrow.parquet", "v73.mat": "h5py", "mcap": "mcap.reader"}.get(form)
+    package = {"parquet": "pyarrow.parquet", "v73.mat": "h5py", "mcap": "mcap.stream_reader"}.get(
+        form.removeprefix("json.")
+    )
     if package is None:
         assert load_trace(path).samples == N
         return

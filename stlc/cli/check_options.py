@@ -14,7 +14,7 @@ Files = Annotated[
     list[str],
     typer.Argument(
         metavar="[SPEC] TRACE…",
-        help="Traces (.npz, .csv, .parquet, .mat, .mcap, or -), after a specification.",
+        help="Traces (.npz, .csv, .parquet, .mat, .mcap, bags of ROS, or -), after a spec.",
     ),
 ]
 Spec = Annotated[
@@ -52,7 +52,10 @@ FailUnder = Annotated[
 ]
 Out = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="Write the robustness signals there; a folder for several traces."),
+    typer.Option(
+        metavar="FILE",
+        help="Write the robustness signals there (.npz, .csv, .mcap); a folder for several traces.",
+    ),
 ]
 Junit = Annotated[Path | None, typer.Option(metavar="FILE", help="Write the verdicts there, as JUnit XML.")]
 Jobs = Annotated[int, typer.Option("--jobs", "-j", min=0, help="Processes; 0: one a core.")]

@@ -53,7 +53,7 @@ MarginOption = Annotated[
     ),
 ]
 RecordOption = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Write the trace there too (.npz or .csv).")
+    Path | None, typer.Option(metavar="FILE", help="Write the trace there too (.npz, .csv, .mcap).")
 ]
 FailUnderOption = Annotated[
     float | None, typer.Option(metavar="SHARE", help="Exit with 1 if the plan accuracy is less.")
