@@ -219,6 +219,7 @@ CODES: dict[str, str] = {
     "S207": "a world that fails while it runs",
     "S208": "a function from outside that cannot be loaded, or that fails",
     "S209": "a file that a system file extends, and that cannot be read",
+    "S210": "a specification of drives that cannot be read",
     "S301": "initial states that are (nearly) all rejected",
     "S302": "dynamics that give NaN or infinity",
     "S303": "initial states in a file that cannot be used",

@@ -22,8 +22,29 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "origin": (int,),
     "spec_library": (dict,),
     "spec_set": (dict,),
+    "judge_library": (dict,),
+    "judge_set": (dict,),
 }
-_TEXTS = ("spec_library", "spec_set")
+_TEXTS = ("spec_library", "spec_set", "judge_library", "judge_set")
+
+
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """A specification in a trace.
+
+    Attributes:
+        name: of it, where that is known.
+        path: where it lay.
+        text: the whole; "" where the trace has none.
+        library: texts of the files that it imports, by key.
+        overrides: constants that were set to something else than the text says, as texts.
+    """
+
+    name: str
+    path: str
+    text: str
+    library: Mapping[str, str]
+    overrides: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +58,8 @@ class TraceMeta:
         spec_library: texts of the files that it imports, by key (`stlc.compile.modules`).
         spec_set: constants that were set to something else than the text says, as texts.
         spec_hash: SHA-256 of those texts, hexadecimal.
+        judge_path: where the specification by which drives are judged was read; the same for `judge_text`,
+            `judge_library` and `judge_set`. Without a text what was recorded is judged by `spec_text`.
         system_name: name of the system.
         system_path: its path as the user gave it.
         system_text: the text of its file.
@@ -56,6 +79,10 @@ class TraceMeta:
     spec_library: Mapping[str, str] = field(default_factory=dict)
     spec_set: Mapping[str, str] = field(default_factory=dict)
     spec_hash: str = ""
+    judge_path: str = ""
+    judge_text: str = ""
+    judge_library: Mapping[str, str] = field(default_factory=dict)
+    judge_set: Mapping[str, str] = field(default_factory=dict)
     system_name: str = ""
     system_path: str = ""
     system_text: str = ""
@@ -67,6 +94,18 @@ class TraceMeta:
     origin: int | None = None
     created: str = ""
     stlc_version: str = ""
+
+    @property
+    def planned(self) -> Carried:
+        """What plans were made for."""
+        return Carried(self.spec_name, self.spec_path, self.spec_text, self.spec_library, self.spec_set)
+
+    @property
+    def carried(self) -> Carried:
+        """What the trace is judged by: the rules of drives that were recorded with it, else `planned`."""
+        if not self.judge_text:
+            return self.planned
+        return Carried("", self.judge_path, self.judge_text, self.judge_library, self.judge_set)
 
 
 def read_meta(path: Path, array: NDArray[Any] | None) -> tuple[TraceMeta, dict[str, Column]]:

@@ -27,7 +27,6 @@ def outcome_in_chunks(path: Path, work: Work) -> Outcome:
     """
     from stlc.monitor.online import How
     from stlc.trace_chunks import pieces
-    from stlc.trace_recording import Recording
 
     question = work.question
     _require_pieces(path, work)
@@ -35,9 +34,8 @@ def outcome_in_chunks(path: Path, work: Work) -> Outcome:
     given = None if question.spec is None else monitor_of(read_source(question.spec), question)
     read = pieces(path, work.chunk or CHUNK, laid_reading(given, question))
     first = next(read)
-    head = Recording(str(path), (), meta=first.meta)
-    source, note = specification(head, question.spec)
-    monitor = given or monitor_of(source, question, first.meta)
+    source, note = specification(str(path), question.spec, first.meta.carried)
+    monitor = given or monitor_of(source, question, first.meta.carried)
     at = instant_of(question.at, str(path), first.dt, first.t0, None)
     how = How(at, question.end, question.tolerance, first.t0, reasons=True)
     online = monitor.online(how, require=question.require, like=first)

@@ -25,7 +25,7 @@ def write_robustness(path: Path, result: Checked, question: Question) -> None:
     from stlc.trace import Trace, save_trace
 
     trace = result.trace
-    monitor = monitor_of(result.source, question, result.trace.meta)
+    monitor = monitor_of(result.source, question, result.trace.meta.carried)
     end: Literal["strict", "truncate"] = "truncate" if question.end == "truncate" else "strict"
     values = monitor.requirement_robustness(trace, end=end, semantics=question.semantics)
     chosen = {judgement.name for judgement in result.verdict}
@@ -36,5 +36,5 @@ def write_robustness(path: Path, result: Checked, question: Question) -> None:
     }
     signature = Signature(tuple(map(Column, data)))
     path.parent.mkdir(parents=True, exist_ok=True)
-    meta = replace(trace.meta, spec_text="", spec_path="")
+    meta = replace(trace.meta, spec_text="", spec_path="", judge_text="", judge_path="")
     save_trace(path, Trace(signature, trace.dt, data, trace.t0, meta=meta, name=str(path)))

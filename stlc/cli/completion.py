@@ -51,4 +51,4 @@ def _specification(path: Path) -> str:
     from stlc.files import find_trace
     from stlc.trace import read_recording
 
-    return read_recording(find_trace(str(path))).meta.spec_text
+    return read_recording(find_trace(str(path))).meta.carried.text

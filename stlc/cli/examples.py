@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from stlc.diagnostics import Diagnostic, UsageError
@@ -14,6 +14,7 @@ FIRST, EMPTY = "cart", "empty"
 
 _SPECS = LIBRARY / "specs" if (LIBRARY / "specs").is_dir() else LIBRARY.parent / "specs"
 _SYSTEM = re.compile(r'^(system\s+")[^"\n]*?([^"/\n]+\.yaml)"', re.MULTILINE)
+_JUDGE = re.compile(r"^ *judge: *(?:[^\s#]*/)?([\w-]+\.stl)\b", re.MULTILINE)
 _BESIDE = re.compile(r"[\w-]+\.(?:py|urdf)\b")
 
 
@@ -36,7 +37,8 @@ def example_files(name: str) -> dict[str, str]:
         note = (f"there are {', '.join(examples())}",)
         raise UsageError(Diagnostic("U101", f"there is no example `{name}`", help=advice, note=note))
     files: dict[str, str] = {}
-    for path in specs:
+    judges = [_SPECS / judge for _, system in _pairs(specs) for judge in _JUDGE.findall(_text(system))]
+    for path in dict.fromkeys((*specs, *judges)):
         text = path.read_text(encoding="utf-8")
         system = next(found[2] for found in _SYSTEM.finditer(text))
         files[f"specs/{path.name}"] = _SYSTEM.sub(r'\1../systems/\2"', text)
@@ -44,9 +46,9 @@ def example_files(name: str) -> dict[str, str]:
     return files
 
 
-def _pairs() -> Iterator[tuple[Path, str]]:
-    """Every specification whose system is installed, and the name of that file."""
-    for path in sorted(_SPECS.glob("*.stl")):
+def _pairs(specs: Iterable[Path] | None = None) -> Iterator[tuple[Path, str]]:
+    """Every specification (of those given) whose system is installed, and the name of that file."""
+    for path in sorted(_SPECS.glob("*.stl")) if specs is None else specs:
         named = _SYSTEM.search(path.read_text(encoding="utf-8"))
         if named and (LIBRARY / named[2]).is_file():
             yield path, named[2]
@@ -54,6 +56,10 @@ def _pairs() -> Iterator[tuple[Path, str]]:
 
 def _system(name: str) -> dict[str, str]:
     """A system file, and the files beside it that it names."""
-    text = (LIBRARY / name).read_text(encoding="utf-8")
+    text = _text(name)
     beside = [word for word in dict.fromkeys(_BESIDE.findall(text)) if (LIBRARY / word).is_file()]
     return {f"systems/{file}": (LIBRARY / file).read_text(encoding="utf-8") for file in (name, *beside)}
+
+
+def _text(system: str) -> str:
+    return (LIBRARY / system).read_text(encoding="utf-8")

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from stlc.monitor.instants import At
     from stlc.monitor.verdict import Monitor
     from stlc.trace import Reading, Trace
-    from stlc.trace_meta import TraceMeta
+    from stlc.trace_meta import Carried
     from stlc.trace_recording import Recording
 
 End = Literal["open", "strict", "truncate"]
@@ -112,8 +112,9 @@ def judged(path: Path, question: Question) -> tuple[Checked, list[str]]:
     from stlc.trace import read_recording
 
     recording = read_recording(path)
-    source, note = specification(recording, question.spec)
-    monitor = monitor_of(source, question, recording.meta)
+    carried = recording.meta.carried
+    source, note = specification(recording.name, question.spec, carried)
+    monitor = monitor_of(source, question, carried)
     trace = laid_out(recording, monitor, question)
     del recording  # what was converted is not kept twice
     verdict = monitor.check(
@@ -159,35 +160,34 @@ def _below(path: Path) -> Path:
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
-def specification(recording: Recording, spec: Path | None) -> tuple[Source, str]:
-    """The specification to judge by, and what is to be said about it."""
+def specification(name: str, spec: Path | None, carried: Carried) -> tuple[Source, str]:
+    """The specification to judge the trace `name` by, which carries one, and what is to be said about it."""
     if spec is not None:
         return read_source(spec), ""
-    meta, name = recording.meta, recording.name
-    if not meta.spec_text:
+    if not carried.text:
         raise usage(f"`{name}` carries no specification", f"stlc check SPEC {name}", "elsewhere: --spec SPEC")
-    source = Source(meta.spec_path or f"{meta.spec_name or 'specification'} in {name}", meta.spec_text)
-    changed = ", ".join(f"{constant} = {text}" for constant, text in meta.spec_set.items())
+    source = Source(carried.path or f"{carried.name or 'specification'} in {name}", carried.text)
+    changed = ", ".join(f"{constant} = {text}" for constant, text in carried.overrides.items())
     told = f"with {changed}, as it was recorded" if changed else ""
-    if meta.spec_path and Path(meta.spec_path).is_file() and read_source(meta.spec_path).text != source.text:
+    if carried.path and Path(carried.path).is_file() and read_source(carried.path).text != source.text:
         since = (
-            f"{meta.spec_path} has changed since; judging by the text in {name} "
-            f"(--spec {meta.spec_path} takes the new one)"
+            f"{carried.path} has changed since; judging by the text in {name} "
+            f"(--spec {carried.path} takes the new one)"
         )
         told = f"{since}; {told}" if told else since
     return source, told
 
 
-def monitor_of(source: Source, question: Question, carried: TraceMeta | None = None) -> Monitor:
+def monitor_of(source: Source, question: Question, carried: Carried | None = None) -> Monitor:
     """The monitor for a specification; the same for every trace that carries the same one.
 
-    `carried` is what a trace keeps of imported files and of constants that were set; where the specification
-    was given as a file, only the question counts.
+    `carried` says what a trace keeps of imported files and of constants that were set; where the
+    specification was given as a file, only the question counts.
     """
     library: Mapping[str, str] = {}
     changed = question.overrides
     if carried is not None and question.spec is None:
-        library, changed = carried.spec_library, {**carried.spec_set, **changed}
+        library, changed = carried.library, {**carried.overrides, **changed}
     spec = source.name, source.text, tuple(library.items())
     return _monitor(spec, question.system, tuple(changed.items()))
 

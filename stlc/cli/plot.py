@@ -71,8 +71,9 @@ def plot(
     grid = time_step("--resample", resample)
     question = Question(spec, system, names_of(map_), resample=grid, overrides=parse_overrides(set_))
     recording = read_recording(path)
-    source, note = specification(recording, question.spec)
-    monitor = monitor_of(source, question, recording.meta)
+    planned = recording.meta.planned  # margins over time are those of windows
+    source, note = specification(recording.name, question.spec, planned)
+    monitor = monitor_of(source, question, planned)
     recorded = laid_out(recording, monitor, question)
     if places:
         shown = list(range(recorded.traces)) if trace is None else [trace]

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from stlc.controller.deploy import Mode
     from stlc.controller.drive import Setting
     from stlc.controller.evaluate import Deployment
+    from stlc.controller.rules import Rules
     from stlc.controller.run import Run
     from stlc.dynamics.decl_deployment import ScenarioDecl
 
@@ -45,6 +46,7 @@ LimitOption = Annotated[
     ),
 ]
 
+WindowsOption = Annotated[bool, typer.Option("--windows", help="Show how plans fared window by window, too.")]
 MarginOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -83,9 +85,10 @@ def register(app: typer.Typer) -> None:
             "stlc simulate --backup --seeds 1 --live --margins margins.jsonl",
             note="The newest run unless one is named. With --backup the paper's backup policy guards it, "
             "and the same seeds are driven without it too, to compare. Trace, scene and figures go "
-            "into the run's folder. Means over seeds come with 95 % intervals (Student's t). Every system "
-            "has the scenarios mismatch, disturb and noise, also with a number of per cent (mismatch-20); "
-            "--scenario disturbed drives them all.",
+            "into the run's folder. Drives, one agent over one seed each, are judged by the "
+            "specification that the system names (test: judge). Means over seeds come with 95 % intervals "
+            "(Student's t). Every system has the scenarios mismatch, disturb and noise, also with a number "
+            "of per cent (mismatch-20); --scenario disturbed drives them all.",
         ),
     )(simulate)
 
@@ -110,6 +113,7 @@ def simulate(
     scenario: ScenarioOption = None,
     live: LiveOption = False,
     margins: MarginsOption = None,
+    windows: WindowsOption = False,
     set_: SetOption = None,
     runs: RunsOption = Path("runs"),
     pictures: Annotated[bool, typer.Option(help="Draw the animation and the report.")] = True,
@@ -140,8 +144,8 @@ def simulate(
     order = _Order(opened, chosen, setting, record, live, margins, parse_overrides(set_), _asked(margin))
     document = _all(order, several) if several else _driven(order, scenario)
     code = 1 if fail_under is not None and _accuracy(document, chosen) < fail_under else 0
-    if not json:
-        _print(screen(document), printed)  # before the pictures: they must not change what was measured
+    if not json:  # before the pictures: they must not change what was measured
+        _print(screen(document, windows=windows), printed)
     drawn = draw(opened) if pictures else {}
     if json:
         emit_json("simulate/1", ok=code == 0, exit_code=code, result=document | drawn)
@@ -178,11 +182,13 @@ def _driven(order: _Order, name: str | None, *, kept: bool = True) -> Record:
     from stlc.cli.output import show_diagnostics
     from stlc.cli.simulate_text import TITLES
     from stlc.cli.simulate_watch import Watching
+    from stlc.controller.rules import rules_of
     from stlc.controller.run import Run
 
     run, found = order.run, {}
     if name is not None:
         run = Run.open(run.dir.path, overrides=order.overrides, scenario=name)
+    rules = rules_of(run)
     margin = order.asked.of(run.task, run.policy, order.guard, order.setting.replan)
     setting = replace(order.setting, margin=margin)
     for mode in GUARDS[order.guard]:
@@ -190,12 +196,12 @@ def _driven(order: _Order, name: str | None, *, kept: bool = True) -> Record:
         last = kept and mode == order.guard
         watching = Watching(title, order.live, order.margins if last else None)
         try:
-            found[mode] = _deploy(run, setting, mode, watching, order.record)
+            found[mode] = _deploy(run, replace(order, setting=setting), mode, watching, rules)
         except RunError as error:
             if mode == order.guard:
                 raise
             show_diagnostics(error.diagnostics)  # only the comparison is missing: the guard may go on
-    return _save(run, replace(order, setting=setting), found)
+    return _save(run, replace(order, setting=setting), found, rules)
 
 
 def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
@@ -241,9 +247,10 @@ def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Record:
         name: {
             "doc": scenario.doc,
             "expect": scenario.expect,
-            "guards": _driven(order, name, kept=False)["guards"],
+            **{key: document[key] for key in ("judge", "guards")},
         }
         for name, scenario in scenarios.items()
+        for document in [_driven(order, name, kept=False)]
     }
     document = {**_driven(order, None), "scenarios": found}
     order.run.dir.write_json(SCENARIOS, document)
@@ -283,30 +290,30 @@ def _guard(backup: bool | None, guard: str | None) -> Mode:
     return "paper" if backup else "none"
 
 
-def _deploy(run: Run, setting: Setting, mode: Mode, watching: Watching, record: Path | None) -> Deployment:
+def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rules | None) -> Deployment:
     """One deployment that is watched; what was driven before a failure or Ctrl-C is saved."""
     from stlc.cli.output import say
     from stlc.controller.archive import save_trace_of
     from stlc.controller.evaluate import InterruptedDeploymentError, deploy
 
     try:
-        with watching.of(run.task, setting) as watch:
-            return deploy(run.task, run.policy, setting, mode, watch=watch)
+        with watching.of(run.task, order.setting) as watch:
+            return deploy(run.task, run.policy, order.setting, mode, watch=watch, rules=rules)
     except InterruptedDeploymentError as error:
         if error.recording is not None:
-            paths = save_trace_of(run, error.recording, setting, record)
+            paths = save_trace_of(run, error.recording, order.setting, order.record, rules=rules)
             say(f"the first {error.recording.steps} steps are in {paths[0]}")
         raise (error.__cause__ or error) from None
 
 
-def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment]) -> Record:
+def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rules | None) -> Record:
     """Write trace, scene and figures into the run's folder; returns what was measured."""
     from stlc.controller.archive import RESULT, SCENE, save_scene, save_trace_of
     from stlc.controller.disturbance import errors_of
     from stlc.controller.evaluate import as_json
 
     last = list(found.values())[-1]
-    save_trace_of(run, last.recording, order.setting, order.record)
+    save_trace_of(run, last.recording, order.setting, order.record, rules=rules)
     save_scene(run.dir.path / SCENE, last.recording.scene)
     world = run.task.system.decl.test.world
     facts = {
@@ -316,6 +323,7 @@ def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment]) -> Record:
         "world": world.path.name if world is not None else None,
         "scenario": _laid_over(run),
         "errors": errors_of(run.task.plain.truth),
+        "judge": None if rules is None else {"spec": rules.name, "path": rules.path, "rules": rules.docs},
         "trace": f"{run.dir.shown}/trace.npz",
         "overrides": dict(order.overrides),
     }

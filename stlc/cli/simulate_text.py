@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 Record: TypeAlias = "dict[str, Any]"
 
 MOST_LISTED = 12
+MOST_BROKEN = 6
+"""Drives that broke rules and are listed."""
 ERRORS = {
     "actuator_gain": "wrong: gains of actuators",
     "parameters": "wrong: numbers of the dynamics",
@@ -19,8 +21,8 @@ ERRORS = {
 }
 """Errors of a scenario, in words."""
 TITLES = {"none": "no guard", "paper": "paper's guard", "full": "full guard"}
-COMPARED = {"plan accuracy": "plan_accuracy", "savable": "savable", "saved": "saved"}
-"""What scenarios are compared by."""
+COMPARED = ("obeyed every rule", "plan accuracy")
+"""What scenarios are compared by; drives that are lost from their start are not counted."""
 
 ROWS = {
     "plan accuracy": "plan_accuracy",
@@ -38,8 +40,8 @@ ROWS = {
 }
 
 
-def screen(document: Record) -> Iterator[str]:
-    """What was measured, as a person reads it."""
+def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
+    """What was measured, as a person reads it: the drives first; with `windows` plans and starts, too."""
     from stlc.cli.output import table
 
     guards = document["guards"]
@@ -52,19 +54,61 @@ def screen(document: Record) -> Iterator[str]:
     if document.get("margin"):
         spared = ", ".join(f"{name} {margin:.3g}" for name, margin in document["margin"].items())
         yield f"  the guard asks for a margin: {spared}"
+    yield ""
+    yield from _drives(document)
     header = ("", *(TITLES[name] for name in guards))
-    yield table([*_shares(guards), *_progress(guards), *_times(guards)], header=header)
+    shares = _shares(guards) if windows else ()
+    yield table([*_rules(document), *shares, *_progress(guards), *_times(guards)], header=header)
     for name, guard in guards.items():
         if name != "none":
             yield f"  guard acted in {_acted(guard['decisions'])}"
-    yield f"  {_unsafe(list(guards.values())[-1]['unsafe'], seeds * agents)}"
-    foreseen = list(guards.values())[-1]["metrics"].get("foreseen")
+    last = list(guards.values())[-1]
+    yield from _broken(last["drives"])
+    if windows:
+        yield f"  {_unsafe(last['unsafe'], seeds * agents)}"
+        yield from _foreseen(last["metrics"].get("foreseen"))
+    if document.get("scenarios"):
+        yield from compared(document)
+
+
+def _drives(document: Record) -> Iterator[str]:
+    """The verdict on what was driven, and who could not have been driven better."""
+    from stlc.view.words import obeyed_sentence, viable_sentence
+
+    yield f"  {obeyed_sentence(document)}"
+    lost = viable_sentence(document)
+    if lost:
+        yield f"  {lost}"
+    judge = document["judge"]
+    if judge is not None:
+        yield f"  judged by {judge['path']}"
+
+
+def _rules(document: Record) -> Iterator[tuple[str, ...]]:
+    """How many drives obeyed each rule, a column per guard."""
+    guards = [guard["drives"] for guard in document["guards"].values()]
+    for name in guards[-1]["rules"]:
+        yield (name, *(f"{each['rules'][name]['obeyed']} of {each['count']}" for each in guards))
+
+
+def _broken(drives: Record) -> Iterator[str]:
+    """`broken by seed 3, agent 7: full_stop (4.3 s)`, the first few."""
+    for each in drives["broken"][:MOST_BROKEN]:
+        rules = ", ".join(
+            name if time is None else f"{name} ({time:.3g} s)" for name, time in each["rules"].items()
+        )
+        lost = "; lost from its start" if each["lost"] else ""
+        yield f"  broken by seed {each['seed']}, agent {each['agent']}: {rules}{lost}"
+    more = len(drives["broken"]) - MOST_BROKEN
+    if more > 0:
+        yield f"  broken by {more} more: see eval/simulate.json"
+
+
+def _foreseen(foreseen: Record | None) -> Iterator[str]:
     if foreseen and foreseen["mean"] > 0:
         share = _part(foreseen["mean"])
         beyond = "; others hold what no plan could know" if foreseen["mean"] < 1 else ""
         yield f"  foreseen: the {share} of starts from which the world did as the model says{beyond}"
-    if document.get("scenarios"):
-        yield from compared(document)
 
 
 def _wrong(errors: Mapping[str, Any]) -> Iterator[str]:
@@ -78,17 +122,27 @@ def _wrong(errors: Mapping[str, Any]) -> Iterator[str]:
 
 
 def compared(document: Record) -> Iterator[str]:
-    """All scenarios in one table."""
+    """All scenarios in one table: who obeyed every rule, and of whom that could be had."""
     from stlc.cli.output import table
 
     guards = list(document["guards"])
     header = ("scenario", *(f"{TITLES[name]}: {label}" for name in guards for label in COMPARED))
     rows = []
     for name, each in {"as it is": document, **document["scenarios"]}.items():
-        metrics = [each["guards"][guard]["metrics"].get(key) for guard in guards for key in COMPARED.values()]
-        rows.append((name, *("" if metric is None else _number(metric, "", 3) for metric in metrics)))
+        cells: list[str] = []
+        for guard in guards:
+            found = each["guards"].get(guard)
+            cells += ["", ""] if found is None else _both(found)
+        rows.append((name, *cells))
     yield ""
     yield table(rows, header=header)
+
+
+def _both(guard: Record) -> list[str]:
+    """Plan accuracy, and the drives that obeyed of those that were not lost from their start."""
+    drives = guard["drives"]
+    obeyed = f"{drives['obeyed']} of {drives['count'] - drives['lost']}"
+    return [obeyed, _number(guard["metrics"]["plan_accuracy"], "", 3)]
 
 
 def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: str | None) -> Iterator[str]:

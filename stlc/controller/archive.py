@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from stlc.controller.drive import Recording, Setting
+    from stlc.controller.rules import Rules
     from stlc.controller.run import Run
 
 TRACE = "trace.npz"
@@ -30,7 +31,7 @@ SCENE = "scene.npz"
 RESULT = "eval/simulate.json"
 
 
-def trace_of(run: Run, recording: Recording, setting: Setting) -> Trace:
+def trace_of(run: Run, recording: Recording, setting: Setting, rules: Rules | None = None) -> Trace:
     """All agents of all seeds as traces, decisions beside them.
 
     Extras, each (traces, steps): `action.NAME` for every control, `decision` (0 policy, 1 backup, 2 safest,
@@ -55,20 +56,30 @@ def trace_of(run: Run, recording: Recording, setting: Setting) -> Trace:
             "seed": np.array(setting.seeds)[rows // recording.agents],
             "agent": rows % recording.agents,
         },
-        meta=_meta(run, setting),
+        meta=_meta(run, setting, rules),
     )
 
 
-def save_trace_of(run: Run, recording: Recording, setting: Setting, also: Path | None = None) -> list[Path]:
-    """Write the trace into the folder of the run, and to `also`; returns where. Raises MissingError."""
-    trace = trace_of(run, recording, setting)
+def save_trace_of(
+    run: Run,
+    recording: Recording,
+    setting: Setting,
+    also: Path | None = None,
+    *,
+    rules: Rules | None = None,
+) -> list[Path]:
+    """Write the trace into the folder of the run, and to `also`; returns where. Raises MissingError.
+
+    `rules` travel in the trace, so that whoever checks it judges what was driven by them.
+    """
+    trace = trace_of(run, recording, setting, rules)
     paths = [run.dir.path / TRACE, *([also] if also is not None else [])]
     for path in paths:
         save_trace(path, trace)
     return paths
 
 
-def _meta(run: Run, setting: Setting) -> TraceMeta:
+def _meta(run: Run, setting: Setting, rules: Rules | None) -> TraceMeta:
     record, spec = run.dir.record(), read_source(run.dir.path / SPEC).text
     library = read_library(run.dir)
     return TraceMeta(
@@ -78,6 +89,10 @@ def _meta(run: Run, setting: Setting) -> TraceMeta:
         spec_library=library,
         spec_set=_set_in(spec, run),
         spec_hash=spec_sha256(spec, library),
+        judge_path="" if rules is None else rules.path,
+        judge_text="" if rules is None else rules.spec.source.text,
+        judge_library={} if rules is None else dict(rules.spec.library or {}),
+        judge_set={} if rules is None else dict(rules.overrides),
         system_name=run.task.system.name,
         system_path=str(record.get("system_path", "")),
         system_text=read_source(run.dir.path / SYSTEM).text,

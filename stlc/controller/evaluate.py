@@ -18,6 +18,7 @@ from stlc.controller.drive import Recorder, Recording, Setting, Watch, drive
 from stlc.controller.executed import Executed, judge_executed
 from stlc.controller.intervals import Interval
 from stlc.controller.polish import Limits
+from stlc.controller.rules import Drives, Rules, drives_json, drives_of_plans, judge_drives
 from stlc.controller.savable import solvable
 from stlc.controller.world import world_type
 
@@ -81,6 +82,7 @@ class Deployment:
         decisions: share of decisions by source, and those of the backup by T0 ("backup T0=1").
         latency: of one decision.
         unsafe: the agents that were not driven safely.
+        drives: who obeyed the rules that drives are judged by.
     """
 
     guard: Mode
@@ -89,6 +91,7 @@ class Deployment:
     decisions: Mapping[str, float]
     latency: Latency
     unsafe: tuple[Unsafe, ...]
+    drives: Drives
 
 
 class InterruptedDeploymentError(Exception):
@@ -100,9 +103,15 @@ class InterruptedDeploymentError(Exception):
 
 
 def deploy(
-    task: Task, policy: Policy, setting: Setting, guard: Mode, *, watch: Watch | None = None
+    task: Task,
+    policy: Policy,
+    setting: Setting,
+    guard: Mode,
+    *,
+    watch: Watch | None = None,
+    rules: Rules | None = None,
 ) -> Deployment:
-    """Deploy a policy in the world of its system; `watch` is told every step.
+    """Deploy a policy in the world of its system; `watch` is told every step, `rules` judge what was driven.
 
     Raises:
         InterruptedDeploymentError: from whatever has ended it early, which is its `__cause__`: a
@@ -117,14 +126,22 @@ def deploy(
         drive(guarded, make, setting, recorder, watch)
         recording = recorder.recording()
         assert recording is not None
-        return judged(guarded, recording, setting.ceiling)
+        return judged(guarded, recording, setting.ceiling, rules)
     except BaseException as error:
         raise InterruptedDeploymentError(recorder.recording()) from error
 
 
-def judged(guard: Guard, recording: Recording, ceiling: int = 0) -> Deployment:
-    """What is to be known of a recorded deployment under a guard; see `feasible_states` for `ceiling`."""
+def judged(guard: Guard, recording: Recording, ceiling: int = 0, rules: Rules | None = None) -> Deployment:
+    """What is to be known of a recorded deployment under a guard; see `feasible_states` for `ceiling`.
+
+    Without `rules` a drive obeys where it satisfies the specification of plans from every start.
+    """
     executed = judge_executed(guard.task, recording)
+    drives = (
+        drives_of_plans(executed.rules, executed.savable, guard.task.dt)
+        if rules is None
+        else judge_drives(rules, guard.task, recording, executed.savable)
+    )
     return Deployment(
         guard.mode,
         recording,
@@ -132,6 +149,7 @@ def judged(guard: Guard, recording: Recording, ceiling: int = 0) -> Deployment:
         decided(recording),
         latency(guard, recording),
         unsafe_agents(executed, recording.agents),
+        drives,
     )
 
 
@@ -260,6 +278,7 @@ def as_json(
                     key: {"mean": m.mean, "low": m.low, "high": m.high, "values": list(m.values)}
                     for key, m in found.metrics.items()
                 },
+                "drives": drives_json(found.drives, setting.seeds, setting.agents),
                 "units": dict(found.recording.units),
                 "decisions": dict(found.decisions),
                 "unsafe": [

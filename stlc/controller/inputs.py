@@ -34,6 +34,9 @@ def input_files(
             decl = load_system_decl(there, overrides or {})
             found.update(dict.fromkeys(function_files(decl).values()))
             found.update(dict.fromkeys(world.path for world in decl.worlds))
+            for judge in decl.judges:
+                found[judge.path] = None
+                found.update(dict.fromkeys(_imported(load_modules(parse(read_source(judge.path))))))
     return tuple(file for file in found if file.is_file())
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from stlc.compile.dump import dump
 from stlc.compile.modules import library_of
 from stlc.controller.config import ENGINE_VERSION, TrainConfig, decide
+from stlc.controller.rules import keep_rules
 from stlc.controller.run import SPEC, SYSTEM, Run, save_library, spec_hash, system_hash
 from stlc.controller.train import train
 from stlc.dynamics.functions import function_files
@@ -84,6 +85,7 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
         write_atomic(folder.path / path.name, path.read_bytes())
     for name, path in function_files(decl).items():
         write_atomic(folder.path / name, path.read_bytes())
+    keep_rules(folder, task)
     write_atomic(folder.path / "compiled.txt", dump(task.compiled))
     hashes = {"spec_hash": spec_hash(folder), "system_hash": system_hash(folder), "learnt": decl.learnt}
     folder.update(hashes)

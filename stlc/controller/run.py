@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 SPEC = "spec.stl"
 SYSTEM = "system.yaml"
 LIB = "lib"
-INDEX = f"{LIB}/index.json"
+INDEX = "index.json"
 CONFIG = "config.resolved.yaml"
 
 
@@ -131,23 +131,23 @@ def _hash(folder: RunDir, name: str, library: Mapping[str, str] | None = None) -
     return sha256(read_source(folder.path / name).text + json.dumps(overrides, sort_keys=True) + kept)
 
 
-def save_library(folder: RunDir, library: Mapping[str, str]) -> None:
-    """Keep what a specification imports: the texts below `lib/`, and which is which."""
+def save_library(folder: RunDir, library: Mapping[str, str], below: str = LIB) -> None:
+    """Keep what a specification imports: the texts in a folder of their own, and which is which."""
     for key, text in library.items():
-        write_atomic(folder.path / LIB / file_of(key), text)
+        write_atomic(folder.path / below / file_of(key), text)
     if library:
-        folder.write_json(INDEX, {key: file_of(key) for key in library})
+        folder.write_json(f"{below}/{INDEX}", {key: file_of(key) for key in library})
 
 
-def read_library(folder: RunDir) -> dict[str, str]:
+def read_library(folder: RunDir, below: str = LIB) -> dict[str, str]:
     """The texts that `save_library` kept, by key. Raises RunError (R101) where one is damaged."""
-    if not (folder.path / INDEX).is_file():
+    if not (folder.path / below / INDEX).is_file():
         return {}
-    index = folder.read_json(INDEX)
+    index = folder.read_json(f"{below}/{INDEX}")
     names = index.values() if isinstance(index, dict) else [None]
     if any(not isinstance(name, str) or name.startswith("/") or ".." in name.split("/") for name in names):
-        raise RunError(Diagnostic("R101", f"`{folder.shown}/{INDEX}` is damaged"))
-    return {key: read_source(folder.path / LIB / name).text for key, name in index.items()}
+        raise RunError(Diagnostic("R101", f"`{folder.shown}/{below}/{INDEX}` is damaged"))
+    return {key: read_source(folder.path / below / name).text for key, name in index.items()}
 
 
 def save_engine(folder: RunDir, engine: Engine) -> None:

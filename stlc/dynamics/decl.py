@@ -10,7 +10,7 @@ from pathlib import Path
 
 from stlc.compile.interface import Grid, Interface
 from stlc.diagnostics import Diagnostic
-from stlc.dynamics.decl_deployment import BackupDecl, ScenarioDecl, TestDecl, WorldRef
+from stlc.dynamics.decl_deployment import BackupDecl, JudgeRef, ScenarioDecl, TestDecl, WorldRef
 from stlc.dynamics.decl_init import InitDecl
 from stlc.dynamics.decl_learning import ObjectiveDecl, PolicyDecl, TrainDecl
 from stlc.dynamics.decl_model import Assign, ControlDecl, FunctionDecl, JumpDecl
@@ -102,6 +102,12 @@ class SystemDecl:
         """Every world that the file names, for `test` and for scenarios."""
         named = (self.test.world, *(scenario.world for scenario in self.scenarios))
         return tuple(world for world in named if world is not None)
+
+    @property
+    def judges(self) -> tuple[JudgeRef, ...]:
+        """Every specification of drives that the file names, for `test` and for scenarios."""
+        named = (self.test.judge, *(scenario.judge for scenario in self.scenarios))
+        return tuple(judge for judge in named if judge is not None)
 
     @property
     def grid(self) -> Grid:

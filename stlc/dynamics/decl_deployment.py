@@ -66,11 +66,27 @@ class WorldRef:
 
 
 @dataclass(frozen=True, slots=True)
+class JudgeRef:
+    """The specification that drives are judged by.
+
+    Attributes:
+        path: of its file.
+        written: the path as the system file has it, by which a run knows its copy.
+        span: where that stands.
+    """
+
+    path: Path
+    written: str
+    span: Span = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
 class TestDecl:
     """A deployment: how long, how many agents, how often they plan, and what happens to them.
 
     `uncertain`: the constants that `parameters` of a scenario's errors makes wrong; None: those that
     `stlc.dynamics.uncertain` finds.
+    `judge`: the specification that drives are judged by; None: the one that plans are made for.
     """
 
     __test__ = False
@@ -82,6 +98,7 @@ class TestDecl:
     metrics: tuple[str, ...] = ()
     world: WorldRef | None = None
     uncertain: tuple[str, ...] | None = None
+    judge: JudgeRef | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +140,7 @@ class ScenarioDecl:
         errors: of actuators and sensors.
         prefer: performance terms that plans are chosen by, beside those of the objective.
         backup: in the place of the system's.
+        judge: in the place of that of `test`.
     """
 
     name: str
@@ -138,3 +156,4 @@ class ScenarioDecl:
     errors: ErrorsDecl = field(default_factory=ErrorsDecl)
     prefer: tuple[Term, ...] = ()
     backup: BackupDecl | None = None
+    judge: JudgeRef | None = None

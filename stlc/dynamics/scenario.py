@@ -83,7 +83,8 @@ def _laid_over(decl: SystemDecl, name: str) -> SystemDecl:
     scenario = find_scenario(decl, name)
     init = replace(decl.init, override=(*decl.init.override, *scenario.override))
     events = (*decl.test.events, *scenario.events)
-    test = replace(decl.test, events=events, world=scenario.world or decl.test.world)
+    world, judge = scenario.world or decl.test.world, scenario.judge or decl.test.judge
+    test = replace(decl.test, events=events, world=world, judge=judge)
     objective = replace(decl.objective, terms=(*decl.objective.terms, *scenario.prefer))
     backup = scenario.backup or decl.backup
     return replace(decl, init=init, test=test, objective=objective, backup=backup, scenario=scenario)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from fractions import Fraction
 from pathlib import Path
 from typing import Literal
@@ -9,7 +10,7 @@ from typing import Literal
 from stlc.compile import ir
 from stlc.compile.scope import Known
 from stlc.compile.values import Number
-from stlc.dynamics.decl_deployment import EventDecl, TestDecl, WorldRef
+from stlc.dynamics.decl_deployment import EventDecl, JudgeRef, TestDecl, WorldRef
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import read_sets
 from stlc.dynamics.schema_names import Names, base_name
@@ -17,9 +18,10 @@ from stlc.dynamics.schema_reader import Reader, first_line
 from stlc.dynamics.yaml_nodes import Node, Scalar
 from stlc.grammar import ast
 
-TEST_KEYS = ("steps", "agents", "replan", "events", "metrics", "world", "uncertain")
+TEST_KEYS = ("steps", "agents", "replan", "events", "metrics", "world", "uncertain", "judge")
 EVENT_KEYS = ("name", "when", "at", "every", "set")
 METRICS = ("stl_accuracy", "safety", "progress", "latency")
+SPECS = (".stl", ".stlc")
 Edge = Literal["rise", "fall"]
 
 
@@ -42,6 +44,7 @@ def read_test(node: Node | None, reader: Reader, names: Names, dt: Fraction) -> 
         tuple(metric for metric in metrics if metric),
         read_world(found.get("world"), reader),
         _uncertain(found["uncertain"], reader, names) if "uncertain" in found else None,
+        read_judge(found.get("judge"), reader),
     )
 
 
@@ -110,3 +113,17 @@ def read_world(node: Node | None, reader: Reader) -> WorldRef | None:
         reader.wrong(node, "`world`", "a Python file and a class", "write `traffic_grid.py:TrafficGrid`")
         return None
     return WorldRef(Path(node.span.source.name).parent / file, name, node.span)
+
+
+def read_judge(node: Node | None, reader: Reader) -> JudgeRef | None:
+    """A specification, relative to the file that names it."""
+    if node is None or (isinstance(node, Scalar) and node.is_null):
+        return None
+    text = reader.text(node, "`judge`")
+    if text is None:
+        return None
+    if not text.endswith(SPECS):
+        reader.wrong(node, "`judge`", "the path of a specification", "write `../specs/driving_rules.stl`")
+        return None
+    folder = Path(node.span.source.name).parent
+    return JudgeRef(Path(os.path.normpath(folder / text)), text, node.span)

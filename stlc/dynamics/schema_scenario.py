@@ -9,7 +9,7 @@ from stlc.compile.scope import Known
 from stlc.compile.values import Number
 from stlc.dynamics.decl_deployment import ErrorsDecl, ScenarioDecl
 from stlc.dynamics.decl_model import Assign
-from stlc.dynamics.schema_deploy import read_event, read_world
+from stlc.dynamics.schema_deploy import read_event, read_judge, read_world
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import rate_unit, read_sets, states_of
 from stlc.dynamics.schema_names import Clockwork, Names
@@ -31,6 +31,7 @@ SCENARIO_KEYS = (
     "world",
     "prefer",
     "backup",
+    "judge",
 )
 ERROR_KEYS = ("actuator_gain", "parameters", "actuator_noise", "sensor_noise")
 EXPECTED = ("nominal", "ood")
@@ -66,6 +67,7 @@ def _scenario(entry: Entry, reader: Reader, names: Names, clock: Clockwork) -> S
         read_backup(found["backup"], reader, names, clock.horizon, f"`backup` of {where}")
         if "backup" in found
         else None,
+        read_judge(found.get("judge"), reader),
     )
 
 

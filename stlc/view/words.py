@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 
 def share(value: float | None, digits: int = 1) -> str:
@@ -51,3 +52,34 @@ def seconds(value: float | None) -> str:
 def count(many: int, what: str) -> str:
     """`1 trace`, `20 traces`."""
     return f"{many:,} {what}{'' if many == 1 else 's'}"
+
+
+def obeyed_sentence(simulation: Mapping[str, Any]) -> str:
+    """`198 of 200 drives obeyed every rule; without the guard 150`, from the document of a deployment.
+
+    A drive is one agent over one seed. Without a specification of drives it is judged as plans are: from
+    every start by the one that they are made for.
+    """
+    guards: Mapping[str, Any] = simulation["guards"]
+    name, last = list(guards.items())[-1]
+    drives = last["drives"]
+    planned = f"satisfied {simulation['spec']} from every start"
+    did = "obeyed every rule" if simulation.get("judge") else planned
+    words = f"{drives['obeyed']} of {count(drives['count'], 'drive')} {did}"
+    if drives["undecided"]:
+        words += f", {drives['undecided']} ended too early to say"
+    if name != "none" and "none" in guards:
+        words += f"; without the guard {guards['none']['drives']['obeyed']}"
+    return words
+
+
+def viable_sentence(simulation: Mapping[str, Any]) -> str:
+    """How many drives no plan could have kept safe, and how many of the others obeyed; "" for none."""
+    drives = list(simulation["guards"].values())[-1]["drives"]
+    lost, others = drives["lost"], drives["count"] - drives["lost"]
+    if not lost:
+        return ""
+    return (
+        f"{count(lost, 'drive')} {'was' if lost == 1 else 'were'} lost from the start, where no safe plan is "
+        f"known: {drives['obeyed']} of the {others} others obeyed"
+    )

@@ -28,7 +28,8 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         spec, system = ROOT / "specs/traffic.stl", folder / "car.yaml"
-        system.write_text((ROOT / "examples/car.yaml").read_text() + SCENARIO)
+        text = (ROOT / "examples/car.yaml").read_text().replace("../specs", str(ROOT / "specs"))
+        system.write_text(text + SCENARIO)
         (folder / "traffic_grid.py").write_text((ROOT / "examples/traffic_grid.py").read_text())
         command = ["train", str(spec), "--system", str(system), "--steps", "30", "--batch", "64"]
         assert main([*command, "--no-pictures"]) == 0
@@ -51,8 +52,16 @@ def test_the_newest_run_is_simulated_with_and_without_guard(
     assert f"run {there.name}" in lines[0]
     assert "world traffic_grid.py" in lines[0]
     assert "2 seeds x 4 agents x 30 steps" in lines[0]
-    assert lines[1].split() == ["no", "guard", "paper's", "guard"]
-    assert any(line.strip().startswith("plan accuracy") and "±" in line for line in lines)
+    assert lines[1] == ""
+    document = there.read_json("eval/simulate.json")
+    drives = {name: guard["drives"] for name, guard in document["guards"].items()}
+    told = f"  {drives['paper']['obeyed']} of 8 drives obeyed every rule; without the guard "
+    assert lines[2] == f"{told}{drives['none']['obeyed']}"
+    assert ["no", "guard", "paper's", "guard"] in [line.split() for line in lines]
+    (rule,) = (line for line in lines if line.strip().startswith("red_light"))
+    each = [f"{found['rules']['red_light']['obeyed']} of 8" for found in drives.values()]
+    assert rule.split() == ["red_light", *" ".join(each).split()]
+    assert not any("plan accuracy" in line for line in lines)
     assert any(line.strip().startswith("mean speed") and "m/s" in line for line in lines)
     assert any("guard acted in" in line for line in lines)
     assert lines[-1].split(maxsplit=1) == ["next", "stlc check trace.npz"]
@@ -71,10 +80,14 @@ def test_a_trace_is_judged_by_the_constants_it_was_driven_with(
 ) -> None:
     many = ["--seeds", "1", "--agents", "20", "--steps", "50", "--no-pictures", "--json"]
     assert main(["simulate", *many, "--set", "x_inter=-19 m", "--set", "vmax=9"]) == 0
-    metrics = json.loads(capsys.readouterr().out)["result"]["guards"]["none"]["metrics"]
-    driven = metrics["holds.give_way"]["mean"]
+    guard = json.loads(capsys.readouterr().out)["result"]["guards"]["none"]
+    windows, driven = (
+        guard["metrics"]["holds.give_way"]["mean"],
+        guard["drives"]["rules"]["give_way"]["obeyed"] / 20,
+    )
     trace = str(there.path / "trace.npz")
-    assert load_trace(Path(trace)).meta.spec_set == {"x_inter": "-19 m"}  # the other is the system's
+    meta = load_trace(Path(trace)).meta
+    assert meta.spec_set == meta.judge_set == {"x_inter": "-19 m"}  # the other is the system's
 
     def share(*options: str) -> float:
         main(["check", trace, "--json", *options])
@@ -84,9 +97,52 @@ def test_a_trace_is_judged_by_the_constants_it_was_driven_with(
     assert driven < 1.0
     assert share() == pytest.approx(driven)
     assert share("--set", "x_inter=19 m") > driven
-    assert share("--spec", str(ROOT / "specs/traffic.stl")) > driven
+    assert share("--spec", str(ROOT / "specs/driving_rules.stl")) > driven
+    assert share("--spec", str(ROOT / "specs/traffic.stl"), "--set", "x_inter=-19 m") == pytest.approx(
+        windows
+    )
     main(["check", trace])
     assert "with x_inter = -19 m, as it was recorded" in capsys.readouterr().err
+
+
+def test_windows_are_shown_where_they_are_asked_for(
+    there: RunDir, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["simulate", there.name, *SMALL, "--steps", "30", "--windows"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.strip().startswith("plan accuracy") and "±" in line for line in lines)
+    assert any("driven safely" in line for line in lines)
+
+
+def test_without_rules_drives_are_judged_as_plans_are(
+    there: RunDir, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["simulate", there.name, *SMALL, "--steps", "30", "--set", "test.judge=null"]
+    assert main(command) == 0
+    assert "of 8 drives satisfied traffic from every start\n" in capsys.readouterr().out
+    assert load_trace(there.path / "trace.npz").meta.judge_text == ""
+    assert main([*command, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert misfits(document, load_schema("simulate/1")) == []
+    result = document["result"]
+    assert result["judge"] is None
+    drives, metrics = (result["guards"]["none"][name] for name in ("drives", "metrics"))
+    assert drives["obeyed"] / 8 == metrics["executed"]["mean"]
+    assert set(drives["rules"]) == {"no_collision", "stop_sign", "give_way", "red_light"}
+
+
+def test_what_was_driven_is_checked_by_the_rules_that_travel_with_it(
+    there: RunDir, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["simulate", there.name, *SMALL, "--steps", "30", "--json"]) == 0
+    drives = json.loads(capsys.readouterr().out)["result"]["guards"]["none"]["drives"]
+    obeyed = drives["obeyed"] == drives["count"] == 8
+    assert main(["check", str(there.path / "trace.npz"), "--json"]) == (0 if obeyed else 1)
+    result = json.loads(capsys.readouterr().out)["result"]
+    assert {each["name"] for each in result["requirements"]} == set(drives["rules"])
+    main(["check", str(ROOT / "specs/traffic.stl"), str(there.path / "trace.npz"), "--json"])
+    windows = json.loads(capsys.readouterr().out)["result"]
+    assert "stop_sign" in {each["name"] for each in windows["requirements"]}
 
 
 def test_without_backup_nothing_is_guarded(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
@@ -146,7 +202,7 @@ def test_all_scenarios_are_driven_and_compared(there: RunDir, capsys: pytest.Cap
     assert "scenario" not in lines[0]
     rows = [line.split() for line in lines]
     (header,) = (row for row in rows if row[:1] == ["scenario"])
-    assert header.count("guard:") == 6
+    assert header.count("guard:") == 4
     assert {row[0] for row in rows if len(row) > 5} >= {"as", "slippery"}
     assert main(["simulate", spec, "--scenario", "all", *SMALL, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
@@ -260,7 +316,7 @@ def test_margins_may_be_the_standard_output(there: RunDir, capsys: pytest.Captur
     assert main(["simulate", there.name, *SMALL, "--margins", "-"]) == 0
     captured = capsys.readouterr()
     assert [json.loads(line)["step"] for line in captured.out.splitlines()][::8] == list(range(7))
-    assert "plan accuracy" in captured.err
+    assert "of 8 drives obeyed every rule" in captured.err
 
 
 def test_the_disturbed_scenarios_of_every_system(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,6 +29,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (home / "models/car.yaml").write_text("extends: base.yaml\n")
     text = (ROOT / "specs/traffic.stl").read_text().replace('"../examples/car.yaml"', '"../models/car.yaml"')
     (home / "specs/drive.stl").write_text(text)
+    (home / "specs/driving_rules.stl").write_text((ROOT / "specs/driving_rules.stl").read_text())
     monkeypatch.chdir(home)
     return home
 
@@ -44,7 +45,7 @@ def test_what_a_training_reads(project: Path) -> None:
         path.resolve().relative_to(project.resolve()).as_posix()
         for path in input_files(Path("specs/drive.stl"))
     }
-    assert {"specs/drive.stl", "models/car.yaml", "models/base.yaml"} <= read
+    assert {"specs/drive.stl", "specs/driving_rules.stl", "models/car.yaml", "models/base.yaml"} <= read
     (project / "specs/broken.stl").write_text("require a: always[0, ")
     assert input_files(Path("specs/broken.stl")) == (Path("specs/broken.stl"),)
     assert input_files(Path("specs/none.stl")) == ()

@@ -2,7 +2,16 @@
 
 import pytest
 
-from stlc.view.words import count, interval, number, seconds, share, spread
+from stlc.view.words import (
+    count,
+    interval,
+    number,
+    obeyed_sentence,
+    seconds,
+    share,
+    spread,
+    viable_sentence,
+)
 
 
 @pytest.mark.parametrize(
@@ -50,3 +59,26 @@ def test_shares_and_counts():
     assert count(2000, "trace") == "2,000 traces"
     assert number(None) == ""
     assert number(23.54, "GiB") == "23.5 GiB"
+
+
+def drives(obeyed, lost=0, undecided=0, count=200):
+    return {"drives": {"count": count, "obeyed": obeyed, "lost": lost, "undecided": undecided}}
+
+
+def test_how_many_drives_obeyed():
+    guards = {"none": drives(181), "paper": drives(200)}
+    simulation = {"spec": "traffic", "judge": {"spec": "driving_rules"}, "guards": guards}
+    assert obeyed_sentence(simulation) == "200 of 200 drives obeyed every rule; without the guard 181"
+    assert viable_sentence(simulation) == ""
+    alone = {**simulation, "judge": None, "guards": {"none": drives(0, 1, 1, 1)}}
+    assert obeyed_sentence(alone) == (
+        "0 of 1 drive satisfied traffic from every start, 1 ended too early to say"
+    )
+    assert viable_sentence(alone) == (
+        "1 drive was lost from the start, where no safe plan is known: 0 of the 0 others obeyed"
+    )
+    some = {**simulation, "guards": {"full": drives(190, 8)}}
+    assert obeyed_sentence(some) == "190 of 200 drives obeyed every rule"
+    assert viable_sentence(some) == (
+        "8 drives were lost from the start, where no safe plan is known: 190 of the 192 others obeyed"
+    )

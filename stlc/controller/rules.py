@@ -1,0 +1,322 @@
+"""The rules that drives are judged by: the specification of `test: {judge: …}`, and who obeyed it.
+
+Plans are judged window by window by the specification that they are made for. What was driven is judged once,
+from its first sample to its last, by another one, which may look back and knows what a world does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from stlc.compile.modules import file_of, library_of
+from stlc.compile.pipeline import compile_spec
+from stlc.controller.run import INDEX, read_library, save_library
+from stlc.diagnostics import Diagnostic, RunError, SystemFileError, UsageError
+from stlc.dynamics.schema import load_system_decl
+from stlc.files import read_source, write_atomic
+from stlc.grammar import ast
+from stlc.grammar.parser import parse
+from stlc.monitor.explain import explain
+from stlc.monitor.verdict import Monitor
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from stlc.controller.drive import Recording
+    from stlc.controller.run import Run
+    from stlc.controller.task import Task
+    from stlc.dynamics.decl import SystemDecl
+    from stlc.dynamics.decl_deployment import JudgeRef
+    from stlc.monitor.judgement import Verdict
+    from stlc.rundir import RunDir
+
+JUDGE = "judge"
+_INDEX = f"{JUDGE}/{INDEX}"
+MOST_TIMED = 200
+"""Broken rules of one guard whose moment is looked for: each takes some milliseconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """A specification of drives.
+
+    Attributes:
+        spec: as parsed, with the texts that it imports.
+        path: where it was read when the run was made, as a person finds it.
+        overrides: those of its constants that the run or the deployment changed, as texts.
+    """
+
+    spec: ast.Spec
+    path: str
+    overrides: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Of the specification."""
+        return self.spec.name or Path(self.path).stem
+
+    @property
+    def docs(self) -> dict[str, str]:
+        """Rule -> what its `##` comment says."""
+        return {item.name: " ".join((item.doc or "").split()) for item in _requirements(self.spec)}
+
+
+@dataclass(frozen=True, slots=True)
+class Broken:
+    """A drive that broke rules.
+
+    Attributes:
+        row: of the recording.
+        rules: rule -> when, in seconds from the start; None where nobody has looked.
+    """
+
+    row: int
+    rules: Mapping[str, float | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Drives:
+    """What became of each drive, one agent over one seed.
+
+    Attributes:
+        rules: rule -> status of each drive, (rows,): `satisfied`, `violated` or `inconclusive`.
+        broken: the drives that broke a rule, in order.
+        viable: (rows,), who obeyed, or from whose start a safe plan is known.
+    """
+
+    rules: Mapping[str, NDArray[np.str_]]
+    broken: tuple[Broken, ...]
+    viable: NDArray[np.bool_]
+
+    @property
+    def obeyed(self) -> NDArray[np.bool_]:
+        """(rows,), who obeyed every rule."""
+        return obeying(self.rules, len(self.viable))
+
+
+def obeying(rules: Mapping[str, NDArray[np.str_]], rows: int) -> NDArray[np.bool_]:
+    """(rows,), who satisfies every rule."""
+    held = np.ones(rows, dtype=bool)
+    for statuses in rules.values():
+        held &= statuses == "satisfied"
+    return held
+
+
+# ------------------------------------------------------------------------ where rules are
+
+
+def read_rules(judge: JudgeRef) -> ast.Spec:
+    """The specification that a system file names, with what it imports.
+
+    Raises:
+        SystemFileError: S210, there is no such file.
+        SpecError: it is no specification.
+    """
+    try:
+        spec = parse(read_source(judge.path))
+    except UsageError as error:
+        first = error.diagnostics[0]
+        advice = (*first.help, "`--set test.judge=null` does without")
+        finding = Diagnostic("S210", first.message, judge.span, label="named here", help=advice)
+        raise SystemFileError(finding) from None
+    return replace(spec, library=library_of(spec))
+
+
+def keep_rules(folder: RunDir, task: Task) -> None:
+    """Write the rules that a system names into the folder of a run, whether they fit checked before.
+
+    Raises:
+        SystemFileError: S210, there is no such file.
+        SpecError: they are invalid, or do not fit the system.
+    """
+    decl = task.system.decl
+    found = {judge.written: (judge, _fitting(judge, task)) for judge in decl.judges}
+    index: dict[str, dict[str, str]] = {}
+    for number, (written, (judge, spec)) in enumerate(found.items()):
+        name = judge.path.name if number == 0 else f"{number}-{judge.path.name}"
+        write_atomic(folder.path / JUDGE / name, spec.source.text)
+        save_library(folder, spec.library or {}, _library_of(name))
+        index[written] = {"file": name, "path": str(judge.path)}
+    folder.write_json(_INDEX, index)
+
+
+def _fitting(judge: JudgeRef, task: Task) -> ast.Spec:
+    """The rules, compiled for the states that will be recorded: findings come before the training."""
+    spec, system = read_rules(judge), task.plain
+    changed = _own(spec, system.decl.overrides)
+    compile_spec(
+        spec, grid=system.decl.grid, interface=system.interface(), overrides=changed, purpose="check"
+    )
+    return spec
+
+
+def rules_of(run: Run) -> Rules | None:
+    """The rules of a run's system as it is deployed; None where drives are judged as plans are.
+
+    They are those that the run keeps of the file that its `system.yaml` names. A file that is named there
+    since (or with `--set test.judge=…`) is read where it lies. A run that was trained before systems named
+    such files has the rules that its system file names now.
+
+    Raises:
+        RunError: R101, what the run keeps is damaged.
+        SystemFileError, SpecError: the file is missing, or is no specification.
+    """
+    decl = run.task.system.decl
+    judge, overrides = decl.test.judge, decl.overrides
+    if (run.dir.path / _INDEX).is_file():
+        return None if judge is None else _kept(run.dir, judge, overrides)
+    if judge is None:
+        judge = _named_since(run.dir, decl)
+    if judge is None:
+        return None
+    spec = read_rules(judge)
+    return Rules(spec, str(judge.path), _own(spec, overrides))
+
+
+def _kept(folder: RunDir, judge: JudgeRef, overrides: Mapping[str, str]) -> Rules:
+    index = folder.read_json(_INDEX)
+    if isinstance(index, dict) and judge.written not in index:
+        spec = read_rules(judge)
+        return Rules(spec, str(judge.path), _own(spec, overrides))
+    entry = index[judge.written] if isinstance(index, dict) else None
+    name = entry.get("file") if isinstance(entry, dict) else None
+    if not isinstance(entry, dict) or not isinstance(name, str) or Path(name).name != name:
+        raise RunError(Diagnostic("R101", f"`{folder.shown}/{_INDEX}` is damaged"))
+    spec = parse(read_source(folder.path / JUDGE / name))
+    spec = replace(spec, library=read_library(folder, _library_of(name)))
+    return Rules(spec, str(entry.get("path", name)), _own(spec, overrides))
+
+
+def _named_since(folder: RunDir, decl: SystemDecl) -> JudgeRef | None:
+    """What the system file that a run was trained for names today, for the scenario that is laid over."""
+    path = Path(str(folder.record().get("system_path") or ""))
+    if "test.judge" in decl.overrides or not path.is_file():
+        return None
+    try:
+        now = load_system_decl(path)
+    except SystemFileError:
+        return None
+    laid = None if decl.scenario is None else decl.scenario.name
+    own = [each.judge for each in now.scenarios if each.name == laid and each.judge is not None]
+    return own[0] if own else now.test.judge
+
+
+def _library_of(name: str) -> str:
+    return f"{JUDGE}/lib/{file_of(name)}"
+
+
+def _own(spec: ast.Spec, overrides: Mapping[str, str]) -> dict[str, str]:
+    """Those of the constants that were changed which a specification declares."""
+    own = {item.name for item in spec.items if isinstance(item, (ast.Const, ast.Param))}
+    return {name: text for name, text in overrides.items() if name in own}
+
+
+def _requirements(spec: ast.Spec) -> Iterator[ast.Require]:
+    return (item for item in spec.items if isinstance(item, ast.Require))
+
+
+# ----------------------------------------------------------------------- who obeyed
+
+
+def judge_drives(rules: Rules, task: Task, recording: Recording, savable: NDArray[np.bool_]) -> Drives:
+    """Judge every drive from its first sample to its last.
+
+    Args:
+        rules: to judge by.
+        task: the states by name, the time step and the functions from outside.
+        recording: what was driven.
+        savable: (rows,), from whose start a safe plan is known.
+
+    Raises:
+        SpecError: the rules do not fit what was recorded.
+    """
+    outside = any(isinstance(item, ast.Extern) for item in rules.spec.items)
+    decl = task.system.decl
+    monitor = Monitor(
+        rules.spec,
+        dt=decl.dt,
+        horizon=decl.dt * decl.horizon,
+        system=decl.path if outside else None,
+        overrides=rules.overrides,
+    )
+    columns = np.moveaxis(recording.states, -1, 0)
+    verdict = monitor.check(dict(zip(task.names, columns, strict=True)))
+    found = {judgement.name: np.array(judgement.statuses) for judgement in verdict}
+    viable = savable | obeying(found, len(savable))
+    return Drives(found, tuple(_broken(verdict, found)), viable)
+
+
+def drives_of_plans(held: Mapping[str, NDArray[np.bool_]], savable: NDArray[np.bool_], dt: float) -> Drives:
+    """The same where drives are judged as plans are: requirement -> (starts, rows), whether it holds there.
+
+    A requirement is obeyed where it holds at every start; it was broken at the first one where it does not.
+    """
+    rules = {name: np.where(starts.all(0), "satisfied", "violated") for name, starts in held.items()}
+    rules |= {name: np.full(len(savable), "inconclusive") for name, starts in held.items() if not len(starts)}
+    names = {row: [name for name in rules if rules[name][row] == "violated"] for row in range(len(savable))}
+    first = {name: starts.argmin(0) * dt for name, starts in held.items() if len(starts)}
+    broken = (
+        Broken(row, {name: float(first[name][row]) for name in each}) for row, each in names.items() if each
+    )
+    return Drives(rules, tuple(broken), savable | obeying(rules, len(savable)))
+
+
+def _broken(verdict: Verdict, rules: Mapping[str, NDArray[np.str_]]) -> Iterator[Broken]:
+    left = MOST_TIMED
+    for row in range(verdict.traces):
+        names = [name for name, statuses in rules.items() if statuses[row] == "violated"]
+        if names:
+            yield Broken(row, _moments(verdict, row, names) if left > 0 else dict.fromkeys(names))
+            left -= len(names)
+
+
+def _moments(verdict: Verdict, row: int, names: Sequence[str]) -> dict[str, float | None]:
+    """When a drive broke rules: at the sample that decides."""
+    alone = np.zeros(verdict.traces, dtype=bool)
+    alone[row] = True
+    causes = {name: explain(verdict.within(alone), name) for name in names}
+    return {name: None if cause is None else float(cause.time) for name, cause in causes.items()}
+
+
+# ------------------------------------------------------------------------- as data
+
+
+def drives_json(drives: Drives, seeds: Sequence[int], agents: int) -> dict[str, Any]:
+    """The entry `drives` of a guard in `eval/simulate.json`.
+
+    `count` drives, of which `obeyed` kept every rule and `undecided` ended too early to say; `lost` of the
+    others have no start from which a safe plan is known. `rules`: the same for each rule. `broken`: who broke
+    which, and when (seconds from the start, null where nobody has looked).
+    """
+    obeyed, rows = drives.obeyed, len(drives.viable)
+    violated = np.zeros(rows, dtype=bool)
+    for statuses in drives.rules.values():
+        violated |= statuses == "violated"
+    return {
+        "count": rows,
+        "obeyed": int(obeyed.sum()),
+        "undecided": int((~obeyed & ~violated).sum()),
+        "lost": int((~drives.viable).sum()),
+        "rules": {
+            name: {
+                "obeyed": int((statuses == "satisfied").sum()),
+                "broken": int((statuses == "violated").sum()),
+                "undecided": int((statuses == "inconclusive").sum()),
+            }
+            for name, statuses in drives.rules.items()
+        },
+        "broken": [
+            {
+                "seed": seeds[each.row // agents],
+                "agent": each.row % agents,
+                "lost": not bool(drives.viable[each.row]),
+                "rules": dict(each.rules),
+            }
+            for each in drives.broken
+        ],
+    }

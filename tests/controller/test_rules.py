@@ -1,0 +1,230 @@
+"""The rules of drives: where a run finds them, who obeyed, and what travels with a trace."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stlc.controller.config import TrainConfig
+from stlc.controller.drive import Recording
+from stlc.controller.launch import Launch, open_folder
+from stlc.controller.rules import Rules, drives_json, drives_of_plans, judge_drives, rules_of
+from stlc.controller.run import Run, load_task
+from stlc.controller.task import Task
+from stlc.diagnostics import RunError, SpecError, SystemFileError
+from stlc.dynamics.system import System
+from stlc.files import read_source
+from stlc.grammar.parser import parse
+from stlc.rundir import RunDir
+
+SYSTEM = """stlc: 1
+name: cart
+spec: cart.stl
+time: {dt: 1 s, horizon: 3 steps}
+state: {x: {unit: m, range: [-10, 10]}}
+control: {u: {unit: m/s, range: [-1, 1]}}
+flow: {x: u}
+init: {mixture: [{weight: 1, draw: {x: 0}}]}
+test: {judge: ../rules/cart.stl, steps: 4, agents: 2}
+scenario: {far: {judge: far.stl}, same: {doc: nothing else}}
+"""
+PLAN = "spec cart\nsignal x [m]\nconst wall = 4 m\n@safety require near: always[0, T] x < wall\n"
+RULES = (
+    'spec cart_rules\nimport "parts/limit.stl" as limit\nsignal x [m]\nconst wall = 3 m\n'
+    "## Never at the wall.\nrequire stay: always x < wall\n"
+    "require home: always[1 s, end] prev(x) > limit.low\n"
+)
+LIMIT = "const low = -2 m\n"
+FAR = "spec far\nsignal x [m]\nrequire far: always x < 9 m\n"
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """A system with rules in a folder beside, which import a file, and a scenario with rules of its own."""
+    files = {
+        "car/cart.yaml": SYSTEM,
+        "car/cart.stl": PLAN,
+        "car/far.stl": FAR,
+        "rules/cart.stl": RULES,
+        "rules/parts/limit.stl": LIMIT,
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+def task_of(home: Path, overrides: Mapping[str, str] | None = None) -> Task:
+    spec = parse(read_source(home / "car/cart.stl"))
+    return Task.of(spec, System.load(home / "car/cart.yaml", overrides or {}))
+
+
+def opened(folder: RunDir, overrides: Mapping[str, str] | None = None, scenario: str | None = None) -> Run:
+    return Run(folder, load_task(folder, overrides, scenario), None)  # type: ignore[arg-type]
+
+
+def run_of(home: Path, overrides: Mapping[str, str] | None = None) -> RunDir:
+    launch = Launch(root=home / "runs", name="test", overrides=overrides or {})
+    return open_folder(task_of(home, overrides), TrainConfig(steps=1), launch)
+
+
+def found(run: Run) -> Rules:
+    rules = rules_of(run)
+    assert rules is not None
+    return rules
+
+
+def driven(xs: list[list[float]]) -> Recording:
+    """Drives along these x."""
+    states = np.array(xs, dtype=float)[..., None]
+    rows, steps = states.shape[0], states.shape[1] - 1
+    whole = np.zeros((rows, steps))
+    none = whole.astype(np.int64)
+    actions = np.zeros((rows, steps, 1))
+    return Recording(rows, states, actions, none, none, whole, whole, whole == 0, ({},), {}, {})
+
+
+# ------------------------------------------------------------------------ where they are
+
+
+def test_a_run_judges_by_the_rules_that_it_was_made_with(home: Path) -> None:
+    folder = run_of(home)
+    for name in ("rules/cart.stl", "rules/parts/limit.stl", "car/far.stl"):
+        (home / name).unlink()
+    rules = found(opened(folder))
+    assert (rules.name, rules.spec.source.text) == ("cart_rules", RULES)
+    assert rules.spec.library == {"parts/limit.stl": LIMIT}
+    assert rules.docs == {"stay": "Never at the wall.", "home": ""}
+    assert rules.path.endswith("rules/cart.stl")
+    drives = judge_drives(
+        rules, opened(folder).task, driven([[0, 1, 2], [0, 1, 3.5], [-3, 0, 0]]), savable(3)
+    )
+    assert {name: list(each == "satisfied") for name, each in drives.rules.items()} == {
+        "stay": [True, False, True],
+        "home": [True, True, False],
+    }
+
+
+def test_the_same_name_in_the_folder_of_the_run_is_another_file(home: Path) -> None:
+    """Copies of rules lie in a folder of their own: none replaces the specification, or a system file."""
+    (home / "rules/cart.stl").rename(home / "rules/spec.stl")
+    (home / "car/cart.yaml").write_text(SYSTEM.replace("rules/cart.stl", "rules/spec.stl"))
+    folder = run_of(home)
+    assert (folder.path / "spec.stl").read_text() == PLAN
+    assert found(opened(folder)).name == "cart_rules"
+
+
+def test_a_scenario_may_bring_rules_of_its_own(home: Path) -> None:
+    folder = run_of(home)
+    assert found(opened(folder, scenario="far")).name == "far"
+    assert found(opened(folder, scenario="same")).name == "cart_rules"
+    assert found(opened(folder, scenario="noise")).name == "cart_rules"
+
+
+def test_constants_that_were_changed_are_changed_in_the_rules_too(home: Path) -> None:
+    folder = run_of(home, {"wall": "1 m", "x": "0.5 m", "train.seed": "3"})
+    assert found(opened(folder)).overrides == {"wall": "1 m"}
+    assert found(opened(folder, {"wall": "2 m"})).overrides == {"wall": "2 m"}
+
+
+def test_rules_may_be_left_out_or_given_anew(home: Path) -> None:
+    folder = run_of(home)
+    assert rules_of(opened(folder, {"test.judge": "null"})) is None
+    assert found(opened(folder, {"test.judge": str(home / "car/far.stl")})).name == "far"
+
+
+def test_a_run_from_before_has_the_rules_that_its_system_names_now(home: Path) -> None:
+    (home / "car/cart.yaml").write_text(SYSTEM.replace("judge: ../rules/cart.stl, ", ""))
+    folder = run_of(home)
+    assert rules_of(opened(folder)) is None
+    (home / "car/cart.yaml").write_text(SYSTEM)
+    assert rules_of(opened(folder)) is None  # the run was made without, by a release that knew of rules
+    for path in (folder.path / "judge").iterdir():
+        path.unlink()
+    assert found(opened(folder)).name == "cart_rules"
+    assert rules_of(opened(folder, {"test.judge": "null"})) is None
+    (home / "car/cart.yaml").write_text("stlc: 1\n")
+    assert rules_of(opened(folder)) is None
+    (home / "car/cart.yaml").unlink()
+    assert rules_of(opened(folder)) is None
+
+
+def test_rules_that_are_missing_or_do_not_fit_stop_a_training(home: Path) -> None:
+    (home / "rules/cart.stl").write_text(RULES.replace("signal x [m]", "signal x [s]"))
+    with pytest.raises(SpecError):
+        run_of(home)
+    (home / "rules/cart.stl").unlink()
+    with pytest.raises(SystemFileError) as caught:
+        run_of(home)
+    (finding,) = caught.value.diagnostics
+    assert finding.code == "S210"
+    assert finding.span is not None
+    assert finding.span.text == "../rules/cart.stl"
+    assert "--set test.judge=null" in finding.help[-1]
+
+
+@pytest.mark.parametrize(
+    "broken", ['{"../rules/cart.stl": {"file": "../../x.stl"}}', '{"../rules/cart.stl": 3}', "[", "[]"]
+)
+def test_a_copy_that_is_damaged_is_said(home: Path, broken: str) -> None:
+    folder = run_of(home)
+    (folder.path / "judge/index.json").write_text(broken)
+    with pytest.raises(RunError) as caught:
+        rules_of(opened(folder))
+    assert caught.value.diagnostics[0].code == "R101"
+
+
+# ------------------------------------------------------------------------- who obeyed
+
+
+def savable(rows: int, *lost: int) -> np.ndarray:
+    able = np.ones(rows, dtype=bool)
+    able[list(lost)] = False
+    return able
+
+
+def test_drives_are_counted(home: Path) -> None:
+    task, rules = opened(run_of(home)).task, found(opened(run_of(home)))
+    recording = replace(driven([[0, 1, 2], [0, 3.5, 1], [-3, 3, 0], [0, 0, 0]]), agents=2)
+    drives = judge_drives(rules, task, recording, savable(4, 2, 3))
+    document = drives_json(drives, (7, 8), 2)
+    assert json.loads(json.dumps(document)) == {
+        "count": 4,
+        "obeyed": 2,
+        "undecided": 0,
+        "lost": 1,  # the last one obeyed although no search has found a plan for it
+        "rules": {
+            "stay": {"obeyed": 3, "broken": 1, "undecided": 0},
+            "home": {"obeyed": 3, "broken": 1, "undecided": 0},
+        },
+        "broken": [
+            {"seed": 7, "agent": 1, "lost": False, "rules": {"stay": 1.0}},
+            {"seed": 8, "agent": 0, "lost": True, "rules": {"home": 1.0}},
+        ],
+    }
+
+
+def test_a_drive_that_ends_too_early_is_neither(home: Path) -> None:
+    text = "spec soon\nsignal x [m]\nrequire soon: eventually[0 s, 5 s] x > 1\n"
+    rules = Rules(parse(text_of(home, text)), "soon.stl")
+    task = opened(run_of(home)).task
+    document = drives_json(judge_drives(rules, task, driven([[0, 2, 0], [0, 0, 0]]), savable(2)), (0,), 2)
+    assert (document["obeyed"], document["undecided"], document["broken"]) == (1, 1, [])
+
+
+def text_of(home: Path, text: str):  # type: ignore[no-untyped-def]
+    (home / "other.stl").write_text(text)
+    return read_source(home / "other.stl")
+
+
+def test_without_rules_every_start_counts() -> None:
+    held = {"a": np.array([[True, True], [True, False], [False, False]]), "b": np.ones((0, 2), dtype=bool)}
+    drives = drives_of_plans({"a": held["a"]}, savable(2, 1), 0.5)
+    assert [each.rules for each in drives.broken] == [{"a": 1.0}, {"a": 0.5}]
+    assert drives.viable.tolist() == [True, False]
+    assert drives_json(drives_of_plans({"b": held["b"]}, savable(2), 0.5), (0,), 2)["undecided"] == 2
