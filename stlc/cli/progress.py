@@ -6,13 +6,16 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
 from stlc.cli.output import console as open_console
+
+if TYPE_CHECKING:
+    from stlc.view.learning import Learning
 
 LINE_EVERY = 30.0  # seconds between lines where there is no terminal to redraw
 BLOCKS = "▁▂▃▄▅▆▇█"
@@ -57,7 +60,8 @@ class Summary:
         feasible: share of the held-out starts for which some satisfying plan is known, or None.
         seconds: of training.
         folder: of the run.
-        next_command: what to do next.
+        learning: the verdict on the training, with what to do next.
+        steps: of the optimiser.
         where: where the worst requirement fails, in words, or "".
         unsolved: what remains, in words, or "".
         picture: that shows it, or "".
@@ -71,7 +75,8 @@ class Summary:
     feasible: float | None = None
     seconds: float = 0.0
     folder: str = ""
-    next_command: str = "stlc simulate --backup"
+    learning: Learning | None = None
+    steps: int = 0
     where: str = ""
     unsolved: str = ""
     picture: str = ""
@@ -305,7 +310,7 @@ def native_text(by_torch: Mapping[str, str]) -> str:
 
 
 def final_screen(summary: Summary, spark: str = "") -> list[str]:
-    """The lines that close a training run; the last one is the next command."""
+    """The lines that close a training run; the last one is the next command, where there is a verdict."""
     low, high = summary.interval
     lines = [
         f"plan accuracy   {summary.accuracy:.3f}   95 % interval [{low:.3f}, {high:.3f}]"
@@ -314,7 +319,10 @@ def final_screen(summary: Summary, spark: str = "") -> list[str]:
     if summary.feasible:
         share = percent(summary.accuracy / summary.feasible)
         lines.append(f"known feasible  {summary.feasible:.3f}   of which {share} are satisfied")
-    if summary.requirements:
+    learning = summary.learning
+    if learning is not None:
+        lines.append(f"verdict         {learning.level}: {learning.sentence}")
+    if summary.requirements and min(summary.requirements.values()) < 1.0:
         worst = min(summary.requirements, key=summary.requirements.__getitem__)
         lines.append(f"worst           {worst} {summary.requirements[worst]:.3f}")
         if summary.where:
@@ -323,10 +331,14 @@ def final_screen(summary: Summary, spark: str = "") -> list[str]:
         lines.append(f"unsolved        {summary.unsolved}")
     if summary.picture:
         lines.append(f"picture         {summary.picture}")
-    took = f"{summary.seconds:.0f} s of training"
+    for i, advice in enumerate(() if learning is None else learning.advice):
+        lines.append(f"{'' if i else 'what helps':<15} {advice}")
+    took = f"{summary.seconds:.0f} s of training and verdict" + (
+        f", {summary.steps:,} steps" if summary.steps else ""
+    )
     lines.append(f"{summary.status:<15} {took}" + (f"   {summary.folder}" if summary.folder else ""))
-    lines.append("")
-    lines.append(f"Next:  {summary.next_command}")
+    if learning is not None:
+        lines += ["", f"Next:  {learning.command}"]
     return lines
 
 

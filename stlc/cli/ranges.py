@@ -36,6 +36,15 @@ def parse_seconds(text: str) -> float:
     return value
 
 
+def parse_count(text: str, option: str) -> int:
+    """A whole number of at least 1. Raises UsageError (U101) for anything else."""
+    if re.fullmatch(r"\s*0*[1-9]\d{0,17}\s*", text, re.ASCII):
+        return int(text)
+    raise UsageError(
+        Diagnostic("U101", f"`{option} {text}` is no number from 1 on", help=(f"{option} 1200",))
+    )
+
+
 def parse_limit(text: str) -> float | None:
     """A duration in seconds, or None for `none`. Raises UsageError (U101) for anything else."""
     return None if text.strip() == "none" else parse_seconds(text)

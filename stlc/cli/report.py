@@ -7,7 +7,7 @@ from pathlib import Path
 import typer
 
 from stlc.cli.options import JsonOption, RunArgument, RunsOption, describe
-from stlc.cli.output import emit, emit_json
+from stlc.cli.output import emit, emit_json, say
 
 
 def register(app: typer.Typer) -> None:
@@ -30,12 +30,20 @@ def report(
 ) -> None:
     """Write the report of `run` and print where it is."""
     from stlc.rundir import RunDir
+    from stlc.view.learning import Commands, learning_of_run
     from stlc.view.report import write_report
 
     folder = RunDir.open(run, runs)
     write_report(folder)
     path = f"{folder.shown}/report.html"
+    learning = learning_of_run(folder, Commands.of(folder.shown))
     if as_json:
-        emit_json("report/1", ok=True, exit_code=0, result={"run": folder.shown, "report": path})
+        result: dict[str, object] = {"run": folder.shown, "report": path}
+        result |= {} if learning is None else {"verdict": learning.summary()}
+        emit_json("report/1", ok=True, exit_code=0, result=result)
     else:
+        if learning is not None:
+            say(f"{learning.level}: {learning.sentence}")
+        for advice in () if learning is None else learning.advice:
+            say(f"what helps: {advice}")
         emit(path)

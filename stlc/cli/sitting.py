@@ -16,6 +16,7 @@ from stlc.cli.progress import Progress, RunInfo, Summary
 from stlc.controller.train import Outcome, Watch
 from stlc.diagnostics import StlcError
 from stlc.rundir import LATEST, RUNS
+from stlc.view.learning import Commands, Learning, learning_of_run
 
 if TYPE_CHECKING:
     from types import FrameType, TracebackType
@@ -101,7 +102,7 @@ class Sitting:
             raise typer.Exit(self._signalled if outcome.interrupted else 0)
         if outcome.score is None:
             say(f"interrupted, saved: {self.folder.shown}")
-            say(f"go on with: {started(outcome.ranks)} train --resume {spoken(self.folder)}")
+            say(f"go on with: {_commands(self.folder, outcome.ranks).train_on}")
             code = self._signalled
             if json:
                 result = {"run": self.folder.shown, "seconds": outcome.seconds}
@@ -113,7 +114,10 @@ class Sitting:
         found = outcome.score.feasible > 0.0
         code = 0 if found else 1
         if json:
+            learning = _learning(outcome)
             result = {"run": self.folder.shown, "seconds": outcome.seconds, **outcome.score.summary()}
+            result |= {} if learning is None else {"verdict": learning.summary()}
+            result |= {key: self.folder.record().get(key) for key in ("steps", "schedule")}
             emit_json("train/1", ok=found, exit_code=code, diagnostics=why, result=result)
         else:
             self.progress.finish(_summary(outcome, pictures=pictures), to=console())
@@ -132,10 +136,15 @@ def spoken(folder: RunDir) -> str:
     return folder.name if usual else folder.shown
 
 
-def _next(folder: RunDir) -> str:
-    """The command that drives the run: it need not be named while it is the newest."""
+def _commands(folder: RunDir, ranks: int = 1) -> Commands:
+    """The commands that a closing screen names; the run need not be named while it is the newest."""
     newest = (RUNS / LATEST).resolve() == folder.path.resolve()
-    return "stlc simulate --backup" if newest else f"stlc simulate {spoken(folder)} --backup"
+    return Commands.of(spoken(folder), newest=newest, start=started(ranks))
+
+
+def _learning(outcome: Outcome) -> Learning | None:
+    """The verdict on the training, as its record has it."""
+    return learning_of_run(outcome.run.dir, _commands(outcome.run.dir, outcome.ranks))
 
 
 def _info(folder: RunDir) -> RunInfo:
@@ -156,6 +165,7 @@ def _info(folder: RunDir) -> RunInfo:
 def _summary(outcome: Outcome, *, pictures: bool) -> Summary:
     from stlc.view.held_out import find_weakness, load_held_out, unsolved_text, weakness_text
 
+    learning = _learning(outcome)
     score, folder = outcome.score, outcome.run.dir
     assert score is not None
     held = load_held_out(folder.path / "eval" / "held_out.npz")
@@ -173,7 +183,8 @@ def _summary(outcome: Outcome, *, pictures: bool) -> Summary:
         feasible=score.feasible,
         seconds=outcome.seconds,
         folder=folder.shown,
-        next_command=_next(folder),
+        steps=outcome.steps,
+        learning=learning,
         where=where,
         unsolved=unsolved,
         picture=f"{folder.shown}/{FAILURES}" if pictures and weakness and drawn.is_file() else "",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -13,7 +14,7 @@ import typer
 from stlc.cli import train_options as o
 from stlc.cli.one_voice import one_voice
 from stlc.cli.options import JsonOption, SetOption, SystemOption, describe, parse_overrides
-from stlc.cli.ranges import parse_clock, parse_seconds, parse_seeds
+from stlc.cli.ranges import parse_clock, parse_count, parse_seconds, parse_seeds
 from stlc.cli.train_many import Many, train_many
 from stlc.diagnostics import Diagnostic, UsageError
 
@@ -24,9 +25,23 @@ if TYPE_CHECKING:
     from stlc.controller.config import Method, TrainConfig
     from stlc.controller.launch import Launch
     from stlc.controller.logbook import Opener
+    from stlc.controller.pace import StepSchedule
     from stlc.controller.task import Task
 
 METHODS: tuple[Method, ...] = ("guided", "gradient")
+
+
+@dataclass(frozen=True, slots=True)
+class Length:
+    """How far a resumed run is to go; what is left of it where neither is given.
+
+    Attributes:
+        steps: a new total of steps.
+        more: seconds of training more.
+    """
+
+    steps: int | None
+    more: float | None
 
 
 def register(app: typer.Typer) -> None:
@@ -36,7 +51,7 @@ def register(app: typer.Typer) -> None:
         help=describe(
             "Learn a policy that satisfies a specification.",
             "stlc train specs/traffic.stl --system car.yaml --budget 60s",
-            "stlc train --resume latest",
+            "stlc train --resume latest --budget 5min",
             "stlc train specs/traffic.stl --seeds 0..2 --jobs 2",
             "stlc train specs/traffic.stl specs/ship_safe.stl --seeds 0..2 --cluster auto",
             note="The run's folder holds everything that repeats it. Ctrl-C saves a checkpoint and stops.",
@@ -77,17 +92,20 @@ def train(
     logbook = _logbook(log)
     if resume is not None:
         _refuse_on_resume(
-            {"SPEC": spec or None, "--system": system, "--budget": budget, "--seed": seed, "--method": method}
+            {"SPEC": spec or None, "--system": system, "--seed": seed, "--method": method}
             | {"--name": name, "--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch}
             | {"--set": set_, "--seeds": seeds, "--held-out": held_out, "--cluster": cluster}
         )
-        _go_on(resume, runs=runs, steps=steps, device=device, logbook=logbook, pictures=pictures, json=json)
+        total = parse_count(steps, "--steps") if steps is not None else None
+        more = parse_seconds(budget) if budget is not None else None
+        length = Length(total, more)
+        _go_on(resume, runs=runs, length=length, device=device, logbook=logbook, pictures=pictures, json=json)
     from stlc.controller.config import HELD_OUT, TrainConfig
 
     config = TrainConfig(
         method=_method(method) if method is not None else None,
         budget=parse_seconds(budget) if budget is not None else None,
-        steps=steps,
+        steps=_steps(steps) if steps is not None else None,
         seed=seed,
         device=device,
         threads=threads,
@@ -106,7 +124,7 @@ def train(
         _train(task, config, launch, logbook).conclude(pictures=pictures, json=json)
 
 
-def _check_together(*, seed: int | None, seeds: str | None, budget: str | None, steps: int | None) -> None:
+def _check_together(*, seed: int | None, seeds: str | None, budget: str | None, steps: str | None) -> None:
     """Options that exclude each other."""
     if budget is not None and steps is not None:
         raise UsageError(Diagnostic("U101", "`--budget` and `--steps` contradict each other"))
@@ -145,6 +163,21 @@ def _method(name: str) -> Method:
         if name == method:
             return method
     raise UsageError(Diagnostic("U101", f"there is no method `{name}`", help=(" or ".join(METHODS),)))
+
+
+def _steps(text: str) -> int | StepSchedule:
+    """A number of steps, or the schedule that a run with a budget has on record."""
+    from stlc.controller.pace import StepSchedule
+
+    if text.strip().isdecimal():
+        return parse_count(text, "--steps")
+    try:
+        return StepSchedule.parse(text)
+    except ValueError as error:
+        help_ = ("--steps 1200", "the schedule of a run is in its report and in its run.json")
+        raise UsageError(
+            Diagnostic("U101", f"`--steps {text}` is no number of steps", help=help_, note=(str(error),))
+        ) from None
 
 
 def _rate(value: float) -> float:
@@ -190,7 +223,7 @@ def _go_on(
     where: str,
     *,
     runs: Path,
-    steps: int | None,
+    length: Length,
     device: str,
     logbook: Opener | None,
     pictures: bool,
@@ -198,7 +231,7 @@ def _go_on(
 ) -> NoReturn:
     """Resume a run and conclude it."""
     with one_voice():
-        sitting = _resume(where, runs=runs, steps=steps, device=device, logbook=logbook)
+        sitting = _resume(where, runs=runs, length=length, device=device, logbook=logbook)
         sitting.conclude(pictures=pictures, json=json)
 
 
@@ -227,7 +260,7 @@ def _train(task: Task, config: TrainConfig, launch: Launch, logbook: Opener | No
     return sitting
 
 
-def _resume(where: str, *, runs: Path, steps: int | None, device: str, logbook: Opener | None) -> Sitting:
+def _resume(where: str, *, runs: Path, length: Length, device: str, logbook: Opener | None) -> Sitting:
     """An old run, from its last checkpoint to its verdict."""
     from stlc.cli.sitting import Sitting
     from stlc.controller.ranks import joined
@@ -236,18 +269,20 @@ def _resume(where: str, *, runs: Path, steps: int | None, device: str, logbook: 
 
     folder = RunDir.open(where, runs)
     with joined(device) as ranks, Sitting(folder, logbook=logbook, keeps=ranks.first) as sitting:
-        sitting.outcome = resume(folder, steps=steps, device=device, watch=sitting.watch, ranks=ranks)
+        sitting.outcome = resume(
+            folder, steps=length.steps, budget=length.more, device=device, watch=sitting.watch, ranks=ranks
+        )
     return sitting
 
 
 def _refuse_on_resume(given: Mapping[str, object]) -> None:
-    """A resumed run goes on with what it was started with; only `--steps` and `--device` may change."""
+    """A resumed run goes on with what it was started with; how far it goes and `--device` may change."""
     named = [option for option, value in given.items() if value is not None]
     if named:
         raise UsageError(
             Diagnostic(
                 "R104",
                 f"{', '.join(named)} cannot change when a run is resumed",
-                help=("stlc train --resume RUN [--steps N]", "a new run takes any option"),
+                help=("stlc train --resume RUN [--steps N | --budget TIME]", "a new run takes any option"),
             )
         )

@@ -14,7 +14,10 @@ SpecsArgument = Annotated[
     typer.Argument(metavar="SPEC", help="The specification, a .stl file; of several, each is trained for."),
 ]
 BudgetOption = Annotated[
-    str | None, typer.Option(metavar="TIME", help="Time to train, such as 60s or 5min; becomes steps.")
+    str | None,
+    typer.Option(
+        metavar="TIME", help="Time to train, such as 60s or 5min; planned as steps again and again."
+    ),
 ]
 ClockOption = Annotated[
     str,
@@ -22,7 +25,10 @@ ClockOption = Annotated[
         metavar="wall|processor", help="What a budget counts; processor time as on an idle machine."
     ),
 ]
-StepsOption = Annotated[int | None, typer.Option(min=1, help="Steps of the optimiser instead of a budget.")]
+StepsOption = Annotated[
+    str | None,
+    typer.Option(metavar="N", help="Steps of the optimiser instead of a budget, or a recorded schedule."),
+]
 SeedOption = Annotated[
     int | None,
     typer.Option(min=0, max=2**63 - 1, help="Seed of everything random; the system file's if not given."),

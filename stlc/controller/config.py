@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 
 if TYPE_CHECKING:
+    from stlc.controller.pace import StepSchedule
     from stlc.controller.task import Task
 
 Method = Literal["guided", "gradient"]
@@ -34,9 +35,9 @@ class TrainConfig:
 
     Attributes:
         method: `guided` (the default) searches and distils; `gradient` is the paper's.
-        budget: seconds, turned into steps in the first of them.
+        budget: seconds, the verdict included; planned as steps again and again.
         clock: of the budget.
-        steps: of the optimiser; wins over `budget`.
+        steps: of the optimiser, or the schedule of a run with a budget; wins over `budget`.
         seed: of everything random in training.
         device: of torch.
         threads: of torch; None leaves a core to the search beside it.
@@ -48,7 +49,7 @@ class TrainConfig:
 
     method: Method | None = None
     budget: float | None = None
-    steps: int | None = None
+    steps: int | StepSchedule | None = None
     seed: int | None = None
     device: str = "cpu"
     threads: int | None = None

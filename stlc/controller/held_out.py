@@ -18,6 +18,7 @@ from stlc.controller.task import satisfied
 from stlc.files import write_atomic
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from torch import Tensor
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 CEILING_TRIES = 8000
 """Plans that are tried for a held-out state before it counts as infeasible."""
+CHUNK = 256
+"""Failing states that are searched together; between chunks the search can be ended."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,11 +40,13 @@ class Score:
         accuracy: share whose plan satisfies the specification (rho >= -1e-6 in float64).
         interval: its 95 % Wilson interval.
         requirements: share per requirement.
-        feasible: share for which some satisfying plan is known, the policy's or one that search found.
+        feasible: share for which some satisfying plan is known, the policy's or one that search found; where
+            not all failing states were searched, those that were, in random order, speak for the others.
         states: (n, dim), float64.
         rho: (n,).
         each: (n, requirements).
         known: states for which some satisfying plan is known, (n,) bool.
+        searched: states that the policy solves or that were searched, (n,) bool.
     """
 
     accuracy: float
@@ -52,6 +57,7 @@ class Score:
     rho: Tensor
     each: Tensor
     known: Tensor
+    searched: Tensor
 
     def summary(self) -> dict[str, object]:
         """The plain numbers, for `run.json`."""
@@ -61,11 +67,22 @@ class Score:
             "held_out": self.states.shape[0],
             "requirements": self.requirements,
             "feasible": self.feasible,
+            "searched": int(self.searched.sum()),
         }
 
 
-def score(policy: Mlp, *, n: int = HELD_OUT, seed: int = HELD_OUT_SEED) -> Score:
-    """Judge a policy on `n` held-out states of seed `seed`; of missions, on states along held-out ones."""
+def score(
+    policy: Mlp,
+    *,
+    n: int = HELD_OUT,
+    seed: int = HELD_OUT_SEED,
+    enough: Callable[[], bool] = lambda: False,
+) -> Score:
+    """Judge a policy on `n` held-out states of seed `seed`; of missions, on states along held-out ones.
+
+    The failing states are searched for any satisfying plan, in random order, until `enough` says so; one
+    chunk of them is searched in any case.
+    """
     task = policy.task
     if task.compiled.timers:
         states = visited(policy, n, seed)
@@ -74,30 +91,36 @@ def score(policy: Mlp, *, n: int = HELD_OUT, seed: int = HELD_OUT_SEED) -> Score
     plans, judged = policy.plan_judged(states)
     good = satisfied(judged.rho)
     shares = satisfied(judged.requirements).double().mean(0)
+    generator = torch.Generator().manual_seed(HELD_OUT_SEED + 1)
     failing = (~good).nonzero()[:, 0]
-    known = good.clone()
-    known[failing] = _solvable(task, states[failing], plans[failing], plans[good])
+    failing = failing[torch.randperm(len(failing), generator=generator)]
+    known, searched = good.clone(), good.clone()
+    searcher = Searcher(task, generator, enough=1e-4)
+    for chunk in torch.split(failing, CHUNK):
+        if bool(searched[failing].any()) and enough():
+            break
+        start, bank = plans[chunk].float(), plans[good].float()
+        known[chunk] = searcher.repair(states[chunk].float(), start, bank, tries=CEILING_TRIES).solved
+        searched[chunk] = True
     accuracy = float(good.double().mean())
     return Score(
         accuracy=accuracy,
         interval=wilson(accuracy, n),
         requirements={rule.name: float(share) for rule, share in zip(task.rules, shares, strict=True)},
-        feasible=float(known.double().mean()),
+        feasible=_feasible(known, searched, failing),
         states=states,
         rho=judged.rho,
         each=judged.requirements,
         known=known,
+        searched=searched,
     )
 
 
-def _solvable(task: Task, states: Tensor, plans: Tensor, bank: Tensor) -> Tensor:
-    """Which of the failing states a search can solve, (k,) bool."""
-    if states.shape[0] == 0:
-        return torch.zeros(0, dtype=torch.bool)
-    generator = torch.Generator().manual_seed(HELD_OUT_SEED + 1)
-    searcher = Searcher(task, generator, enough=1e-4)
-    found = searcher.repair(states.float(), plans.float(), bank.float(), tries=CEILING_TRIES)
-    return found.solved
+def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:
+    """The share of states that are known to be feasible; failing ones stand for those not searched."""
+    found, tried = int(known[failing].sum()), int(searched[failing].sum())
+    left = len(failing) - tried
+    return (int(known.sum()) + left * found / max(1, tried)) / len(known)
 
 
 def wilson(share: float, n: int, z: float = 1.96) -> tuple[float, float]:
@@ -117,6 +140,7 @@ def save_states(path: Path, task: Task, result: Score) -> None:
         rho=result.rho.numpy(),
         requirements=result.each.numpy(),
         known=result.known.numpy(),
+        searched=result.searched.numpy(),
         meta=np.array(json.dumps(meta)),
     )
     path.parent.mkdir(exist_ok=True)

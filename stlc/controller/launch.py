@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from stlc.compile.dump import dump
@@ -71,7 +71,7 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
             "budget": config.budget,
             "device": config.device,
             "threads": decide(task, config).threads,
-            "options": asdict(config),
+            "options": asdict(replace(config, steps=None)) | {"steps": config.steps and str(config.steps)},
             "engine_version": ENGINE_VERSION,
             "versions": versions(),
             "git": git_state(),

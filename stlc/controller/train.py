@@ -16,7 +16,7 @@ from stlc.controller.conflict import conflict
 from stlc.controller.held_out import Score, score
 from stlc.controller.journal import Journal
 from stlc.controller.natives import by_torch
-from stlc.controller.pace import OpenEnd, clock_of, steps_within
+from stlc.controller.pace import PROVISIONAL, Pace, StepSchedule, clock_of, verdict_reserve
 from stlc.controller.ranks import ALONE, Ranks
 from stlc.controller.run import Run, load_engine, load_task, spec_hash, system_hash
 from stlc.controller.symmetry import check_mirror
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 DEFAULT_BUDGET = 60.0
 BARREN_LOOKS, BARREN_SHARE = 5, 0.1
 """After so many looks, and this share of the steps, a search that never found a plan is given up."""
+VERDICT_OVER = 0.04
+"""Share of a budget by which the verdict may exceed it before the search for what is feasible is ended."""
 SAVE_EVERY = 500
 """Steps between checkpoints at most."""
 SAVE_SECONDS = 10.0
@@ -62,6 +64,7 @@ class Outcome:
         run: the run with its policy.
         score: on held-out states; None where training was interrupted, and on ranks after the first.
         seconds: of training, held-out verdict included.
+        steps: that were made in all.
         interrupted: ended by `Watch.stop`.
         ranks: that trained together.
         why: why no plan satisfies the specification, where none was found for any start.
@@ -73,6 +76,7 @@ class Outcome:
     interrupted: bool
     ranks: int = 1
     why: Diagnostic | None = None
+    steps: int = 0
 
 
 def train(
@@ -110,20 +114,19 @@ def train(
     journal = Journal(folder, writes=ranks.first)
     journal.engine(engine)
     declared = task.system.decl.train
-    steps = config.steps or (declared.steps if config.budget is None else None)
-    budget, end = config.budget or declared.budget or DEFAULT_BUDGET, None
-    if steps is None and engine.hold:
-        steps, end = round(2 * engine.every / engine.hold), OpenEnd(budget, begun)
-    steps = steps or steps_within(task, engine, budget, device, ranks)
-    trainer = Trainer(task, engine, steps=steps, device=device, ranks=ranks)
-    journal.note({"steps": trainer.steps, "margin": trainer.margin, "engine": asdict(engine)})
-    return _Session(journal, trainer, watch or Watch(), begun, end).finish()
+    told = config.steps or (declared.steps if config.budget is None else None)
+    budget = 0.0 if told is not None else config.budget or declared.budget or DEFAULT_BUDGET
+    schedule = told if isinstance(told, StepSchedule) else StepSchedule.of(told or PROVISIONAL)
+    trainer = Trainer(task, engine, steps=schedule.at(0), device=device, ranks=ranks)
+    journal.note({"margin": trainer.margin, "engine": asdict(engine), "seconds_allowed": budget or None})
+    return _Session(journal, trainer, watch or Watch(), begun, schedule, budget).finish()
 
 
 def resume(
     folder: RunDir,
     *,
     steps: int | None = None,
+    budget: float | None = None,
     device: str = "cpu",
     watch: Watch | None = None,
     ranks: Ranks = ALONE,
@@ -132,7 +135,9 @@ def resume(
 
     Args:
         folder: of the run.
-        steps: a new total of steps; None keeps the old one. Another total is another schedule.
+        steps: a new total of steps.
+        budget: seconds more; where neither is given, what is left of the budget of the run is used, or its
+            schedule of steps is followed to its end.
         device: of torch.
         watch: progress and interruption.
         ranks: that train together: as many as before.
@@ -152,20 +157,29 @@ def resume(
     place = find_device(ranks.device(device))
     trainer = Trainer(task, engine, steps=int(saved.facts["steps"]), device=place, ranks=ranks)
     trainer.restore(saved.tensors, saved.facts)
-    trainer.steps = steps or trainer.steps
-    if trainer.step >= trainer.steps and folder.status == "finished":
+    record = folder.record()
+    schedule = StepSchedule.parse(str(saved.facts.get("schedule", trainer.steps)))
+    if steps is not None:
+        schedule = schedule.with_steps(trainer.step, steps)
+        trainer.steps = steps
+    before = max((row.get("seconds", 0.0) for row in folder.rows()), default=0.0)
+    before = float(saved.facts.get("seconds", before))
+    allowed = 0.0 if steps is not None else float(record.get("seconds_allowed") or 0.0)
+    if budget is not None:
+        allowed = before + budget
+        schedule = schedule.with_steps(trainer.step, trainer.step + PROVISIONAL)
+    if trainer.step >= schedule.steps and folder.status == "finished":
         raise RunError(
             Diagnostic(
                 "R103",
-                f"run `{folder.name}` is finished: {trainer.step} of {trainer.steps} steps",
-                help=(f"stlc train --resume {folder.name} --steps {2 * trainer.steps} goes on",),
+                f"run `{folder.name}` is finished: {trainer.step} of {schedule.steps} steps",
+                help=(f"stlc train --resume {folder.name} --budget 60s goes on",),
             )
         )
     journal = Journal(folder, writes=ranks.first)
     journal.before(trainer.next_look)
-    journal.note({"status": "running", "steps": trainer.steps})
-    before = max((row.get("seconds", 0.0) for row in folder.rows()), default=0.0)
-    return _Session(journal, trainer, watch or Watch(), begun - before).finish()
+    journal.note({"status": "running", "seconds_allowed": allowed or None})
+    return _Session(journal, trainer, watch or Watch(), begun - before, schedule, allowed).finish()
 
 
 def _require_as_many(before: int, now: int) -> None:
@@ -198,48 +212,104 @@ def find_device(name: str) -> torch.device:
     return device
 
 
+def _searching(trainer: Trainer) -> bool:
+    """Whether a search goes on beside the steps at this moment."""
+    return trainer.repairing is not None and not trainer.repairing.done()
+
+
 class _Session:
     """One sitting of training: from wherever the trainer stands to the end, or to an interruption."""
 
     def __init__(
-        self, journal: Journal, trainer: Trainer, watch: Watch, begun: float, end: OpenEnd | None = None
+        self,
+        journal: Journal,
+        trainer: Trainer,
+        watch: Watch,
+        begun: float,
+        schedule: StepSchedule,
+        budget: float = 0.0,
     ) -> None:
+        """A sitting that counts its time from `begun`.
+
+        `schedule` is followed to its end; with a `budget` (seconds from `begun`) it is planned again and
+        again as the pace demands.
+        """
         self.journal = journal
         self.trainer = trainer
         self.watch = watch
         self.begun = begun
+        self.schedule = schedule
+        self.budget = budget
         self.now = clock_of(trainer.engine.clock)
-        self.end = end
+        searching = trainer.engine.method == "guided"
+        self.pace = Pace(every=trainer.engine.every, searching=searching, now=self.now(), seconds=budget)
         self.barren = not trainer.ranks.any(trainer.buffer.count > 0)
 
     def finish(self) -> Outcome:
         """Train to the end, judge, and close the record."""
         trainer = self.trainer
-        sat_down, first = self.now(), trainer.step
         torch_does = by_torch(trainer.task, trainer.engine, trainer.device.type)
         self.journal.note({"by_torch": dict(torch_does)})
-        chosen = {**asdict(trainer.engine), "margin": trainer.margin, "steps": trainer.steps}
-        self.watch.begun({**chosen, "by_torch": torch_does})
-        saved = time.perf_counter()
-        self._revise()
-        while trainer.step < trainer.steps:
-            if trainer.step >= trainer.next_look:
-                self._revise()
-                pace = (self.now() - sat_down) / max(1, trainer.step - first)
-                look = trainer.look()
-                self._row(look, pace)
-                if self._hopeless(look):
-                    break
+        self._note_schedule()
+        chosen = {**asdict(trainer.engine), "margin": trainer.margin, "budget": self.budget or None}
+        self.watch.begun({**chosen, "steps": self._known_steps, "by_torch": torch_does})
+        saved, stopped = time.perf_counter(), False
+        while not stopped and self._planned() > trainer.step:
+            if trainer.step >= trainer.next_look and self._hopeless(self._look()):
+                self._save()
+                break
             if not math.isfinite(trainer.advance()):
                 raise self._broken()
+            self.pace.stepped(trainer.step, self.now(), search_runs=_searching(trainer))
             due = trainer.step % SAVE_EVERY == 0 or time.perf_counter() - saved > SAVE_SECONDS
-            if trainer.ranks.any(due):
+            due = trainer.ranks.any(due)
+            if due:
                 self._save()
                 saved = time.perf_counter()
-            if trainer.ranks.any(self.watch.stop()) and trainer.step < trainer.steps:
-                return self._interrupted()
-        self._save()
+            stopped = trainer.ranks.any(self.watch.stop()) and trainer.step < self.schedule.steps
+            if not due and (stopped or trainer.step >= self._planned()):
+                self._save()  # which waits for the search: there may be time left for more steps
+        if stopped:
+            return self._interrupted()
         return self._judged() if trainer.ranks.first else self._ended()
+
+    def _planned(self) -> int:
+        """The steps of the run as they are planned at this moment: by its budget, or by its schedule."""
+        trainer = self.trainer
+        if self.budget:
+            left = self.begun + self.budget - verdict_reserve(self.budget) - self.now()
+            steps = self.pace.plan(trainer.step, trainer.steps, trainer.next_look, left)
+            steps = int(trainer.ranks.agree(steps))
+            if steps != trainer.steps:
+                self.schedule = self.schedule.with_steps(trainer.step, steps)
+                self._note_schedule()
+        trainer.steps = self.schedule.at(trainer.step)
+        return trainer.steps
+
+    @property
+    def _known_steps(self) -> int | None:
+        """Steps of the whole run; None until those of a budget have been planned."""
+        return None if self.budget and not self.pace.planned else self.schedule.steps
+
+    def _note_schedule(self) -> None:
+        self.journal.note({"steps": self._known_steps, "schedule": str(self.schedule)})
+
+    def _look(self) -> Look:
+        """A search round, and its row."""
+        trainer = self.trainer
+        self._wait_for_search()
+        began = self.now()
+        look = trainer.look()
+        self.pace.looked(trainer.step, self.now() - began)
+        self._row(look)
+        return look
+
+    def _wait_for_search(self) -> None:
+        """Let the search beside the steps come to its end, as a search round and a checkpoint do."""
+        if self.trainer.repairing is not None:
+            began = self.now()
+            self.trainer.repairing.result()
+            self.pace.searched(self.trainer.step, self.now() - began)
 
     def _hopeless(self, look: Look) -> bool:
         """Whether neither the policy nor the search has ever satisfied the specification for any state."""
@@ -248,16 +318,9 @@ class _Session:
         enough = max(BARREN_LOOKS * trainer.engine.every, BARREN_SHARE * trainer.steps)
         return self.barren and trainer.engine.method == "guided" and trainer.step >= enough
 
-    def _revise(self) -> None:
-        """Where a budget is still open, say anew how many steps it is worth."""
-        if self.end is not None:
-            self.end.mark(self.trainer, self.now())
-            self.trainer.steps = int(self.trainer.ranks.agree(self.trainer.steps))
-            self.journal.note({"steps": self.trainer.steps})
-
     def _judged(self) -> Outcome:
         self.trainer.average.cpu()  # verdicts are float64, and the kernel's
-        result = score(self.trainer.policy, n=self.trainer.engine.held_out)
+        result = score(self.trainer.policy, n=self.trainer.engine.held_out, enough=self._out_of_time)
         self.journal.held_out(self.trainer.task, result)
         seconds = self.now() - self.begun
         why = conflict(self.trainer.task) if result.feasible == 0.0 else None
@@ -265,21 +328,31 @@ class _Session:
         self.journal.close("finished", {**result.summary(), **found})
         return replace(self._ended(), score=result, why=why)
 
+    def _out_of_time(self) -> bool:
+        """Whether the verdict of a run with a budget has to come to its end."""
+        return self.budget > 0.0 and self.now() - self.begun > (1.0 + VERDICT_OVER) * self.budget
+
     def _interrupted(self) -> Outcome:
-        self._save()
         self.journal.close("interrupted")
         return self._ended(interrupted=True)
 
     def _ended(self, *, interrupted: bool = False) -> Outcome:
         run = Run(self.journal.folder, self.trainer.task, self.trainer.policy)
         seconds, ranks = self.now() - self.begun, self.trainer.ranks.size
-        return Outcome(run, None, seconds, interrupted=interrupted, ranks=ranks)
+        steps = self.trainer.step
+        return Outcome(run, None, seconds, interrupted=interrupted, ranks=ranks, steps=steps)
 
     def _save(self) -> None:
-        self.journal.checkpoint(self.trainer.tensors(), self.trainer.facts(), step=self.trainer.step)
+        """Write a checkpoint; it waits for the search that goes on beside the steps."""
+        self._wait_for_search()
+        began = self.now()
+        facts = {**self.trainer.facts(), "schedule": str(self.schedule), "seconds": began - self.begun}
+        self.journal.checkpoint(self.trainer.tensors(), facts, step=self.trainer.step)
+        self.pace.saved(self.now() - began)
 
-    def _row(self, look: Look, pace: float) -> None:
+    def _row(self, look: Look) -> None:
         trainer = self.trainer
+        rest = max(1, trainer.steps - trainer.step)
         names = [rule.name for rule in trainer.task.rules]
         row = {
             "step": trainer.step,
@@ -292,7 +365,7 @@ class _Session:
             "lr": trainer.rate,
             "repaired": look.repaired,
             "failing": look.failing,
-            "s_per_step": pace,
+            "s_per_step": self.pace.remaining(trainer.step, trainer.steps, trainer.next_look) / rest,
         }
         self.journal.row(row)
         self.watch.row(row)

@@ -45,7 +45,7 @@ def repeat_section(material: Material) -> Section:
     """The commands that lead here again."""
     intro = el(
         "p",
-        "The same seed and number of steps give the same weights on the same machine. The folder of the run "
+        "The same seed and steps give the same weights on the same machine. The folder of the run "
         "holds the specification and the system as they were.",
     )
     lines = "\n".join(_commands(material))
@@ -57,9 +57,10 @@ def _commands(material: Material) -> list[str]:
     spec = str(record.get("spec_path") or f"{material.run.shown}/spec.stl")
     system = str(record.get("system_path") or f"{material.run.shown}/system.yaml")
     train = ["stlc", "train", spec, "--system", system]
-    for option in ("seed", "steps"):
-        if record.get(option) is not None:
-            train += [f"--{option}", str(record[option])]
+    steps = record.get("schedule") or record.get("steps")
+    for option, value in (("seed", record.get("seed")), ("steps", steps)):
+        if value is not None:
+            train += [f"--{option}", str(value)]
     options = record.get("options") or {}
     for option in ("method", "plans", "lr", "batch", "threads"):
         if options.get(option) not in (None, "guided"):

@@ -40,6 +40,7 @@ class HeldOut:
         rho: (starts,) over all requirements.
         each: (starts, requirements).
         known: starts that some satisfying plan is known for, (starts,); None in runs that did not keep it.
+        searched: starts that the policy solves or that were searched for any plan, (starts,); None: all.
     """
 
     names: tuple[str, ...]
@@ -48,6 +49,12 @@ class HeldOut:
     rho: Array
     each: Array
     known: Mask | None = None
+    searched: Mask | None = None
+
+    @property
+    def unsearched(self) -> int:
+        """Starts whose plan fails and that were not searched."""
+        return 0 if self.searched is None else int((~self.searched).sum())
 
     @property
     def worst(self) -> int:
@@ -104,15 +111,16 @@ def load_held_out(path: Path) -> HeldOut | None:
             meta = json.loads(str(file["meta"]))
             x0, rho, each = (np.asarray(file[key], dtype=float) for key in ("x0", "rho", "requirements"))
             known = np.asarray(file["known"], dtype=bool) if "known" in file else None
+            searched = np.asarray(file["searched"], dtype=bool) if "searched" in file else None
     except (OSError, KeyError, ValueError, BadZipFile):
         return None
     names, requirements = tuple(meta.get("names", ())), tuple(meta.get("requirements", ()))
     shapes_fit = x0.ndim == 2 and each.shape == (len(x0), len(requirements)) and rho.shape == (len(x0),)
     if not shapes_fit or x0.shape[1] != len(names) or not len(x0) or not requirements:
         return None
-    if known is not None and known.shape != rho.shape:
+    if any(mask is not None and mask.shape != rho.shape for mask in (known, searched)):
         return None
-    return HeldOut(names, requirements, x0, rho, each, known)
+    return HeldOut(names, requirements, x0, rho, each, known, searched)
 
 
 def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | None:
@@ -272,6 +280,9 @@ def unsolved_text(held: HeldOut) -> str:
     text = f"{failing:,} of {len(held.x0):,} starts"
     if held.known is None or not failing:
         return text
+    if held.unsearched:
+        tried = failing - held.unsearched
+        return f"{text}; a satisfying plan is known for {known:,} of the {tried:,} that were searched"
     if not known:
         return f"{text}; no satisfying plan is known for any of them"
     if known == failing:

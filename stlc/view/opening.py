@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from typing import Any
 
 from stlc.view.curves import draw_curves
 from stlc.view.highlight import spec_html
 from stlc.view.html import Child, Html, classed, el, facts, figure, join, table
+from stlc.view.learning import Commands, clause, learning_on_record
 from stlc.view.material import Material, untagged
 from stlc.view.page import Section
 from stlc.view.words import count, interval, number, seconds, share
@@ -21,6 +23,7 @@ def headline(material: Material, tiles: list[tuple[str, str]]) -> Html:
         classed("p", "eyebrow", " · ".join(name for name in names if name)),
         el("h1", _verdict(material)),
         el("p", _beside(result)) if result else None,
+        _advice(material),
         _tiles([*_training_tiles(result), *tiles]),
     )
 
@@ -45,12 +48,30 @@ def _beside(result: Mapping[str, Any]) -> str:
     return " ".join(part for part in parts if part)
 
 
+def _advice(material: Material) -> Html | None:
+    """How far the training came, and what would help, where the policy falls short."""
+    where = clause(material.held_out, material.signature)
+    commands = Commands.of(shlex.quote(material.run.shown))
+    learning = learning_on_record(material.record, material.rows, commands, where)
+    if learning is None or not learning.advice:
+        return None
+    level = f"{learning.level[0].upper()}{learning.level[1:]}."
+    items = [el("li", *_spoken(advice)) for advice in learning.advice]
+    return join(el("p", el("strong", level), " What helps:"), el("ul", items))
+
+
+def _spoken(advice: str) -> list[Child]:
+    """A sentence whose commands are set apart, and that begins and ends as sentences do."""
+    sentence = f"{advice[0].upper()}{advice[1:]}."
+    return [el("code", part) if i % 2 else part for i, part in enumerate(sentence.split("`"))]
+
+
 def _training_tiles(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     accuracy, feasible = result.get("accuracy"), result.get("feasible")
     tiles = [(share(accuracy), "plan accuracy")]
     if accuracy is not None and feasible:
         tiles.append((share(accuracy / feasible), "of what is known feasible"))
-    tiles.append((seconds(result.get("seconds")), "of training"))
+    tiles.append((seconds(result.get("seconds")), "of training and verdict"))
     return [(value, name) for value, name in tiles if value]
 
 

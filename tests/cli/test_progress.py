@@ -20,6 +20,7 @@ from stlc.cli.progress import (
     native_text,
     sparkline,
 )
+from stlc.view.learning import Learning
 
 INFO = RunInfo("traffic", "car.yaml", "examples/car.yaml", "0001-quiet-heron", 0, 2)
 ROW = {
@@ -44,6 +45,8 @@ SUMMARY = Summary(
     seconds=61.2,
     folder="runs/traffic/0001-quiet-heron",
     where="fails in 63 % of the starts with sign = stop",
+    learning=Learning("trained", 0.988, "it is good", (), "stlc simulate --backup"),
+    steps=5900,
 )
 
 
@@ -172,12 +175,18 @@ def test_the_closing_screen_says_all_that_matters():
     assert lines == [
         "plan accuracy   0.957   95 % interval [0.951, 0.962] on 5,000 held-out starts",
         "known feasible  0.969   of which 98.8 % are satisfied",
+        "verdict         trained: it is good",
         "worst           stop_sign 0.971",
         "                fails in 63 % of the starts with sign = stop",
-        "finished        61 s of training   runs/traffic/0001-quiet-heron",
+        "finished        61 s of training and verdict, 5,900 steps   runs/traffic/0001-quiet-heron",
         "",
         "Next:  stlc simulate --backup",
     ]
+    poor = Learning("undertrained", 0.03, "it is poor", ("more time", "luck"), "stlc train --resume 7")
+    lines = final_screen(replace(SUMMARY, learning=poor))
+    assert lines[2] == "verdict         undertrained: it is poor"
+    assert lines[-5:-3] == ["what helps      more time", "                luck"]
+    assert lines[-1] == "Next:  stlc train --resume 7"
 
 
 def test_the_closing_screen_can_go_elsewhere():

@@ -1,0 +1,260 @@
+"""The verdict on a training: how much of what is known to be feasible a policy reaches, and what would help.
+
+Numbers and sentences only; nothing is drawn here. The terminal, the JSON document, the report and
+`stlc report` say the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from stlc.diagnostics import StlcError
+from stlc.dynamics.schema import load_system_decl
+from stlc.rundir import RunDir
+from stlc.signature import Signature
+from stlc.view.held_out import HeldOut, find_weakness, load_held_out, weakness_text
+from stlc.view.words import seconds as duration
+from stlc.view.words import share
+
+Level: TypeAlias = Literal["infeasible", "undertrained", "partly trained", "trained"]
+
+UNDERTRAINED, TRAINED = 0.5, 0.9
+"""Shares of what is known to be feasible: below is undertrained; from there on is trained."""
+MUCH_INFEASIBLE = 0.5
+"""Share of the starts without a known plan from which on that is said first."""
+LEAST_ROUNDS = 5
+"""Search rounds that a learning curve must have before anything is foretold from it."""
+FLAT = 0.1
+"""Growth of the odds (their logarithm, for twice the steps) below which a learning curve is flat."""
+MOST_TIMES = 32.0
+"""Multiples of the steps beyond which nothing is foretold."""
+ROUND_TIMES = (10.0, 20.0, 30.0, 60.0, 120.0, 180.0, 300.0, 600.0, 900.0, 1200.0, 1800.0, 3600.0)
+"""Budgets, seconds, that are proposed; multiples of an hour beyond."""
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """What a learning curve foretells.
+
+    Attributes:
+        state: `short`: too few rounds to say; `flat`: twice the steps would change little; `rising`.
+        times: how many times the steps would lead to the share `TRAINED` if the curve went on as steeply as
+            it was; curves flatten, so that its square is the other end of what is foretold. None beyond
+            `MOST_TIMES`, and where the curve is not rising.
+    """
+
+    state: Literal["short", "flat", "rising"]
+    times: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Learning:
+    """How far a training came.
+
+    Attributes:
+        level: in a word.
+        share: accuracy over what is known to be feasible; None where nothing is.
+        sentence: the same as a sentence.
+        advice: what would help, a sentence each; empty for a policy that is trained.
+        command: what to do next.
+    """
+
+    level: Level
+    share: float | None
+    sentence: str
+    advice: tuple[str, ...]
+    command: str
+
+    def summary(self) -> dict[str, object]:
+        """For JSON documents."""
+        return {
+            "level": self.level,
+            "share_of_feasible": self.share,
+            "sentence": self.sentence,
+            "advice": list(self.advice),
+            "next": self.command,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Commands:
+    """The commands that a verdict may name, of one run.
+
+    Attributes:
+        train_on: that goes on with the training, without a budget.
+        simulate: that drives the policy under the guard.
+        report: that writes the report.
+    """
+
+    train_on: str
+    simulate: str
+    report: str
+
+    @classmethod
+    def of(cls, run: str, *, newest: bool = False, start: str = "stlc") -> Commands:
+        """Those of the run that is found by the name `run`; `newest` need not be named to be driven."""
+        simulate = "stlc simulate --backup" if newest else f"stlc simulate {run} --backup"
+        return cls(f"{start} train --resume {run}", simulate, f"stlc report {run}")
+
+
+def learning_of_run(run: RunDir, commands: Commands) -> Learning | None:
+    """The verdict on the training of a run; None where that is not finished.
+
+    Raises:
+        RunError: R101, its record is damaged.
+    """
+    try:
+        signature = load_system_decl(run.path / "system.yaml").signature
+    except StlcError:
+        signature = None
+    held = load_held_out(run.path / "eval" / "held_out.npz")
+    return learning_on_record(run.record(), run.rows(), commands, clause(held, signature))
+
+
+def learning_on_record(
+    record: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], commands: Commands, where: str
+) -> Learning | None:
+    """The verdict on the training that `run.json` and `train.jsonl` tell of; None where none is finished."""
+    result = record.get("result")
+    if not isinstance(result, Mapping) or result.get("accuracy") is None or result.get("feasible") is None:
+        return None
+    return learning_of(result, rows, commands, where)
+
+
+def clause(held: HeldOut | None, signature: Signature | None) -> str:
+    """Where the worst requirement fails, or ""."""
+    weakness = None if held is None else find_weakness(held)
+    return "" if held is None or weakness is None else weakness_text(weakness, held, signature)
+
+
+def learning_of(
+    result: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], commands: Commands, where: str = ""
+) -> Learning:
+    """The verdict on a finished training.
+
+    Args:
+        result: that of `run.json`: `accuracy`, `feasible`, `requirements`, `seconds`.
+        rows: of `train.jsonl`.
+        commands: that may be named.
+        where: where in the initial set the worst requirement fails, as a clause ("fails in …"), or "".
+    """
+    accuracy, feasible = float(result["accuracy"]), float(result["feasible"])
+    if feasible <= 0.0:
+        sentence = (
+            "no plan that satisfies the specification was found for any start, by the policy or by search"
+        )
+        advice: tuple[str, ...] = (
+            "a looser specification, a longer horizon, or another initial set: more training cannot help",
+        )
+        return Learning("infeasible", None, sentence, advice, commands.report)
+    part = min(accuracy / feasible, 1.0)
+    level: Level = (
+        "trained" if part >= TRAINED else "partly trained" if part >= UNDERTRAINED else "undertrained"
+    )
+    sentence = (
+        f"the policy's plan satisfies the specification from {share(accuracy)} of the starts; some plan that "
+        f"does is known for {share(feasible)}"
+    )
+    if level == "trained":
+        return Learning(level, part, sentence, _hard_starts(feasible), commands.simulate)
+    curve = forecast(rows, accuracy, feasible)
+    longer = _longer(curve, float(result.get("seconds") or 0.0), commands)
+    advice = (longer[0], *_worst(result, where), *_hard_starts(feasible))
+    if level == "partly trained":
+        return Learning(level, part, sentence, advice, commands.simulate)
+    guard = (
+        f"`{commands.simulate}` shows what the guard makes of it: it replaces rejected plans where it finds "
+        "better ones, and the policy stays as it is"
+    )
+    return Learning(level, part, sentence, (*advice, guard), longer[1] or commands.report)
+
+
+def forecast(rows: Sequence[Mapping[str, Any]], accuracy: float, feasible: float) -> Curve:
+    """What the curve of plan accuracy foretells of a policy of `accuracy` where `feasible` is possible.
+
+    The logarithm of the odds of success is fitted by a line over the logarithm of the step, from a quarter
+    of the steps on, and goes on from where the policy is. The learning rate falls at the end of every
+    training, which helps, and will do so again: a rough figure.
+    """
+    pairs = [
+        (float(row["step"]), float(row["accuracy"]) / feasible)
+        for row in rows
+        if row.get("accuracy") is not None and row.get("step")
+    ]
+    late = [(step, value) for step, value in pairs if 4.0 * step >= pairs[-1][0]]
+    if len(late) < LEAST_ROUNDS:
+        return Curve("short")
+    doublings = np.log2([step for step, _ in late])
+    odds = np.array([_log_odds(value) for _, value in late])
+    centred = doublings - doublings.mean()
+    growth = float((centred * odds).sum() / (centred * centred).sum())
+    left = odds - odds.mean() - growth * centred
+    doubt = math.sqrt(float((left * left).sum()) / (len(late) - 2) / float((centred * centred).sum()))
+    if growth - doubt < FLAT:
+        return Curve("flat")
+    times = 2.0 ** min((_log_odds(TRAINED) - _log_odds(accuracy / feasible)) / growth, 60.0)
+    return Curve("rising", times if times <= MOST_TIMES else None)
+
+
+def _log_odds(value: float) -> float:
+    kept = min(max(value, 0.001), 0.999)
+    return math.log(kept / (1.0 - kept))
+
+
+def _longer(curve: Curve, seconds: float, commands: Commands) -> tuple[str, str]:
+    """What a longer training would bring, and the command; "" where it is not what helps."""
+    twice = f"{commands.train_on} --budget {budget_text(max(seconds, 10.0))}"
+    match curve.state, curve.times:
+        case "rising", float(times):
+            late = min(times * times, MOST_TIMES)
+            command = f"{commands.train_on} --budget {budget_text(max((late - 1.0) * seconds, 10.0))}"
+            about = f"{duration(_rough(times * seconds))} to {duration(_rough(late * seconds))}"
+            told = f"a longer budget: the curve is rising, and points to {share(TRAINED, 0)} of what is known"
+            return f"{told} to be feasible after {about} in all (a rough figure): `{command}`", command
+        case "rising", _:
+            told = (
+                "a much longer budget: the curve is rising, but slowly, and no time can be foretold from it"
+            )
+            return f"{told}: `{twice}`", twice
+        case "flat", _:
+            told = "a longer budget alone promises little, the curve is flat: let the policy see what decides"
+            return f"{told} (`policy: {{observe: …}}`), or look at where it fails: `{commands.report}`", ""
+    told = f"a longer budget: {LEAST_ROUNDS} search rounds are needed to say how long, and there were fewer"
+    return f"{told}: `{twice}`", twice
+
+
+def _worst(result: Mapping[str, Any], where: str) -> tuple[str, ...]:
+    shares: Mapping[str, float] = result.get("requirements") or {}
+    if not shares or min(shares.values()) >= 1.0:
+        return ()
+    worst = min(shares, key=shares.__getitem__)
+    there = f": it {where}" if where else ""
+    return (f"the worst requirement is {worst}, {share(shares[worst])} satisfied{there}",)
+
+
+def _hard_starts(feasible: float) -> tuple[str, ...]:
+    if feasible > MUCH_INFEASIBLE:
+        return ()
+    told = f"for {share(1.0 - feasible)} of the starts no satisfying plan was found by search either"
+    return (f"{told}: a narrower `init`, a longer `horizon` or later deadlines would change that",)
+
+
+def _rough(seconds: float) -> float:
+    """A duration with one digit, or two where the first is a 1."""
+    digits = math.floor(math.log10(max(seconds, 1.0)))
+    step = 10.0**digits if seconds >= 2.0 * 10.0**digits else 10.0 ** (digits - 1)
+    return float(round(max(seconds, 1.0) / step)) * step
+
+
+def budget_text(seconds: float) -> str:
+    """The next round budget from so many seconds on: `60s`, `5min`, `2h`."""
+    fitting = [time for time in ROUND_TIMES if time >= 0.95 * seconds]
+    time = fitting[0] if fitting else 3600.0 * math.ceil(0.95 * seconds / 3600.0)
+    if time < 120.0:
+        return f"{time:.0f}s"
+    return f"{time / 60.0:.0f}min" if time < 3600.0 else f"{time / 3600.0:.0f}h"

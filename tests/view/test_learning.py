@@ -1,0 +1,113 @@
+"""What is said of a training is true of a policy at 3 %, at 50 % and at 97 %."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from stlc.rundir import RunDir
+from stlc.view.learning import (
+    LEAST_ROUNDS,
+    MOST_TIMES,
+    Commands,
+    budget_text,
+    forecast,
+    learning_of,
+    learning_of_run,
+)
+
+COMMANDS = Commands.of("7", newest=True)
+WHERE = "fails in 63 % of the starts with sign = stop (40 % of its failures)"
+
+
+def result(accuracy: float, feasible: float, seconds: float = 30.0) -> dict[str, object]:
+    shares = {"stop_sign": min(1.0, accuracy + 0.02), "red_light": 1.0}
+    return {"accuracy": accuracy, "feasible": feasible, "requirements": shares, "seconds": seconds}
+
+
+def rows(accuracy: float, feasible: float, growth: float, count: int = 20) -> list[dict[str, float]]:
+    """A curve that ends at `accuracy`: its log-odds grow by `growth` for twice the steps."""
+    part = min(accuracy / feasible, 0.999)
+    end = math.log(part / (1.0 - part))
+    found = []
+    for i in range(1, count + 1):
+        odds = end + growth * math.log2(i / count)
+        found.append({"step": 50.0 * i, "accuracy": feasible / (1.0 + math.exp(-odds))})
+    return found
+
+
+def test_at_three_percent_it_is_undertrained_and_training_goes_on() -> None:
+    learning = learning_of(result(0.027, 0.93), rows(0.027, 0.93, 2.0), COMMANDS, WHERE)
+    assert learning.level == "undertrained"
+    assert learning.share == pytest.approx(0.029, abs=1e-3)
+    assert "from 2.7 % of the starts" in learning.sentence
+    assert "known for 93.0 %" in learning.sentence
+    longer, worst, guard = learning.advice
+    assert "the curve is rising" in longer
+    assert "--budget" in longer
+    assert worst == f"the worst requirement is stop_sign, 4.7 % satisfied: it {WHERE}"
+    assert "stlc simulate --backup" in guard
+    assert learning.command.startswith("stlc train --resume 7 --budget ")
+    assert learning.command in longer
+
+
+def test_at_half_it_is_partly_trained_and_may_be_driven() -> None:
+    learning = learning_of(result(0.5, 0.9), rows(0.5, 0.9, 1.0), COMMANDS, WHERE)
+    assert learning.level == "partly trained"
+    assert learning.command == "stlc simulate --backup"
+    assert "90 % of what is known to be feasible after 1 min" in learning.advice[0].replace(
+        "100 s", "1 min 40 s"
+    )
+    assert not any("guard" in advice for advice in learning.advice)
+
+
+def test_at_97_percent_nothing_is_advised() -> None:
+    learning = learning_of(result(0.97, 0.975), rows(0.97, 0.975, 0.5), COMMANDS, WHERE)
+    assert (learning.level, learning.advice) == ("trained", ())
+    assert learning.command == "stlc simulate --backup"
+
+
+def test_a_policy_that_reaches_all_that_is_possible_is_trained_however_little_that_is() -> None:
+    learning = learning_of(result(0.34, 0.36), rows(0.34, 0.36, 0.1), COMMANDS)
+    assert learning.level == "trained"
+    (hard,) = learning.advice
+    assert hard.startswith("for 64.0 % of the starts no satisfying plan was found by search either")
+
+
+def test_where_nothing_is_possible_training_is_not_the_advice() -> None:
+    learning = learning_of(result(0.0, 0.0), [], COMMANDS)
+    assert (learning.level, learning.share) == ("infeasible", None)
+    assert "more training cannot help" in learning.advice[0]
+    assert "train" not in learning.command
+
+
+def test_a_flat_curve_is_not_answered_with_more_time() -> None:
+    learning = learning_of(result(0.03, 0.9), rows(0.03, 0.9, 0.0), COMMANDS)
+    assert "promises little, the curve is flat" in learning.advice[0]
+    assert learning.command == "stlc report 7"
+
+
+def test_nothing_is_foretold_from_a_short_curve_or_for_ever() -> None:
+    assert forecast(rows(0.1, 0.9, 1.0, count=LEAST_ROUNDS - 2), 0.1, 0.9).state == "short"
+    far = forecast(rows(0.03, 0.9, 0.4), 0.03, 0.9)
+    assert (far.state, far.times) == ("rising", None)
+    near = forecast(rows(0.5, 0.9, 1.0), 0.5, 0.9)
+    assert near.times is not None
+    assert near.times == pytest.approx(2.0 ** (math.log(9.0) - math.log(1.25)), rel=1e-6)
+    assert near.times < MOST_TIMES
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(3.0, "10s"), (31.0, "30s"), (33.0, "60s"), (100.0, "2min"), (900.0, "15min"), (4000.0, "2h")],
+)
+def test_budgets_are_round(seconds: float, text: str) -> None:
+    assert budget_text(seconds) == text
+
+
+def test_a_run_that_is_not_finished_has_no_verdict(tmp_path: Path) -> None:
+    run = RunDir.create(tmp_path, "traffic", "a")
+    run.update({"status": "interrupted"})
+    assert learning_of_run(run, COMMANDS) is None
