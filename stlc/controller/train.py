@@ -253,8 +253,8 @@ class _Session:
         self._note_schedule()
         chosen = {**asdict(trainer.engine), "margin": trainer.margin, "budget": self.budget or None}
         self.watch.begun({**chosen, "steps": self._known_steps, "by_torch": torch_does})
-        saved, stopped = time.perf_counter(), False
-        while not stopped and self._planned() > trainer.step:
+        saved = time.perf_counter()
+        while self._goes_on():
             if trainer.step >= trainer.next_look and self._hopeless(self._look()):
                 self._save()
                 break
@@ -262,16 +262,23 @@ class _Session:
                 raise self._broken()
             self.pace.stepped(trainer.step, self.now(), search_runs=_searching(trainer))
             due = trainer.step % SAVE_EVERY == 0 or time.perf_counter() - saved > SAVE_SECONDS
-            due = trainer.ranks.any(due)
-            if due:
+            if trainer.ranks.any(due):
                 self._save()
                 saved = time.perf_counter()
-            stopped = trainer.ranks.any(self.watch.stop()) and trainer.step < self.schedule.steps
-            if not due and (stopped or trainer.step >= self._planned()):
-                self._save()  # which waits for the search: there may be time left for more steps
-        if stopped:
-            return self._interrupted()
+            if trainer.ranks.any(self.watch.stop()) and trainer.step < self.schedule.steps:
+                return self._interrupted()
         return self._judged() if trainer.ranks.first else self._ended()
+
+    def _goes_on(self) -> bool:
+        """Whether there is a step to make; where there is none, everything is saved.
+
+        To save is to wait for the search that goes on beside the steps. Where that took less than was
+        expected there is time for more steps.
+        """
+        if self._planned() > self.trainer.step:
+            return True
+        self._save()
+        return self._planned() > self.trainer.step
 
     def _planned(self) -> int:
         """The steps of the run as they are planned at this moment: by its budget, or by its schedule."""
@@ -333,6 +340,7 @@ class _Session:
         return self.budget > 0.0 and self.now() - self.begun > (1.0 + VERDICT_OVER) * self.budget
 
     def _interrupted(self) -> Outcome:
+        self._save()
         self.journal.close("interrupted")
         return self._ended(interrupted=True)
 
