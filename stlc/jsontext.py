@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from fractions import Fraction
 from pathlib import PurePath
-from typing import TypeAlias
+from typing import Any, TypeAlias
+
+from stlc.escape import json_text
 
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
 
@@ -58,5 +61,21 @@ def _number(value: float) -> float | str:
 
 
 def dumps(value: object, *, indent: int | None = None) -> str:
-    """`value` as a JSON text, by the rules of `plain`; on one line unless `indent` is given."""
-    return json.dumps(plain(value), indent=indent, ensure_ascii=False, allow_nan=False)
+    """`value` as a JSON text, by the rules of `plain`; on one line unless `indent` is given.
+
+    What cannot be seen, and halves of pairs, which no file in UTF-8 holds, are written in escapes.
+    """
+    return json_text(json.dumps(plain(value), indent=indent, ensure_ascii=False, allow_nan=False))
+
+
+_ESCAPES = re.compile(r"(\\\\|\\u[dD][89abAB]..\\u[dD][c-fC-F]..)|\\u[dD][89a-fA-F]..|[\ud800-\udfff]")
+
+
+def loads(text: str) -> Any:
+    """What a JSON text from elsewhere holds; half of a character, which no file can hold, becomes U+FFFD.
+
+    Raises:
+        ValueError: it is no JSON.
+        RecursionError: it is nested too deeply.
+    """
+    return json.loads(_ESCAPES.sub(lambda match: match[1] or "\ufffd", text))

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from stlc.diagnostics import Diagnostic, MissingError, RunError, UsageError
+from stlc.escape import file_part, shell
 from stlc.files import write_atomic
 from stlc.jsontext import dumps
 from stlc.registry import closest
@@ -277,7 +278,7 @@ def _of_spec(path: Path, root: Path) -> RunDir:
     trained = [run for run in runs if _spec_path(run) == path.resolve()]
     found = trained or [run for run in runs if run.path.parent.name == _slug(path.stem)]
     if not found:
-        help_ = (f"train one: stlc train {path}",)
+        help_ = (f"train one: {shell(('stlc', 'train', str(path)))}",)
         raise UsageError(Diagnostic("R101", f"there is no run of `{path}` in `{root}`", help=help_))
     return found[-1]
 
@@ -303,7 +304,7 @@ def _folder_of(path: Path) -> Path:
 
 
 def _slug(name: str) -> str:
-    return re.sub(r"[^\w.-]+", "-", name).strip("-.") or "spec"
+    return file_part(name, empty="spec")
 
 
 def _checked(words: str) -> str:

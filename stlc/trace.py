@@ -199,6 +199,9 @@ def save_trace(path: Path | str, trace: Trace) -> None:
     if taken:
         raise TraceError(Diagnostic("E605", f"a recorded signal cannot be called `{taken[0]}`"))
     if Path(path).suffix.lower() == ".csv":
+        if grouped := [name for name in trace.data if name in GROUPS]:
+            message = f"the column `{grouped[0]}` of a `.csv` says which trace a line is of"
+            raise TraceError(Diagnostic("E605", message, help=("write a `.npz`, which has no such column",)))
         _to_csv(path, trace)
         return
     meta = meta_array(replace(trace.meta, dt=trace.dt), trace.signature)

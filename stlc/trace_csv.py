@@ -10,8 +10,9 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.escape import from_spreadsheet, spreadsheet, unseen
 from stlc.files import write_atomic
 from stlc.source import Source, Span
 from stlc.trace_cells import NUMBER, STRETCH, Lines, bare, load, read_lines, value_of
@@ -39,6 +41,7 @@ _FILLED = re.compile(r"[^\n]*\S[^\n]*")
 _COMMA = re.compile(r"(?<!\d),|,(?!\d)")
 """A comma that is not within a number."""
 _MAX_FINDINGS = 20
+_QUOTED = re.compile(r'"(?:[^"]|"")*"')
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +121,7 @@ def _sheet(path: Path, data: bytes) -> _Sheet:
     end = body.find("\n", start)
     end = len(body) if end < 0 else end
     header = body[start:end]
-    delimiter = max(",;\t", key=header.count)
+    delimiter = delimiter_of(header)
     if delimiter != "," and "," in body[end:] and not _COMMA.search(body, end):
         body = body[:end] + body[end:].replace(",", ".")  # decimal commas, as many spreadsheets write them
     return _Sheet(Source(str(path), body), delimiter, header, start, min(end + 1, len(body)))
@@ -128,7 +131,7 @@ def _read_header(sheet: _Sheet) -> tuple[list[str], dict[str, str]]:
     findings: list[Diagnostic] = []
     units: dict[str, str] = {}
     names: list[str] = []
-    for text, span in _cells(sheet.source, sheet.header_at, sheet.header, sheet.delimiter):
+    for text, span in _head_cells(sheet):
         bare = text.removeprefix("#").strip() if not names else text  # how np.savetxt begins a header
         name, unit = split_head(bare)
         if not _HEAD.fullmatch(bare):
@@ -144,6 +147,36 @@ def _read_header(sheet: _Sheet) -> tuple[list[str], dict[str, str]]:
     if findings:
         raise TraceError(*findings[:_MAX_FINDINGS])
     return names, units
+
+
+def delimiter_of(header: str) -> str:
+    """What stands between the names of a first line: comma, semicolon or tab."""
+    return max(",;\t", key=_QUOTED.sub("", header).count)
+
+
+def head_cells(header: str, delimiter: str) -> list[str]:
+    """The cells of a first line as they were meant, without quotes and what kept a spreadsheet from them."""
+    return [_head(raw) for raw in _raw_heads(header, delimiter)]
+
+
+def _raw_heads(header: str, delimiter: str) -> list[str]:
+    """The cells of a first line as they stand there; a delimiter within quotes is none."""
+    hidden = _QUOTED.sub(lambda match: "\0" * len(match[0]), header)
+    edges = [-1, *(at for at, char in enumerate(hidden) if char == delimiter), len(header)]
+    return [header[left + 1 : right] for left, right in pairwise(edges)]
+
+
+def _head(raw: str) -> str:
+    text = bare(raw)
+    return from_spreadsheet(text.replace('""', '"') if _QUOTED.fullmatch(raw.strip()) else text)
+
+
+def _head_cells(sheet: _Sheet) -> Iterator[tuple[str, Span]]:
+    start = sheet.header_at
+    for raw in _raw_heads(sheet.header, sheet.delimiter):
+        at = start + (len(raw) - len(raw.lstrip()))
+        yield _head(raw), sheet.source.span(at, max(at + len(raw.strip()), at + 1))
+        start += len(raw) + 1
 
 
 def split_head(text: str) -> tuple[str, str]:
@@ -271,13 +304,36 @@ def _decimal_comma(sheet: _Sheet, cells: Sequence[object], width: int) -> tuple[
 def write_csv(path: Path | str, columns: Mapping[str, NDArray[Any]], units: Mapping[str, str]) -> None:
     """Write columns of equal length so that reading them back gives the same numbers.
 
+    The first line names the columns; a name that a spreadsheet would run as a formula (from `=`, `+`, `-`, `@`)
+    is written with an apostrophe before it, which reading takes off.
+
     Raises:
+        TraceError: E605, a name that would be read as something else, such as one with a unit in brackets.
         MissingError: R201, no room or no permission; an old file stays as it was.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     heads = [f"{name} [{units[name]}]" if units.get(name) else name for name in columns]
-    writer.writerow(heads)
+    writer.writerow(map(spreadsheet, heads))
+    _require_names(Path(path), text.getvalue(), columns)
     for row in zip(*(values.tolist() for values in columns.values()), strict=True):
         writer.writerow([repr(value) for value in row])
     write_atomic(path, text.getvalue())
+
+
+def _require_names(path: Path, header: str, names: Iterable[str]) -> None:
+    """Raise TraceError (E605) where a first line is not read back as these names."""
+    try:
+        read, _ = _read_header(_sheet(path, header.encode("utf-8", "replace")))
+    except TraceError:
+        read = []
+    for position, name in enumerate(names):
+        if position >= len(read) or read[position] != name:
+            odd = name if len(read) == len(list(names)) else next(filter(_is_odd, names), name)
+            message = f"no column of a `.csv` can be called `{odd}`"
+            raise TraceError(Diagnostic("E605", message, help=("write a `.npz`, which holds any name",)))
+
+
+def _is_odd(name: str) -> bool:
+    """Whether a name does not survive alone."""
+    return split_head(name) != (name, "") or bool(unseen(name)) or name != name.strip()

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.jsontext import loads
 from stlc.signature import Column, Signature
 from stlc.trace_npz import unreadable
 from stlc.units import DIMENSIONLESS, parse_unit
@@ -119,7 +120,7 @@ def read_meta(path: Path, array: NDArray[Any] | None) -> tuple[TraceMeta, dict[s
     if array.dtype.kind != "U" or array.shape != ():
         raise unreadable(path, "`meta` is not a JSON text")
     try:
-        written = json.loads(str(array))
+        written = loads(str(array))
         return _meta_of(written), _columns_of(written)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
         raise unreadable(path, f"`meta` is damaged ({str(error)[:80]})") from None

@@ -32,6 +32,8 @@ except ImportError:  # a Python without it: `zipfile` says so
 Array = NDArray[Any]
 
 MAX_BYTES = 4_000_000_000
+MAX_NAME = 60_000
+"""Bytes of the name of an array that an archive has room for."""
 MAX_ARRAYS = 10_000
 
 _ROOM = 500_000_000
@@ -210,9 +212,12 @@ def write_npz(path: Path | str, arrays: Mapping[str, Array]) -> None:
     """Write arrays beside `path`, then rename; the same arrays always give the same bytes.
 
     Raises:
+        TraceError: E603, a name is too long.
         MissingError: R201, no room or no permission; an old file stays as it was.
     """
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
+            if len(name.encode()) > MAX_NAME:
+                raise unreadable(Path(path), f"a name of {len(name)} characters is too long for an archive")
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as stream:
                 npy.write_array(stream, np.asarray(array), allow_pickle=False)

@@ -43,6 +43,7 @@ TRACE_FORMATS = (
 ROOMS = (
     {"source", "version"},
     {"diagnostics"},
+    {"escape"},
     {"registry", "units", "words", "jsontext"},
     {"signature"},
     {"rundir", "files", "provenance", "cache", "toolchain", "native", "trace", *TRACE_FORMATS},

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from stlc.diagnostics import CODES, Diagnostic
+from stlc.escape import sarif_message, uri, workflow_data, workflow_property
 from stlc.source import Span
 from stlc.version import __version__
 
@@ -18,22 +19,18 @@ def github(findings: Iterable[Diagnostic]) -> str:
 
 
 def _command(finding: Diagnostic) -> str:
-    places = [f"title={_property(finding.code)}"]
+    places = [f"title={workflow_property(finding.code)}"]
     if finding.span is not None:
         (line, column), (end_line, end_column) = _ends(finding.span)
-        places += [f"file={_property(finding.span.source.name)}", f"line={line}", f"endLine={end_line}"]
+        places += [
+            f"file={workflow_property(finding.span.source.name)}",
+            f"line={line}",
+            f"endLine={end_line}",
+        ]
         if line == end_line:
             places += [f"col={column}", f"endColumn={end_column}"]
     text = "\n".join([finding.message, *finding.help])
-    return f"::{finding.severity} {','.join(places)}::{_data(text)}"
-
-
-def _data(text: str) -> str:
-    return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
-
-
-def _property(text: str) -> str:
-    return _data(text).replace(":", "%3A").replace(",", "%2C")
+    return f"::{finding.severity} {','.join(places)}::{workflow_data(text)}"
 
 
 def sarif(findings: Sequence[Diagnostic]) -> dict[str, Any]:
@@ -55,11 +52,13 @@ def _result(finding: Diagnostic, rule: int) -> dict[str, Any]:
         "ruleId": finding.code,
         "ruleIndex": rule,
         "level": finding.severity,
-        "message": {"text": text},
+        "message": {"text": sarif_message(text)},
     }
     if finding.span is not None:
         result["locations"] = [_location(finding.span)]
-    related = [{**_location(label.span), "message": {"text": label.text}} for label in finding.labels]
+    related = [
+        {**_location(label.span), "message": {"text": sarif_message(label.text)}} for label in finding.labels
+    ]
     if related:
         result["relatedLocations"] = related
     return result
@@ -68,7 +67,7 @@ def _result(finding: Diagnostic, rule: int) -> dict[str, Any]:
 def _location(span: Span) -> dict[str, Any]:
     (line, column), (end_line, end_column) = _ends(span)
     region = {"startLine": line, "startColumn": column, "endLine": end_line, "endColumn": end_column}
-    artifact = {"uri": span.source.name.replace("\\", "/")}
+    artifact = {"uri": uri(span.source.name)}
     return {"physicalLocation": {"artifactLocation": artifact, "region": region}}
 
 

@@ -127,10 +127,10 @@ def _print(outcomes: Sequence[Outcome]) -> None:
         show_diagnostics(fresh)
         told.update(fresh)
     if len(outcomes) == 1:
-        emit(outcomes[0].text)
+        emit(outcomes[0].text, styled=True)
         return
     parts = [outcome.text for outcome in outcomes if outcome.text and outcome.status != "satisfied"]
-    emit("\n\n".join([*parts, summary(outcomes)]))
+    emit("\n\n".join([*parts, summary(outcomes)]), styled=True)
 
 
 def _print_document(outcomes: Sequence[Outcome], code: int) -> None:

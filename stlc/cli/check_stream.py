@@ -6,7 +6,6 @@ time step; without one the system does.
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -18,7 +17,9 @@ from stlc.cli.outcome import WORDS, Outcome
 from stlc.cli.output import emit, wants_color
 from stlc.cli.tallies import Told, outcome_of_tallies
 from stlc.diagnostics import Diagnostic, TraceError
+from stlc.escape import visible
 from stlc.files import read_source
+from stlc.jsontext import loads
 
 if TYPE_CHECKING:
     from stlc.monitor.online import Decision, Online
@@ -92,7 +93,7 @@ def _tell(decision: Decision, online: Online) -> None:
     value = f"{low:+.3f}" if low == high else f"[{low:+.3f}, {high:+.3f}]"
     judged = f", judged from t = {decision.time:.10g} s" if repeated else ""
     now = online.time(decision.sample)
-    emit(f"t = {now:.10g} s  {decision.requirement}  {WORDS[decision.status]}  {value}{judged}")
+    emit(f"t = {now:.10g} s  {visible(decision.requirement)}  {WORDS[decision.status]}  {value}{judged}")
 
 
 # -------------------------------------------------------------------------- samples
@@ -142,7 +143,7 @@ def _bad(number: int, what: str, code: str = "E603") -> TraceError:
 
 def _json(text: str, number: int) -> Sample:
     try:
-        found = json.loads(text)
+        found = loads(text)
     except (ValueError, RecursionError):
         raise _bad(number, "is not a JSON object") from None
     if not isinstance(found, dict):
@@ -160,10 +161,10 @@ def _is_number(value: object) -> bool:
 
 
 def _header(text: str, number: int) -> _Header:
-    from stlc.trace_csv import split_head
+    from stlc.trace_csv import delimiter_of, head_cells, split_head
 
-    delimiter = max(",;\t", key=text.count)
-    names = tuple(split_head(cell.strip().strip('"'))[0] for cell in text.split(delimiter))
+    delimiter = delimiter_of(text)
+    names = tuple(split_head(cell)[0] for cell in head_cells(text, delimiter))
     if len(set(names)) < len(names) or not all(names):
         raise _bad(number, "does not name every column, or names one twice", "E605")
     if all(_number(name) is not None for name in names):

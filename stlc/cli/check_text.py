@@ -13,6 +13,7 @@ from stlc.cli.outcome import WORDS, Row
 from stlc.cli.output import table
 from stlc.cli.render import render_place
 from stlc.compile.semantics import TOLERANCE
+from stlc.escape import operand, shell, visible
 from stlc.monitor.explain import Cause
 from stlc.monitor.judgement import Judgement, Verdict
 
@@ -42,13 +43,13 @@ def _parts(result: Checked, color: bool) -> Iterator[str]:
     yield _summary(result.verdict)
     folder = _run_of(result)
     if folder is not None:
-        yield f"next: stlc report {folder}"
+        yield f"next: {shell(('stlc', 'report', folder))}"
 
 
 def _title(result: Checked) -> str:
     trace = result.trace
     count = f"{trace.traces} trace{'s' if trace.traces != 1 else ''} x {trace.samples} samples"
-    return f"{result.source.name} on {trace.name}    {count}, dt {trace.dt:g} s"
+    return f"{visible(result.source.name)} on {visible(trace.name)}    {count}, dt {trace.dt:g} s"
 
 
 def _table(result: Checked) -> str:
@@ -125,14 +126,14 @@ def _why(judged: Judgement, result: Checked) -> str:
 def _violation(judged: Judgement, cause: Cause, result: Checked, color: bool) -> str:
     verdict = result.verdict
     moment = verdict.subject.time(cause.start)
-    asked = f"{result.asked} " if result.asked else ""
-    replay = f"stlc check {asked}{result.trace.name} --require {judged.name} --at {moment:.10g}s"
+    words = (*result.asked, operand(result.trace.name), "--require", judged.name, "--at", f"{moment:.10g}s")
+    replay = shell(("stlc", "check", *words))
     advice = [("because", cause.because), ("replay", replay)]
     return f"{_count(judged, verdict)}\n{render_place(cause.place, cause.labels, advice, color=color)}"
 
 
 def _count(judged: Judgement, verdict: Verdict) -> str:
-    headline = f"{judged.name} is violated"
+    headline = f"{visible(judged.name)} is violated"
     if verdict.traces > 1:
         headline += f" in {judged.statuses.count('violated')} of {verdict.in_scope} traces"
     if judged.instants > 1:
@@ -142,12 +143,11 @@ def _count(judged: Judgement, verdict: Verdict) -> str:
 
 
 def _inconclusive(judged: Judgement, result: Checked) -> str:
+    name = visible(judged.name)
     needed, length = result.needs(judged)
     if needed > length:
-        return (
-            f"{judged.name} is inconclusive: it needs {needed:.6g} s of signal, the trace has {length:.6g} s."
-        )
-    return f"{judged.name} is inconclusive: it has no value where it was judged."
+        return f"{name} is inconclusive: it needs {needed:.6g} s of signal, the trace has {length:.6g} s."
+    return f"{name} is inconclusive: it has no value where it was judged."
 
 
 def _summary(verdict: Verdict) -> str:

@@ -30,7 +30,7 @@ class Checked:
     source: Source
     verdict: Verdict
     causes: Mapping[str, Cause]
-    asked: str = ""
+    asked: tuple[str, ...] = ()
 
     @property
     def warnings(self) -> tuple[Diagnostic, ...]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
 import typer
+
+from stlc.escape import shell
 
 _REQUIRE = re.compile(r"\brequire\s+(`[^`\n]+`|[^\W\d]\w*)\s*:")
 _COMMENT = re.compile(r"(#|//).*")
@@ -20,7 +22,7 @@ def run_names(context: typer.Context, incomplete: str) -> list[str]:
     root = Path(str(context.params.get("runs") or "runs"))
     runs = [run.path for run in every_run(root)][::-1]
     names = [LATEST, *(path.name for path in runs), *(path.parent.name for path in runs)] if runs else []
-    return [name for name in dict.fromkeys(names) if name.startswith(incomplete)]
+    return _fitting(names, incomplete)
 
 
 def requirement_names(context: typer.Context, incomplete: str) -> list[str]:
@@ -32,7 +34,13 @@ def requirement_names(context: typer.Context, incomplete: str) -> list[str]:
             names |= dict.fromkeys(name.strip("`") for name in _REQUIRE.findall(text))
         if names:
             break
-    return [name for name in names if name.startswith(incomplete)]
+    return _fitting(names, incomplete)
+
+
+def _fitting(names: Iterable[str], incomplete: str) -> list[str]:
+    """Those that go on as written and that a shell takes as they are: what is completed is not quoted."""
+    plain = (name for name in dict.fromkeys(names) if shell((name,)) == name and not name.startswith("-"))
+    return [name for name in plain if name.startswith(incomplete)]
 
 
 def _named(context: typer.Context) -> Iterator[Path]:

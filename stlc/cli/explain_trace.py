@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from stlc.cli.output import emit, emit_json, wants_color
+from stlc.escape import visible
 
 if TYPE_CHECKING:
     from stlc.cli.checked import Checked
@@ -32,7 +33,7 @@ def explain_trace(name: str, question: Question, runs: Path, *, as_json: bool) -
         found = {"trace": result.trace.name, "verdict": result.verdict.overall, "causes": causes}
         emit_json("explain/1", ok=code == 0, exit_code=code, diagnostics=result.warnings, result=found)
     else:
-        emit(_told(result))
+        emit(_told(result), styled=True)
     raise typer.Exit(code)
 
 
@@ -40,7 +41,7 @@ def _told(result: Checked) -> str:
     blocks = ["\n".join(_lines(cause, result)) for cause in result.causes.values()]
     if blocks:
         return "\n\n".join(blocks)
-    return f"{result.trace.name}: nothing is violated ({result.verdict.overall})"
+    return f"{visible(result.trace.name)}: nothing is violated ({result.verdict.overall})"
 
 
 def _lines(cause: Cause, result: Checked) -> Iterator[str]:
@@ -50,12 +51,12 @@ def _lines(cause: Cause, result: Checked) -> Iterator[str]:
     judged = cause.judgement
     of = f" in trace {cause.trace}" if result.verdict.traces > 1 else ""
     started = result.verdict.subject.moment(cause.start)
-    yield f"{judged.name} is violated{of}, judged from {started}: robustness {cause.tree.rho:+.6g}"
+    yield f"{visible(judged.name)} is violated{of}, judged from {started}: robustness {cause.tree.rho:+.6g}"
     advice = [("because", cause.because)]
     yield render_place(cause.place, cause.labels, advice, color=wants_color(sys.stdout)).rstrip("\n")
     yield ""
     for depth, node in _walk(cause.tree):
-        yield f"  {'  ' * depth}{_line(node, cause, result)}"
+        yield f"  {'  ' * depth}{visible(_line(node, cause, result))}"
 
 
 def _walk(tree: Blame) -> Iterator[tuple[int, Blame]]:

@@ -9,6 +9,7 @@ import typer
 
 from stlc.cli.options import JsonOption, RunArgument, RunsOption, describe
 from stlc.cli.output import emit, emit_json, say
+from stlc.escape import visible
 
 
 def register(app: typer.Typer) -> None:
@@ -67,4 +68,4 @@ def export(
             "one agent, one thread, stlc.runtime"
         )
     for name in done.files:
-        emit(str(shown / name))
+        emit(visible(str(shown / name)))

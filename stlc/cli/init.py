@@ -11,6 +11,7 @@ import typer
 from stlc.cli.examples import EMPTY, FIRST, example_files, examples
 from stlc.cli.options import JsonOption, describe
 from stlc.cli.output import emit, emit_json, say
+from stlc.escape import operand, shell, visible
 
 
 def register(app: typer.Typer) -> None:
@@ -49,8 +50,8 @@ def init(
         emit_json("init/1", ok=True, exit_code=0, result={"files": [str(path) for path in files]})
         return
     for path in files:
-        emit(str(path))
-    here = "" if folder == Path() else f"cd {folder} && "
+        emit(visible(str(path)))
+    here = "" if folder == Path() else f"{shell(('cd', operand(str(folder))))} && "
     say(f"next: {here}{_following(files)}")
 
 
@@ -58,7 +59,7 @@ def _following(files: Iterable[Path]) -> str:
     """What to do with the files."""
     for path in files:
         if path.suffix == ".stl":
-            return f"stlc train specs/{path.name} --budget 60s"
+            return shell(("stlc", "train", f"specs/{path.name}", "--budget", "60s"))
     return "stlc new system cart"
 
 

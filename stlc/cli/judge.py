@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 from stlc.cli.output import say, show_diagnostics
 from stlc.diagnostics import Diagnostic, UsageError
+from stlc.escape import operand
 from stlc.files import read_source
 from stlc.source import Source
 
@@ -128,14 +128,14 @@ def judged(path: Path, question: Question) -> tuple[Checked, list[str]]:
     return Checked(trace, source, verdict, explain_all(verdict), spoken(question)), [note] if note else []
 
 
-def spoken(question: Question) -> str:
+def spoken(question: Question) -> tuple[str, ...]:
     """The words of the command line that say how a trace is read and judged."""
-    words = [] if question.spec is None else [str(question.spec)]
+    words = [] if question.spec is None else [operand(str(question.spec))]
     words += [] if question.system is None else ["--system", question.system]
     for option, pairs in (("--map", question.names), ("--set", question.overrides)):
         words += [word for name, value in pairs.items() for word in (option, f"{name}={value}")]
     words += [] if question.resample is None else ["--resample", f"{question.resample:.10g}s"]
-    return shlex.join(words)
+    return tuple(words)
 
 
 def laid_out(recording: Recording, monitor: Monitor, question: Question) -> Trace:

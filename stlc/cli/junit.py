@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
-from xml.sax.saxutils import escape, quoteattr
 
 from stlc.cli.outcome import Outcome, Row
-
-_CONTROL = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+from stlc.escape import xml
 
 
 def junit(outcomes: Sequence[Outcome]) -> str:
@@ -35,7 +32,7 @@ def _suite(outcome: Outcome) -> Iterator[str]:
     yield f"  <testsuite name={_attribute(outcome.name)}{_counts([outcome])}>"
     for error in outcome.errors[:1]:
         yield f'    <testcase classname={_attribute(outcome.name)} name="trace">'
-        detail = _text("\n".join(f"{e.code}: {e.message}" for e in outcome.errors))
+        detail = xml("\n".join(f"{e.code}: {e.message}" for e in outcome.errors))
         told = f"type={_attribute(error.code)} message={_attribute(error.message)}"
         yield f"      <error {told}>{detail}</error>"
         yield "    </testcase>"
@@ -52,15 +49,11 @@ def _case(outcome: Outcome, row: Row) -> Iterator[str]:
     yield f"{head}>"
     if row.status == "violated":
         message = f"robustness {row.robustness}{', ' + row.where if row.where else ''}"
-        yield f'      <failure type="violated" message={_attribute(message)}>{_text(row.why)}</failure>'
+        yield f'      <failure type="violated" message={_attribute(message)}>{xml(row.why)}</failure>'
     else:
         yield f"      <skipped message={_attribute(row.why or row.status)}/>"
     yield "    </testcase>"
 
 
-def _text(text: str) -> str:
-    return escape(_CONTROL.sub("?", text))
-
-
 def _attribute(text: str) -> str:
-    return quoteattr(_CONTROL.sub("?", text))
+    return f'"{xml(text)}"'

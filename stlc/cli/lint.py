@@ -180,7 +180,7 @@ def _show(result: _Result, layout: Format, code: int) -> None:
             if findings:
                 from stlc.cli.render import render_text
 
-                emit(render_text(findings, color=wants_color(sys.stdout)).rstrip("\n") + "\n")
+                emit(render_text(findings, color=wants_color(sys.stdout)).rstrip("\n") + "\n", styled=True)
             say(_summary(result))
 
 

@@ -10,6 +10,7 @@ import typer
 
 from stlc.cli.options import JsonOption, describe, only_help
 from stlc.cli.output import emit, emit_json, say
+from stlc.escape import operand, shell, visible
 
 _Name = Annotated[str, typer.Argument(metavar="NAME", help="Of what is made; a path says where.")]
 _Force = Annotated[bool, typer.Option("--force", help="Overwrite a file that is there.")]
@@ -61,7 +62,7 @@ def spec(
         reference = Path(os.path.relpath(decl.path, path.parent)).as_posix()
     text = spec_text(path.stem, decl, reference)
     write_new(path, format_text(Source(str(path), text)), force=force)
-    _done(path, f"stlc lint {path}", as_json=as_json)
+    _done(path, shell(("stlc", "lint", operand(str(path)))), as_json=as_json)
 
 
 def system(name: _Name, force: _Force = False, as_json: JsonOption = False) -> None:
@@ -71,7 +72,7 @@ def system(name: _Name, force: _Force = False, as_json: JsonOption = False) -> N
     path = _path(name, "systems", ".yaml")
     checked_name(path.stem)
     write_new(path, read_template("system.yaml").format(name=path.stem), force=force)
-    _done(path, f"stlc system show {path}", as_json=as_json)
+    _done(path, shell(("stlc", "system", "show", operand(str(path)))), as_json=as_json)
 
 
 def _path(name: str, folder: str, suffix: str) -> Path:
@@ -85,5 +86,5 @@ def _done(path: Path, following: str, *, as_json: bool) -> None:
     if as_json:
         emit_json("new/1", ok=True, exit_code=0, result={"path": str(path)})
         return
-    emit(str(path))
+    emit(visible(str(path)))
     say(f"next: {following}")

@@ -15,6 +15,7 @@ from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 from stlc.diagnostics import Diagnostic, Notice
+from stlc.escape import screen, visible
 from stlc.jsontext import dumps, plain
 
 if TYPE_CHECKING:
@@ -25,14 +26,18 @@ ColorMode = Literal["auto", "always", "never"]
 COLOR: ContextVar[ColorMode] = ContextVar("stlc_color", default="auto")
 
 
-def emit(text: str) -> None:
-    """Write `text` and a line break to the standard output."""
-    _write(sys.stdout, text)
+def emit(text: str, *, styled: bool = False) -> None:
+    """Write `text` and a line break to the standard output.
+
+    Of what it holds only line breaks and tabs reach a terminal as such, and colours where it is `styled`;
+    what names hold of them is made `visible` by whoever puts the colours in.
+    """
+    _write(sys.stdout, screen(text, styled=styled))
 
 
-def say(text: str) -> None:
-    """Write `text` and a line break to the standard error."""
-    _write(sys.stderr, text)
+def say(text: str, *, styled: bool = False) -> None:
+    """Write a line to the standard error; what is `styled` may be several, with colours, as for `emit`."""
+    _write(sys.stderr, screen(text, styled=True) if styled else visible(text))
 
 
 def emit_json(
@@ -71,7 +76,7 @@ def show_diagnostics(diagnostics: Sequence[Diagnostic]) -> None:
     from stlc.cli.render import render_text
 
     if diagnostics:
-        say(render_text(tuple(diagnostics), color=wants_color(sys.stderr)).rstrip("\n"))
+        say(render_text(tuple(diagnostics), color=wants_color(sys.stderr)).rstrip("\n"), styled=True)
 
 
 @contextmanager
@@ -127,7 +132,7 @@ def console(*, stderr: bool = False, width: int | None = None) -> Console:
 
 def table(rows: Sequence[Sequence[str]], *, header: Sequence[str] = (), indent: str = "  ") -> str:
     """Columns of text, aligned by width, two blanks apart; a cell that reads as a number stands right."""
-    lines = [tuple(header), *map(tuple, rows)] if header else [tuple(row) for row in rows]
+    lines = [tuple(map(visible, row)) for row in ([header, *rows] if header else rows)]
     if not lines:
         return ""
     count = max(len(line) for line in lines)

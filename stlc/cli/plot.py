@@ -12,6 +12,7 @@ from stlc.cli import check_options as given
 from stlc.cli.options import JsonOption, RequireOption, SetOption, SystemOption, describe, parse_overrides
 from stlc.cli.output import emit, emit_json, say
 from stlc.diagnostics import Diagnostic, StlcError, UsageError
+from stlc.escape import visible
 
 if TYPE_CHECKING:
     from stlc.grammar import ast
@@ -92,7 +93,7 @@ def plot(
     say(f"trace {path}")
     if note:
         say(note)
-    emit(str(target))
+    emit(visible(str(target)))
 
 
 def _find(what: str, runs: Path) -> Path:

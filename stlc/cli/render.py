@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from stlc.diagnostics import Diagnostic, Label
+from stlc.escape import visible
 from stlc.source import Source, Span
 
 TAB = 4
@@ -59,7 +60,7 @@ def render_text(diagnostics: Iterable[Diagnostic], *, color: bool) -> str:
 
 def _block(diagnostic: Diagnostic, paint: _Paint) -> Iterator[str]:
     title = f"{diagnostic.severity}[{diagnostic.code}]"
-    yield f"{paint(diagnostic.severity, title)}{paint('headline', f': {_printable(diagnostic.message)}')}"
+    yield f"{paint(diagnostic.severity, title)}{paint('headline', f': {visible(diagnostic.message)}')}"
     yield from _body(_marks(diagnostic), _advice(diagnostic), paint, diagnostic.severity)
 
 
@@ -80,7 +81,7 @@ def _body(
     if marks:
         yield from _snippets(marks, width, paint, severity)
     for word, entry in advice:
-        first, *more = _printable(entry, keep="\n").split("\n")
+        first, *more = (visible(line) for line in entry.split("\n"))
         yield f"{margin}{paint('frame', '=')} {paint('help', f'{word}:')} {first}"
         yield from (f"{margin}  {' ' * len(word)}  {line}" for line in more)
 
@@ -109,7 +110,7 @@ def _snippets(marks: Sequence[_Mark], width: int, paint: _Paint, severity: str) 
         own = [mark for mark in marks if mark.span.source is source]
         place = own[0].span
         arrow = "-->" if index == 0 else ":::"
-        name = _printable(source.name)
+        name = visible(source.name)
         yield f"{margin}{paint('frame', arrow)} {name}:{place.line}:{place.column}"
         yield f"{margin} {paint('frame', '|')}"
         yield from _lines(source, own, width, paint, severity)
@@ -127,7 +128,7 @@ def _lines(source: Source, marks: Sequence[_Mark], width: int, paint: _Paint, se
         for mark in row.marks:
             style = severity if mark.primary else "secondary"
             under = " " * row.column(mark.span.start) + paint(style, row.underline(mark))
-            label = f" {paint(style, _printable(mark.text))}" if mark.text else ""
+            label = f" {paint(style, visible(mark.text))}" if mark.text else ""
             yield f"{' ' * width} {paint('frame', '|')} {under}{label}"
 
 
@@ -166,7 +167,7 @@ def _laid_out(line: str, *, indent: int) -> tuple[list[int], str]:
     column = indent
     for char in line:
         columns.append(column)
-        text = " " * (TAB - column % TAB) if char == "\t" else _printable(char)
+        text = " " * (TAB - column % TAB) if char == "\t" else visible(char)
         shown.append(text)
         column += sum(map(_width, text))
     return [*columns, column], "".join(shown)
@@ -177,20 +178,6 @@ def _width(char: str) -> int:
     if unicodedata.category(char) in ("Mn", "Me"):
         return 0
     return 2 if unicodedata.east_asian_width(char) in ("W", "F") else 1
-
-
-def _printable(text: str, *, keep: str = "") -> str:
-    """The text with control characters made visible: no file may steer the terminal."""
-    return "".join(char if char in keep else _visible(char) for char in text)
-
-
-def _visible(char: str) -> str:
-    code = ord(char)
-    if code < 0x20:
-        return chr(0x2400 + code)
-    if code == 0x7F:
-        return "\u2421"
-    return "\ufffd" if unicodedata.category(char) in ("Cc", "Cf", "Cs", "Zl", "Zp") else char
 
 
 # -------------------------------------------------------------------------- JSON

@@ -8,6 +8,7 @@ import typer
 
 from stlc.cli.options import JsonOption, RunArgument, RunsOption, describe
 from stlc.cli.output import emit, emit_json, say
+from stlc.escape import visible
 
 
 def register(app: typer.Typer) -> None:
@@ -46,4 +47,4 @@ def report(
             say(f"{learning.level}: {learning.sentence}")
         for advice in () if learning is None else learning.advice:
             say(f"what helps: {advice}")
-        emit(path)
+        emit(visible(path))

@@ -12,6 +12,7 @@ from stlc.cli.completion import run_names
 from stlc.cli.options import JsonOption, RunArgument, describe
 from stlc.cli.output import emit, emit_json, say, table
 from stlc.diagnostics import Diagnostic, UsageError
+from stlc.escape import visible
 
 Sort = Literal["time", "acc", "name"]
 
@@ -78,11 +79,11 @@ def show(run: RunArgument = "latest", runs: _Runs = RUNS, as_json: JsonOption = 
         result = {"run": folder.shown, "record": record, "files": files}
         emit_json("runs/1", ok=True, exit_code=0, result=result)
         return
-    emit(folder.shown)
+    emit(visible(folder.shown))
     facts = flattened(record)
     width = max(map(len, facts), default=0)
-    emit("\n".join(f"  {key:<{width}}  {value}" for key, value in facts.items()))
-    emit("files\n" + "\n".join(f"  {name}" for name in files))
+    emit("\n".join(visible(f"  {key:<{width}}  {value}") for key, value in facts.items()))
+    emit("files\n" + "\n".join(visible(f"  {name}") for name in files))
 
 
 def diff(

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from stlc.escape import operand, shell, visible
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
@@ -49,7 +51,7 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
     size = f"{seeds} seed{'s' * (seeds > 1)} x {agents} agents x {steps} steps"
     world = document["world"] or f"{document['system']} and its events"
     scenario = [f"scenario {document['scenario']}"] if document["scenario"] else []
-    yield " · ".join((document["spec"], f"run {document['run']}", f"world {world}", *scenario, size))
+    yield visible(" · ".join((document["spec"], f"run {document['run']}", f"world {world}", *scenario, size)))
     yield from _wrong(document.get("errors", {}))
     if document.get("margin"):
         spared = ", ".join(f"{name} {margin:.3g}" for name, margin in document["margin"].items())
@@ -150,17 +152,18 @@ def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: s
     from stlc.files import find_trace
 
     yield ""
-    yield f"  trace      {trace}"
+    yield f"  trace      {visible(trace)}"
     for what, path in drawn.items():
-        yield f"  {what:<10} {path}"
+        yield f"  {what:<10} {visible(path)}"
     found = (
         find_trace("trace.npz")
         if Path("trace.npz").exists() or Path("runs/latest/trace.npz").exists()
         else None
     )
     short = found is not None and found.resolve() == Path(trace).resolve()
-    needed = "" if system is None else f" --system {system}"
-    yield f"  next       stlc check {record or ('trace.npz' if short else trace)}{needed}"
+    judged = operand(str(record or ("trace.npz" if short else trace)))
+    needed = () if system is None else ("--system", system)
+    yield f"  next       {shell(('stlc', 'check', judged, *needed))}"
 
 
 def _shares(guards: Record) -> Iterator[tuple[str, ...]]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from stlc.diagnostics import Diagnostic, MissingError
+from stlc.escape import visible
 
 if TYPE_CHECKING:
     from stlc.controller.drive import Moment, Setting, Watch
@@ -115,7 +116,12 @@ def _bar(title: str) -> Iterator[Watch]:
     from stlc.cli.output import console
 
     talk = console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=talk, transient=True, disable=not talk.is_terminal) as progress:
-        bar = progress.add_task(title, total=None)
+        bar = progress.add_task(visible(title), total=None)
         yield lambda moment: progress.update(bar, completed=moment.step, total=moment.steps)

@@ -10,6 +10,7 @@ import typer
 
 from stlc.cli.options import JsonOption, SetOption, describe, only_help, parse_overrides
 from stlc.cli.output import emit, emit_json, say, show_diagnostics, table
+from stlc.escape import visible
 
 if TYPE_CHECKING:
     from stlc.diagnostics import Diagnostic
@@ -80,7 +81,7 @@ def check(
     show_diagnostics(warnings)
     moved = f", {_DRAWN} starts driven {steps} steps" if steps else ""
     size = f"{_counted(len(decl.signature), 'state')}, {_counted(len(decl.controls), 'control')}"
-    emit(f"{decl.path} is valid: {size}{moved}")
+    emit(f"{visible(str(decl.path))} is valid: {size}{moved}")
 
 
 def list_(as_json: JsonOption = False) -> None:

@@ -14,6 +14,7 @@ from stlc.cli.outcome import WORDS, Outcome, Row
 from stlc.cli.output import table
 from stlc.cli.render import render_place
 from stlc.compile.semantics import TOLERANCE
+from stlc.escape import visible
 from stlc.source import Source
 
 if TYPE_CHECKING:
@@ -102,13 +103,14 @@ def _row(name: str, tally: Tally, online: Online, cause: Cause | None) -> Row:
 def _text(
     told: Told, rows: tuple[Row, ...], tallies: Mapping[str, Tally], causes: Mapping[str, Cause]
 ) -> Iterator[str]:
-    yield f"{told.source.name} on {told.name}    1 trace x {told.samples} samples, dt {told.dt:g} s"
+    head = f"{visible(told.source.name)} on {visible(told.name)}"
+    yield f"{head}    1 trace x {told.samples} samples, dt {told.dt:g} s"
     yield ""
-    head = ("requirement", "verdict", "robustness", "starts", "where")
+    columns = ("requirement", "verdict", "robustness", "starts", "where")
     lines = [
         (row.name, WORDS[row.status], row.robustness, _share(tallies[row.name]), row.where) for row in rows
     ]
-    yield table(lines, header=head)
+    yield table(lines, header=columns)
     for name, cause in causes.items():
         yield ""
         yield _violation(name, tallies[name], cause, color=told.color)
@@ -117,7 +119,7 @@ def _text(
 def _violation(name: str, tally: Tally, cause: Cause, *, color: bool) -> str:
     count = f", at {tally.fails:,} of {tally.instants:,} starts" if tally.instants > 1 else ""
     place = render_place(cause.place, cause.labels, [("because", cause.because)], color=color)
-    return f"{name} is violated{count}.\n{place}".rstrip("\n")
+    return f"{visible(name)} is violated{count}.\n{place}".rstrip("\n")
 
 
 def _share(tally: Tally) -> str:

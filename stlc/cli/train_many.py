@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import typer
 
 from stlc.cli.output import emit, emit_json, say, table
+from stlc.escape import operand
 
 if TYPE_CHECKING:
     from stlc.controller.config import TrainConfig
@@ -99,7 +100,7 @@ class Many:
         given = [word for key, value in options.items() if value is not None for word in (key, str(value))]
         changed = [word for key, value in launch.overrides.items() for word in ("--set", f"{key}={value}")]
         drawn = () if self.pictures else ("--no-pictures",)
-        arguments = (str(part.spec), *given, *changed, *drawn)
+        arguments = (operand(str(part.spec)), *given, *changed, *drawn)
         if self.cluster is None:
             return Errand(self.name(part), arguments)
         from stlc.controller.inputs import input_files
@@ -115,7 +116,8 @@ def train_many(many: Many, *, json: bool) -> NoReturn:
     try:
         for back in _backs(many, lambda errand: say(f"{errand.name} {sent}")):
             found[back.errand.name] = back
-            say(_line(back))
+            for line in _line(back).splitlines():
+                say(line)
     except (KeyboardInterrupt, SystemExit):
         say(f"interrupted; runs that were going are saved: stlc runs list --runs {many.launch.root}")
         raise

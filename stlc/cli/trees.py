@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from fractions import Fraction
 from typing import Any
 
+from stlc.escape import dot
 from stlc.grammar import ast
 from stlc.grammar.children import children
+from stlc.jsontext import dumps
 
 _HIDDEN = frozenset({"span", "name_span", "system_span", "source", "quoted"})
+_ODD = re.compile(r"[\s\"\\=]")
 
 
 def as_tree(spec: ast.Spec) -> str:
@@ -57,8 +61,8 @@ def _short(value: object) -> str:
             return "=".join(map(_short, value))
         case Fraction():
             return str(value.numerator) if value.denominator == 1 else f"{float(value):.12g}"
-        case str() if " " in value or "\n" in value:
-            return '"' + value.replace("\n", " / ") + '"'
+        case str() if _ODD.search(value):
+            return dumps(value.replace("\n", " / "))
         case _:
             return str(value)
 
@@ -91,8 +95,8 @@ def as_dot(specs: Sequence[ast.Spec]) -> str:
     stack: list[tuple[int | None, ast.Node]] = [(None, spec) for spec in reversed(specs)]
     while stack:
         parent, node = stack.pop()
-        label = " ".join([type(node).__name__, *_facts(node)]).replace("\\", "\\\\").replace('"', '\\"')
-        lines.append(f'  n{count} [label="{label}"];')
+        label = dot(" ".join([type(node).__name__, *_facts(node)]))
+        lines.append(f"  n{count} [label={label}];")
         if parent is not None:
             lines.append(f"  n{parent} -> n{count};")
         own, count = count, count + 1

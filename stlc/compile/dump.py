@@ -13,10 +13,12 @@ from stlc.compile import ir
 from stlc.compile.bounds import in_words
 from stlc.compile.horizon import columns, nodes
 from stlc.compile.interface import Grid
-from stlc.compile.ir_text import show_formula
+from stlc.compile.ir_text import show_formula, shown
 from stlc.compile.pipeline import Compiled, Rule
 from stlc.compile.timers import Timer
+from stlc.escape import screen
 from stlc.grammar.printer import show
+from stlc.grammar.printer_expr import show_name
 
 WIDTH, LEFT = 110, 44
 """Columns of the whole text, and at most of what was written."""
@@ -39,12 +41,12 @@ def dump(compiled: Compiled, part: Part = "all") -> str:
         blocks += ["\n".join(_rule(*each, compiled, part)) for each in _rules(compiled)]
     if part in ("all", "states"):
         blocks.append("\n".join(_states(compiled)))
-    return "\n\n".join(blocks) + "\n"
+    return screen("\n\n".join(blocks)) + "\n"
 
 
 def _head(compiled: Compiled) -> Iterator[str]:
     grid = compiled.grid
-    facts = [compiled.name]
+    facts = [show_name(compiled.name)]
     if grid.dt is not None:
         facts.append(f"dt {in_words(Fraction(1), grid)}")
     if grid.horizon is not None:
@@ -84,7 +86,9 @@ def _became(rule: Rule, compiled: Compiled) -> Iterator[str]:
     read = columns(rule.formula)
     added = [timer for timer in compiled.timers if timer.name in read]
     if added:
-        yield "+ " + ", ".join(t.name if t.name == t.kind else f"{t.kind} {t.name}" for t in added)
+        yield "+ " + ", ".join(
+            shown(t.name) if t.name == t.kind else f"{t.kind} {shown(t.name)}" for t in added
+        )
     yield from (f"time  {line}" for line in _instants(rule, compiled.grid))
 
 
@@ -103,12 +107,12 @@ def _cut(lines: list[str]) -> list[str]:
 
 
 def _name(rule: Rule, kind: str) -> str:
-    tags = [f"@{tag}" for tag in sorted(rule.tags)]
+    tags = [f"@{show_name(tag)}" for tag in sorted(rule.tags)]
     if rule.weight != 1:
         tags.append(f"@weight({rule.weight:g})")
     if rule.scale != 1:
         tags.append(f"@scale({rule.scale:g})")
-    return "  ".join(["", *([kind] if kind else []), rule.name, *tags]).rstrip()
+    return "  ".join(["", *([kind] if kind else []), show_name(rule.name), *tags]).rstrip()
 
 
 def _rule(rule: Rule, kind: str, compiled: Compiled, part: Part) -> Iterator[str]:
@@ -123,7 +127,7 @@ def _rule(rule: Rule, kind: str, compiled: Compiled, part: Part) -> Iterator[str
 
 def _added(timer: Timer) -> str:
     """A state that the compiler adds, and what it says."""
-    return f"  + {timer.kind:<6}  {timer.name}  {timer.about}".rstrip()
+    return f"  + {timer.kind:<6}  {shown(timer.name)}  {timer.about}".rstrip()
 
 
 def _instants(rule: Rule, grid: Grid) -> list[str]:
@@ -153,11 +157,11 @@ def _interval(op: str, window: ir.Window, grid: Grid, *, back: bool) -> str:
 def _states(compiled: Compiled) -> Iterator[str]:
     added = [each.column.name for each in compiled.parameters] + [timer.name for timer in compiled.timers]
     read = [name for name in compiled.signature.names if name not in added]
-    yield "  columns   " + " ".join(read) + (f" | {' '.join(added)}" if added else "")
+    yield "  columns   " + " ".join(map(shown, read)) + (f" | {' '.join(map(shown, added))}" if added else "")
     for each in compiled.parameters:
-        yield f"  + param   {each.column.name}  {each.text}, drawn for every trajectory"
+        yield f"  + param   {shown(each.column.name)}  {each.text}, drawn for every trajectory"
     yield from (_added(timer) for timer in compiled.timers)
     if compiled.mission is not None:
         yield f"  mission   {_both(compiled.mission, compiled.grid)}"
-    safe = ", ".join(rule.name for rule in compiled.safety)
+    safe = ", ".join(show_name(rule.name) for rule in compiled.safety)
     yield f"  phi_safe  {safe or '(no requirement is tagged @safety)'}"

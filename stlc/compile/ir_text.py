@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from typing import assert_never
 
 from stlc.compile import ir
+from stlc.grammar.printer_expr import show_name
 
 _INFIX = {
     "add": ("+", 1),
@@ -14,6 +16,8 @@ _INFIX = {
     "mod": ("%", 2),
     "pow": ("^", 4),
 }
+_FROZEN = re.compile(r"#\d+@.*", re.S)
+_COMPONENT = re.compile(r"(?<!^)\[\d+\]\Z")
 _UNARY = 3
 _TOP = 5
 _FLIPPED = {">": "<", ">=": "<=", "<": ">", "<=": ">="}
@@ -76,8 +80,10 @@ def _sides(num: ir.Num) -> tuple[ir.Num, ir.Num]:
 
 
 def shown(name: str) -> str:
-    """A name as it was written: frozen values have a number behind theirs."""
-    return name.partition("#")[0]
+    """A name as it was written: frozen values have a place behind theirs, components a number."""
+    name = _FROZEN.sub("", name)
+    part = _COMPONENT.search(name)
+    return show_name(name) if part is None else show_name(name[: part.start()]) + part[0]
 
 
 def show_number(num: ir.Num, level: int = 0) -> str:
@@ -89,11 +95,11 @@ def show_number(num: ir.Num, level: int = 0) -> str:
 def _leaf(leaf: ir.Col | ir.At | ir.Held) -> str:
     match leaf:
         case ir.At(name, 1):
-            return f"next({name})"
+            return f"next({shown(name)})"
         case ir.At(name, -1):
-            return f"prev({name})"
+            return f"prev({shown(name)})"
         case ir.At(name, steps):
-            return f"shift({name}, {steps})"
+            return f"shift({shown(name)}, {steps})"
         case _:
             return shown(leaf.name)
 

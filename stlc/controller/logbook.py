@@ -8,6 +8,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from stlc.diagnostics import Diagnostic, MissingError
+from stlc.escape import markdown, tag
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -41,7 +42,7 @@ class Logbook:
 
     def begun(self, chosen: Mapping[str, Any]) -> None:
         """Enter what the engine chose."""
-        lines = "\n".join(f"| {key} | {value} |" for key, value in chosen.items())
+        lines = "\n".join(f"| {markdown(key)} | {markdown(str(value))} |" for key, value in chosen.items())
         self._writer.add_text("engine", f"| | |\n|---|---|\n{lines}", 0)
 
     def row(self, row: Mapping[str, Any]) -> None:
@@ -51,7 +52,7 @@ class Logbook:
             if row.get(key) is not None:
                 self._writer.add_scalar(key, float(row[key]), step)
         for name, share in (row.get("requirements") or {}).items():
-            self._writer.add_scalar(f"requirements/{name}", float(share), step)
+            self._writer.add_scalar(f"requirements/{tag(name)}", float(share), step)
         if row.get("failing"):
             self._writer.add_scalar("repaired", row["repaired"] / row["failing"], step)
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from stlc.dynamics.decl import SystemDecl
 from stlc.dynamics.decl_init import Situation
 from stlc.dynamics.decl_model import Assign
+from stlc.escape import visible
 from stlc.signature import Column
 
 Row = tuple[str, ...]
@@ -14,7 +15,7 @@ Row = tuple[str, ...]
 
 def describe(decl: SystemDecl) -> str:
     """States, controls, flow, jumps, initial situations and scenarios of a system, as lines of text."""
-    head = f"{decl.name}: {decl.doc}" if decl.doc else decl.name
+    head = visible(f"{decl.name}: {decl.doc}" if decl.doc else decl.name)
     substeps = f", {decl.substeps} substeps" if decl.substeps > 1 else ""
     kind = "discrete" if decl.discrete else decl.integrator
     seconds = float(decl.dt * decl.horizon)
@@ -76,6 +77,7 @@ def _table(title: str, rows: Sequence[Row]) -> list[str]:
     """A title and aligned rows; nothing where there are none."""
     if not rows:
         return []
+    rows = [tuple(map(visible, row)) for row in rows]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
     return ["", title, *(f"  {line}".rstrip() for line in lines)]

@@ -121,7 +121,7 @@ def _declaration(
     flow = read_flow(found.get("flow"), reader, names, clock)
     spec = reader.text(found.get("spec"), "`spec`")
     return SystemDecl(
-        name=reader.text(found.get("name"), "`name`") or path.stem,
+        name=reader.name(found.get("name"), "`name`") or path.stem,
         doc=" ".join((reader.text(found.get("doc"), "`doc`") or "").split()),
         path=path,
         source=source,

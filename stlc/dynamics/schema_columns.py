@@ -96,12 +96,12 @@ def _members(node: Node, where: str, reader: Reader) -> tuple[tuple[str, float],
     """`{stop: 0, light: 1}` or `[stop, light]`."""
     members: list[tuple[str, float]] = []
     if isinstance(node, Sequence):
-        words = [reader.text(item, f"a member of {where}") for item in reader.items(node, where)]
+        words = [reader.name(item, f"a member of {where}") for item in reader.items(node, where)]
         members = [(word, float(value)) for value, word in enumerate(words) if word]
     else:
         for entry in reader.entries(node, f"`enum` of {where}"):
             value = reader.integer(entry.value, f"the member `{entry.key.text}`", low=-1_000_000)
-            if value is not None:
+            if value is not None and reader.nameable(entry.key, f"a member of {where}"):
                 members.append((entry.key.text, float(value)))
     if len(dict(members)) < max(len(members), 1) or len({value for _, value in members}) < len(members):
         help_ = "{enum: {stop: 0, go: 1}}"

@@ -62,7 +62,7 @@ def read_event(node: Node, index: int, here: Expressions, names: Names, dt: Frac
     """One event: exactly one of `when`, `at` and `every`."""
     reader = here.reader
     found = reader.fields(node, "an event", EVENT_KEYS, required=("set",))
-    name = reader.text(found.get("name"), "`name` of an event") or f"event {index + 1}"
+    name = reader.name(found.get("name"), "`name` of an event") or f"event {index + 1}"
     triggers = [key for key in ("when", "at", "every") if key in found]
     if len(triggers) != 1:
         place = first_line(node.span)

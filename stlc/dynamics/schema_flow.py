@@ -52,7 +52,7 @@ def read_jumps(node: Node | None, reader: Reader, names: Names) -> tuple[JumpDec
     found: list[JumpDecl] = []
     for index, item in enumerate(reader.items(node, "`jump`")):
         fields = reader.fields(item, "a jump", JUMP_KEYS, required=("guard", "reset"))
-        name = reader.text(fields.get("name"), "`name` of a jump") or f"jump {index + 1}"
+        name = reader.name(fields.get("name"), "`name` of a jump") or f"jump {index + 1}"
         guard = here.formula(fields.get("guard"), "a guard")
         resets = read_sets(fields.get("reset"), "`reset`", here, names)
         sharpness = reader.number(fields.get("sharpness"), "`sharpness`", low=1e-9)

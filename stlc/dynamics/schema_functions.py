@@ -40,6 +40,8 @@ def read_functions(node: Node | None, reader: Reader, names: Names) -> tuple[Fun
 
 def _function(entry: Entry, reader: Reader) -> FunctionDecl | None:
     where = f"the function `{entry.key.text}`"
+    if not reader.nameable(entry.key, "the name of a function"):
+        return None
     keys = tuple(dict.fromkeys((*PYTHON_KEYS, *URDF_KEYS)))
     found = reader.fields(entry.value, where, keys, required=("kind",))
     match reader.option(found.get("kind"), f"`kind` of {where}", KINDS):

@@ -124,7 +124,7 @@ def _mixture(items: tuple[Node, ...], drawn: _Drawn, reader: Reader, names: Name
 def _situation(node: Node, drawn: _Drawn, reader: Reader, names: Names) -> Situation:
     """One situation, or one branch of one."""
     found = reader.fields(node, "a situation", SITUATION_KEYS)
-    name = reader.text(found.get("name"), "`name` of a situation") or ""
+    name = reader.name(found.get("name"), "`name` of a situation") or ""
     weight = reader.number(found.get("weight"), "`weight`")
     draws = _Draws(reader, names, drawn)
     draws.read(found)

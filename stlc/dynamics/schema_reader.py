@@ -7,9 +7,12 @@ from dataclasses import dataclass, field
 
 from stlc.diagnostics import Diagnostic, Findings, Label, SystemFileError, tell
 from stlc.dynamics.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence, as_bool, as_float, as_int
+from stlc.escape import unseen
 from stlc.registry import closest
 from stlc.source import Source, Span
 
+LONGEST_NAME = 200
+"""Characters of a name that is free text: of a system, an event, a scenario, the word of an enum."""
 _OPENING, _CLOSING = "([{", ")]}"
 
 
@@ -141,6 +144,22 @@ class Reader:
             self.wrong(node, where, "a text")
             return None
         return node.text
+
+    def name(self, node: Node | None, where: str) -> str | None:
+        """A text of one line that can be seen whole, as names are."""
+        text = self.text(node, where)
+        return text if text is None or self.nameable(node, where) else None
+
+    def nameable(self, node: Node | None, where: str) -> bool:
+        """Whether a text can be a name: nothing in it is invisible, and it is not too long; says why not."""
+        assert isinstance(node, Scalar)
+        hidden = unseen(node.text)
+        if not hidden and len(node.text) <= LONGEST_NAME:
+            return True
+        wanted = f"a text of at most {LONGEST_NAME} characters that can all be seen"
+        told = f"of {len(node.text)} characters" if not hidden else f"with the character U+{ord(hidden):04X}"
+        self.report("S103", f"{where} must be {wanted}, this is one {told}", first_line(node.span))
+        return False
 
     def integer(self, node: Node | None, where: str, *, low: int = 1, high: int = 10**9) -> int | None:
         """A whole number between `low` and `high`."""

@@ -41,7 +41,11 @@ def read_scenarios(
     node: Node | None, reader: Reader, names: Names, clock: Clockwork
 ) -> tuple[ScenarioDecl, ...]:
     """All overlays, in the order of the file."""
-    return tuple(_scenario(entry, reader, names, clock) for entry in reader.entries(node, "`scenario`"))
+    return tuple(
+        _scenario(entry, reader, names, clock)
+        for entry in reader.entries(node, "`scenario`")
+        if reader.nameable(entry.key, "the name of a scenario")
+    )
 
 
 def _scenario(entry: Entry, reader: Reader, names: Names, clock: Clockwork) -> ScenarioDecl:

@@ -84,7 +84,7 @@ def _term(node: Node, here: Expressions) -> tuple[Term, ...]:
     """One performance term."""
     reader = here.reader
     found = reader.fields(node, "a term", TERM_KEYS, required=("expr",))
-    name = reader.text(found.get("name"), "`name` of a term") or written(found.get("expr"))
+    name = reader.name(found.get("name"), "`name` of a term") or written(found.get("expr"))
     weight = reader.number(found.get("weight"), "`weight`")
     value = here.number(found.get("expr"), f"the term `{name}`")
     return () if value is None else (Term(name, 1.0 if weight is None else weight, value.num),)

@@ -119,6 +119,7 @@ Node: TypeAlias = Scalar | Sequence | Mapping
 
 _TRUE = frozenset({"true", "True", "TRUE"})
 _FALSE = frozenset({"false", "False", "FALSE"})
+_HALF = re.compile("[\ud800-\udfff]")
 _INT = re.compile(r"[-+]?[0-9]+\Z")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\Z")
 
@@ -266,6 +267,8 @@ class _Builder:
         """A scalar, a sequence or a mapping."""
         if isinstance(event, yaml.ScalarEvent):
             span = self.span(event) if event.value or event.style else self.here(event)
+            if _HALF.search(event.value):
+                raise self.refuse(event, "half of a character (U+D800 to U+DFFF), which no file can hold")
             return Scalar(span, event.value, _STYLES[event.style])
         if isinstance(event, yaml.SequenceStartEvent):
             return self.sequence(event, depth)

@@ -16,6 +16,7 @@ from stlc.editor.document import Document
 from stlc.editor.modules import borrowed_at
 from stlc.editor.symbols import Symbol
 from stlc.editor.vocabulary import BUILT_IN, FUNCTIONS, KEYWORDS, TAGS, TEMPORAL, TYPES
+from stlc.escape import markdown, markdown_code, screen
 from stlc.grammar import ast
 from stlc.grammar.printer import show
 from stlc.grammar.scan import Lexeme, lexemes
@@ -101,17 +102,27 @@ def duration(steps: int, grid: Grid) -> str:
 def about(document: Document, symbol: Symbol) -> str:
     """The declaration of a symbol, its `##` comment, and what it comes to."""
     item = symbol.item
-    parts = [] if item is None else [f"```stlc\n{show(replace(item, doc='', tags=()))}\n```"]
+    parts = [] if item is None else [_code(item)]
     parts += list(_facts(document, symbol))
     if item is not None and item.doc and symbol.kind not in ("argument", "member"):
-        parts.append(item.doc)
+        parts.append(_told(item.doc))
     return "\n\n".join(parts)
+
+
+def _code(item: ast.Item) -> str:
+    """A declaration as a block of code, on lines of its own whatever its names hold."""
+    return f"```stlc\n{screen(show(replace(item, doc='', tags=())))}\n```"
+
+
+def _told(doc: str) -> str:
+    """A `##` comment: text, not mark-up."""
+    return "\n".join(map(markdown, doc.split("\n")))
 
 
 def about_shared(item: ast.Item, key: str) -> str:
     """A declaration of an imported file."""
-    origin = "library std" if key == STD else key
-    parts = [f"```stlc\n{show(replace(item, doc='', tags=()))}\n```", f"from {origin}", item.doc]
+    origin = "library std" if key == STD else markdown_code(key)
+    parts = [_code(item), f"from {origin}", _told(item.doc)]
     return "\n\n".join(filter(None, parts))
 
 
@@ -137,9 +148,9 @@ def _facts(document: Document, symbol: Symbol) -> Iterator[str]:
         case "member":
             item = symbol.item
             value_ = dict(item.members).get(symbol.name) if isinstance(item, ast.Enum) else None
-            yield f"member of `{symbol.item.name if symbol.item else ''}`, {value_}"
+            yield f"member of {markdown_code(symbol.item.name if symbol.item else '')}, {value_}"
         case "argument":
-            yield f"argument of `{symbol.item.name if symbol.item else ''}`"
+            yield f"argument of {markdown_code(symbol.item.name if symbol.item else '')}"
         case _:
             yield symbol.kind
 
@@ -155,7 +166,7 @@ def _about_column(document: Document, symbol: Symbol) -> Iterator[str]:
     system = document.system
     if system is not None and first.name.removesuffix("[0]") in system.places:
         place = system.places[first.name.removesuffix("[0]")]
-        yield f"a state of {system.path.name}, line {place.line}"
+        yield f"a state of {markdown_code(system.path.name)}, line {place.line}"
 
 
 def _range(column: Column) -> str:

@@ -16,6 +16,7 @@ from stlc.controller.backup import grid_of
 from stlc.controller.kernel import motion_of
 from stlc.controller.prefix import BEYOND, anchored, open_ended
 from stlc.dynamics.controls import raw_width
+from stlc.escape import c_comment, c_string
 from stlc.export import c_numbers, c_weights
 from stlc.runtime.prefixes import generators
 
@@ -48,7 +49,7 @@ def header(task: Task, network: PlanNetwork) -> str:
 
 def main_of(task: Task) -> str:
     """An example program: states from standard input, decisions to standard output."""
-    return _template("main.c.txt").substitute({"SYSTEM": task.system.name})
+    return _template("main.c.txt").substitute({"SYSTEM": c_comment(task.system.name)})
 
 
 def makefile() -> str:
@@ -70,16 +71,16 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
     most = max((grid.count(length) for length in grid.lengths), default=0)
     controls = task.system.controls
     return {
-        "NAME": task.system.name,
-        "SPEC": task.compiled.name,
+        "NAME": c_comment(task.system.name),
+        "SPEC": c_comment(task.compiled.name),
         "STATES": len(task.names),
-        "NAMES": ", ".join(f'"{name}"' for name in task.names),
-        "INPUTS": ", ".join(f'"{control.name}"' for control in controls),
+        "NAMES": ", ".join(map(c_string, task.names)),
+        "INPUTS": ", ".join(c_string(control.name) for control in controls),
         "CONTROLS": len(controls),
         "STEPS": task.horizon,
         "DT": literal(task.dt),
         "RULES": len(task.rules),
-        "RULE_NAMES": ", ".join(f'"{rule.name}"' for rule in task.rules),
+        "RULE_NAMES": ", ".join(c_string(rule.name) for rule in task.rules),
         "SAFETY": len(task.compiled.safety),
         "PLANS": network.plans,
         "RAW": raw_width(controls),

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping
 from typing import Any
 
+from stlc.escape import operand, shell
 from stlc.view.failures import draw_failures
 from stlc.view.held_out import unsolved_text
 from stlc.view.highlight import spec_html, yaml_html
@@ -53,7 +53,7 @@ def repeat_section(material: Material) -> Section:
 
 
 def _commands(material: Material) -> list[str]:
-    record, run = material.record, shlex.quote(material.run.shown)
+    record, run = material.record, operand(material.run.shown)
     spec = str(record.get("spec_path") or f"{material.run.shown}/spec.stl")
     system = str(record.get("system_path") or f"{material.run.shown}/system.yaml")
     train = ["stlc", "train", spec, "--system", system]
@@ -66,13 +66,13 @@ def _commands(material: Material) -> list[str]:
         if options.get(option) not in (None, "guided"):
             train += [f"--{option}", str(options[option])]
     train += _set(record)
-    commands = [shlex.join(train), shlex.join([*_simulate(material), *_set(material.simulation or {})])]
+    commands = [shell(train), shell([*_simulate(material), *_set(material.simulation or {})])]
     if material.trace is not None:
         check = ["stlc", "check", f"{material.run.shown}/trace.npz"]
         if material.outside:
             check += ["--system", f"{material.run.shown}/system.yaml"]
-        commands.append(shlex.join(check))
-    return [*commands, f"stlc report {run}"]
+        commands.append(shell(check))
+    return [*commands, shell(("stlc", "report", run))]
 
 
 def _set(record: Mapping[str, Any]) -> list[str]:

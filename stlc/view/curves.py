@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.escape import picture
 from stlc.view.style import BLUE, INK, MUTED, SERIES, Picture, look, new_figure
 
 if TYPE_CHECKING:
@@ -105,7 +106,9 @@ def _draw_requirements(axes: Axes, rows: Rows) -> None:
         shares = np.array([float(row["requirements"][name]) for row in kept])
         everything.append(shares)
         color, style = SERIES[index % len(SERIES)], "-" if index < len(SERIES) else "--"
-        _draw_share(axes, seconds, shares, color=color, ls=style, label=f"{name}  {_even(shares)[-1]:.3f}")
+        _draw_share(
+            axes, seconds, shares, color=color, ls=style, label=picture(f"{name}  {_even(shares)[-1]:.3f}")
+        )
     if everything:
         _set_share_axis(axes, everything)
         _legend(axes, 3)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.semantics import TOLERANCE
+from stlc.escape import picture
 from stlc.signature import Signature
 from stlc.view.held_out import (
     Condition,
@@ -71,7 +72,7 @@ def _draw_starts(axes: Axes, held: HeldOut, weakness: Weakness, signature: Signa
             color=color,
             alpha=0.28 if color == BLUE else 0.8,
             lw=0,
-            label=f"{label} ({int(mask.sum()):,})",
+            label=picture(f"{label} ({int(mask.sum()):,})"),
             rasterized=True,
         )
     _draw_region(axes, weakness, held.x0[shown])

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from html import escape
 from typing import TypeAlias
+
+from stlc.escape import html as text_of
 
 _VOID = frozenset({"br", "hr", "img", "meta"})
 
@@ -20,7 +21,7 @@ Child: TypeAlias = "Html | str | Iterable[Html | str] | None"
 
 def el(name: str, *children: Child, attrs: Mapping[str, str] | None = None) -> Html:
     """The element `name` with `attrs` around `children`; None leaves a child out."""
-    written = "".join(f' {key}="{escape(value, quote=True)}"' for key, value in (attrs or {}).items())
+    written = "".join(f' {key}="{text_of(value)}"' for key, value in (attrs or {}).items())
     if name in _VOID:
         return Html(f"<{name}{written}>")
     return Html(f"<{name}{written}>{join(*children)}</{name}>")
@@ -37,7 +38,7 @@ def _written(child: Child) -> str:
     if isinstance(child, Html):
         return str(child)
     if isinstance(child, str):
-        return escape(child, quote=True)
+        return text_of(child)
     return "".join(_written(item) for item in child)
 
 

@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from stlc.diagnostics import StlcError
+from stlc.escape import operand, shell
 from stlc.dynamics.schema import load_system_decl
 from stlc.rundir import RunDir
 from stlc.signature import Signature
@@ -98,6 +99,7 @@ class Commands:
     @classmethod
     def of(cls, run: str, *, newest: bool = False, start: str = "stlc") -> Commands:
         """Those of the run that is found by the name `run`; `newest` need not be named to be driven."""
+        run = shell((operand(run),))
         simulate = "stlc simulate --backup" if newest else f"stlc simulate {run} --backup"
         return cls(f"{start} train --resume {run}", simulate, f"stlc report {run}")
 

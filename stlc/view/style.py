@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stlc.escape import screen
 from stlc.files import atomic_path
 from stlc.view import require_drawing
 
@@ -71,6 +72,7 @@ _RC: Any = {
     "legend.fontsize": 8,
     "svg.fonttype": "path",
     "svg.hashsalt": "stlc",
+    "text.parse_math": False,  # a dollar in a name is a dollar
 }
 
 
@@ -120,7 +122,11 @@ class Picture:
 
     def svg(self) -> str:
         """The figure as SVG whose inks follow the reader's light or dark scheme."""
+        from matplotlib.text import Text
+
         buffer = io.StringIO()
+        for text in self.figure.findobj(Text):
+            text.set_text(screen(text.get_text()))  # its comments may hold what XML may not
         with look():
             self.figure.savefig(
                 buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None}

@@ -18,7 +18,7 @@ def test_a_signal(traffic):
     text = say(traffic, "v_lead")
     assert "env signal v_lead [m/s] in [0, 10]" in text
     assert "env real [m/s], 0 to 10 m/s (enforced)" in text
-    assert "a state of car.yaml, line 24" in text
+    assert "a state of `car.yaml`, line 24" in text
 
 
 def test_a_nominal_range(traffic):

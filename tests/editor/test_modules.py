@@ -39,7 +39,7 @@ def test_hover(typed):
     assert found[0].text == "near"
     assert "def near(d) = d < top" in found[1]
     assert "near enough" in found[1]
-    assert "from limits.stl" in found[1]
+    assert "from `limits.stl`" in found[1]
     assert "library std" in hover(*typed("require r: std.stays│(go, 1 s)"))[1]
 
 

@@ -1,0 +1,245 @@
+"""Text from elsewhere, made to stand in C, markup, tables, terminals, shells and paths as mere text.
+
+Names, comments, units and file names come from files that anybody may have written. Each target has one
+function here; what is written for that target goes through it, whoever wrote the text. Where the target has
+a way to write every character, the text comes back exactly when the target is read; where it has none (a
+comment, a terminal, a picture), what cannot be shown is replaced by a visible sign.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import html as _html
+import re
+import shlex
+from collections.abc import Iterable
+from urllib.parse import quote
+
+_UNSEEN = (
+    r"\x00-\x1f\x7f-\x9f\xad\u0600-\u0605\u061c\u06dd\u070f\u0890\u0891\u08e2\u180e\u200b-\u200f\u2028-\u202e"
+    r"\u2060-\u2064\u2066-\u206f\ud800-\udfff\ufeff\ufff9-\ufffb\U000110bd\U000110cd\U00013430-\U0001343f"
+    r"\U0001bca0-\U0001bca3\U0001d173-\U0001d17a\U000e0001\U000e0020-\U000e007f"
+)
+"""Controls, formats, halves of pairs, separators of lines: what steers a terminal, turns text or hides it."""
+
+_INVISIBLE = re.compile(f"[{_UNSEEN}]")
+_ON_SCREEN = re.compile(f"(?![\n\t])[{_UNSEEN}]")
+_STYLE = re.compile(r"\x1b\[[0-9;]*m")
+_SURROGATE = re.compile("[\ud800-\udfff]")
+
+# ------------------------------------------------------------------------ terminals
+
+
+def visible(text: str) -> str:
+    """A name on one line of a terminal: no control character, no line break, nothing that turns text."""
+    return text if text.isascii() and text.isprintable() else _INVISIBLE.sub(_sign, text)
+
+
+def unseen(text: str) -> str:
+    """The first character of a text that is not `visible` as it is; "" where all are."""
+    found = _INVISIBLE.search(text)
+    return "" if found is None else found[0]
+
+
+def screen(text: str, *, styled: bool = False) -> str:
+    """A whole text for a terminal, of which only line breaks and tabs steer it.
+
+    Args:
+        text: lines.
+        styled: whether it holds colours of its own; then every name in it has to be `visible` already.
+    """
+    if text.isascii() and text.isprintable():
+        return text
+    if not styled:
+        return _ON_SCREEN.sub(_sign, text)
+    pieces = _STYLE.split(text)
+    styles = [*_STYLE.findall(text), ""]
+    shown = [_ON_SCREEN.sub(_sign, piece) for piece in pieces]
+    return "".join(part for pair in zip(shown, styles, strict=True) for part in pair)
+
+
+def _sign(match: re.Match[str]) -> str:
+    """The picture of a control character, `\N{REPLACEMENT CHARACTER}` for what has none."""
+    code = ord(match[0])
+    if code < 0x20:
+        return chr(0x2400 + code)
+    return "\u2421" if code == 0x7F else "\ufffd"
+
+
+def shell(words: Iterable[str]) -> str:
+    """A command line to copy: each word is one argument, whatever it holds, and steers no terminal."""
+    return " ".join(_word(word) for word in words)
+
+
+def operand(path: str) -> str:
+    """A path as a word of a command: none that begins with a dash is taken for an option."""
+    return f"./{path}" if path.startswith("-") else path
+
+
+def _word(text: str) -> str:
+    if not _INVISIBLE.search(text):
+        return shlex.quote(text)
+    special = {"\\": r"\\", "'": r"\'"}
+    return "$'" + "".join(special.get(char, _ansi(char)) for char in text) + "'"
+
+
+def _ansi(char: str) -> str:
+    """A character between `$'` and `'`, by its bytes where it cannot be seen."""
+    if not _INVISIBLE.match(char):
+        return char
+    return "".join(
+        f"\\x{byte:02x}" for byte in char.encode("utf-8", "surrogateescape" if _raw(char) else "replace")
+    )
+
+
+def _raw(char: str) -> bool:
+    """Whether it stands for a byte of a file name that is not UTF-8."""
+    return "\udc80" <= char <= "\udcff"
+
+
+# ------------------------------------------------------------------------- C
+
+
+def c_string(text: str) -> str:
+    """A literal of C99 and C++11 that holds the text in UTF-8, quotes included.
+
+    What is not printable ASCII is written in octal, which ends after three digits; a question mark begins no
+    trigraph. The literal is no format: print it by `%s`.
+    """
+    data = _SURROGATE.sub("\ufffd", text).encode()
+    return '"' + "".join(_C_BYTES.get(byte) or f"\\{byte:03o}" for byte in data) + '"'
+
+
+_C_BYTES = {code: chr(code) for code in range(0x20, 0x7F)} | {0x22: r"\"", 0x5C: r"\\", 0x3F: r"\?"}
+
+
+def c_comment(text: str) -> str:
+    """Words within a comment of either kind: they do not end it, continue it, or open another."""
+    words = visible(text).replace("\\", "\N{SET MINUS}")
+    return re.sub(r"\*(?=/)|/(?=[*/])|\?(?=\?)", r"\g<0> ", words)
+
+
+# ----------------------------------------------------------------------- markup
+
+
+def html(text: str) -> str:
+    """Text, or the value of an attribute between double quotes, in HTML."""
+    return _html.escape(_KEPT_IN_MARKUP.sub(_sign, text), quote=True)
+
+
+def script_json(text: str) -> str:
+    """A JSON text to stand within `<script>`: it neither ends the element nor opens a comment in it."""
+    return text.translate(_IN_SCRIPT)
+
+
+_IN_SCRIPT = str.maketrans({char: f"\\u{ord(char):04x}" for char in "<>&\u2028\u2029"})
+_KEPT_IN_MARKUP = re.compile(
+    "[^\t\n\\x20-\x7e\xa0-\u2027\u202f-\u2065\u206a-\ud7ff\ue000-\ufdcf\ufdf0-\ufffd\U00010000-\U0010ffff]"
+)
+"""What no XML 1.0 may hold, what HTML replaces or refuses, and what turns text round."""
+
+
+def xml(text: str) -> str:
+    """Text, or the value of an attribute between double quotes, in XML 1.0; line breaks and tabs are kept."""
+    escaped = _html.escape(_KEPT_IN_MARKUP.sub(_sign, text), quote=True)
+    return escaped.replace("\n", "&#10;").replace("\t", "&#9;")
+
+
+def markdown(text: str) -> str:
+    """Words in a line or a cell of a table of Markdown: no mark-up, no link, no HTML, no next cell."""
+    return re.sub(r"[\\`*_{}\[\]()#+\-.!|<>~&$:@=]", r"\\\g<0>", visible(text))
+
+
+def markdown_code(text: str) -> str:
+    """A name in code letters in a line of Markdown, whatever back quotes it holds."""
+    words = visible(text)
+    longest = max(map(len, re.findall("`+", words)), default=0)
+    fence = "`" * (longest + 1)
+    blank = " " if words.startswith("`") or words.endswith("`") or words != words.strip() or not words else ""
+    return f"{fence}{blank}{words}{blank}{fence}"
+
+
+def workflow_data(text: str) -> str:
+    """The message of a workflow command of GitHub, on one line."""
+    return visible(text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A"))
+
+
+def workflow_property(text: str) -> str:
+    """The value of a property of a workflow command of GitHub."""
+    return workflow_data(text).replace(":", "%3A").replace(",", "%2C")
+
+
+def sarif_message(text: str) -> str:
+    """A plain message of SARIF 2.1.0: no link and no place for an argument (sections 3.11.5 and 3.11.6)."""
+    return re.sub(r"\](?=\()", r"\\]", re.sub(r"\{(\d+)\}", r"{{\1}}", text))
+
+
+def uri(path: str) -> str:
+    """A path as a relative reference: what is no letter of an address is written in hexadecimal."""
+    return quote(path.replace("\\", "/"), safe="/-._~+@=,()", errors="surrogateescape")
+
+
+def dot(text: str) -> str:
+    """A quoted word of Graphviz, quotes included."""
+    return '"' + visible(text).replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+# ---------------------------------------------------------------- pictures and logs
+
+
+def picture(text: str) -> str:
+    """A label in the legend of a picture, which leaves out what begins with an underline."""
+    return f"\N{THIN SPACE}{visible(text)}" if text.startswith("_") else visible(text)
+
+
+def tag(name: str) -> str:
+    """A name as one part of a tag of TensorBoard: no group of its own, and no other name gives the same."""
+    return re.sub(r"[^\w.-]|_(?=x[0-9a-f]+_)", lambda match: f"_x{ord(match[0]):x}_", name)
+
+
+def json_text(text: str) -> str:
+    """A text of JSON as it may stand in a file or on a terminal: what cannot be seen is in escapes."""
+    if text.isascii() and "\x7f" not in text:
+        return text
+    return _ON_SCREEN.sub(lambda match: _unit(match[0]), text)
+
+
+def _unit(char: str) -> str:
+    data = char.encode("utf-16-be", "surrogatepass")
+    return "".join(f"\\u{data[i]:02x}{data[i + 1]:02x}" for i in range(0, len(data), 2))
+
+
+# ------------------------------------------------------------------- tables and paths
+
+_FORMULA = re.compile(r"'*[=+\-@\t\r]")
+
+
+def spreadsheet(text: str) -> str:
+    """A word in a cell of a table of text that no spreadsheet takes for a formula."""
+    return f"'{text}" if _FORMULA.match(text) else text
+
+
+def from_spreadsheet(text: str) -> str:
+    """The word that `spreadsheet` wrote."""
+    return text[1:] if text.startswith("'") and _FORMULA.match(text) else text
+
+
+LONGEST = 80
+"""Bytes of a part of a path that a name gives; file systems have room for 255."""
+
+_RESERVED = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.I)
+
+
+def file_part(name: str, *, empty: str) -> str:
+    """A name as one part of a path: letters, digits, `_`, `-`, `.`; in its folder, and never too long.
+
+    Args:
+        name: of anything.
+        empty: what stands for a name of which nothing is left.
+    """
+    part = re.sub(r"[^\w.-]+", "-", visible(name).replace("\ufffd", "-")).strip("-.") or empty
+    if len(part.encode()) <= LONGEST and not _RESERVED.fullmatch(part):
+        return part
+    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    kept = part.encode()[: LONGEST - len(digest) - 1].decode("utf-8", "ignore").rstrip("-.")
+    return f"{kept}-{digest}"
