@@ -147,7 +147,8 @@ def xml(text: str) -> str:
 
 def markdown(text: str) -> str:
     """Words in a line or a cell of a table of Markdown: no mark-up, no link, no HTML, no next cell."""
-    return re.sub(r"[\\`*_{}\[\]()#+\-.!|<>~&$:@=]", r"\\\g<0>", visible(text))
+    words = re.sub(r"[\\`*_{}\[\]()#+\-.!|<>~&$:@=]", r"\\\g<0>", visible(text))
+    return re.sub(r"^ +| +\Z", lambda match: "\N{NO-BREAK SPACE}" * len(match[0]), words)
 
 
 def markdown_code(text: str) -> str:

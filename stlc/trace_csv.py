@@ -304,8 +304,8 @@ def _decimal_comma(sheet: _Sheet, cells: Sequence[object], width: int) -> tuple[
 def write_csv(path: Path | str, columns: Mapping[str, NDArray[Any]], units: Mapping[str, str]) -> None:
     """Write columns of equal length so that reading them back gives the same numbers.
 
-    The first line names the columns; a name that a spreadsheet would run as a formula (from `=`, `+`, `-`, `@`)
-    is written with an apostrophe before it, which reading takes off.
+    The first line names the columns; a name that a spreadsheet would run as a formula, such as `=1+1`, has an
+    apostrophe before it, which reading takes off.
 
     Raises:
         TraceError: E605, a name that would be read as something else, such as one with a unit in brackets.
