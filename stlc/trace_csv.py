@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
-from stlc.escape import from_spreadsheet, spreadsheet, unseen
+from stlc.escape import from_spreadsheet, spreadsheet
 from stlc.files import write_atomic
 from stlc.source import Source, Span
 from stlc.trace_cells import NUMBER, STRETCH, Lines, bare, load, read_lines, value_of
@@ -311,29 +311,35 @@ def write_csv(path: Path | str, columns: Mapping[str, NDArray[Any]], units: Mapp
         TraceError: E605, a name that would be read as something else, such as one with a unit in brackets.
         MissingError: R201, no room or no permission; an old file stays as it was.
     """
-    text = io.StringIO()
+    head = _row(f"{name} [{units[name]}]" if units.get(name) else name for name in columns)
+    _require_names(Path(path), head, list(columns))
+    text = io.StringIO(head)
+    text.seek(0, io.SEEK_END)
     writer = csv.writer(text, lineterminator="\n")
-    heads = [f"{name} [{units[name]}]" if units.get(name) else name for name in columns]
-    writer.writerow(map(spreadsheet, heads))
-    _require_names(Path(path), text.getvalue(), columns)
     for row in zip(*(values.tolist() for values in columns.values()), strict=True):
         writer.writerow([repr(value) for value in row])
     write_atomic(path, text.getvalue())
 
 
-def _require_names(path: Path, header: str, names: Iterable[str]) -> None:
+def _require_names(path: Path, header: str, names: Sequence[str]) -> None:
     """Raise TraceError (E605) where a first line is not read back as these names."""
+    if _names_in(path, header) == list(names):
+        return
+    odd = next((name for name in names if _names_in(path, _row((name,))) != [name]), names[0])
+    message = f"no column of a `.csv` can be called `{odd}`"
+    raise TraceError(Diagnostic("E605", message, help=("write a `.npz`, which holds any name",)))
+
+
+def _names_in(path: Path, header: str) -> list[str]:
+    """What a first line is read as; [] where it is refused."""
     try:
-        read, _ = _read_header(_sheet(path, header.encode("utf-8", "replace")))
+        return _read_header(_sheet(path, header.encode("utf-8", "replace")))[0]
     except TraceError:
-        read = []
-    for position, name in enumerate(names):
-        if position >= len(read) or read[position] != name:
-            odd = name if len(read) == len(list(names)) else next(filter(_is_odd, names), name)
-            message = f"no column of a `.csv` can be called `{odd}`"
-            raise TraceError(Diagnostic("E605", message, help=("write a `.npz`, which holds any name",)))
+        return []
 
 
-def _is_odd(name: str) -> bool:
-    """Whether a name does not survive alone."""
-    return split_head(name) != (name, "") or bool(unseen(name)) or name != name.strip()
+def _row(heads: Iterable[str]) -> str:
+    """A first line."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow(map(spreadsheet, heads))
+    return text.getvalue()

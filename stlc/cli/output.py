@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 ColorMode = Literal["auto", "always", "never"]
 
+WIDEST = 80
+"""Columns up to which a cell of a table makes room for itself in the others."""
+
 COLOR: ContextVar[ColorMode] = ContextVar("stlc_color", default="auto")
 
 
@@ -136,7 +139,9 @@ def table(rows: Sequence[Sequence[str]], *, header: Sequence[str] = (), indent: 
     if not lines:
         return ""
     count = max(len(line) for line in lines)
-    widths = [max((len(line[i]) for line in lines if i < len(line)), default=0) for i in range(count)]
+    widths = [
+        min(max((len(line[i]) for line in lines if i < len(line)), default=0), WIDEST) for i in range(count)
+    ]
     return "\n".join(
         (indent + "  ".join(_cell(cell, width) for cell, width in zip(line, widths, strict=False))).rstrip()
         for line in lines

@@ -15,7 +15,7 @@ from stlc.grammar.tokens import Context, Leaf, name_of, number_of, own_name, uni
 from stlc.source import Source, Span
 
 _SIZE_DIGITS = 4
-_DOC = re.compile(r"^[ \t]*##(?!#)[ \t]?(.*?)[ \t\r]*$", re.MULTILINE)
+_DOC = re.compile(r"^[ \t]*##(?!#)[ \t]?(.*?)[^\S\n]*$", re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True)
