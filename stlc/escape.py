@@ -198,6 +198,11 @@ def tag(name: str) -> str:
     return re.sub(r"[^\w.-]|_(?=x[0-9a-f]+_)", lambda match: f"_x{ord(match[0]):x}_", name)
 
 
+def topic(name: str, *, empty: str) -> str:
+    """A name as one part of a topic of messages: letters, digits, `_`, `-` and `.`."""
+    return re.sub(r"[^\w.-]+", "_", name) or empty
+
+
 def json_text(text: str) -> str:
     """A text of JSON as it may stand in a file or on a terminal: what cannot be seen is in escapes."""
     if text.isascii() and "\x7f" not in text:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from typing import IO, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.escape import topic as topic_of
 from stlc.files import atomic_path
 from stlc.signature import Signature
 from stlc.trace_extras import needed
@@ -231,7 +231,7 @@ def write_mcap(path: Path | str, trace: Written) -> None:
     """
     writers = needed("mcap.writer")
     traces = len(next(iter(trace.data.values())))
-    base = "/" + (re.sub(r"[^\w.-]+", "_", Path(path).stem) or "trace")
+    base = "/" + topic_of(Path(path).stem, empty="trace")
     topics = [base] if traces == 1 else [f"{base}/{k}" for k in range(traces)]
     first = math.floor(float(trace.times[0]) * 1e9)
     origin = max(trace.origin or 0, -first)

@@ -14,8 +14,8 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from stlc.diagnostics import StlcError
-from stlc.escape import operand, shell
 from stlc.dynamics.schema import load_system_decl
+from stlc.escape import operand, shell
 from stlc.rundir import RunDir
 from stlc.signature import Signature
 from stlc.view.held_out import HeldOut, find_weakness, load_held_out, weakness_text
