@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.files import write_atomic
-from stlc.grammar.printer_expr import show_name
+from stlc.grammar.printer_expr import own_name
 
 if TYPE_CHECKING:
     from stlc.dynamics.decl import SystemDecl
@@ -67,11 +67,11 @@ def spec_text(name: str, system: SystemDecl | None, reference: str) -> str:
 
 def _signal(column: Column) -> str:
     role = column.role if column.role in ("input", "output", "state", "env") else "state"
-    head = f"{role} signal {show_name(column.name)}"
+    head = f"{role} signal {own_name(column.name)}"
     if column.kind == "bool":
         return f"{head} : bool"
     if column.labels:
-        members = ", ".join(f"{show_name(label)} = {value:g}" for label, value in column.labels)
+        members = ", ".join(f"{own_name(label)} = {value:g}" for label, value in column.labels)
         kind = column.name.capitalize()
         return f"enum {kind} {{ {members} }}\n{head} : {kind}"
     unit = f" [{column.unit}]" if column.unit.text else ""
@@ -81,11 +81,11 @@ def _signal(column: Column) -> str:
 
 def _predicate(column: Column) -> str:
     if column.kind == "bool":
-        return show_name(column.name)
+        return own_name(column.name)
     if column.labels:
-        return f"{show_name(column.name)} == {show_name(column.labels[0][0])}"
+        return f"{own_name(column.name)} == {own_name(column.labels[0][0])}"
     high = 0.0 if column.high is None else column.high
-    return f"{show_name(column.name)} <= {high:g}" + (f" {column.unit}" if column.unit.text else "")
+    return f"{own_name(column.name)} <= {high:g}" + (f" {column.unit}" if column.unit.text else "")
 
 
 def write_new(path: Path, text: str, *, force: bool) -> None:

@@ -267,12 +267,21 @@ class _Builder:
         """A scalar, a sequence or a mapping."""
         if isinstance(event, yaml.ScalarEvent):
             span = self.span(event) if event.value or event.style else self.here(event)
-            if _HALF.search(event.value):
-                raise self.refuse(event, "half of a character (U+D800 to U+DFFF), which no file can hold")
-            return Scalar(span, event.value, _STYLES[event.style])
+            return Scalar(span, self.joined(event), _STYLES[event.style])
         if isinstance(event, yaml.SequenceStartEvent):
             return self.sequence(event, depth)
         return self.mapping(event, depth)
+
+    def joined(self, event: Any) -> str:
+        """The value of a scalar; a character that escapes give in two halves, as JSON does, is one."""
+        value: str = event.value
+        if not _HALF.search(value):
+            return value
+        try:
+            return value.encode("utf-16", "surrogatepass").decode("utf-16")
+        except UnicodeDecodeError:
+            message = "half of a character (U+D800 to U+DFFF), which no file can hold"
+            raise self.refuse(event, message) from None
 
     def here(self, event: Any) -> Span:
         """The empty place of a value that is not there."""
