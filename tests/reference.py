@@ -2,16 +2,17 @@
 
 Nothing here is clever: recursion over the typed formula at one instant, plain Python floats, exact fractions
 for time. `robustness` gives an interval (low, high) over all continuations of the trace; where the trace is
-known or windows are cut both ends are equal. `holds` is the Boolean semantics.
+known or windows are cut both ends are equal. `holds` is the Boolean semantics. `EXTREMA` are minima and
+maxima of every semantics, each from its paper's equation.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from stlc.compile import ir, typed
 from stlc.compile.interface import Grid
@@ -201,14 +202,69 @@ def distances(interval: typed.Interval, grid: Grid, most: int, *, outward: bool)
 # ------------------------------------------------------------------- robustness
 
 
-def _most(values: Sequence[Interval | None], pick: Literal["min", "max"]) -> Interval | None:
-    if any(value is None for value in values):
-        return None
-    known = [value for value in values if value is not None]
-    if not known:
-        return TRUE if pick == "min" else FALSE
-    choose = min if pick == "min" else max
-    return choose(low for low, _ in known), choose(high for _, high in known)
+Extremum: TypeAlias = Callable[[Sequence[float], Literal["min", "max"]], float]
+"""The minimum or the maximum of at least one value."""
+
+
+def exact(values: Sequence[float], pick: Literal["min", "max"]) -> float:
+    """As they are."""
+    return min(values) if pick == "min" else max(values)
+
+
+def _by_minimum(minimum: Callable[[Sequence[float]], float]) -> Extremum:
+    """From the minimum of two or more finite values; the maximum is its mirror.
+
+    Infinite values are neutral or decide, and one value alone stands for itself.
+    """
+
+    def extremum(values: Sequence[float], pick: Literal["min", "max"]) -> float:
+        if pick == "max":
+            return -extremum([-value for value in values], "min")
+        finite = [value for value in values if value < math.inf]
+        if -math.inf in finite:
+            return -math.inf
+        if len(finite) < 2:
+            return finite[0] if finite else math.inf
+        return minimum(finite)
+
+    return extremum
+
+
+def log_sum_exp(k: float) -> Extremum:
+    """The paper's smooth operators, at scale `k`."""
+
+    def minimum(values: Sequence[float]) -> float:
+        least = min(values)
+        return least - math.log(sum(math.exp(-k * (value - least)) for value in values)) / k
+
+    return _by_minimum(minimum)
+
+
+def _arithmetic_geometric(values: Sequence[float]) -> float:
+    """Mehdipour, Vasile and Belta (ACC 2019)."""
+    if min(values) > 0:
+        return math.exp(sum(math.log1p(value) for value in values) / len(values)) - 1
+    return sum(min(value, 0.0) for value in values) / len(values)
+
+
+def generalized_mean(eps: float) -> Extremum:
+    """D-GMSR of order 1: Uzun, Elango, Garoche and Acikmese (2024)."""
+
+    def minimum(values: Sequence[float]) -> float:
+        n = len(values)
+        product = math.prod(max(value, 0.0) ** 2 for value in values)
+        power = sum(min(value, 0.0) ** 2 for value in values) / n
+        return math.sqrt((eps**n + product) ** (1 / n)) - math.sqrt(eps + power)
+
+    return _by_minimum(minimum)
+
+
+EXTREMA: Mapping[str, Extremum] = {
+    "exact": exact,
+    "smooth": log_sum_exp(2.0),
+    "agm": _by_minimum(_arithmetic_geometric),
+    "dgmsr": generalized_mean(0.1),
+}
 
 
 def _negated(value: Interval | None) -> Interval | None:
@@ -218,8 +274,8 @@ def _negated(value: Interval | None) -> Interval | None:
 class Robustness:
     """Robustness of typed formulas on one trace, remembered per node and instant."""
 
-    def __init__(self, trace: Trace) -> None:
-        self.trace = trace
+    def __init__(self, trace: Trace, extremum: Extremum = exact) -> None:
+        self.trace, self.extremum = trace, extremum
         self._known: dict[tuple[int, int, bool], Interval | None] = {}
         self._alive: list[typed.Formula] = []
 
@@ -252,13 +308,23 @@ class Robustness:
                 if t == 0:
                     return None if now is None else FALSE
                 before = self.at(body, t - 1, not positive if op == "rise" else positive)
-                return _most([now, _negated(before)] if op == "rise" else [_negated(now), before], "min")
+                return self._most([now, _negated(before)] if op == "rise" else [_negated(now), before], "min")
             case typed.Freeze():
                 inner = _frozen(node, self.trace, t)
                 if self.trace.end == "strict" and None in inner.held.values():
                     return None
-                return Robustness(inner).at(node.body, t, positive)
+                return Robustness(inner, self.extremum).at(node.body, t, positive)
         raise TypeError(node)
+
+    def _most(self, values: Sequence[Interval | None], pick: Literal["min", "max"]) -> Interval | None:
+        if any(value is None for value in values):
+            return None
+        known = [value for value in values if value is not None]
+        if not known:
+            return TRUE if pick == "min" else FALSE
+        return self.extremum([low for low, _ in known], pick), self.extremum(
+            [high for _, high in known], pick
+        )
 
     def _pred(self, num: ir.Num, strict: bool, guard: bool, t: int) -> Interval | None:
         if not self.trace.has(num, t):
@@ -270,15 +336,17 @@ class Robustness:
 
     def _logic(self, node: typed.Logic, t: int, positive: bool) -> Interval | None:
         if node.op in ("and", "or"):
-            return _most([self.at(i, t, positive) for i in node.items], "min" if node.op == "and" else "max")
+            return self._most(
+                [self.at(i, t, positive) for i in node.items], "min" if node.op == "and" else "max"
+            )
         left, right = node.items
         if node.op == "->":
-            return _most([_negated(self.at(left, t, not positive)), self.at(right, t, positive)], "max")
+            return self._most([_negated(self.at(left, t, not positive)), self.at(right, t, positive)], "max")
         if node.op == "xor":
             return _negated(self.at(typed.Logic(node.span, "<->", node.items), t, not positive))
         there = self.at(typed.Logic(node.span, "->", (left, right)), t, positive)
         back = self.at(typed.Logic(node.span, "->", (right, left)), t, positive)
-        return _most([there, back], "min")
+        return self._most([there, back], "min")
 
     def _window(self, interval: typed.Interval, t: int, outward: bool) -> list[int] | None:
         """Instants of a window of the future; None: it leaves a strict trace; [-1]: nobody knows."""
@@ -307,7 +375,7 @@ class Robustness:
             return None
         if instants == [-1]:
             return UNKNOWN
-        return _most([self.at(node.body, k, positive) for k in instants], "min" if every else "max")
+        return self._most([self.at(node.body, k, positive) for k in instants], "min" if every else "max")
 
     def _until(self, node: typed.Until, t: int, positive: bool) -> Interval | None:
         match node.op:
@@ -331,7 +399,7 @@ class Robustness:
                 met = self.at(
                     typed.Until(node.span, "until", node.interval, node.left, node.right), t, positive
                 )
-                return _most([held, met], "max")
+                return self._most([held, met], "max")
 
     def _met(
         self, left: typed.Formula, right: typed.Formula, when: tuple[int, list[int] | None], positive: bool
@@ -345,8 +413,8 @@ class Robustness:
         values = []
         for k in instants:
             between = [self.at(left, i, positive) for i in range(min(t, k), max(t, k) + 1)]
-            values.append(_most([self.at(right, k, positive), *between], "min"))
-        return _most(values, "max")
+            values.append(self._most([self.at(right, k, positive), self._most(between, "min")], "min"))
+        return self._most(values, "max")
 
     def _shift(self, body: typed.Formula, t: int, positive: bool) -> Interval | None:
         if 0 <= t < self.trace.samples or (t >= 0 and self.trace.end == "open"):

@@ -1,104 +1,303 @@
-"""The proofs of the monitor at any size: random formulas on random traces against the definitions.
+"""The proofs of the compiler and the monitor at any size: random formulas and traces against the definitions.
 
-    python tools/proofs.py values --count 10000
+    python tools/proofs.py --count 100000 --jobs 16 --seed 1 --log proofs.jsonl
+    python tools/proofs.py values online --count 500
 
-Runs a test of `tests/proof/` on cases that nobody has seen (or from `--first` on) and prints, every
-`--every` cases, how many there were, in how many blocks of them one disagreed, the greatest difference of two
-finite values that should be equal, and the seconds of processor time. A mismatch is printed with its case and
-seed. Exit code: 1 if there was one.
+Runs the checks of `tests/proof/` and `tests/laws.py` on cases that nobody has seen, or on those of `--seed`,
+in blocks of 100, `--jobs` of them at the same time. With `--log` each finished block is a line of that file;
+the same command again goes on behind the last one. A mismatch is printed with its case. In the end a table
+says, for each proof, how many cases there were, how many disagreed, the greatest difference of two finite
+values that should be equal, and the seconds of processor time.
+Exit code: 1 if one disagreed.
 """
 
+from __future__ import annotations
+
+import json
+import multiprocessing
 import random
 import sys
 import time
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
+import hypothesis
 import numpy as np
 import torch
 import typer
+from hypothesis import strategies as st
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from proof import test_gradients, test_monitor, test_online
+import laws
+from formula_strategies import formulas, traces
+from mission_strategies import bodies, missions
+from proof import missions as states
+from proof import monitored, slopes, streamed
 from proof.cases import Case
 
 BLOCK = 100
-"""Cases after the first mismatch of a block are not looked at."""
+"""Cases that one process runs before it tells what came out."""
+
+MOST = 10
+"""Mismatches of one proof that are printed in full."""
 
 
-def _rtamt(numbers: range) -> None:
+@dataclass(frozen=True)
+class Block:
+    """Some cases of one proof: `count` from the number `first` on."""
+
+    proof: str
+    first: int
+    count: int
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came out of a block.
+
+    Attributes:
+        block: the cases.
+        cases: how many of them were judged; some drawn formulas are refused.
+        mismatches: what was found, with the case.
+        worst: the greatest difference of two finite values that should be equal.
+        seconds: of processor time.
+    """
+
+    block: Block
+    cases: int
+    mismatches: list[str] = field(default_factory=list)
+    worst: float = 0.0
+    seconds: float = 0.0
+
+
+# ---------------------------------------------------------------------- the proofs
+
+Check = Callable[[int], Any]
+"""Judges the case of a number: raises where it disagrees, False where there was nothing to judge."""
+
+
+def one_by_one(check: Check, block: Block) -> tuple[int, list[str]]:
+    """Cases drawn from their numbers."""
+    cases, mismatches = 0, []
+    for number in range(block.first, block.first + block.count):
+        try:
+            cases += check(number) is not False
+        except Exception as error:
+            cases += 1
+            mismatches.append(f"{block.proof} {number}: {type(error).__name__}: {error}")
+    return cases, mismatches
+
+
+def by_hypothesis(
+    check: Callable[..., None], given: Mapping[str, Any], block: Block
+) -> tuple[int, list[str]]:
+    """Cases drawn by hypothesis, the whole block from its first number; a mismatch is shrunk."""
+    cases = 0
+
+    def judged(**values: Any) -> None:
+        nonlocal cases
+        check(**values)
+        cases += 1
+
+    run = hypothesis.seed(block.first)(
+        hypothesis.settings(
+            max_examples=block.count,
+            deadline=None,
+            database=None,
+            phases=[hypothesis.Phase.generate, hypothesis.Phase.shrink],
+            suppress_health_check=list(hypothesis.HealthCheck),
+            print_blob=False,
+        )(hypothesis.given(**given)(judged))
+    )
+    try:
+        run()
+    except Exception as error:
+        notes = "\n".join(getattr(error, "__notes__", ()))
+        return block.count, [f"{block.proof} {block.first}: {type(error).__name__}: {error}\n{notes}"]
+    return min(cases, block.count), []
+
+
+def _law(data: st.DataObject, env: dict[str, Any], flip: bool, name: str) -> None:
+    laws.check_law(laws.LAWS[name], data.draw, env, flip=flip)
+
+
+def _moved(data: st.DataObject, env: dict[str, Any]) -> None:
+    laws.check_moved(data.draw, env)
+    laws.check_clock(data.draw, env)
+
+
+def _rtamt(number: int) -> None:
     from proof.test_rtamt import test_rtamt_says_the_same
 
-    test_rtamt_says_the_same(numbers)
+    test_rtamt_says_the_same(range(number, number + 1))
 
 
-def _slopes(name: str) -> Callable[[range], None]:
-    return lambda numbers: test_gradients.check_gradients(numbers, name)
-
-
-PROOFS: dict[str, Callable[[range], None]] = {
-    "values": test_monitor.test_every_value_is_the_definition,
-    "other": test_monitor.test_the_other_evaluator_says_the_same,
-    "truth": test_monitor.test_truth_is_boolean_and_agrees_with_the_sign,
-    "clock": test_monitor.test_the_mission_clock,
-    "windows": test_monitor.test_planning_windows,
-    "online": test_online.test_samples_one_by_one,
-    "promises": test_online.test_what_was_said_stays_true,
-    "rtamt": _rtamt,
-    **{f"gradients-{name}": _slopes(name) for name in ("exact", "smooth", "agm", "dgmsr")},
+_SHORT = traces(high=9, batch=1)
+_SEEDS = st.integers(0, 2**32 - 1)
+_LAW = {
+    "data": st.data(),
+    "env": _SHORT,
+    "flip": st.booleans(),
+    "name": st.sampled_from(sorted(laws.LAWS)),
 }
+_WHOLE = {"formula": formulas() | formulas(held=()), "env": _SHORT}
+
+PROOFS: dict[str, Callable[[Block], tuple[int, list[str]]]] = {
+    "values": partial(one_by_one, monitored.check_values),
+    "other": partial(one_by_one, monitored.check_other),
+    "truth": partial(one_by_one, monitored.check_truth),
+    "clock": partial(one_by_one, monitored.check_clock),
+    "windows": partial(one_by_one, monitored.check_windows),
+    "online": partial(one_by_one, streamed.check_online),
+    "promises": partial(one_by_one, streamed.check_promise),
+    "missions": partial(by_hypothesis, states.check_mission, {"formula": missions, "seed": _SEEDS}),
+    "past": partial(by_hypothesis, states.check_past, {"formula": bodies, "seed": _SEEDS}),
+    "recorded": partial(by_hypothesis, states.check_recorded, {"formula": missions, "seed": _SEEDS}),
+    "laws": partial(by_hypothesis, _law, _LAW),
+    "moved": partial(by_hypothesis, _moved, {"data": st.data(), "env": _SHORT}),
+    "compiled": partial(by_hypothesis, laws.check_compiled, _WHOLE),
+    **{
+        f"gradients-{name}": partial(one_by_one, partial(slopes.check_gradient, name=name))
+        for name in ("exact", "smooth", "agm", "dgmsr")
+    },
+    "rtamt": partial(one_by_one, _rtamt),
+}
+EXTRA = frozenset({"rtamt"})
+"""What is only run when it is named: it needs another package."""
 
 
-class Differences:
-    """Notes how far values are apart that the proofs compare, while it is entered."""
+def run(block: Block) -> Outcome:
+    """Judge the cases of a block."""
+    began, apart = time.process_time(), 0.0
+    same = Case.same
 
-    def __init__(self) -> None:
-        self.worst = 0.0
+    def noted(case: Case, found: Any, wanted: Any, about: str) -> None:
+        nonlocal apart
+        with np.errstate(invalid="ignore"):
+            gaps = np.abs(np.asarray(found, float) - np.asarray(wanted, float))
+        apart = max(apart, float(np.max(gaps, where=np.isfinite(gaps), initial=0.0)))
+        same(case, found, wanted, about)
 
-    def __enter__(self) -> Self:
-        same = self._same = Case.same
+    Case.same = noted  # type: ignore[method-assign]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", hypothesis.errors.HypothesisWarning)
+            cases, mismatches = PROOFS[block.proof](block)
+    finally:
+        Case.same = same  # type: ignore[method-assign]
+    return Outcome(block, cases, mismatches, apart, time.process_time() - began)
 
-        def noted(case: Case, found: Any, wanted: Any, about: str) -> None:
-            with np.errstate(invalid="ignore"):
-                apart = np.abs(np.asarray(found, float) - np.asarray(wanted, float))
-            self.worst = max(self.worst, float(np.max(apart, where=np.isfinite(apart), initial=0.0)))
-            same(case, found, wanted, about)
 
-        Case.same = noted  # type: ignore[method-assign]
-        return self
+# ------------------------------------------------------------------------ the run
 
-    def __exit__(self, *_: object) -> None:
-        Case.same = self._same  # type: ignore[method-assign]
+
+def blocks_of(names: list[str], count: int, seed: int) -> list[Block]:
+    """All of them, those of the proofs by turns: what is wrong anywhere shows early."""
+    firsts = range(seed, seed + count, BLOCK)
+    return [Block(name, first, min(BLOCK, seed + count - first)) for first in firsts for name in names]
+
+
+def finished(log: Path | None) -> list[Outcome]:
+    """The blocks of a log; a line that was being written when all ended does not count."""
+    found = []
+    for line in log.read_text(encoding="utf-8").splitlines() if log is not None and log.exists() else ():
+        try:
+            entry = json.loads(line)
+            found.append(Outcome(**{**entry, "block": Block(**entry["block"])}))
+        except (ValueError, TypeError, KeyError):
+            continue
+    return found
+
+
+def outcomes(blocks: list[Block], jobs: int) -> Iterator[Outcome]:
+    """What comes out of each block, in the order in which they end."""
+    torch.set_num_threads(1)
+    if jobs == 1:
+        yield from map(run, blocks)
+        return
+    with multiprocessing.get_context("spawn").Pool(jobs, torch.set_num_threads, (1,)) as pool:
+        yield from pool.imap_unordered(run, blocks)
+
+
+class Tally:
+    """Counts of every proof, and the mismatches as they come."""
+
+    def __init__(self, names: list[str], every: int) -> None:
+        self.totals = {name: Outcome(Block(name, 0, 0), 0) for name in names}
+        self._every, self._told = every, 0
+
+    def add(self, new: Outcome) -> None:
+        """One more block, printed where there are mismatches and now and then."""
+        name = new.block.proof
+        old = self.totals[name]
+        for text in new.mismatches[: max(MOST - len(old.mismatches), 0)]:
+            print(f"MISMATCH {text}", flush=True)
+        self.totals[name] = Outcome(
+            old.block,
+            old.cases + new.cases,
+            old.mismatches + new.mismatches,
+            max(old.worst, new.worst),
+            old.seconds + new.seconds,
+        )
+        done = sum(total.cases for total in self.totals.values())
+        if done // self._every > self._told:
+            self._told = done // self._every
+            print(f"{done:9,} cases  {self.wrong} mismatches", flush=True)
+
+    @property
+    def wrong(self) -> int:
+        """Mismatches so far."""
+        return sum(len(total.mismatches) for total in self.totals.values())
+
+    def table(self) -> None:
+        """A line a proof, and their sum."""
+        print(f"{'proof':18}{'cases':>10}{'mismatches':>12}{'difference':>12}{'seconds':>9}")
+        for name, total in self.totals.items():
+            wrong = len(total.mismatches)
+            print(f"{name:18}{total.cases:10,}{wrong:12}{total.worst:12.1e}{total.seconds:9.0f}")
+        cases = sum(total.cases for total in self.totals.values())
+        seconds = sum(total.seconds for total in self.totals.values())
+        print(f"{'all':18}{cases:10,}{self.wrong:12}{'':12}{seconds:9.0f}", flush=True)
 
 
 def main(
-    name: Annotated[str, typer.Argument(help=f"One of {', '.join(PROOFS)}.")],
-    count: int = 10_000,
-    first: int | None = None,
-    every: int = 500,
+    names: Annotated[list[str] | None, typer.Argument(help=f"Of {', '.join(PROOFS)}; all but rtamt.")] = None,
+    count: Annotated[int, typer.Option(min=1, help="Cases of each proof.")] = 10_000,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Number of the first case; drawn if not given.")
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    log: Annotated[Path | None, typer.Option(help="File of finished blocks, to go on from.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Cases between two lines of counts.")] = 5_000,
 ) -> None:
-    """Run one proof and print what came out."""
-    if name not in PROOFS:
-        raise typer.BadParameter(f"the proofs are {', '.join(PROOFS)}")
-    torch.set_num_threads(1)
-    begin = random.SystemRandom().randrange(1 << 40) if first is None else first
-    began, bad = time.process_time(), 0
-    print(f"{name}: cases from {begin} on")
-    with Differences() as differences:
-        for low in range(begin, begin + count, BLOCK):
-            numbers = range(low, min(low + BLOCK, begin + count))
-            try:
-                PROOFS[name](numbers)
-            except Exception as error:
-                bad += 1
-                print(f"MISMATCH among {numbers}: {type(error).__name__}: {error}")
-            done, seconds = numbers.stop - begin, time.process_time() - began
-            if done % every == 0 or done == count:
-                told = f"{done:6} cases  {bad} blocks with a mismatch"
-                print(f"{told}  greatest difference {differences.worst:.1e}  {seconds:.0f} s", flush=True)
-    raise typer.Exit(code=1 if bad else 0)
+    """Run proofs and print what came out."""
+    chosen = list(names) if names else [name for name in PROOFS if name not in EXTRA]
+    if unknown := set(chosen) - PROOFS.keys():
+        raise typer.BadParameter(f"{', '.join(sorted(unknown))}: the proofs are {', '.join(PROOFS)}")
+    before = [outcome for outcome in finished(log) if outcome.block.proof in chosen]
+    if seed is None:
+        starts = [outcome.block.first for outcome in before]
+        seed = min(starts) if starts else random.SystemRandom().randrange(1 << 40)
+    print(f"{', '.join(chosen)}: {count:,} cases each from {seed} on", flush=True)
+    wanted = blocks_of(chosen, count, seed)
+    known = {outcome.block: outcome for outcome in before}
+    tally = Tally(chosen, every)
+    for block in wanted:
+        if block in known:
+            tally.add(known[block])
+    for outcome in outcomes([block for block in wanted if block not in known], jobs):
+        if log is not None:
+            with log.open("a", encoding="utf-8") as file:
+                file.write("\n" + json.dumps(asdict(outcome)) + "\n")
+        tally.add(outcome)
+    tally.table()
+    raise typer.Exit(code=1 if tally.wrong else 0)
 
 
 if __name__ == "__main__":

@@ -218,9 +218,8 @@ def _scheduled(formula: ir.Formula, run: Run, extent: Extent) -> Schedule:
 class Weighed(Protocol):
     """What the graph asks of a requirement; `stlc.compile.pipeline.Rule` has it."""
 
-    @property
-    def formula(self) -> ir.Formula:
-        """In steps."""
+    def under(self, semantics: Semantics) -> ir.Formula:
+        """In steps, with what laws of the semantics allow left out."""
 
     @property
     def weight(self) -> float:
@@ -252,7 +251,7 @@ class RobustnessGraph:
         self.rules = tuple(rules)
         self.signature = signature
         self.semantics = semantics_of(semantics)
-        self._formulas = tuple(rule.formula for rule in self.rules)
+        self._formulas: dict[tuple[bool, bool], list[ir.Formula]] = {}
 
     def robustness(self, x: Array, smoothing: float | None = None) -> Array:
         """Of the whole: min over requirements of `weight * rho / scale`, `(batch,)`."""
@@ -290,7 +289,10 @@ class RobustnessGraph:
         return ops.cat(rows).T
 
     def _rows(self, env: Mapping[str, Array], ops: Ops, semantics: Semantics) -> list[Array]:
-        return evaluate(self._formulas, env, ops=ops, semantics=semantics)
+        laws = semantics.associative, semantics.idempotent
+        if laws not in self._formulas:
+            self._formulas[laws] = [rule.under(semantics) for rule in self.rules]
+        return evaluate(self._formulas[laws], env, ops=ops, semantics=semantics)
 
     def _columns(self, x: Array) -> tuple[dict[str, Array], Ops]:
         if x.shape[-1] != len(self.signature):

@@ -13,7 +13,7 @@ from stlc.compile import ir
 from stlc.compile.ops import Array
 from stlc.compile.schedule import Extent, Run, Step
 from stlc.compile.semantics import Pick
-from stlc.compile.windows import Windows, dual, neutral
+from stlc.compile.windows import Windows, neutral
 
 Kernel: TypeAlias = Callable[[Sequence[Array], Array], Array]
 """The values of the parts that exist, and any column for shape, dtype and device -> `(count, batch)`."""
@@ -138,21 +138,11 @@ class Machine:
 
     def _windows(self, window: ir.Window, operands: int, pick: Pick, rows: int) -> Kernel:
         """One operand: its extrema. Two: `until` from `window.lo` on, and the left one holds up to there."""
-        extrema, until = self.windows.extrema, self.windows.until
-        pair, ops, lo = self.windows.semantics.pair, self.windows.ops, window.lo
+        extrema, until, lo = self.windows.extrema, self.windows.until, window.lo
         most = _ENDLESS if window.hi is None else window.hi - lo + 1
         if operands == 1:
             return lambda parts, _: extrema(parts[0], pick, count=rows, width=most)
-        if not lo:
-            return lambda parts, _: until(parts[0], parts[1], pick, count=rows, width=most)
-
-        def kernel(parts: Sequence[Array], _: Array) -> Array:
-            left, right = parts
-            reached = until(left[lo:], right, pick, count=rows, width=most)
-            held = extrema(left, dual(pick), count=rows, width=lo)
-            return pair(held, reached, dual(pick), ops)
-
-        return kernel
+        return lambda parts, _: until(parts[0], parts[1], pick, count=rows, width=most, lo=lo)
 
     def _shift(self, node: ir.Shift, run: Run, operands: int) -> Kernel:
         if node.outside is not None:

@@ -31,6 +31,7 @@ from stlc.compile.ranges import Facts
 from stlc.compile.resolve import resolve
 from stlc.compile.safety import safe_part
 from stlc.compile.scales import nominal
+from stlc.compile.semantics import Semantics
 from stlc.compile.simplify import simplify
 from stlc.compile.timers import Ledger, Timer
 from stlc.compile.walk import absolute, mentions_horizon
@@ -59,6 +60,7 @@ class Rule:
         weight: factor of its robustness in the whole.
         scale: divisor of its robustness in the whole.
         formula: in negation normal form and steps.
+        lowered: the same before laws were applied that may hold for exact minima and maxima only.
         reach: how many steps of the future it needs.
         windowed: it mentions `T`, and so speaks about every planning window.
         uses_end: a window of it runs to the end of the trace.
@@ -74,6 +76,7 @@ class Rule:
     weight: float
     scale: float
     formula: ir.Formula
+    lowered: ir.Formula = field(repr=False)
     reach: int
     windowed: bool
     uses_end: bool
@@ -81,6 +84,10 @@ class Rule:
     alive: ir.Formula
     span: Span = field(compare=False, repr=False)
     typed: typed.Requirement = field(compare=False, repr=False)
+
+    def under(self, semantics: Semantics) -> ir.Formula:
+        """The formula with the robustness of `semantics`: shortened by the laws that hold there."""
+        return self.formula if semantics.exact else simplify(self.lowered, semantics)
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +204,8 @@ class _Stage:
         rewritten = self._rewritten(requirement)
         if rewritten.goal is not None:
             self.goals.append(rewritten.goal)
-        formula = self._lowered(rewritten.formula)
+        lowered = lower(rewritten.formula, self.grid, self.sink)
+        formula = simplify(lowered)
         return Rule(
             name=requirement.name,
             doc=requirement.doc,
@@ -205,6 +213,7 @@ class _Stage:
             weight=requirement.weight,
             scale=requirement.scale,
             formula=formula,
+            lowered=lowered,
             reach=reach(formula).future,
             windowed=mentions_horizon(written),
             uses_end=uses_end(formula),

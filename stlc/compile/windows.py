@@ -104,35 +104,40 @@ class Windows:
             tuple(part[:rows] for part in a), tuple(part[shift : shift + rows] for part in b), pick, self.ops
         )
 
-    def until(self, left: Array, right: Array, pick: Pick, *, count: int, width: int) -> Array:
+    def until(self, left: Array, right: Array, pick: Pick, *, count: int, width: int, lo: int = 0) -> Array:
         """`until` for `pick` "max", its dual `release` for "min".
 
         Row `j` is the extremum over rows `t` of window `j` of the dual extremum of `right[t]` and of
-        `left[j..t]`.
+        `left[j..lo + t]`.
 
         Args:
             left: what must hold up to and including `t`; `(time, batch)`.
-            right: what must hold at `t`; as long as `left`.
+            right: what must hold at `t`, from `lo` rows later on.
             pick: "max" or "min".
             count: number of windows.
             width: rows of a window.
+            lo: rows of `left` before the window.
 
         Returns:
             `(count, batch)`
         """
-        rows = left.shape[0]
+        rows = right.shape[0]
         width = min(width, max(rows, 1))
+        if not self.semantics.exact:
+            return self._until_by_definition(left, right, pick, (count, width, lo))
+        if lo:
+            reached = self.until(left[lo:], right, pick, count=count, width=width)
+            held = self.extrema(left, dual(pick), count=count, width=lo)
+            return self.semantics.pair(held, reached, dual(pick), self.ops)
         if tiles := self._tiles(left, count, width):
             out = self.ops.empty((count, *left.shape[1:]), left)
             for asked, seen in tiles:
                 many = asked.stop - asked.start
                 out[asked] = self.until(left[seen], right[seen], pick, count=many, width=width)
             return out
-        if not self.semantics.associative:
-            return self._until_by_offset(left, right, pick, count, width)
         if count == 1 and rows:
             return self._until_once(left[:width], right[:width], pick)
-        if self.semantics.exact and rows:
+        if rows:
             found = self.ops.until(left, right, pick, Sliding(rows, min(count, rows), width))
             if found is not None:
                 return self.padded(found, count, neutral(pick))
@@ -144,24 +149,46 @@ class Windows:
 
     def _until_once(self, left: Array, right: Array, pick: Pick) -> Array:
         pair, other = self.semantics.pair, dual(pick)
-        if not self.semantics.idempotent:
-            return self._until_doubling(left, pair(left, right, other, self.ops), pick, left.shape[0])
         held = (self.ops.cummin if pick == "max" else self.ops.cummax)(left)
         return self.semantics.reduce(pair(held, right, other, self.ops), pick, self.ops)
 
-    def _until_by_offset(self, left: Array, right: Array, pick: Pick, count: int, width: int) -> Array:
-        """By the definition, one distance of `t` after the other: `width` operations on `count` rows."""
+    def _until_by_definition(
+        self, left: Array, right: Array, pick: Pick, sizes: tuple[int, int, int]
+    ) -> Array:
+        """One distance of `t` after the other: `lo + width` operations on `count` rows.
+
+        Minima do not distribute over maxima unless both are exact, so there is no shorter way for many rows.
+        """
         semantics, ops, other = self.semantics, self.ops, dual(pick)
-        left = self.padded(left, count + width - 1, neutral(other))
+        count, width, lo = sizes
+        left = self.padded(left, count + lo + width - 1, neutral(other))
         right = self.padded(right, count + width - 1, neutral(pick))
-        held = semantics.lift(left[:count], other, ops)
-        found = semantics.lift(semantics.pair(left[:count], right[:count], other, ops), pick, ops)
-        for ahead in range(1, width):
-            rows = slice(ahead, ahead + count)
-            held = semantics.merge(held, semantics.lift(left[rows], other, ops), other, ops)
-            met = semantics.pair(semantics.finish(held, other, ops), right[rows], other, ops)
-            found = semantics.merge(found, semantics.lift(met, pick, ops), pick, ops)
+        if count == 1 and semantics.associative:
+            held_so_far = self._from_first(left, other)[lo:]
+            return semantics.reduce(semantics.pair(held_so_far, right, other, ops), pick, ops)
+        held, found = semantics.lift(left[:count], other, ops), None
+        for ahead in range(lo + width):
+            if ahead:
+                held = semantics.merge(
+                    held, semantics.lift(left[ahead : ahead + count], other, ops), other, ops
+                )
+            if ahead < lo:
+                continue
+            here = right[ahead - lo : ahead - lo + count]
+            met = semantics.lift(
+                semantics.pair(semantics.finish(held, other, ops), here, other, ops), pick, ops
+            )
+            found = met if found is None else semantics.merge(found, met, pick, ops)
+        assert found is not None
         return semantics.finish(found, pick, ops)
+
+    def _from_first(self, x: Array, pick: Pick) -> Array:
+        """The extremum of all rows up to each one, in about log2(rows) operations."""
+        size = 1
+        while size < x.shape[0]:
+            later = self.semantics.pair(x[size:], x[:-size], pick, self.ops)
+            x, size = self.ops.cat([x[:size], later]), 2 * size
+        return x
 
     def _until_to_end(self, left: Array, right: Array, pick: Pick, count: int) -> Array:
         """The recursion `u(t) = min(left(t), max(right(t), u(t + 1)))`, from behind."""

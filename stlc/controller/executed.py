@@ -82,8 +82,9 @@ def as_driven(rule: Rule, task: Task) -> Rule:
     """A requirement on the mission clock is judged as it was written, once, on all that was driven."""
     if not rule.absolute:
         return rule
-    written = simplify(lower(recorded(rule.typed.formula), task.compiled.grid, []))
-    return replace(rule, formula=written, reach=reach(written).future, windowed=False)
+    lowered = lower(recorded(rule.typed.formula), task.compiled.grid, [])
+    written = simplify(lowered)
+    return replace(rule, formula=written, lowered=lowered, reach=reach(written).future, windowed=False)
 
 
 def _held(rule: Rule, columns: Mapping[str, NDArray[Any]], horizon: int) -> Mask:

@@ -31,7 +31,7 @@ def sparing(task: Task, margin: Spare) -> Task:
 
 
 def _tightened(rule: Rule, margin: float) -> Rule:
-    return replace(rule, formula=tighter(rule.formula, margin))
+    return replace(rule, formula=tighter(rule.formula, margin), lowered=tighter(rule.lowered, margin))
 
 
 def tighter(formula: ir.Formula, margin: float) -> ir.Formula:

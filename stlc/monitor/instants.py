@@ -55,8 +55,8 @@ def rule_bounds(
     """Both ends of the values at the judged instants, each `(count, batch)`; one array where all is known."""
     window = window_of(rule, horizon)
     if window is None:
-        return bounds(rule.formula, record, starts, ends)
-    return window_bounds(rule.formula, record, starts, window, ends)
+        return bounds(rule.under(record.semantics), record, starts, ends)
+    return window_bounds(rule.under(record.semantics), record, starts, window, ends)
 
 
 def rule_signal(rule: Rule, record: Record, horizon: int | None, end: End) -> Array:
@@ -68,9 +68,8 @@ def rule_signal(rule: Rule, record: Record, horizon: int | None, end: End) -> Ar
         (value,) = rules_at([rule], record, 0, horizon, end)
         return record.ops.cat([value] * record.samples)
     if window_of(rule, horizon) is None:
-        return robustness_signal(
-            rule.formula, record.env, ops=record.ops, semantics=record.semantics, end=end
-        )
+        formula = rule.under(record.semantics)
+        return robustness_signal(formula, record.env, ops=record.ops, semantics=record.semantics, end=end)
     return _window_signal(rule, record, horizon or 0, end)
 
 
@@ -81,7 +80,7 @@ def _window_signal(rule: Rule, record: Record, window: int, end: End) -> Array:
     ends: Ends = "truncate" if end == "truncate" else "open"
     parts = []
     if starts:
-        low, high = window_bounds(rule.formula, record, starts, window, ends)
+        low, high = window_bounds(rule.under(record.semantics), record, starts, window, ends)
         parts.append(high if end == "upper" else low)
     if len(starts) < record.samples:
         like = next(iter(record.env.values()))
@@ -92,16 +91,17 @@ def _window_signal(rule: Rule, record: Record, window: int, end: End) -> Array:
 def rules_at(rules: Sequence[Rule], record: Record, at: int, horizon: int | None, end: End) -> list[Array]:
     """Values at one sample, `(1, batch)` each; NaN where `end` "strict" leaves one undefined."""
     starts_of_all = [starts_of(rule, record.samples, horizon, 0 if rule.absolute else at) for rule in rules]
+    formulas = [rule.under(record.semantics) for rule in rules]
     together = [
-        rule.formula
-        for rule, starts in zip(rules, starts_of_all, strict=True)
+        formula
+        for rule, formula, starts in zip(rules, formulas, starts_of_all, strict=True)
         if starts.start == at and window_of(rule, horizon) is None and _has_value(rule, record, at, end)
     ]
     here = range(at, at + 1)
     values = dict(zip(together, record.values(together, here, end), strict=True)) if together else {}
     return [
-        values[rule.formula] if rule.formula in values else _alone(rule, record, starts.start, horizon, end)
-        for rule, starts in zip(rules, starts_of_all, strict=True)
+        values[formula] if formula in values else _alone(rule, record, starts.start, horizon, end)
+        for rule, formula, starts in zip(rules, formulas, starts_of_all, strict=True)
     ]
 
 
@@ -118,7 +118,8 @@ def _alone(rule: Rule, record: Record, at: int, horizon: int | None, end: End) -
         like = next(iter(record.env.values()))
         return record.ops.full((1, like.shape[1]), math.nan, like)
     going_on = not whole and end in ("lower", "upper")
-    return inner.values([rule.formula], range(at, at + 1), end, stop if going_on else None)[0]
+    formula = rule.under(record.semantics)
+    return inner.values([formula], range(at, at + 1), end, stop if going_on else None)[0]
 
 
 def check_length(rule: Rule, samples: int, starts: range, grid: Grid) -> Diagnostic | None:

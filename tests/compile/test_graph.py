@@ -18,7 +18,7 @@ from stlc.compile.lower import lower
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.ops_torch import TORCH
 from stlc.compile.schedule import Extent, Run
-from stlc.compile.semantics import Exact, LogSumExp
+from stlc.compile.semantics import Exact, LogSumExp, Semantics
 from stlc.compile.simplify import simplify
 from stlc.signature import Column, Signature
 
@@ -310,6 +310,9 @@ class Requirement(NamedTuple):
     formula: ir.Formula
     weight: float = 1.0
     scale: float = 1.0
+
+    def under(self, _: Semantics) -> ir.Formula:
+        return self.formula
 
 
 SIGNATURE = Signature(tuple(Column(name) for name in NAMES))

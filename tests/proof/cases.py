@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import random
 from typing import Any
 
 import numpy as np
-import pytest
 from proof.draw import DT, HORIZON, Drawing, Taste, rows, trace
 from proof.language import Constant, Formula, nodes
 from proof.levels import End, Record, ahead
@@ -17,14 +15,6 @@ from stlc.grammar.parser import parse
 from stlc.grammar.printer import show
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
-
-FULL = 10_000
-BLOCK = 500
-FAST = 100
-"""Cases of the ordinary suite, of each kind."""
-
-FIRST = random.SystemRandom().randrange(1 << 40) if os.environ.get("STLC_EXPLORE") else 0
-"""The first seed: always the same, or drawn freshly where hypothesis explores too."""
 
 
 class Case:
@@ -68,13 +58,3 @@ class Case:
     def same(self, found: Any, wanted: Any, about: str) -> None:
         """Equal within 1e-9, infinities and NaN included."""
         np.testing.assert_allclose(found, wanted, atol=1e-9, rtol=0, err_msg=f"{about}\n{self}")
-
-
-def seeds(count: int, fast: int = FAST) -> list[Any]:
-    """The first ones in the ordinary suite, blocks of all of them behind the marker `slow`."""
-    last = FIRST + count
-    slow = [range(low, min(low + BLOCK, last)) for low in range(FIRST, last, BLOCK)]
-    return [
-        pytest.param(range(FIRST, FIRST + fast), id="some"),
-        *(pytest.param(part, id=f"{part.start}", marks=pytest.mark.slow) for part in slow),
-    ]

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from proof.cases import Case, seeds
+from proof.amounts import seeds
+from proof.cases import Case
 from proof.levels import robustness, truth
 
 from stlc.cli.app import main

@@ -1,93 +1,25 @@
-"""Gradients of robustness against central differences, away from ties, for every semantics.
-
-The robustness of a random formula is, almost everywhere, one predicate at one sample, so its gradient is the
-slope of that predicate. Where a predicate has a kink within a step, or two of them meet, the slopes to both
-sides differ: such points are left out, and there must be few of them. The other semantics blend all of them.
-"""
+"""Gradients of robustness against central differences, for every semantics; `tools/proofs.py` runs many."""
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
 import pytest
-import torch
-from proof.cases import FULL, Case, seeds
-from proof.draw import Taste
-
-from stlc.compile.semantics import LogSumExp, Semantics, semantics_of
-
-STEP = 1e-6
-SMOOTH = Taste(smooth=True, constants=False, off_grid=False, depth=3)
-SMOOTHED = {"smooth": LogSumExp(5.0), "agm": semantics_of("agm"), "dgmsr": semantics_of("dgmsr")}
-MOVED = ("x", "y", "z", "q")
-
-
-def moved(case: Case, name: str, place: tuple[int, ...], by: float) -> dict[str, Any]:
-    changed = case.signals[name].copy()
-    changed[place] += by
-    return {**case.signals, name: changed}
+from proof.amounts import FULL, seeds
+from proof.slopes import SMOOTHED, check_gradient
 
 
 @pytest.mark.parametrize("numbers", seeds(FULL, 60))
 def test_the_gradient_is_the_central_difference(numbers: range) -> None:
-    check_gradients(numbers, "exact")
+    few_are_left_out(numbers, "exact")
 
 
 @pytest.mark.parametrize("name", SMOOTHED)
 @pytest.mark.parametrize("numbers", seeds(FULL // 10, 12))
 def test_the_gradient_of_the_other_semantics(numbers: range, name: str) -> None:
-    check_gradients(numbers, name)
+    few_are_left_out(numbers, name)
 
 
-def check_gradients(numbers: range, name: str) -> None:
-    ties = compared = 0
-    for seed in numbers:
-        case = Case(seed, SMOOTH, longest=9, generic=True)
-        found, left_out = compare(case, SMOOTHED.get(name, semantics_of("exact")))
-        compared, ties = compared + found, ties + left_out
+def few_are_left_out(numbers: range, name: str) -> None:
+    counts = [check_gradient(seed, name) for seed in numbers]
+    compared, ties = (sum(part) for part in zip(*counts, strict=True))
     assert compared > 2 * len(numbers)
     assert ties < 0.02 * compared
-
-
-def compare(case: Case, semantics: Semantics) -> tuple[int, int]:
-    """How many slopes were compared, and how many of them left out."""
-    monitor, at = case.monitor(), case.seed % case.samples
-
-    def robustness(signals: dict[str, Any]) -> Any:
-        return monitor.robustness(signals, end="truncate", at=at, semantics=semantics)
-
-    tensors = {
-        name: torch.tensor(values, requires_grad=name in MOVED) for name, values in case.signals.items()
-    }
-    value, now = robustness(tensors), robustness(case.signals)
-    case.same(value.item(), now, "torch and NumPy")
-    if not np.isfinite(now):
-        return 0, 0
-    gradients = gradients_of(value, tensors)
-    moves, ties = places(gradients, case.seed), 0
-    for name, place in moves:
-        sides = [robustness(moved(case, name, place, by)) - now for by in (STEP, -STEP)]
-        if abs(sides[0] + sides[1]) > 0.01 * STEP:
-            ties += 1
-            continue
-        slope, found = (sides[0] - sides[1]) / (2 * STEP), gradients[name][place]
-        assert found == pytest.approx(slope, abs=2e-4), f"d/d{name}{place} at {at}\n{case}"
-    return len(moves), ties
-
-
-def gradients_of(value: torch.Tensor, tensors: dict[str, torch.Tensor]) -> dict[str, Any]:
-    value.backward()
-    return {
-        name: np.zeros(tensors[name].shape) if tensors[name].grad is None else tensors[name].grad.numpy()
-        for name in MOVED
-    }
-
-
-def places(gradients: dict[str, Any], seed: int) -> list[tuple[str, tuple[int, ...]]]:
-    """Numbers to move: all that have a gradient, and one of every signal."""
-    source = np.random.default_rng(seed)
-    chosen = [(name, tuple(map(int, place))) for name in MOVED for place in np.argwhere(gradients[name])]
-    return chosen + [
-        (name, tuple(int(source.integers(size)) for size in gradients[name].shape)) for name in MOVED
-    ]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from proof.cases import Case, seeds
+from proof.amounts import seeds
+from proof.cases import Case
 from proof.draw import Taste
 from proof.peer import values
 

@@ -1,0 +1,27 @@
+"""How many cases the tests of this folder look at."""
+
+from __future__ import annotations
+
+import os
+import random
+from typing import Any
+
+import pytest
+
+FULL = 10_000
+BLOCK = 500
+FAST = 100
+"""Cases of the ordinary suite, of each kind."""
+
+FIRST = random.SystemRandom().randrange(1 << 40) if os.environ.get("STLC_EXPLORE") else 0
+"""The first seed: always the same, or drawn freshly where hypothesis explores too."""
+
+
+def seeds(count: int, fast: int = FAST) -> list[Any]:
+    """The first ones in the ordinary suite, blocks of all of them behind the marker `slow`."""
+    last = FIRST + count
+    slow = [range(low, min(low + BLOCK, last)) for low in range(FIRST, last, BLOCK)]
+    return [
+        pytest.param(range(FIRST, FIRST + fast), id="some"),
+        *(pytest.param(part, id=f"{part.start}", marks=pytest.mark.slow) for part in slow),
+    ]

@@ -1,0 +1,92 @@
+"""Checks that time compiled into state says the same as the formula that was written, on executed traces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+from formula_strategies import SPAN
+from hypothesis import assume
+from laws import OnTheClock
+from mission_strategies import GRID, SAMPLES, augmented, requirement, walks
+from reference import Interval, Trace
+
+from stlc.compile import typed
+from stlc.compile.augment import augment
+from stlc.compile.graph import evaluate
+from stlc.compile.lift import recorded
+from stlc.compile.lower import lower
+from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.semantics import TOLERANCE
+from stlc.compile.simplify import simplify
+from stlc.compile.timers import Ledger
+from stlc.compile.walk import absolute
+from stlc.diagnostics import Diagnostic
+
+BATCH = 4
+HORIZON = GRID.horizon or 0
+
+
+def _defined(formula: typed.Formula, columns: Mapping[str, np.ndarray], t: int = 0) -> list[bool]:
+    """Verdicts from the definitions, one a trace."""
+    return [low >= -TOLERANCE for low, _ in _bounds(formula, columns, "truncate", t)]
+
+
+def _bounds(
+    formula: typed.Formula, columns: Mapping[str, np.ndarray], end: Literal["truncate", "open"], t: int = 0
+) -> list[Interval]:
+    """Robustness from the definitions, one a trace."""
+    found = []
+    for row in range(next(iter(columns.values())).shape[1]):
+        trace = Trace({name: column[:, row] for name, column in columns.items()}, GRID, end)
+        value = OnTheClock(trace).at(formula, t)
+        assert value is not None
+        found.append(value)
+    return found
+
+
+def _planned(formula: typed.Formula, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Whether the rewritten formula holds in every planning window, (starts, batch)."""
+    sink: list[Diagnostic] = []
+    ledger = Ledger(frozenset(columns))
+    found = augment(requirement(formula), GRID, ledger, sink)
+    errors = {finding.code for finding in sink if finding.severity == "error"}
+    assume(not errors & {"E312", "E307"})
+    assert not errors
+    compiled = simplify(lower(found.formula, GRID, sink))
+    env = augmented(ledger.timers, columns)
+    (margins,) = evaluate([compiled], env, ops=NUMPY, count=SAMPLES - HORIZON)
+    return np.broadcast_to(margins, (SAMPLES - HORIZON, BATCH)) >= -TOLERANCE
+
+
+def check_mission(formula: typed.Formula, seed: int) -> None:
+    """Every planning window satisfies the rewriting iff the trace satisfies the mission."""
+    assume(absolute(formula))
+    columns = walks(seed, BATCH)
+    planned = _planned(formula, columns)
+    np.testing.assert_array_equal(planned.all(0), _defined(formula, columns))
+    assert (np.diff(planned.astype(int), axis=0) <= 0).all(), "what is falsified stays falsified"
+
+
+def check_past(formula: typed.Formula, seed: int) -> None:
+    """Timers say what operators of the past say."""
+    columns = walks(seed, BATCH)
+    whole = typed.Temporal(SPAN, "always", typed.Interval(typed.Time(), typed.Time(horizons=1)), formula)
+    planned = _planned(whole, columns)
+    for k in (0, 1, 7, SAMPLES - HORIZON - 1):
+        np.testing.assert_array_equal(planned[k], _defined(whole, columns, k))
+
+
+def check_recorded(formula: typed.Formula, seed: int) -> None:
+    """The robustness of a recorded mission, and its bounds where it goes on."""
+    assume(absolute(formula))
+    sink: list[Diagnostic] = []
+    cut = {name: column[: 1 + seed % SAMPLES] for name, column in walks(seed, BATCH).items()}
+    compiled = simplify(lower(recorded(formula), GRID, sink))
+    ends = {end: evaluate([compiled], cut, ops=NUMPY, end=end)[0] for end in ("truncate", "lower", "upper")}
+    judged = {end: np.broadcast_to(values, (1, BATCH))[0] for end, values in ends.items()}
+    np.testing.assert_array_equal(judged["truncate"], [low for low, _ in _bounds(formula, cut, "truncate")])
+    bounds = _bounds(formula, cut, "open")
+    np.testing.assert_array_equal(judged["lower"], [low for low, _ in bounds])
+    np.testing.assert_array_equal(judged["upper"], [high for _, high in bounds])
