@@ -62,7 +62,7 @@ def test_every_mismatch_is_counted_and_told(
 
 
 def test_a_mismatch_that_hypothesis_draws_is_shrunk(proofs: ModuleType) -> None:
-    def wrong(formula: object, number: int) -> None:
+    def wrong(formula: object, number: int) -> None:  # noqa: ARG001
         assert number < 10, f"{number} is too large"
 
     given = {"formula": formulas(), "number": st.integers(0, 1000)}
