@@ -82,10 +82,10 @@ def load(path: Path | str) -> ast.Spec:
         UsageError: there is no such file.
         SpecError: the text is no specification; the error carries all diagnostics.
     """
-    from stlc.files import read_source
+    from stlc.files import find_spec, read_source
     from stlc.grammar.parser import parse as parse_source
 
-    return parse_source(read_source(path))
+    return parse_source(read_source(find_spec(path)))
 
 
 def parse(text: str, name: str = "<text>") -> ast.Spec:

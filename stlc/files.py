@@ -14,15 +14,11 @@ from stlc.registry import closest
 from stlc.source import Source
 
 MAX_BYTES = 10_000_000
-LIBRARY = next(
-    (
-        folder
-        for folder in (Path(__file__).parent / "library", Path(__file__).parents[1] / "examples")
-        if folder.is_dir()
-    ),
-    Path(__file__).parent / "library",
-)
-"""Installed systems; of an editable install those of the source tree."""
+_INSTALLED = Path(__file__).parent / "library"
+LIBRARY = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[1]
+"""What is installed beside the code, laid out as in the source tree; of an editable install that tree."""
+SYSTEMS, SPECS = LIBRARY / "examples", LIBRARY / "specs"
+"""The installed systems, and what they are to do. They name each other by `../`."""
 
 _SYSTEM_SUFFIXES = ("", ".yaml", ".yml")
 _MESH = re.compile(r"\s*(solid\b[^\n]*)\n\s*(facet|endsolid)\b")
@@ -180,13 +176,24 @@ def find_system(name: str, spec_path: Path | None = None) -> Path:
     folders = [Path()]
     if spec_path is not None:
         folders.append(spec_path.parent)
-    folders += [Path("systems"), Path("examples"), LIBRARY]
+    folders += [Path("systems"), Path("examples"), SYSTEMS, LIBRARY]
     for folder in folders:
         for suffix in _SYSTEM_SUFFIXES:
             path = folder / f"{name}{suffix}"
             if path.is_file():
                 return _straight(path)
     raise UsageError(_no_such("system", name, folders))
+
+
+def find_spec(name: Path | str) -> Path:
+    """The specification called `name`: as given, else among the installed ones, with or without `specs/`.
+
+    What is nowhere comes back as it is: who reads it says so.
+    """
+    path = Path(name)
+    if path.is_absolute() or ".." in path.parts or path.suffix != ".stl" or path.exists():
+        return path
+    return next((there for folder in (LIBRARY, SPECS) if (there := folder / path).is_file()), path)
 
 
 def _straight(path: Path) -> Path:
@@ -222,17 +229,19 @@ def is_stored(path: Path) -> bool:
 
 def _no_such(kind: str, name: str, folders: Sequence[Path]) -> Diagnostic:
     wanted = Path(name).name
-    nearby = {entry: folder for folder in reversed(folders) for entry in _siblings(folder)}
+    nearby = {
+        entry: folder for folder in reversed(folders) if folder != LIBRARY for entry in _siblings(folder)
+    }
     if kind == "system":
         nearby = {entry: folder for entry, folder in nearby.items() if entry.endswith((".yaml", ".yml"))}
     near = closest(wanted, nearby)
-    places = ", ".join(dict.fromkeys(_shown(folder / name) for folder in folders))
+    places = ", ".join(dict.fromkeys(_shown(folder / name) for folder in folders if folder != LIBRARY))
     advice = (f"did you mean `{_shown(nearby[near] / near)}`?",) if near else ()
     return Diagnostic("U102", f"there is no {kind} `{name}`", help=advice, note=(f"looked at: {places}",))
 
 
 def _shown(path: Path) -> str:
-    return f"installed: {path.name}" if LIBRARY in path.parents else str(path)
+    return f"installed: {path.name}" if SYSTEMS in path.parents else str(path)
 
 
 def beside(home: Path, name: str) -> Path:

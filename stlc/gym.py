@@ -9,7 +9,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -23,8 +22,14 @@ from stlc.controller.world import world_type
 from stlc.controller.worlds import Setting, Worlds
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.system import System
-from stlc.files import find_system, read_source
+from stlc.files import find_spec, find_system, read_source
 from stlc.grammar.parser import parse
+
+try:
+    import gymnasium
+except ModuleNotFoundError:
+    message = "stlc.gym needs gymnasium, which is not installed: pip install 'stlc[gym]'"
+    raise ModuleNotFoundError(message, name="gymnasium") from None
 
 Reward: TypeAlias = Literal["dense", "sparse"]
 Observation: TypeAlias = NDArray[np.float32]
@@ -133,9 +138,10 @@ def make(
         UsageError: there is no such file, or no system is named.
         SpecError, SystemFileError: a file is invalid, or they do not fit.
     """
-    parsed = parse(read_source(Path(spec)))
+    path = find_spec(spec)
+    parsed = parse(read_source(path))
     named = system or parsed.system
     if named is None:
         raise UsageError(Diagnostic("U101", f"`{spec}` names no system", help=("give one",)))
-    found = System.load(find_system(str(named), None if system else Path(spec)))
+    found = System.load(find_system(str(named), None if system else path))
     return SpecEnv(Task.of(parsed, found), steps=steps, reward=reward)

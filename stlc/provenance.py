@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("stlc", "torch", "numpy", "lark", "pydantic", "safetensors", "typer")
+PACKAGES = ("stlc", "torch", "numpy", "lark", "safetensors", "typer")
 
 
 def sha256(data: bytes | str) -> str:

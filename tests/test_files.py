@@ -15,7 +15,7 @@ import pytest
 from stlc import files
 from stlc.cli.render import render_text
 from stlc.diagnostics import MissingError, SpecError, StlcError, UsageError
-from stlc.files import MAX_BYTES, atomic_path, find_system, find_trace, read_source, write_atomic
+from stlc.files import MAX_BYTES, atomic_path, find_spec, find_system, find_trace, read_source, write_atomic
 
 ROOT = Path(__file__).resolve().parent.parent
 FULL = Path("/dev/full")
@@ -244,8 +244,20 @@ def test_a_system_is_found_as_given_beside_the_spec_and_in_folders_of_systems(pr
 def test_an_installed_system_is_found_last(tmp_path, monkeypatch):
     library = tmp_path / "installed"
     write_atomic(library / "ship.yaml", "")
-    monkeypatch.setattr(files, "LIBRARY", library)
+    monkeypatch.setattr(files, "SYSTEMS", library)
     assert find_system("ship") == library / "ship.yaml"
+
+
+@pytest.mark.usefixtures("project")
+def test_an_installed_specification_is_found_last(tmp_path, monkeypatch):
+    library = tmp_path / "installed"
+    write_atomic(library / "specs/ship.stl", "")
+    monkeypatch.setattr(files, "LIBRARY", library)
+    monkeypatch.setattr(files, "SPECS", library / "specs")
+    for name in ("ship.stl", "specs/ship.stl", Path("specs/ship.stl")):
+        assert find_spec(name) == library / "specs/ship.stl"
+    for name in ("specs/traffic.stl", "-", "nowhere.stl", "../installed/specs/ship.stl", "a\0b.stl"):
+        assert find_spec(name) == Path(name)
 
 
 @pytest.mark.usefixtures("project")

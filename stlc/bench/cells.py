@@ -16,7 +16,7 @@ from stlc.controller.task import Task
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.functions import function_files
 from stlc.dynamics.system import System
-from stlc.files import LIBRARY, find_system, read_source
+from stlc.files import SPECS, find_system, read_source
 from stlc.grammar.parser import parse
 from stlc.jsontext import dumps, plain
 from stlc.provenance import sha256
@@ -174,7 +174,7 @@ def _system_hash(task: Task) -> str:
 def spec_path(benchmark: str) -> Path:
     """The specification of a benchmark: in `specs/`, else the installed one. Raises UsageError (U102)."""
     name = f"{benchmark}.stl"
-    places = [Path("specs"), LIBRARY / "specs", LIBRARY.parent / "specs"]
+    places = [Path("specs"), SPECS]
     for path in (folder / part / name for folder in places for part in ("", "families")):
         if path.is_file():
             return path

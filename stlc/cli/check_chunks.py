@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from stlc.cli.judge import instant_of, laid_reading, monitor_of, specification, usage
 from stlc.cli.outcome import Outcome
 from stlc.cli.tallies import Told, outcome_of_tallies
-from stlc.files import read_source
+from stlc.files import find_spec, read_source
 
 if TYPE_CHECKING:
     from stlc.cli.many import Work
@@ -31,7 +31,7 @@ def outcome_in_chunks(path: Path, work: Work) -> Outcome:
     question = work.question
     _require_pieces(path, work)
     begun = time.perf_counter()
-    given = None if question.spec is None else monitor_of(read_source(question.spec), question)
+    given = None if question.spec is None else monitor_of(read_source(find_spec(question.spec)), question)
     read = pieces(path, work.chunk or CHUNK, laid_reading(given, question))
     first = next(read)
     source, note = specification(str(path), question.spec, first.meta.carried)

@@ -18,7 +18,7 @@ from stlc.cli.output import emit, wants_color
 from stlc.cli.tallies import Told, outcome_of_tallies
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.escape import visible
-from stlc.files import read_source
+from stlc.files import find_spec, read_source
 from stlc.jsontext import loads
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def outcome_of_stream(question: Question, *, talk: bool) -> Outcome:
         if given:
             raise usage(f"`{option}` needs the whole trace, and the standard input is judged line by line")
     begun = time.perf_counter()
-    source = read_source(question.spec)
+    source = read_source(find_spec(question.spec))
     monitor = monitor_of(source, question)
     samples = _timed(_renamed(_samples(_lines(sys.stdin.buffer)), question.names))
     first, dt = next(samples)

@@ -60,9 +60,10 @@ def compile_(
 def _files(spec: Path, system: str | None) -> list[str]:
     """The specification, and the system file as far as it can be found now."""
     from stlc.diagnostics import StlcError
-    from stlc.files import find_system, read_source
+    from stlc.files import find_spec, find_system, read_source
     from stlc.grammar.parser import parse
 
+    spec = find_spec(spec)
     try:
         wanted = system or parse(read_source(spec)).system
         return [str(spec), *([str(find_system(wanted, spec))] if wanted else [])]
@@ -90,9 +91,10 @@ def _compiled(path: Path, system: str | None, overrides: Mapping[str, str]) -> t
     from stlc.compile.pipeline import compile_spec
     from stlc.diagnostics import Diagnostic, UsageError
     from stlc.dynamics.schema import load_system_decl
-    from stlc.files import find_system, read_source
+    from stlc.files import find_spec, find_system, read_source
     from stlc.grammar.parser import parse
 
+    path = find_spec(path)
     spec = parse(read_source(path))
     wanted = system or spec.system
     if wanted is None:

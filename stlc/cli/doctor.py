@@ -19,7 +19,7 @@ State = Literal["ok", "missing", "off"]
 MISSING = 5
 
 _SLOWER = "torch does its work, about ten times slower"
-_NEEDED = ("torch", "numpy", "lark", "pydantic", "pyyaml", "safetensors", "typer", "rich")
+_NEEDED = ("torch", "numpy", "lark", "pyyaml", "safetensors", "typer", "rich")
 
 
 def register(app: typer.Typer) -> None:

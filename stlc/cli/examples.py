@@ -7,12 +7,11 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from stlc.diagnostics import Diagnostic, UsageError
-from stlc.files import LIBRARY
+from stlc.files import SPECS, SYSTEMS
 from stlc.registry import closest
 
 FIRST, EMPTY = "cart", "empty"
 
-_SPECS = LIBRARY / "specs" if (LIBRARY / "specs").is_dir() else LIBRARY.parent / "specs"
 _SYSTEM = re.compile(r'^(system\s+")[^"\n]*?([^"/\n]+\.yaml)"', re.MULTILINE)
 _JUDGE = re.compile(r"^ *judge: *(?:[^\s#]*/)?([\w-]+\.stl)\b", re.MULTILINE)
 _BESIDE = re.compile(r"[\w-]+\.(?:py|urdf)\b")
@@ -37,7 +36,7 @@ def example_files(name: str) -> dict[str, str]:
         note = (f"there are {', '.join(examples())}",)
         raise UsageError(Diagnostic("U101", f"there is no example `{name}`", help=advice, note=note))
     files: dict[str, str] = {}
-    judges = [_SPECS / judge for _, system in _pairs(specs) for judge in _JUDGE.findall(_text(system))]
+    judges = [SPECS / judge for _, system in _pairs(specs) for judge in _JUDGE.findall(_text(system))]
     for path in dict.fromkeys((*specs, *judges)):
         text = path.read_text(encoding="utf-8")
         system = next(found[2] for found in _SYSTEM.finditer(text))
@@ -48,18 +47,18 @@ def example_files(name: str) -> dict[str, str]:
 
 def _pairs(specs: Iterable[Path] | None = None) -> Iterator[tuple[Path, str]]:
     """Every specification (of those given) whose system is installed, and the name of that file."""
-    for path in sorted(_SPECS.glob("*.stl")) if specs is None else specs:
+    for path in sorted(SPECS.glob("*.stl")) if specs is None else specs:
         named = _SYSTEM.search(path.read_text(encoding="utf-8"))
-        if named and (LIBRARY / named[2]).is_file():
+        if named and (SYSTEMS / named[2]).is_file():
             yield path, named[2]
 
 
 def _system(name: str) -> dict[str, str]:
     """A system file, and the files beside it that it names."""
     text = _text(name)
-    beside = [word for word in dict.fromkeys(_BESIDE.findall(text)) if (LIBRARY / word).is_file()]
-    return {f"systems/{file}": (LIBRARY / file).read_text(encoding="utf-8") for file in (name, *beside)}
+    beside = [word for word in dict.fromkeys(_BESIDE.findall(text)) if (SYSTEMS / word).is_file()]
+    return {f"systems/{file}": (SYSTEMS / file).read_text(encoding="utf-8") for file in (name, *beside)}
 
 
 def _text(system: str) -> str:
-    return (LIBRARY / system).read_text(encoding="utf-8")
+    return (SYSTEMS / system).read_text(encoding="utf-8")

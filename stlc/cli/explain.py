@@ -122,12 +122,12 @@ def _page(name: str, *, as_json: bool) -> None:
 
 def _spec(name: str, wanted: list[str], *, as_json: bool) -> None:
     """Every requirement of a specification in English."""
-    from stlc.files import read_source
+    from stlc.files import find_spec, read_source
     from stlc.grammar import ast
     from stlc.grammar.english import definitions_of, sentence
     from stlc.grammar.parser import parse
 
-    spec = parse(read_source(name))
+    spec = parse(read_source(find_spec(name)))
     items = [item for item in spec.items if isinstance(item, ast.Require | ast.Assume)]
     for one in wanted:
         if one not in [item.name for item in items]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 from stlc.cli.output import say, show_diagnostics
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.escape import operand
-from stlc.files import read_source
+from stlc.files import find_spec, read_source
 from stlc.source import Source
 
 if TYPE_CHECKING:
@@ -163,7 +163,7 @@ def _below(path: Path) -> Path:
 def specification(name: str, spec: Path | None, carried: Carried) -> tuple[Source, str]:
     """The specification to judge the trace `name` by, which carries one, and what is to be said about it."""
     if spec is not None:
-        return read_source(spec), ""
+        return read_source(find_spec(spec)), ""
     if not carried.text:
         raise usage(f"`{name}` carries no specification", f"stlc check SPEC {name}", "elsewhere: --spec SPEC")
     source = Source(carried.path or f"{carried.name or 'specification'} in {name}", carried.text)

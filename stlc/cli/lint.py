@@ -111,13 +111,13 @@ def _codes(text: str | None) -> tuple[str, ...]:
 
 def _look(names: Sequence[str], job: _Job) -> _Result:
     """Lint every file, repairing it first where that is wanted."""
-    from stlc.files import read_source
+    from stlc.files import find_spec, read_source
 
     findings: list[Diagnostic] = []
     fixed = 0
     for name in names:
         try:
-            source = read_source(name)
+            source = read_source(name if job.fix else find_spec(name))
         except SpecError as error:
             findings += error.diagnostics
             continue

@@ -14,6 +14,7 @@ from stlc.escape import visible
 
 if TYPE_CHECKING:
     from stlc.diagnostics import Diagnostic
+    from stlc.dynamics.crosscheck import Comparison
     from stlc.dynamics.decl import SystemDecl
 
 _File = Annotated[
@@ -42,7 +43,8 @@ def register(app: typer.Typer) -> None:
             "stlc system check car.yaml",
             "stlc system check examples/car.yaml --steps 64",
             note="The file is read without torch; with --steps above 0 states are drawn and driven with "
-            "random controls: initial sets that reject nearly all and dynamics that explode are found.",
+            "random controls: initial sets that reject nearly all and dynamics that explode are found. "
+            "Kinematics from a URDF are compared with pytorch-kinematics where that is installed.",
         )
     )(check)
     group.command("list", help=describe("List the systems that are found by name.", "stlc system list"))(
@@ -74,11 +76,20 @@ def check(
     """Validate `system`; findings are raised by what finds them."""
     decl = _load(system, parse_overrides(set_))
     warnings = [*decl.warnings, *(_drive(decl, steps, seed) if steps else ())]
+    looked = _kinematics(decl) if steps else []
     if as_json:
-        result = {**_values(decl), "driven": {"steps": steps, "seed": seed}}
+        robots = [
+            {"name": one.name, "distance_m": one.distance, "why_not": one.why or None} for one in looked
+        ]
+        result = {**_values(decl), "driven": {"steps": steps, "seed": seed}, "kinematics": robots}
         emit_json("system/1", ok=True, exit_code=0, diagnostics=warnings, result=result)
         return
     show_diagnostics(warnings)
+    for one in looked:
+        if one.distance is None:
+            say(f"{one.name}: not compared; {one.why}")
+        else:
+            say(f"{one.name}: within {one.distance:.1e} m of pytorch-kinematics in 256 random positions")
     moved = f", {_DRAWN} starts driven {steps} steps" if steps else ""
     size = f"{_counted(len(decl.signature), 'state')}, {_counted(len(decl.controls), 'control')}"
     emit(f"{visible(str(decl.path))} is valid: {size}{moved}")
@@ -126,6 +137,16 @@ def _drive(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]:
     return tuple(warnings)
 
 
+def _kinematics(decl: SystemDecl) -> list[Comparison]:
+    """Forward kinematics against another library's; what disagrees is raised."""
+    robots = [function for function in decl.functions if function.body is not None]
+    if not robots:
+        return []
+    from stlc.dynamics.crosscheck import compared
+
+    return [compared(function) for function in robots]
+
+
 def _values(decl: SystemDecl) -> dict[str, Any]:
     """What the file says, as values for JSON."""
     flow = {assign.name: assign.text for assign in decl.flow}
@@ -157,10 +178,10 @@ def _all_systems() -> Iterator[tuple[str, str, str]]:
     """Name, path and first sentence of every system file in the places that are looked at."""
     from stlc.diagnostics import StlcError
     from stlc.dynamics.schema import load_system_decl
-    from stlc.files import LIBRARY
+    from stlc.files import SYSTEMS
 
     seen: set[str] = set()
-    for folder in (Path("systems"), Path("examples"), LIBRARY):
+    for folder in (Path("systems"), Path("examples"), SYSTEMS):
         for path in sorted([*folder.glob("*.yaml"), *folder.glob("*.yml")]):
             if path.name in seen:
                 continue

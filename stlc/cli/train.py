@@ -192,13 +192,13 @@ def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str
     from stlc.cli.output import say, show_diagnostics
     from stlc.controller.task import Task
     from stlc.dynamics.system import System
-    from stlc.files import find_system, read_source
+    from stlc.files import find_spec, find_system, read_source
     from stlc.grammar.parser import parse
 
     if not specs:
         example = "stlc train specs/traffic.stl --system car.yaml"
         raise UsageError(Diagnostic("U101", "which specification is to be trained for?", help=(example,)))
-    (path,) = specs
+    path = find_spec(*specs)
     spec = parse(read_source(path))
     wanted = system or spec.system
     if wanted is None:

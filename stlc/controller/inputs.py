@@ -10,7 +10,7 @@ from stlc.compile.modules import Module, load_modules
 from stlc.diagnostics import StlcError
 from stlc.dynamics.functions import function_files
 from stlc.dynamics.schema import load_system_decl
-from stlc.files import find_system, read_source
+from stlc.files import find_spec, find_system, read_source
 from stlc.grammar.parser import parse
 
 
@@ -24,6 +24,7 @@ def input_files(
         system: instead of the one that the specification names.
         overrides: of `--set`.
     """
+    path = find_spec(path)
     found: dict[Path, None] = {path: None}
     with suppress(StlcError):
         spec = parse(read_source(path))

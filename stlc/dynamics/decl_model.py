@@ -66,6 +66,7 @@ class FunctionDecl:
         library: the arrays that it takes; None takes what the caller has.
         span: where it is named.
         body: what it computes, from one vector to one, where the file says that; None for Python.
+        base: of kinematics, the link that positions are relative to; "" is the root.
     """
 
     name: str
@@ -74,6 +75,7 @@ class FunctionDecl:
     library: Literal["numpy", "torch"] | None = None
     span: Span | None = field(default=None, compare=False, repr=False)
     body: ir.Body | None = field(default=None, repr=False)
+    base: str = ""
 
     def bound(self, arguments: tuple[int | None, ...], result: int | None) -> ir.Body:
         """What it computes; see `stlc.compile.interface.Function`. Raises SystemFileError (S208)."""

@@ -90,4 +90,4 @@ def _kinematics(entry: Entry, found: dict[str, Node], where: str, reader: Reader
         reason = getattr(error, "strerror", None) or str(error)
         reader.report("S208", f"`{file}` gives no kinematics: {reason}", place, label="named here")
         return None
-    return FunctionDecl(entry.key.text, path, tip, span=place, body=position(joints))
+    return FunctionDecl(entry.key.text, path, tip, span=place, body=position(joints), base=base or "")

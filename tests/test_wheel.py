@@ -1,0 +1,237 @@
+"""The wheel: what is in it, and that it works where nothing else is installed, extras or not."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("hatchling", reason="builds the wheel")
+from installed import ROOT, Installed, Said, build_wheel, findings, install
+
+SPECS = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "specs").rglob("*.stl"))
+SYSTEMS = sorted(path.name for path in (ROOT / "examples").glob("*.yaml"))
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    return build_wheel(tmp_path_factory.mktemp("dist"))
+
+
+@pytest.fixture(scope="module")
+def bare(wheel, tmp_path_factory) -> Installed:
+    return install(wheel, tmp_path_factory.mktemp("bare") / "env")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_what_is_in_it(wheel):
+    with zipfile.ZipFile(wheel) as file:
+        names = set(file.namelist())
+    tracked = subprocess.run(
+        ["git", "ls-files", "stlc", "examples", "specs"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    wanted = {name if name.startswith("stlc/") else f"stlc/library/{name}" for name in tracked}
+    packed = {name for name in names if ".dist-info/" not in name}
+    new = {name for name in packed - wanted if not (ROOT / name.replace("stlc/library/", "", 1)).is_file()}
+    assert not wanted - packed
+    assert not new  # what is not committed yet may be there
+    assert not [name for name in names if "__pycache__" in name]
+    assert sum(info.file_size for info in zipfile.ZipFile(wheel).infolist()) < 12_000_000
+
+
+def test_nothing_of_the_tree_is_seen(bare, folder):
+    said = bare.python(folder, "import stlc, sys; print(stlc.__file__); print(sys.path)")
+    assert said.out.startswith(str(bare.packages)), said.err
+    assert str(ROOT) not in said.out
+    assert bare.python(folder, "import pytest").code == 1
+    assert bare.python(folder, "import matplotlib").code == 1
+
+
+def test_every_shipped_specification_compiles_and_names_what_is_there(bare, folder):
+    lines = [
+        line
+        for spec in SPECS
+        for line in (
+            ["compile", str(bare.library / spec), "--json"],
+            ["lint", str(bare.library / spec), "--json"],
+        )
+    ]
+    for line, said in zip(lines, bare.run(folder, *lines), strict=True):
+        assert said.code == 0, (line, said.out)
+    shown = bare.run(folder, *(["system", "check", name, "--steps", "0"] for name in SYSTEMS))
+    assert [said.code for said in shown] == [0] * len(SYSTEMS)
+    for system in (bare.library / "examples").glob("*.yaml"):
+        named = [line.split(": ")[1] for line in system.read_text().splitlines() if line.startswith("spec: ")]
+        assert named
+        assert (system.parent / named[0]).is_file()
+
+
+def test_a_specification_of_the_library_is_found_by_name(bare, folder):
+    for said in bare.run(
+        folder, ["compile", "specs/traffic.stl", "--json"], ["lint", "traffic.stl", "--json"]
+    ):
+        assert said.code == 0, said.out
+    (said,) = bare.run(folder, ["compile", "specs/trafic.stl", "--json"])
+    assert [finding["code"] for finding in findings(said)] == ["U102"]
+
+
+def test_every_example_begins_a_project(bare, folder):
+    examples = [name.removesuffix(".yaml") for name in SYSTEMS]
+    begun = bare.run(folder, *(["init", name, "--example", name] for name in examples))
+    assert [said.code for said in begun] == [0] * len(examples)
+    specs = sorted(folder.glob("*/specs/*.stl"))
+    assert len(specs) >= len(examples)
+    for said in bare.run(folder, *(["compile", str(spec), "--json"] for spec in specs)):
+        assert said.code == 0, said.out
+
+
+THREE = (
+    ["train", "specs/traffic.stl", "--system", "car.yaml", "--steps", "3", "--no-pictures", "--json"],
+    ["simulate", "--backup", "--seeds", "1", "--steps", "3", "--agents", "4", "--no-pictures", "--json"],
+    ["check", "trace.npz", "--json"],
+    ["doctor", "--quick", "--json"],
+)
+
+
+def test_the_three_commands_from_an_empty_folder(bare, folder):
+    train, simulate, check, doctor = bare.run(folder, *THREE)
+    assert train.code == 0, train.err
+    assert simulate.code == 0, simulate.err
+    assert check.code in (0, 1, 4), check.err
+    assert doctor.code == 0, doctor.out
+
+
+# ---------------------------------------------------------------------- extras
+
+PARQUET = """
+import pyarrow
+from pyarrow.parquet import write_table
+write_table(pyarrow.table({'t': [0., 1.], 'x': [1., 2.]}), 'a.parquet')
+"""
+MAT = """
+import h5py
+with h5py.File('a.mat', 'w', userblock_size=512) as f:
+    for name, values in {'t': [[0., 1.]], 'x': [[1., 2.]]}.items():
+        f.create_dataset(name, data=values).attrs['MATLAB_class'] = b'double'
+with open('a.mat', 'r+b') as f:
+    f.write(b'MATLAB 7.3 MAT-file'.ljust(116) + bytes(8) + bytes([0, 2]) + b'IM')
+"""
+MCAP = """
+from mcap_ros2.writer import Writer
+with open('a.mcap', 'wb') as f:
+    writer = Writer(f)
+    schema = writer.register_msgdef('std_msgs/msg/Float64', 'float64 data')
+    for k in range(2):
+        writer.write_message('/x', schema, {'data': 1.0}, log_time=k * 10**9, publish_time=k * 10**9)
+    writer.finish()
+"""
+SPEC = "signal x\nrequire low: x < 5\n"
+QUICK = {
+    "parquet": (PARQUET, ["check", "low.stl", "a.parquet"]),
+    "mat": (MAT, ["check", "low.stl", "a.mat"]),
+    "mcap": (MCAP, ["check", "low.stl", "a.mcap", "--resample", "1s"]),
+    "plot": (
+        "open('a.csv', 'w').write('t,x\\n0,1\\n1,2\\n')",
+        ["plot", "a.csv", "--spec", "low.stl", "-o", "a.svg"],
+    ),
+}
+
+
+@pytest.mark.parametrize("extra", QUICK)
+def test_an_extra(extra, wheel, bare, folder):
+    program, line = QUICK[extra]
+    (folder / "low.stl").write_text(SPEC)
+    subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
+    (without,) = bare.run(folder, line)
+    assert without.code == 5, without
+    assert f"pip install 'stlc[{extra}]'" in without.err
+    (with_it,) = install(wheel, folder / "env", extra).run(folder, line)
+    assert with_it.code == 0, with_it
+
+
+PROGRAMS = {
+    "gym": """
+import stlc.gym
+env = stlc.gym.make("specs/traffic.stl", "car.yaml")
+env.reset(seed=0)
+env.step(env.action_space.sample())
+""",
+    "panda": """
+import os
+os.environ["DISPLAY"] = ":0"
+from stlc.view.bullet import require_window
+require_window()
+import pytorch_kinematics
+""",
+    "video": """
+from stlc.view.video import video
+from PIL import Image
+with video("a.mp4", (64, 64), 40) as write:
+    for _ in range(3):
+        write(Image.new("RGB", (64, 64)))
+""",
+}
+NEEDS = {"video": ("plot",)}
+
+
+def test_the_language_server(wheel, bare, folder):
+    (said,) = bare.run(folder, ["lsp"])
+    assert (said.code, "pip install 'stlc[lsp]'" in said.err) == (5, True)
+    program = "from stlc.editor.server import make_server; make_server()"
+    assert install(wheel, folder / "env", "lsp").python(folder, program) == Said(0, "", "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("extra", PROGRAMS)
+def test_an_extra_of_the_library(extra, wheel, folder):
+    ready = install(wheel, folder / "ready", *NEEDS.get(extra, ()))
+    without = ready.python(folder, PROGRAMS[extra])
+    assert without.code == 1
+    assert "is not installed" in without.err, without.err
+    with_it = install(wheel, folder / "env", extra, *NEEDS.get(extra, ())).python(folder, PROGRAMS[extra])
+    assert with_it.code == 0, with_it.err
+
+
+TRAIN = THREE[0]
+COMMANDS = {
+    "log": ([*TRAIN, "--log", "tensorboard"],),
+    "onnx": (TRAIN, ["export", "latest", "--to", "onnx"]),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("extra", COMMANDS)
+def test_an_extra_of_a_training(extra, wheel, bare, folder):
+    lines = COMMANDS[extra]
+    without = bare.run(folder, *lines)[-1]
+    assert without.code == 5, without
+    assert f"stlc[{extra}]" in without.out + without.err
+    for said in install(wheel, folder / "env", extra).run(folder, *lines):
+        assert said.code == 0, said
+
+
+def test_every_extra_is_tried():
+    extras = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])
+    assert extras == {*QUICK, *PROGRAMS, *COMMANDS, "lsp", "peers", "cluster", "all", "dev"}
+
+
+@pytest.mark.slow
+def test_a_real_installation(wheel, folder):
+    """What `pip install` makes of the wheel, the base dependencies taken from the package index."""
+    subprocess.run([sys.executable, "-m", "venv", "env"], check=True)
+    pip = [str(folder / "env/bin/python"), "-m", "pip", "install", "-q", "-c", str(ROOT / "constraints.txt")]
+    subprocess.run([*pip, str(wheel)], check=True)
+    train, simulate, check, _ = Installed(folder / "env").run(folder, *THREE)
+    assert (train.code, simulate.code) == (0, 0)
+    assert check.code in (0, 1, 4)
+    done = subprocess.run(["env/bin/stlc", "--version"], check=True, capture_output=True, text=True)
+    assert done.stdout.startswith("stlc ")
