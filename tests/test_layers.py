@@ -108,12 +108,8 @@ HOMES = {
     "mcap": ("stlc.trace_mcap",),
     "tensorboardX": ("stlc.controller.logbook",),
     "ray": ("stlc.controller.cluster",),
-<<<<<<< HEAD
     "rosbags": ("stlc.trace_bag",),
-=======
     "pytorch_kinematics": ("stlc.dynamics.crosscheck",),
-    "mcap_ros2": ("stlc.trace_mcap",),
->>>>>>> 724e00e (wheel: systems and specifications lie as in the tree; tried where nothing else is installed)
     "pickle": (),
     "marshal": (),
     "shelve": (),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tomllib
@@ -134,11 +135,17 @@ with open('a.mcap', 'wb') as f:
         writer.write_message('/x', schema, {'data': 1.0}, log_time=k * 10**9, publish_time=k * 10**9)
     writer.finish()
 """
+BAG = """
+import bz2, lz4.frame, robot_logs
+bz2.compress = lz4.frame.compress
+open("a.bag", "wb").write(robot_logs.bag([0.0, 1.0]).replace(b"compression=bz2", b"compression=lz4"))
+"""
 SPEC = "signal x\nrequire low: x < 5\n"
 QUICK = {
     "parquet": (PARQUET, ["check", "low.stl", "a.parquet"]),
     "mat": (MAT, ["check", "low.stl", "a.mat"]),
     "mcap": (MCAP, ["check", "low.stl", "a.mcap", "--resample", "1s"]),
+    "bag": (BAG, ["check", "low.stl", "a.bag", "--map", "x=robot.state.position.x"]),
     "plot": (
         "open('a.csv', 'w').write('t,x\\n0,1\\n1,2\\n')",
         ["plot", "a.csv", "--spec", "low.stl", "-o", "a.svg"],
@@ -150,7 +157,10 @@ QUICK = {
 def test_an_extra(extra, wheel, bare, folder):
     program, line = QUICK[extra]
     (folder / "low.stl").write_text(SPEC)
-    subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
+    if extra == "bag":
+        pytest.importorskip("lz4")
+    helpers = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "tools"), *sys.path])}
+    subprocess.run([sys.executable, "-c", program], env=helpers, check=True)
     (without,) = bare.run(folder, line)
     assert without.code == 5, without
     assert f"pip install 'stlc[{extra}]'" in without.err
