@@ -64,7 +64,7 @@ def named(pattern: str, system: Path) -> list[str]:
 
 
 JUDGES = {Path(name).name for path in (ROOT / "examples").glob("*.yaml") for name in named("judge", path)}
-"""What only judges drives may look back farther than a policy remembers: it is no task, and is not compiled."""
+"""What only judges drives may look back farther than a policy remembers: no task."""
 
 
 def test_every_shipped_specification_compiles_and_names_what_is_there(bare, folder):
