@@ -8,6 +8,8 @@ import subprocess
 import sys
 import tomllib
 import zipfile
+from email import message_from_bytes
+from email.message import Message
 from pathlib import Path
 
 import pytest
@@ -255,3 +257,38 @@ def test_a_real_installation(wheel, folder):
     assert check.code in (0, 1, 4)
     done = subprocess.run(["env/bin/stlc", "--version"], check=True, capture_output=True, text=True)
     assert done.stdout.startswith("stlc ")
+
+
+# ---------------------------------------------------------------------- what it says of itself
+
+
+@pytest.fixture(scope="module")
+def metadata(wheel) -> Message:
+    with zipfile.ZipFile(wheel) as file:
+        (name,) = [name for name in file.namelist() if name.endswith(".dist-info/METADATA")]
+        return message_from_bytes(file.read(name))
+
+
+def test_the_long_description_needs_nothing_of_the_tree(metadata):
+    text = metadata.get_payload()
+    assert metadata["Description-Content-Type"] == "text/markdown"
+    assert text.startswith("# stlc\n")
+    assert "stlc train specs/traffic.stl" in text
+    assert "](" not in re.sub(r"\]\(https?://", "", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
+    assert "<!--" not in text
+    assert "<img" not in text
+
+
+def test_what_it_is(metadata):
+    from trove_classifiers import classifiers
+
+    assert set(metadata.get_all("Classifier")) <= classifiers
+    assert metadata["License-Expression"] == "MIT"
+    assert metadata.get_all("License-File") == ["LICENSE"]
+    for url in metadata.get_all("Project-URL"):
+        assert url.split(", ")[1].startswith("https://")
+    needed = [entry for entry in metadata.get_all("Requires-Dist") if "extra ==" not in entry]
+    assert {re.split(r"[<>=!~ ]", entry)[0] for entry in needed} == IMPORTED
+
+
+IMPORTED = {"lark", "typer", "rich", "pyyaml", "numpy", "torch", "safetensors"}
