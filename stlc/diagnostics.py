@@ -190,6 +190,7 @@ CODES: dict[str, str] = {
     "E310": "an absolute operator whose body looks into the future",
     "E311": "`T`, `dt` or a number of steps without a system that says what they are",
     "E312": "an absolute promise without a deadline, in a specification to train on",
+    "E313": "a requirement that a stream cannot judge at a bounded cost",
     "W101": "a bare number as an interval bound",
     # numbers
     "E401": "division or modulo by zero",

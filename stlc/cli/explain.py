@@ -124,7 +124,7 @@ def _spec(name: str, wanted: list[str], *, as_json: bool) -> None:
     """Every requirement of a specification in English."""
     from stlc.files import find_spec, read_source
     from stlc.grammar import ast
-    from stlc.grammar.english import definitions_of, sentence
+    from stlc.grammar.english import Meanings, sentence
     from stlc.grammar.parser import parse
 
     spec = parse(read_source(find_spec(name)))
@@ -134,6 +134,7 @@ def _spec(name: str, wanted: list[str], *, as_json: bool) -> None:
             near = closest(one, [item.name for item in items])
             advice = (f"did you mean `{near}`?",) if near else ()
             raise UsageError(Diagnostic("U101", f"`{name}` has no requirement `{one}`", help=advice))
+    meanings = Meanings(spec)
     told = [
         {
             "name": item.name,
@@ -141,7 +142,7 @@ def _spec(name: str, wanted: list[str], *, as_json: bool) -> None:
             "tags": [tag.name for tag in item.tags],
             "doc": item.doc,
             "sentence": sentence(item),
-            "where": dict(definitions_of(item, spec)),
+            "where": dict(meanings.of(item)),
         }
         for item in items
         if not wanted or item.name in wanted

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import assert_never
 
 from stlc.grammar import ast
@@ -23,18 +24,42 @@ def sentence(item: ast.Require | ast.Assume) -> str:
 _NAMED = ast.Def | ast.Region | ast.Const
 
 
-def definitions_of(item: ast.Require | ast.Assume, spec: ast.Spec) -> list[tuple[str, str]]:
-    """The names that a requirement uses, those that they use too, each with what it means."""
-    known = {entry.name: entry for entry in spec.items if isinstance(entry, _NAMED)}
-    found: dict[str, str] = {}
-    queue = [item.formula]
-    while queue:
-        for node in descendants(queue.pop(0)):
-            if isinstance(node, ast.Name) and node.name in known and node.name not in found:
-                entry = known[node.name]
-                found[node.name] = _meaning(entry)
-                queue.append(entry.value)
-    return list(found.items())
+REPEATED = 200_000
+"""Letters of definitions that are told again with each requirement that uses them; from then on each is told once."""
+
+
+class Meanings:
+    """The definitions of a specification in words: what they mean is worked out once."""
+
+    def __init__(self, spec: ast.Spec) -> None:
+        self._known = {entry.name: entry for entry in spec.items if isinstance(entry, _NAMED)}
+        self._words: dict[str, str] = {}
+        self._uses: dict[str, list[str]] = {}
+        self._letters = 0
+
+    def of(self, item: ast.Require | ast.Assume) -> list[tuple[str, str]]:
+        """The names that a requirement uses, those that they use too, each with its meaning.
+
+        Where the definitions of a specification come to more than `REPEATED` letters, those that an earlier
+        requirement has told are left out.
+        """
+        found: dict[str, str] = {}
+        queue = deque(self._used(item.formula))
+        while queue:
+            name = queue.popleft()
+            if name in found or (name in self._words and self._letters > REPEATED):
+                continue
+            entry = self._known[name]
+            if name not in self._words:
+                self._words[name], self._uses[name] = _meaning(entry), self._used(entry.value)
+            found[name] = self._words[name]
+            self._letters += len(found[name])
+            queue.extend(self._uses[name])
+        return list(found.items())
+
+    def _used(self, expr: ast.Expr) -> list[str]:
+        names = (node.name for node in descendants(expr) if isinstance(node, ast.Name))
+        return list(dict.fromkeys(name for name in names if name in self._known))
 
 
 def _meaning(entry: ast.Def | ast.Region | ast.Const) -> str:
@@ -134,14 +159,14 @@ def _logic(expr: ast.Logic | ast.Not) -> str:
         case ast.Not(operand=operand):
             return f"it is not so that {_inner(operand)}"
         case ast.Logic(op=op, left=left, right=right):
+            if op == "->":
+                return f"if {say(left)}, then {say(right)}"
             one, other = _side(left, op), _side(right, op)
             match op:
                 case "and" | "or":
                     return f"{one}, {op} {other}" if "," in one or ":" in one else f"{one} {op} {other}"
                 case "xor":
                     return f"either {one} or {other}, not both"
-                case "->":
-                    return f"if {say(left)}, then {say(right)}"
                 case "<->":
                     return f"{one} exactly when {other}"
                 case _:

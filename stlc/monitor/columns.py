@@ -51,12 +51,13 @@ class Reader:
         self.formulas = tuple(formulas)
         self.end = end
         self._stop = FAR if going_on else None
-        self.names = frozenset().union(*map(names_of_columns, self.formulas)) or frozenset({NOTHING})
+        self.names = frozenset().union(*map(names_of_columns, self.formulas))
         self._known: dict[tuple[int, int, int], Schedule] = {}
 
     def __call__(self, env: Mapping[str, Floats], start: int, count: int) -> list[Floats]:
         """Values (count, traces) from row `start` on; columns may be longer than the shortest of them."""
-        length = min(len(env[name]) for name in self.names)
+        names = self.names or (NOTHING if NOTHING in env else next(iter(env)),)
+        length = min(len(env[name]) for name in names)
         if count <= 0:
             return [next(iter(env.values()))[:0]] * len(self.formulas)
         key = (length, start, count)
@@ -66,7 +67,7 @@ class Reader:
             self._known[key] = schedule(
                 self.formulas, Run(start, count), Extent(length, self.end, self._stop)
             )
-        inner = {name: env[name] if len(env[name]) == length else env[name][:length] for name in self.names}
+        inner = {name: env[name] if len(env[name]) == length else env[name][:length] for name in names}
         return execute(self._known[key], inner, _EXACT)
 
 

@@ -17,7 +17,9 @@ from stlc.monitor.asked import Asked, Bounds
 from stlc.monitor.explain import Cause
 from stlc.monitor.instants import At, check_length, starts_of
 from stlc.monitor.judgement import Status, unknown_requirement
+from stlc.monitor.kept import Kept
 from stlc.monitor.needs import Need, needs_of
+from stlc.monitor.paced import Paced
 from stlc.monitor.recall import Recall
 from stlc.monitor.signals import arrange
 from stlc.monitor.tally import Flags, Judged, Tally
@@ -87,13 +89,18 @@ class Watched:
     tally: Tally = field(default_factory=Tally)
     decided: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
-    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
+    def grow(self, kept: Kept) -> None:
         """Take new samples in."""
-        if self.over:
+        if self.over or self.values.samples == kept.samples:
             return
-        self.values.grow(signals, first, samples)
+        signals = kept.columns()
+        self.values.grow(signals, kept.first, kept.samples)
         if self.truths is not None:
-            self.truths.grow(signals, first, samples)
+            self.truths.grow(signals, kept.first, kept.samples)
+
+    def due(self, samples: int) -> bool:
+        """Whether it is worth the work to judge it after so many samples."""
+        return not self.over and (not isinstance(self.values, Paced) or self.values.due(samples))
 
     @property
     def over(self) -> bool:
@@ -133,10 +140,8 @@ class Online:
     def __init__(self, compiled: Compiled, rules: Sequence[Rule], how: How | None = None) -> None:
         self.how = how or How()
         self.compiled = compiled
-        self.samples = 0
         self._needs = needs_of(compiled, [*rules, *compiled.assumptions])
-        self._first = 0
-        self._signals: dict[str, Floats] = {}
+        self._kept = Kept()
         self._trackers = Trackers(compiled.grid.horizon)
         self._watched = [self._watch(rule) for rule in rules]
         self._scope = [self._watch(rule, once=True) for rule in compiled.assumptions]
@@ -175,7 +180,8 @@ class Online:
         self._take({need.column.name: row for need, row in zip(self._needs, rows, strict=True)}, 1)
         found: list[Decision] = []
         for watched in self._watched:
-            if not watched.over:
+            if watched.due(self.samples):
+                watched.grow(self._kept)
                 self._decide(watched, found)
         self._count_scope()
         self._trim()
@@ -198,8 +204,10 @@ class Online:
                 raise self._not_finite(need, float(values[first]), self.samples + first)
         self._take(columns, laid.samples)
         for watched in self._watched:
-            if not watched.over:
-                self._count(watched, self._settled(watched))
+            if not watched.due(self.samples):
+                continue
+            watched.grow(self._kept)
+            self._count(watched, self._settled(watched))
             if self._recall is not None and not (watched.over or watched.everywhere):
                 self._recall_last(watched, watched.judged(*self._pending(watched)))
         self._count_scope()
@@ -214,26 +222,18 @@ class Online:
         columns = columns or {"": np.zeros((count, 1))}
         if self._recall is not None:
             self._recall.take(columns, count)
-        if self.kept:
-            columns = {name: np.concatenate([self._signals[name], x]) for name, x in columns.items()}
-        self._signals = columns
-        self.samples += count
-        for watched in (*self._watched, *self._scope):
-            watched.grow(self._signals, self._first, self.samples)
+        self._kept.take(columns, count)
 
     def _trim(self) -> None:
         alive = [watched for watched in (*self._watched, *self._scope) if not watched.over]
-        needed = min((watched.drop() for watched in alive), default=self.samples)
-        if needed > self._first:
-            self._signals = {name: x[needed - self._first :] for name, x in self._signals.items()}
-            self._first = needed
+        self._kept.forget(min((watched.drop() for watched in alive), default=self.samples))
 
     # ----------------------------------------------------------------------- verdicts
 
     def _pending(self, watched: Watched) -> tuple[int, int]:
         """The instants that are not counted yet."""
-        start, first = watched.tally.next, watched.tally.first
-        return (start, self.samples if watched.everywhere else max(min(first + 1, self.samples), first))
+        start, first, samples = watched.tally.next, watched.tally.first, watched.values.samples
+        return (start, samples if watched.everywhere else max(min(first + 1, samples), first))
 
     def _decide(self, watched: Watched, found: list[Decision]) -> None:
         """Add what the last sample has decided. What was decided once stays so."""
@@ -267,7 +267,7 @@ class Online:
         if not watched.everywhere:
             return watched.values.settled
         window = self.compiled.grid.horizon if watched.rule.windowed else watched.rule.reach
-        return min(watched.values.settled, max(self.samples - (window or 0), 0))
+        return min(watched.values.settled, max(watched.values.samples - (window or 0), 0))
 
     def _count(self, watched: Watched, judged: Judged) -> int:
         """Count what is settled of instants that are not counted yet: how many."""
@@ -281,7 +281,8 @@ class Online:
 
     def _count_scope(self) -> None:
         for watched in self._scope:
-            if not watched.over:
+            if watched.due(self.samples):
+                watched.grow(self._kept)
                 self._count(watched, self._settled(watched))
 
     def time(self, sample: int) -> float:
@@ -303,13 +304,19 @@ class Online:
     @property
     def kept(self) -> int:
         """How many samples of the signals are kept."""
-        return self.samples - self._first
+        return self.samples - self._kept.first
+
+    @property
+    def samples(self) -> int:
+        """How many there were by now."""
+        return self._kept.samples
 
     def open_starts(self, name: str) -> list[tuple[int, float, float]]:
         """Sample, least and greatest robustness of every start that is not settled yet."""
         watched = self._find(name)
-        if watched.over:
+        if watched.over or not self.samples:
             return []
+        watched.grow(self._kept)
         start, stop = self._pending(watched)
         bounds = watched.values.live(start, min(stop, self.samples))
         return [(start + i, float(a), float(b)) for i, (a, b) in enumerate(zip(*bounds, strict=True))]
@@ -319,8 +326,9 @@ class Online:
         return self._standing(self._find(name))
 
     def _standing(self, watched: Watched) -> Tally:
-        if watched.over:
+        if watched.over or not self.samples:
             return watched.tally
+        watched.grow(self._kept)
         start, stop = self._pending(watched)
         return watched.tally.with_more(watched.judged(start, min(stop, self.samples)))
 
@@ -346,6 +354,7 @@ class Online:
         found: dict[str, Tally] = {}
         refused: list[Diagnostic] = []
         for watched in self._watched:
+            watched.grow(self._kept)
             starts = starts_of(watched.rule, self.samples, horizon, self.how.at)
             if self.how.end == "strict":
                 finding = check_length(watched.rule, self.samples, starts, self.compiled.grid)

@@ -159,6 +159,11 @@ class Paired:
     ahead: int
 
     @property
+    def samples(self) -> int:
+        """How many there are by now."""
+        return self.shared.samples
+
+    @property
     def settled(self) -> int:
         """The first instant whose value may still change."""
         return max(self.shared.samples - self.ahead, 0)

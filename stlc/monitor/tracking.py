@@ -12,6 +12,7 @@ from stlc.compile import ir
 from stlc.compile.horizon import reach
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.pipeline import Rule
+from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.asked import (
     Asked,
     Bounds,
@@ -28,6 +29,7 @@ from stlc.monitor.endings import lengthened, with_seen
 from stlc.monitor.everywhere import Everywhere
 from stlc.monitor.frontier import Frontier, skeleton
 from stlc.monitor.instants import rule_bounds, window_of
+from stlc.monitor.paced import MOST, WIDE, Paced, Work, effort, span
 from stlc.monitor.pairs import Pairs, fits
 from stlc.monitor.streams import EndlessError, endless, looks_on, plan
 from stlc.monitor.values import Record, by_truth, window_bounds
@@ -39,6 +41,10 @@ class Tracker(Protocol):
 
     Instants are settled one after the other: from then on their value cannot change.
     """
+
+    @property
+    def samples(self) -> int:
+        """How many it has taken in."""
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
         """Take new samples in; the arguments are those of `Side.grow`."""
@@ -75,10 +81,32 @@ class Trackers:
             rule: the requirement.
             asked: how its values are taken.
             everywhere: it is judged at every instant, and not only at the first one.
+
+        Raises:
+            UsageError: E313, what every instant has windows of its own for is too much.
         """
-        window = window_of(rule, self.horizon)
+        alone = Trackers(self.horizon)
+        tried = alone.plain(rule, asked, everywhere=everywhere)
+        window = tried.window if isinstance(tried, Windowed) else None
+
+        def make(part: Rule) -> Tracker:
+            return Trackers(self.horizon).plain(part, asked, everywhere=everywhere)
+
+        paced = Paced(rule, make, everywhere, isinstance(tried, Whole), window)
+        found = effort(rule.formula, sum(span(rule.formula)) + (window or 0), paced)
+        if found.own > MOST:
+            raise UsageError(_too_much(rule, found))
+        if paced.all_kept or found.rows > WIDE:
+            return paced
+        return self.plain(rule, asked, everywhere=everywhere)
+
+    def plain(self, rule: Rule, asked: Asked, *, everywhere: bool) -> Tracker:
+        """The tracker that judges a requirement after every sample."""
+        formula, window = rule.formula, window_of(rule, self.horizon)
+        if window is not None and (bounded := without_end(formula, window)) is not None:
+            formula, window = bounded, None
         try:
-            plans = _plans(rule.formula, asked.ending, window)
+            plans = _plans(formula, asked.ending, window)
             if window is not None:
                 if plans["truncate"].lag or not everywhere:
                     raise EndlessError
@@ -90,11 +118,46 @@ class Trackers:
             if asked.ending == "truncate" or not fits(plans):
                 return Everywhere(plans, asked)
             counted = (self.horizon if rule.windowed else rule.reach) if everywhere else 0
-            later = max(counted or 0, reach(rule.formula).future)
+            later = max(counted or 0, reach(formula).future)
             pairs = self._pairs.setdefault((everywhere, asked.truth, asked.begin, later), Pairs(asked.truth))
-            return pairs.add(rule.formula)
+            return pairs.add(formula)
         except EndlessError:
             return Whole(rule, self.horizon, asked.ending, asked.truth)
+
+
+def without_end(formula: ir.Formula, window: int) -> ir.Formula | None:
+    """The formula with `end` so many samples after its instant; None where `end` depends on more than that.
+
+    It does under another window, and where windows with an end of their own reach beyond it.
+    """
+    moved = _ended(formula, window)
+    return moved if moved is not None and not endless(moved) and reach(moved).future <= window else None
+
+
+def _ended(formula: ir.Formula, window: int) -> ir.Formula | None:
+    match formula:
+        case ir.Join(items=items):
+            found = [_ended(item, window) for item in items]
+            return None if None in found else replace(formula, items=tuple(each for each in found if each))
+        case ir.Over(window=ir.Window(lo, None)) | ir.Until(window=ir.Window(lo, None)) if lo <= window:
+            return replace(formula, window=ir.Window(lo, window))
+        case _:
+            return formula
+
+
+def _too_much(rule: Rule, found: Work) -> Diagnostic:
+    """E313 for a formula that every instant judges on its own, on too many samples."""
+    assert found.heaviest is not None
+    what = "every instant keeps values of its own" if isinstance(found.heaviest, ir.Freeze) else "`end` moves"
+    return Diagnostic(
+        "E313",
+        f"a stream cannot judge `{rule.name}`: {what}, and {found.own:,} samples to look at",
+        found.heaviest.span or rule.span,
+        help=(
+            "shorten its intervals",
+            "`stlc check SPEC TRACE` judges a recording",
+        ),
+    )
 
 
 def _plans(formula: ir.Formula, ending: Ending, window: int | None) -> Plans:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from stlc.grammar import ast
-from stlc.grammar.english import definitions_of, sentence
+from stlc.grammar.english import REPEATED, Meanings, sentence
 from stlc.grammar.parser import parse
 from stlc.source import Source
 
@@ -53,4 +53,22 @@ def test_definitions_are_followed():
     )
     item = spec.items[-1]
     assert isinstance(item, ast.Require)
-    assert definitions_of(item, spec) == [("d", "3 s"), ("a", "b > 1"), ("b", "x + c"), ("c", "2 [m]")]
+    assert Meanings(spec).of(item) == [("d", "3 s"), ("a", "b > 1"), ("b", "x + c"), ("c", "2 [m]")]
+
+
+def test_an_implication_is_said_once():
+    text = told(" -> ".join(["x > 0"] * 100))
+    assert len(text) < 3000
+
+
+def test_definitions_that_many_requirements_share_are_not_told_with_each():
+    count = 1200
+    chain = "".join(f"def d{i} = not d{i - 1}\n" for i in range(1, count))
+    uses = "".join(f"require r{i}: d{count - 1}\n" for i in range(count))
+    spec = parse(Source("text", f"signal x\ndef d0 = x > 0\n{chain}{uses}"))
+    meanings = Meanings(spec)
+    told = [meanings.of(item) for item in spec.items if isinstance(item, ast.Require)]
+    assert len(told[0]) == count
+    assert told[0] == told[1]
+    assert not told[-1]
+    assert sum(len(text) for each in told for _, text in each) < 2 * REPEATED

@@ -21,12 +21,14 @@ from stlc.compile.horizon import reach, uses_end
 from stlc.compile.lower import lower
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.simplify import simplify
-from stlc.diagnostics import StlcError
+from stlc.diagnostics import StlcError, UsageError
+from stlc.monitor import paced, tracking
 from stlc.monitor.asked import Asked
 from stlc.monitor.columns import FAR
 from stlc.monitor.endings import lengthened, may_end, with_seen
 from stlc.monitor.everywhere import Everywhere
 from stlc.monitor.online import How
+from stlc.monitor.paced import Paced
 from stlc.monitor.pairs import Paired
 from stlc.monitor.tracking import FromTheStart, Trackers, Whole
 from stlc.monitor.values import Record, bounds
@@ -355,6 +357,9 @@ def test_which_memory_a_requirement_needs() -> None:
     for name in REQUIREMENTS:
         (watched,) = monitor_of(name).online()._watched
         kinds[name] = type(watched.values)
+        if isinstance(watched.values, Paced):
+            assert watched.values.all_kept
+            kinds[name] = Whole
     assert kinds["end_under_a_window"] is Whole
     assert {kinds[n] for n in ("always", "response", "infinitely_often", "until", "late_until")} == {
         FromTheStart
@@ -426,3 +431,83 @@ def test_assumptions_say_what_is_in_scope() -> None:
     other = Monitor(text, dt=0.1).online()
     other.push({"a": -0.5})
     assert other.in_scope is False
+
+
+# ---------------------------------------------------------------------------- wide windows
+
+WIDE = {
+    "always": "always[0, W] x > -9",
+    "negated": "not (always[0, W] x > -9)",
+    "nested": "eventually[0, W] always[0, W] x > 9",
+    "response": "always (x > 0 -> eventually[0, W] x < -9)",
+    "once": "always once[0, W] x > 0",
+    "since": "always (x > -9 since[0, W] x > 9)",
+    "until": "x > -9 until[0, W] x > 9",
+    "unless": "always next(x > -9 unless[0, W] x > 9)",
+    "edge": "always[0, W] (rise(x > 9) -> eventually[0, W] x < -9)",
+    "shifted": "always (prev(once[0, W] x > 0) or x < 9)",
+    "swept": "always once[0, W] sweep([x, x]) in circle([0, 0], 1)",
+    "clock": "always@[0 s, W] x > -9",
+}
+
+
+@pytest.mark.parametrize("name", WIDE)
+def test_no_more_rows_for_windows_that_are_longer_than_the_stream(name: str) -> None:
+    rows = []
+    for wide in ("1e5 s", "1e8 s"):
+        online = Monitor(f"signal x\nrequire r: {WIDE[name].replace('W', wide)}", dt=1.0).online()
+        for k in range(40):
+            online.push({"x": float(k % 3)})
+        (watched,) = online._watched
+        assert isinstance(watched.values, Paced)
+        kept = [getattr(watched.values._inner, "shared", None), *getattr(watched.values._inner, "_sides", [])]
+        kept += [front.side for front in getattr(watched.values._inner, "_fronts", [])]
+        columns = [
+            column
+            for side in kept
+            if side is not None
+            for column in getattr(side, "rows", getattr(side, "_rows", {})).values()
+        ]
+        rows.append([len(column) for column in columns])
+    assert rows[0] == rows[1]
+    assert 0 < max(rows[0]) < 20_000
+
+
+def test_wide_windows_are_judged_now_and_then_and_right_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(paced, "WIDE", 16)
+    monkeypatch.setattr(tracking, "WIDE", 16)
+    monkeypatch.setattr(paced, "_SHORT", 8)
+    monitor = Monitor("signal x\nrequire r: always[0 s, 200 s] eventually[0 s, 30 s] x > 0", dt=1.0)
+    online, values = monitor.online(), [1.0 if k < 150 else -1.0 for k in range(300)]
+    told = [d for value in values for d in online.push({"x": value})]
+    (decision,) = told
+    assert decision.status == "violated"
+    assert 180 <= decision.sample < 181 + 181 / 8
+    assert online.finish()["r"].high == monitor.check({"x": np.array(values)})["r"].bounds[1]
+
+
+def test_what_every_instant_has_for_itself_is_refused_before_the_first_sample() -> None:
+    text = "signal x\nrequire r: always (freeze a = x in eventually[0 s, {} s] x > a)"
+    with pytest.raises(UsageError) as caught:
+        Monitor(text.format(100_000), dt=1.0).online()
+    (finding,) = caught.value.diagnostics
+    assert finding.code == "E313"
+    assert finding.span is not None
+    assert finding.span.text.startswith("freeze a = x in")
+    Monitor(text.format(100), dt=1.0).online()
+
+
+@pytest.mark.parametrize(
+    "formula", ["1 > 0", "freeze a = 1 in a > 0", "always once norm([1, 2]) > 3", "true"]
+)
+@pytest.mark.parametrize("end", ["open", "truncate"])
+@pytest.mark.parametrize("tolerance", [1e-6, 0.0])
+def test_requirements_that_read_no_signal(formula: str, end: Any, tolerance: float) -> None:
+    monitor = Monitor(f"signal x\nrequire r: {formula}\nrequire q: x > 0", dt=1.0)
+    online = monitor.online(How(end=end, tolerance=tolerance))
+    for value in (1.0, 2.0):
+        online.push({"x": value})
+    whole = monitor.check({"x": np.array([1.0, 2.0])}, end=end, tolerance=tolerance)
+    assert {name: tally.status for name, tally in online.finish().items()} == {
+        judgement.name: judgement.status for judgement in whole
+    }
