@@ -25,7 +25,7 @@ _NAMED = ast.Def | ast.Region | ast.Const
 
 
 REPEATED = 200_000
-"""Letters of definitions that are told again with each requirement that uses them; from then on each is told once."""
+"""Letters of definitions that are told with each requirement that uses them; after that each is told once."""
 
 
 class Meanings:

@@ -35,7 +35,7 @@ _SHORT = 1 << 9
 """Samples for which windows are cut at first."""
 
 _NARROW = 1 << 12
-"""Samples that windows of the past look back at most where those of the future are cut, or the other way round."""
+"""Samples that windows of one direction look at, at most, where those of the other are cut."""
 
 _FROZEN = 500
 """Rows that take as long as one instant of a `freeze`, apart from what stands in it."""
