@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from stlc.diagnostics import StlcError
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
 from stlc.monitor.explain import Cause, explain_all
+from stlc.monitor.prepared import beside
 from stlc.monitor.verdict import Judgement, Monitor, Verdict
 from stlc.source import Source
 from stlc.trace import Trace
@@ -46,30 +48,36 @@ def driven_section(material: Material) -> Section | None:
         )
         return Section("driven", TITLE, reason)
     names = trace_names(trace)
+    causes = explain_all(verdict)
     choices = choose_traces(_per_trace(verdict), names, acted_in(trace))
     picture = draw_signals(trace, margins, choices, units_of(verdict))
     body = join(
         el("p", _summary(verdict)),
-        _verdict_table(verdict, names),
+        _verdict_table(verdict, causes, names),
         figure(picture.data_uri(), picture.alt, _caption(trace, judged_once(verdict))),
-        causes_of(verdict, names, monitor.spec),
+        causes_of(causes, names, monitor.spec),
     )
     return Section("driven", TITLE, body, picture)
 
 
-def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None) -> Monitor:
+def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None, drives: bool = False) -> Monitor:
     """What judges a trace: by the specification that it carries, or else by `text`.
 
-    `system` is the system file, which provides the functions that a specification takes from outside.
+    Args:
+        trace: what was recorded.
+        text: of a specification, where the trace carries none.
+        system: the system file, which provides the functions that a specification takes from outside.
+        drives: judge by the rules of drives where the trace carries them, not by what plans are made for.
 
     Raises:
         SpecError: the specification is invalid.
     """
-    source = Source("spec.stl", trace.meta.spec_text or text)
-    spec = replace(parse(source), library=trace.meta.spec_library or None)
+    carried = trace.meta.carried if drives else trace.meta.planned
+    source = Source("spec.stl", carried.text or text)
+    spec = replace(parse(source), library=carried.library or None)
     outside = any(isinstance(item, ast.Extern) for item in spec.items)
     used = system if outside and system is not None and system.is_file() else None
-    return Monitor(spec, system=used, overrides=trace.meta.spec_set)
+    return Monitor(spec, system=used, overrides=carried.overrides)
 
 
 def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, NDArray[np.float64]]:
@@ -138,7 +146,7 @@ def _summary(verdict: Verdict) -> str:
     return f"{whole}; from {share(verdict.share)} of all starts what was driven satisfies all of them."
 
 
-def _verdict_table(verdict: Verdict, names: list[str]) -> Html:
+def _verdict_table(verdict: Verdict, causes: Mapping[str, Cause], names: list[str]) -> Html:
     header = (
         "requirement",
         "verdict",
@@ -149,7 +157,7 @@ def _verdict_table(verdict: Verdict, names: list[str]) -> Html:
     )
     rows: list[tuple[Child, ...]] = []
     for judgement in verdict:
-        trace, sample = judgement.worst
+        trace, _ = judgement.worst
         violating = judgement.statuses.count("violated")
         rows.append(
             (
@@ -158,10 +166,19 @@ def _verdict_table(verdict: Verdict, names: list[str]) -> Html:
                 f"{violating:,} of {verdict.traces:,}",
                 share(judgement.share, 2),
                 _least(judgement),
-                f"{names[trace]}, t = {verdict.subject.time(sample):.3g} s",
+                ", ".join(filter(None, (names[trace], where_of(judgement, verdict, causes)))),
             )
         )
     return table(header, rows, numeric=(2, 3, 4))
+
+
+def where_of(judgement: Judgement, verdict: Verdict, causes: Mapping[str, Cause]) -> str:
+    """The instant of the worst violation; without one the start of the window with least to spare."""
+    moment, cause = verdict.subject.moment, causes.get(judgement.name)
+    if cause is None:
+        return f"from {moment(judgement.worst[1])}" if judgement.instants > 1 else ""
+    start = cause.start if judgement.instants > 1 else cause.sample
+    return beside(moment(cause.sample), moment(start))
 
 
 _KINDS = {"satisfied": "good", "violated": "bad"}
@@ -199,13 +216,12 @@ def _key(word: str, color: str) -> Html:
     return join(classed("span", "whole", swatch, word), "  ")
 
 
-def causes_of(verdict: Verdict, names: list[str], spec: ast.Spec) -> Html | None:
+def causes_of(causes: Mapping[str, Cause], names: list[str], spec: ast.Spec) -> Html | None:
     """Of each violated requirement its worst violation: which part, when, with which values."""
-    causes = list(explain_all(verdict).values())
     if not causes:
         return None
     declared = {item.name: item for item in spec.items if isinstance(item, ast.Require)}
-    told = [_cause_html(cause, names, declared.get(cause.judgement.name)) for cause in causes]
+    told = [_cause_html(cause, names, declared.get(cause.judgement.name)) for cause in causes.values()]
     return join(el("h3", "What failed, and why"), told)
 
 
