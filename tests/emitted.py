@@ -7,11 +7,13 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from formula_strategies import GRID, NAMES
-from hypothesis import HealthCheck, Phase, given, settings
+from formula_strategies import GRID, NAMES, numbers, state_formulas
+from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
+from reference import number
 
 from stlc.compile import ir, typed
+from stlc.compile.arith import Program
 from stlc.compile.c_adjoint import emit_adjoint
 from stlc.compile.defined import defined
 from stlc.compile.emit_c import Motion, emit
@@ -19,7 +21,9 @@ from stlc.compile.graph import evaluate
 from stlc.compile.lower import lower
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.ops_torch import TORCH
+from stlc.compile.samples import everything, leaves
 from stlc.compile.simplify import simplify
+from stlc.compile.switch import StraightThrough
 from stlc.native import Adjoint, Kernel, Outcome, load
 
 T = TypeVar("T")
@@ -56,11 +60,20 @@ def adjoint_of(motion: Motion, rules: Sequence[ir.Formula], *, fixed: Sequence[s
 
 
 def gathered(
-    strategy: st.SearchStrategy[T], count: int, keep: Callable[[T], bool] = lambda _: True
+    strategy: st.SearchStrategy[T],
+    count: int,
+    keep: Callable[[T], bool] = lambda _: True,
+    first: int | None = None,
 ) -> list[T]:
     """So many drawn values that are wanted, so that one C text may hold them all."""
     found: list[T] = []
-    run = settings(max_examples=count, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+    run = settings(
+        max_examples=count,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+        database=None,
+        deadline=None,
+    )
 
     @run
     @given(strategy)
@@ -68,7 +81,7 @@ def gathered(
         if keep(value):
             found.append(value)
 
-    gather()
+    (gather if first is None else seed(first)(gather))()
     return found
 
 
@@ -76,6 +89,67 @@ def planned(formula: typed.Formula) -> ir.Formula | None:
     """A formula as it is trained for; None where it looks beyond a plan of `STEPS` steps."""
     node = simplify(lower(formula, GRID, sink=[]))
     return node if defined(node, STEPS + 1)[0] else None
+
+
+def choosing(count: int, first: int) -> list[ir.Num]:
+    """Numbers with choices and indicators, as resolving leaves them: constants are folded."""
+    conditions = state_formulas(numbers)
+    joined = st.builds(ir.Join, st.sampled_from(["and", "or"]), st.tuples(conditions, conditions, conditions))
+    drawn = st.builds(ir.Where, conditions | joined, numbers, numbers) | st.builds(ir.Ind, joined)
+    return list(dict.fromkeys(gathered(drawn, count, _is_folded, first)))
+
+
+def _is_folded(num: ir.Num) -> bool:
+    for part in everything(num):
+        constant = all(isinstance(leaf, ir.Lit) for leaf in leaves(part))
+        if constant and not isinstance(part, ir.Lit):
+            return False
+        if isinstance(part, ir.Ind | ir.Where) and _decided(part.cond):
+            return False
+    return True
+
+
+def _decided(cond: ir.Formula) -> bool:
+    """Whether an atom compares constants."""
+    if isinstance(cond, ir.Join):
+        return any(map(_decided, cond.items))
+    return isinstance(cond, ir.Atom) and isinstance(cond.num, ir.Lit)
+
+
+def slopes_agree(nums: Sequence[ir.Num], points: np.ndarray, slope: float = 4.0) -> None:
+    """Through conditions that step hard: the value is the exact one, the gradient of C is that of torch.
+
+    Args:
+        nums: over the columns of `formula_strategies`.
+        points: values of the columns, (batch, 3).
+        slope: of conditions.
+    """
+    states = tuple(f"state{i}" for i in range(len(nums)))
+    motion = Motion(states, NAMES, (), dict(zip(states, nums, strict=True)), 1, 0.1)
+    adjoint, batch = adjoint_of(motion, [ir.Atom(ir.Col(states[0]))]), len(points)
+    for i, num in enumerate(nums):
+        by_states = np.zeros((len(nums), 2, batch))
+        by_states[i, 1] = 1.0
+        outcome = Outcome(np.zeros((batch, 1)), by_states, slope)
+        found = adjoint.pull(np.zeros((batch, len(nums))), points[:, None].copy(), outcome)[:, 0]
+        x = torch.from_numpy(points.copy()).requires_grad_()
+        env = dict(zip(NAMES, x.unbind(1), strict=True))
+        value = Program({"out": num})(env, TORCH, StraightThrough(slope))["out"].expand(batch)
+        exact = [number(num, dict(zip(NAMES, map(float, row), strict=True))) for row in points]
+        np.testing.assert_allclose(value.detach(), exact, rtol=1e-9, atol=1e-9, err_msg=str(num))
+        expected = np.zeros((batch, len(NAMES)))
+        if value.requires_grad:
+            expected = torch.autograd.grad(value.sum(), x)[0].numpy()
+        np.testing.assert_array_equal(np.isfinite(found), np.isfinite(expected), err_msg=str(num))
+        known = np.isfinite(expected)
+        np.testing.assert_allclose(found[known], expected[known], rtol=1e-7, atol=1e-9, err_msg=str(num))
+
+
+def near_switches(points: np.random.Generator, batch: int) -> np.ndarray:
+    """Values of the columns, (batch, 3): on ties and switches, within 1e-3 of them, and anywhere."""
+    coarse = points.integers(-8, 9, (batch, 3)) / 4.0
+    close = points.normal(0, 1e-3, (batch, 3)) * points.integers(0, 2, (batch, 1))
+    return np.where(points.random((batch, 1)) < 0.75, coarse + close, points.normal(0, 2, (batch, 3)))
 
 
 def traces_of(seed: int, batch: int) -> np.ndarray:

@@ -35,11 +35,14 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 import laws
+from emitted import choosing, near_switches, slopes_agree
 from formula_strategies import formulas, traces
 from mission_strategies import bodies, missions
 from proof import missions as states
 from proof import monitored, slopes, streamed
 from proof.cases import Case
+
+from stlc.native import compiler
 
 BLOCK = 100
 """Cases that one process runs before it tells what came out."""
@@ -123,6 +126,20 @@ def by_hypothesis(
     return min(cases, block.count), []
 
 
+def drawn_choices(block: Block) -> tuple[int, list[str]]:
+    """Choices between numbers, at switches and near them, in C and in torch; nothing without a C compiler."""
+    if compiler() is None:
+        return 0, []
+    nums = choosing(block.count, block.first)
+    points = near_switches(np.random.default_rng(block.first), 60)
+    mismatches = []
+    try:
+        slopes_agree(nums, points)
+    except Exception as error:
+        mismatches.append(f"{block.proof} {block.first}: {type(error).__name__}: {error}")
+    return len(nums), mismatches
+
+
 def _law(data: st.DataObject, env: dict[str, Any], flip: bool, name: str) -> None:
     laws.check_law(laws.LAWS[name], data.draw, env, flip=flip)
 
@@ -166,6 +183,7 @@ PROOFS: dict[str, Callable[[Block], tuple[int, list[str]]]] = {
         f"gradients-{name}": partial(one_by_one, partial(slopes.check_gradient, name=name))
         for name in ("exact", "smooth", "agm", "dgmsr")
     },
+    "gradients-choices": drawn_choices,
     "rtamt": partial(one_by_one, _rtamt),
 }
 EXTRA = frozenset({"rtamt"})

@@ -287,11 +287,14 @@ class _Writer:
         """The soft indicator of a state formula: of its margin, settled where atoms differ in strictness."""
         kinds = _strictness(cond)
         margin = self.margin(cond)
+        truth = self._truth(cond) if len(kinds) > 1 else None
         if isinstance(margin, float):
-            return float(margin > 0 if True in kinds else margin >= 0)
+            known = truth if isinstance(truth, bool) else (margin > 0 if True in kinds else margin >= 0)
+            return float(known)
         weight = self.tape.emit("indicator", margin, params=(True in kinds, sharpness))
-        truth = True if len(kinds) == 1 else self._truth(cond)
-        return weight if isinstance(truth, bool) else self.tape.emit("settle", weight, truth)
+        if truth is None:
+            return weight
+        return self.tape.emit("settle", weight, float(truth) if isinstance(truth, bool) else truth)
 
     def margin(self, cond: ir.Formula) -> Operand:
         """The exact robustness of a state formula."""

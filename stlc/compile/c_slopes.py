@@ -1,6 +1,7 @@
 """Derivatives of numbers as C statements: reverse mode over the registers that a `NumberWriter` has filled.
 
-Conditions step hard and have the slope of `(1 + tanh(slope margin)) / 2`, as `switch.StraightThrough` has it.
+Derivatives are those of `ops_torch`, at ties and kinks too. Conditions step hard and have the slope of
+`(1 + tanh(slope margin)) / 2`, as `switch.StraightThrough` has it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ UNARY_SLOPES = {
     "neg": "(-1.0)",
     "abs": "(double)(({0} > 0.0) - ({0} < 0.0))",
     "square": "(2.0 * {0})",
-    "relu": "(double)({0} > 0.0)",
+    "relu": "(double)({0} >= 0.0)",
     "sqrt": "({r} > 0.0 ? 0.5 / {r} : 0.0)",
     "exp": "{r}",
     "log": "(1.0 / {0})",
@@ -38,14 +39,9 @@ BINARY_SLOPES = {
     "mod": ("1.0", "(-floor({0} / {1}))"),
     "pow": ("({1} * pow({0}, {1} - 1.0))", "({0} > 0.0 ? {r} * log({0}) : 0.0)"),
     "atan2": ("({1} / ({0} * {0} + {1} * {1}))", "(-{0} / ({0} * {0} + {1} * {1}))"),
-    "min": ("(double)!({1} < {0})", "(double)({1} < {0})"),
-    "max": ("(double)!({1} > {0})", "(double)({1} > {0})"),
 }
-CLIP_SLOPES = (
-    "(double)(({0} >= {1}) & ({0} <= {2}))",
-    "(double)(({0} < {1}) & ({1} <= {2}))",
-    "(double)(MAX({0}, {1}) > {2})",
-)
+LESS = {"min": "<", "max": ">"}
+"""Of which operand an extremum is."""
 
 
 class SlopeWriter(NumberWriter):
@@ -121,13 +117,34 @@ class SlopeWriter(NumberWriter):
         register = super()._apply(name, args)
         if name == "norm":
             slopes = [(arg, f"({register} > 0.0 ? {arg} / {register} : 0.0)") for arg in args]
-        elif name == "clip" or name in BINARY_SLOPES:
-            forms = CLIP_SLOPES if name == "clip" else BINARY_SLOPES[name]
+        elif name in LESS:
+            slopes = list(zip(args, self._shares(name, args[0], args[1]), strict=True))
+        elif name == "clip":
+            slopes = self._clipped(*args)
+        elif name in BINARY_SLOPES:
+            forms = BINARY_SLOPES[name]
             slopes = [(arg, form.format(*args, r=register)) for arg, form in zip(args, forms, strict=True)]
         else:
             slopes = [(args[0], UNARY_SLOPES[name].format(*args, r=register))] if name in UNARY_SLOPES else []
         self._remember(register, slopes)
         return register
+
+    def _shares(self, name: str, first: str, second: str) -> tuple[str, str]:
+        """The derivatives of an extremum by its operands: equal ones share it, a constant has none of it."""
+        registers, sign = set(self._texts.values()), LESS[name]
+        if second not in registers:
+            return f"(double)!({second} {sign} {first})", "0.0"
+        if first not in registers:
+            return "0.0", f"(double)!({first} {sign} {second})"
+        equal = f"0.5 * ({first} == {second})"
+        return f"(({first} {sign} {second}) + {equal})", f"(({second} {sign} {first}) + {equal})"
+
+    def _clipped(self, x: str, low: str, high: str) -> list[Slope]:
+        """The derivatives of `min(max(x, low), high)`."""
+        raised = super()._apply("max", [x, low])
+        of_x, of_low = self._shares("max", x, low)
+        of_raised, of_high = self._shares("min", raised, high)
+        return [(x, f"({of_x} * {of_raised})"), (low, f"({of_low} * {of_raised})"), (high, of_high)]
 
     def _remember(self, register: str, slopes: list[Slope]) -> None:
         registers = set(self._texts.values())

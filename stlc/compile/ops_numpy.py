@@ -81,7 +81,7 @@ class NumpyOps:
 
     def settled(self, weight: Array, mask: Mask) -> Array:
         """1 where `mask`, else 0."""
-        return self.number(mask, weight)
+        return np.broadcast_to(np.asarray(mask, dtype=weight.dtype), weight.shape)
 
     def number(self, mask: Mask, like: Array) -> Array:
         """1 where `mask`, else 0."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from emitted import OPERATIONS, STEPS, adjoint_of, gradients_agree
+from emitted import OPERATIONS, STEPS, adjoint_of, choosing, gradients_agree, near_switches, slopes_agree
 from formula_strategies import NAMES
 
 from stlc.compile import ir
@@ -48,6 +48,37 @@ def test_the_gradient_through_conditions_of_a_step_is_that_of_a_tanh() -> None:
     bump = 0.5 * slope / np.cosh(slope * first) ** 2
     through = 1.0 + bump * ((first + 0.7) - 2 * 0.7)
     np.testing.assert_allclose(found[:, 0, 0], np.array([1.0, 2.0]) * through, rtol=1e-12)
+
+
+def test_choices_have_the_slope_of_torch_at_switches_and_near_them() -> None:
+    slopes_agree(choosing(60, 0), near_switches(np.random.default_rng(0), 60))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", range(1, 40))
+def test_many_choices_have_the_slope_of_torch(first: int) -> None:
+    slopes_agree(choosing(150, first), near_switches(np.random.default_rng(first), 100))
+
+
+@pytest.mark.parametrize("strict", [True, False])
+def test_what_is_always_true_is_taken_whatever_the_strictness_of_its_parts(strict: bool) -> None:
+    x, y, z = (ir.Col(name) for name in NAMES)
+    always = ir.Join("or", (ir.Atom(ir.Lit(0.0), strict=not strict), ir.Atom(y, strict=strict)))
+    slopes_agree([ir.Where(always, z, x), ir.Ind(always)], near_switches(np.random.default_rng(1), 60))
+
+
+def test_equal_operands_share_the_slope() -> None:
+    x, y, z = (ir.Col(name) for name in NAMES)
+    both = ir.Join("and", (ir.Atom(x), ir.Atom(y)))
+    choice = ir.Where(both, ir.Lit(3.0), z)
+    motion = Motion(("state",), NAMES, (), {"state": choice}, 1, 0.1)
+    by_state, slope = np.zeros((1, 2, 1)), 2.0
+    by_state[0, 1] = 1.0
+    point = np.array([[[0.25, 0.25, 1.0]]])
+    outcome = Outcome(np.zeros((1, 1)), by_state, slope)
+    found = adjoint_of(motion, [ir.Atom(ir.Col("state"))]).pull(np.zeros((1, 1)), point, outcome)
+    bump = 0.5 * slope / np.cosh(slope * 0.25) ** 2
+    np.testing.assert_allclose(found[0, 0], [bump, bump, 0.0], rtol=1e-12)
 
 
 def test_no_gradient_goes_through_fixed_states_and_broken_rows() -> None:
