@@ -23,6 +23,7 @@ from stlc.trace_parquet import damage, open_parquet, signal_fields, table_of
 from stlc.trace_recording import CLOCK, EXTRA, Recording, Strand, of_arrays
 from stlc.trace_table import of_table
 from stlc.trace_time import RESAMPLE, TOLERANCE
+from stlc.trace_words import instants_of
 
 Array = NDArray[Any]
 
@@ -63,7 +64,7 @@ def pieces(path: Path, samples: int, reading: Reading) -> Iterator[Trace]:
     for recording in _recordings(path, samples):
         if clock is None:
             first = _single(trace_of(recording, reading))
-            clock = _Clock(first.name, first.dt, first.t0, first.samples)
+            clock = _Clock(first, _begin(recording, reading))
             yield first
         else:
             yield _single(clock.next(recording, reading))
@@ -89,11 +90,22 @@ def _single(trace: Trace) -> Trace:
     return trace
 
 
+def _begin(recording: Recording, reading: Reading) -> np.datetime64 | None:
+    """The first date of a clock that is written in dates."""
+    clock = reading.names.get(CLOCK)
+    (strand,) = (recording if clock is None else recording.clocked_by(clock)).strands
+    if strand.clock is None or strand.clock.dtype.kind != "U":
+        return None
+    first: np.datetime64 = instants_of(recording.name, strand).flat[0]
+    return first
+
+
 class _Clock:
     """Time that goes on from one piece to the next."""
 
-    def __init__(self, name: str, dt: float, t0: float, samples: int) -> None:
-        self.name, self.dt, self.t0, self.samples = name, dt, t0, samples
+    def __init__(self, first: Trace, begin: np.datetime64 | None) -> None:
+        self.name, self.dt, self.t0, self.samples = first.name, first.dt, first.t0, first.samples
+        self.begin = begin
 
     def next(self, recording: Recording, reading: Reading) -> Trace:
         """The piece on the grid of those before it."""
@@ -102,13 +114,22 @@ class _Clock:
         recording = recording if renamed is None else recording.clocked_by(renamed)
         (strand,) = recording.strands
         if strand.clock is not None:
-            self._check(strand.clock.astype(np.float64))
+            self._check(self._seconds(strand))
         meta = replace(recording.meta, dt=self.dt)
         unclocked = replace(recording, strands=(Strand(strand.arrays, None),), meta=meta)
         trace = trace_of(unclocked, replace(reading, names=names))
         start = self.t0 + self.samples * self.dt
         self.samples += trace.samples
         return replace(trace, t0=start)
+
+    def _seconds(self, strand: Strand) -> NDArray[np.float64]:
+        """The times of a piece, of dates since the first of the file."""
+        assert strand.clock is not None
+        if strand.clock.dtype.kind not in "Uc":
+            return strand.clock.astype(np.float64)
+        instants = instants_of(self.name, strand)
+        begin = instants.flat[0] if self.begin is None else self.begin
+        return np.asarray((instants - begin) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)
 
     def _check(self, times: NDArray[np.float64]) -> None:
         """Every sample is where the grid says; small errors of rounding may add up slowly."""

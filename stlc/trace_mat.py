@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.trace_extras import needed
-from stlc.trace_mat5 import read_mat5
-from stlc.trace_npz import MAX_ARRAYS, MAX_BYTES, unreadable
+from stlc.trace_mat5 import complex_of, read_mat5
+from stlc.trace_npz import MAX_ARRAYS, MAX_BYTES, room_for, unreadable
 from stlc.trace_parquet import damage
 from stlc.trace_recording import Recording, of_arrays
 
@@ -70,7 +70,7 @@ def _as_signal(values: Array) -> Array:
 def _read_hdf5(path: Path) -> dict[str, Array]:
     h5py = needed("h5py")
     found: dict[str, Array] = {}
-    room = MAX_BYTES
+    room = room_for(path)
     with damage(path), h5py.File(path, "r") as file:
         for name, dataset in _datasets(path, file, "", 0):
             size = int(np.prod(dataset.shape, dtype=np.float64)) * dataset.dtype.itemsize
@@ -85,8 +85,8 @@ def _real(values: Array) -> Array:
     """Pairs of real and imaginary parts as complex numbers; real ones where all of the latter are 0."""
     if values.dtype.names is None:
         return values
-    real, turned = (values[part].astype(np.float64) for part in _COMPLEX)
-    return real + 1j * turned if turned.any() else real
+    real, turned = (values[part] for part in _COMPLEX)
+    return complex_of(real, turned) if turned.any() else real
 
 
 def _datasets(path: Path, group: Any, prefix: str, depth: int) -> Iterator[tuple[str, Any]]:

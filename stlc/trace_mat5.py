@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.trace_npz import MAX_ARRAYS, MAX_BYTES, unreadable
+from stlc.trace_npz import MAX_ARRAYS, room_for, unreadable
 
 Array = NDArray[Any]
 
@@ -53,7 +53,7 @@ def read_mat5(path: Path) -> dict[str, Array]:
         raw = path.read_bytes()
         order = "<" if raw[126:128] == b"IM" else ">"
         found: dict[str, Array] = {}
-        room = MAX_BYTES
+        room = room_for(path)
         for element in _elements(memoryview(raw)[_HEADER:], order):
             if element.kind == _COMPRESSED:
                 data = _inflated(element.data, room)
@@ -72,7 +72,7 @@ def _inflated(data: memoryview, room: int) -> bytes:
     engine = zlib.decompressobj()
     out = engine.decompress(data, room)
     if engine.unconsumed_tail:
-        raise _DamageError(f"it unpacks to more than {MAX_BYTES / 1e9:.0f} GB")
+        raise _DamageError(f"it unpacks to more than {room / 1e9:.1f} GB")
     if not engine.eof:
         raise _DamageError("compressed data that ends early")
     return out
@@ -140,8 +140,15 @@ def _add(found: dict[str, Array], name: str, matrix: _Matrix, order: str, depth:
         dtype = "?" if matrix.logical else _CLASSES[matrix.kind]
         values = _part(name, matrix, 0, order).astype(dtype)
         if matrix.imaginary and (turned := _part(name, matrix, 1, order)).any():
-            values = values + 1j * turned
+            values = complex_of(values, turned)
         found[name] = values.reshape(matrix.shape, order="F")
+
+
+def complex_of(real: Array, turned: Array) -> Array:
+    """Complex numbers of their real and imaginary parts."""
+    made = np.empty(real.shape, dtype=np.complex128)
+    made.real, made.imag = real, turned
+    return made
 
 
 def _part(name: str, matrix: _Matrix, index: int, order: str) -> Array:

@@ -38,8 +38,10 @@ MAX_ARRAYS = 10_000
 
 _ROOM = 500_000_000
 _RATIO = 200
-"""An archive may unpack to `_ROOM`, or to so many times its size; records of sensors take a tenth of that."""
+"""A packed file may unpack to `_ROOM`, or to so many times its size; records of sensors take a tenth."""
 
+_LAST_LETTER, _PAIRS = 0x10FFFF, (0xD800, 0xDFFF)
+"""What Unicode knows, and the halves of pairs that are no letters on their own."""
 _NUMERIC = "biuf"
 _TEXT = "U"
 _ZIP_MAGIC = (b"PK\x03\x04", b"PK\x05\x06")
@@ -107,6 +109,11 @@ def _check_magic(path: Path, file: IO[bytes]) -> None:
     raise unreadable(path, "it is empty" if not start else "it is not an `.npz` archive")
 
 
+def room_for(path: Path) -> int:
+    """Bytes that a packed file may unpack to."""
+    return min(MAX_BYTES, max(_ROOM, _RATIO * path.stat().st_size))
+
+
 class Member:
     """One array of an open archive, read from its start on, so many values along the time axis at a time.
 
@@ -131,12 +138,15 @@ class Member:
         if len(data) != size:
             raise unreadable(self._path, f"`{self._name}` is cut short")
         values = np.frombuffer(data, dtype=self._dtype)
+        _check_letters(self._path, self._name, values)
         return values if self._width == 1 else values.reshape(count, *self._shape[1:])
 
     def whole(self) -> Array:
         """All of it, in its own shape."""
         data = self._stream.read(math.prod(self._shape) * self._dtype.itemsize)
-        return np.frombuffer(data, dtype=self._dtype).reshape(self._shape)
+        values = np.frombuffer(data, dtype=self._dtype)
+        _check_letters(self._path, self._name, values)
+        return values.reshape(self._shape)
 
 
 def open_members(path: Path, stack: ExitStack) -> dict[str, Member]:
@@ -153,7 +163,7 @@ def _read_members(path: Path, archive: zipfile.ZipFile) -> dict[str, Array]:
     if len(members) > MAX_ARRAYS:
         raise unreadable(path, f"it holds {len(members)} arrays, more than {MAX_ARRAYS}")
     size = sum(member.file_size for member in members)
-    most = min(MAX_BYTES, max(_ROOM, _RATIO * path.stat().st_size))
+    most = room_for(path)
     if size > most:
         reason = f"it unpacks to {size / 1e9:.1f} GB, more than {most / 1e9:.1f} GB"
         raise unreadable(path, reason, advice="split it, or do not compress it")
@@ -174,7 +184,16 @@ def _read_array(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo, n
     if len(data) != size:
         raise unreadable(path, f"`{name}` is cut short")
     flat = np.frombuffer(bytearray(data), dtype=dtype) if size else np.zeros(0, dtype)
+    _check_letters(path, name, flat)
     return flat.reshape(shape, order="F" if fortran else "C")
+
+
+def _check_letters(path: Path, name: str, values: Array) -> None:
+    """Raise TraceError (E603) for a text with numbers that are no letters."""
+    if values.dtype.kind == "U" and values.dtype.itemsize and values.size:
+        letters = values.view(np.dtype(np.uint32).newbyteorder(values.dtype.byteorder))
+        if ((letters > _LAST_LETTER) | ((letters >= _PAIRS[0]) & (letters <= _PAIRS[1]))).any():
+            raise unreadable(path, f"`{name}` holds texts with numbers that are no letters")
 
 
 def _checked_header(

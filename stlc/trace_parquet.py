@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, StlcError, TraceError, UsageError
 from stlc.trace_csv import split_head
 from stlc.trace_extras import needed
-from stlc.trace_npz import MAX_BYTES, unreadable
+from stlc.trace_npz import MAX_BYTES, room_for, unreadable
 from stlc.trace_recording import Recording
 from stlc.trace_table import Table, of_table
 
@@ -49,8 +49,9 @@ def open_parquet(path: Path, *, whole: bool = True) -> Any:
     with damage(path):
         file = parquet.ParquetFile(path, memory_map=True)
         size = file.metadata.num_rows * max(file.metadata.num_columns, 1) * 8
-    if whole and not 0 <= size <= MAX_BYTES:
-        why = f"it unpacks to {size / 1e9:.1f} GB, more than {MAX_BYTES / 1e9:.0f} GB"
+    most = min(MAX_BYTES, room_for(path))
+    if whole and not 0 <= size <= most:
+        why = f"it unpacks to {size / 1e9:.1f} GB, more than {most / 1e9:.1f} GB"
         raise unreadable(path, why, advice="split it")
     return file
 

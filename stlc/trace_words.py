@@ -76,18 +76,23 @@ def _refuse_complex(trace: str, name: str, values: NDArray[Any]) -> None:
         raise TraceError(Diagnostic("E603", f"`{name}` in `{trace}` holds complex numbers", help=advice))
 
 
-def _seconds(trace: str, strand: Strand) -> NDArray[np.float64]:
-    """Dates and times (ISO 8601) as seconds since the first."""
+def instants_of(trace: str, strand: Strand) -> NDArray[np.datetime64]:
+    """The dates and times (ISO 8601) of a clock. Raises TraceError (E603) for other words."""
     assert strand.clock is not None
     _refuse_complex(trace, strand.named, strand.clock)
     written = np.char.rstrip(strand.clock, "Zz")
     try:
-        instants = written.astype("datetime64[ns]")
+        return np.asarray(written.astype("datetime64[ns]"))
     except ValueError:
         shown = str(strand.clock.flat[0])[:40]
         message = f"the clock `{strand.named}` in `{trace}` holds words (`{shown}`)"
         advice = ("seconds, or dates and times such as 2026-01-31T12:00:00.5",)
         raise TraceError(Diagnostic("E603", message, help=advice)) from None
+
+
+def _seconds(trace: str, strand: Strand) -> NDArray[np.float64]:
+    """Dates and times as seconds since the first."""
+    instants = instants_of(trace, strand)
     first = instants.flat[0] if instants.size else np.datetime64(0, "ns")
     return np.asarray((instants - first) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)
 

@@ -241,6 +241,17 @@ def test_arrays_of_the_wrong_kind(tmp_path: Path, values: np.ndarray) -> None:
     assert code_of(npz(tmp_path / "a.npz", t=[0.0, 0.1], x=values)) == "E603"
 
 
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("letter", [0x110000, 0xFFFFFFFF, 0xD800])
+def test_texts_with_numbers_that_are_no_letters(tmp_path: Path, letter: int, order: str) -> None:
+    text = np.array([0x61, letter], dtype=f"{order}u4").tobytes()
+    for name in ("meta", "x"):
+        path = zipped(
+            tmp_path / "a.npz", t=header((1,)) + bytes(8), **{name: header((), f"{order}U2") + text}
+        )
+        assert "no letters" in message_of(path)
+
+
 @pytest.mark.parametrize("nested", [b"(" * 3000, b"-" * 3000 + b"1", b"{'descr': '<f8'}"])
 def test_malicious_headers(tmp_path: Path, nested: bytes) -> None:
     block = npy.magic(1, 0) + len(nested).to_bytes(2, "little") + nested

@@ -1,11 +1,13 @@
 """Nothing that a user gives may end in a traceback, a hang, or a machine without memory.
 
-    python tools/fuzz.py --count 100000 --seed 0
+    python tools/fuzz.py --count 40000 --seed 0 --jobs 16 --seconds 10 --memory 2048 --log fuzz.jsonl
 
 Runs `stlc` in process on random, mutated and malicious inputs (`fuzz_inputs.py`) and prints what came out. An
 input fails if `stlc` crashes (exit code 70, a traceback, a Python warning, a dead process), needs more than
 `--seconds` of processor time, or asks for more than `--memory` MB beyond what the program needs. What failed
-is kept in `--keep`, with a README that says how to run it again. Exit code: 1 if anything failed.
+is kept in `--keep`, with a README that says how to run it again. With `--log` a run that was stopped goes on
+where it was; with `--kind csv --kind run` only such inputs are drawn. Formats whose library is not installed
+are left out, and that is said. Exit code: 1 if anything failed.
 """
 
 import argparse
@@ -14,6 +16,7 @@ import concurrent.futures
 import contextlib
 import functools
 import io
+import json
 import multiprocessing
 import os
 import random
@@ -24,15 +27,18 @@ import tempfile
 import time
 import traceback
 import warnings
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import fuzz_foreign
 import fuzz_inputs
+import fuzz_runs
+import fuzz_valid
 import typer
 from fuzz_laws import laws, stage
 from fuzz_specs import SMALL, SYSTEM
 from fuzz_traces import small_trace
+from fuzz_valid import FORMATS
 
 BATCH = 1000
 EVERY = 5000
@@ -41,6 +47,8 @@ PATIENCE = 60
 """Seconds of the clock without a sign of life, after which a worker is taken for hung in foreign code."""
 
 ANSWERS = frozenset(range(6))
+SKIPPED = -2
+"""Instead of an exit code, where a package is missing."""
 MISSING = 5
 """Exit code of what the machine does not have: memory, for instance."""
 
@@ -54,6 +62,7 @@ class Outcome:
     code: int
     seconds: float
     fault: str = ""
+    missing: str = ""
 
 
 @dataclass
@@ -64,13 +73,39 @@ class Limits:
     memory: int
 
 
-def run_one(seed, index, limits):
-    """Run one input in the current, empty folder."""
-    given = fuzz_inputs.draw(random.Random(f"{seed}:{index}"))
+@dataclass
+class Plan:
+    """Which inputs are drawn.
+
+    Attributes:
+        seed: of all.
+        kinds: of these only; of all if there are none.
+    """
+
+    seed: int
+    kinds: tuple = ()
+
+    def draw(self, index):
+        """The input of that number."""
+        return fuzz_inputs.draw(random.Random(f"{self.seed}:{index}"), self.kinds)
+
+
+def lay(folder, given):
+    """Write the files of an input."""
     for name, data in given.files.items():
-        Path(name).write_bytes(data)
+        path = Path(folder) / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+
+
+def run_one(plan, index, limits):
+    """Run one input in the current, empty folder."""
+    given = plan.draw(index)
+    if given.missing:
+        return Outcome(index, given.kind, SKIPPED, 0.0, missing=given.missing)
+    lay(".", given)
     started = time.process_time()
-    code, text, noise = _call(given.arguments, limits) if given.arguments else _read(limits)
+    code, text, noise = _call(given.arguments, limits, given.typed) if given.arguments else _read(limits)
     seconds = time.process_time() - started
     fault = _fault(code, text, noise)
     if not fault and given.arguments and seconds > limits.seconds:
@@ -78,18 +113,21 @@ def run_one(seed, index, limits):
     return Outcome(index, given.kind, code, seconds, fault)
 
 
-def _call(arguments, limits):
+def _call(arguments, limits, typed=b""):
     """Exit code, output and Python's warnings of a command line."""
     from stlc.cli.app import main
 
     out = io.TextIOWrapper(io.BytesIO(), encoding="utf-8", errors="backslashreplace")
-    noise = []
+    noise, before = [], sys.stdin
     try:
+        sys.stdin = io.TextIOWrapper(io.BytesIO(typed), encoding="utf-8")
         with _captured(out, noise), stage("the command", limits.seconds):
             code = main(arguments)
     except BaseException:  # the boundary let something through
         code, text = -1, traceback.format_exc()
         return code, text, noise
+    finally:
+        sys.stdin = before
     out.flush()
     return code, out.buffer.getvalue().decode("utf-8", "replace"), noise
 
@@ -129,7 +167,7 @@ def _fault(code, text, noise):
     return f"a Python warning: {noise[0][:300]}" if noise else ""
 
 
-def worker(seed, indices, limits, results):
+def worker(plan, indices, limits, results):
     """Run a batch of inputs, each in the same folder, and send the outcomes one by one."""
     folder = Path(tempfile.mkdtemp(prefix="stlc-fuzz-"))
     os.chdir(folder)
@@ -146,7 +184,7 @@ def worker(seed, indices, limits, results):
         for index in indices:
             results.send(index)
             before = peak()
-            outcome = run_one(seed, index, limits)
+            outcome = run_one(plan, index, limits)
             if peak() > before and peak() - base > limits.memory << 10:
                 outcome.fault = outcome.fault or f"took {(peak() - base) >> 10} MB"
             results.send(outcome)
@@ -169,10 +207,15 @@ def limit_address_space(megabytes):
     resource.setrlimit(resource.RLIMIT_AS, (used + (megabytes << 20),) * 2)
 
 
-def import_everything():
-    """What commands import must not count as the time of an input: workers are forked with all of it."""
+def import_everything(kinds=()):
+    """Import what commands do, so that it is not the time of an input: workers are forked with all of it.
+
+    Gives the formats that are left out since a package is missing.
+    """
     limits = Limits(60.0, 0)
-    fuzz_foreign.prepare()
+    missing = [*fuzz_foreign.prepare(), *fuzz_valid.prepare(tuple(set(FORMATS) & set(kinds or FORMATS)))]
+    if not kinds or "run" in kinds:
+        missing += fuzz_runs.prepare()
     Path("a.stl").write_text(SMALL)
     Path("t.npz").write_bytes(small_trace())
     for suffix in ("csv", "mat", "mcap", "parquet"):
@@ -182,9 +225,10 @@ def import_everything():
     _call(["system", "check", "b.yaml"], limits)
     for arguments in (["compile", "a.stl"], ["check", "a.stl", "t.npz"], ["lint", "a.stl"], ["fmt", "a.stl"]):
         _call(arguments, limits)
+    return missing
 
 
-def batch(seed, indices, limits):
+def batch(plan, indices, limits):
     """The outcomes of a batch, and the peak memory of the process that ran it in kB.
 
     A worker that dies or falls silent costs the input it was at; another one goes on after it.
@@ -193,7 +237,7 @@ def batch(seed, indices, limits):
     left = list(indices)
     while left:
         ours, theirs = multiprocessing.Pipe(duplex=False)
-        process = multiprocessing.Process(target=worker, args=(seed, left, limits, theirs))
+        process = multiprocessing.Process(target=worker, args=(plan, left, limits, theirs))
         process.start()
         theirs.close()
         at, why = left[0], "the process died"
@@ -220,27 +264,34 @@ def batch(seed, indices, limits):
     return outcomes, most
 
 
-def keep(folder, seed, failed):
+def keep(folder, plan, failed):
     """Write the inputs that failed, each in a folder of its own."""
     for outcome in failed:
-        given = fuzz_inputs.draw(random.Random(f"{seed}:{outcome.index}"))
-        place = Path(folder) / f"{seed}-{outcome.index}"
+        given = plan.draw(outcome.index)
+        place = Path(folder) / f"{plan.seed}-{outcome.index}"
         place.mkdir(parents=True, exist_ok=True)
-        for name, data in given.files.items():
-            (place / name).write_bytes(data)
+        lay(place, given)
+        if given.typed:
+            (place / "stdin").write_bytes(given.typed)
         (place / "README").write_text(
             f"{outcome.fault}\nstlc {given.arguments!r}\n", errors="backslashreplace"
         )
 
 
-def fuzz(count, seed, limits, *, first=0, jobs=1, tell=lambda *_: None):
-    """All outcomes, and the peak memory in kB."""
+def fuzz(count, seed, limits, *, first=0, jobs=1, kinds=(), done=(), tell=lambda *_: None):
+    """All outcomes but those that are `done`, and the peak memory in kB."""
+    plan = Plan(seed, tuple(kinds))
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-        import_everything()
+        for missing in import_everything(plan.kinds):
+            print(f"left out: {missing}", flush=True)
     outcomes, most = [], 0
-    ranges = [range(low, min(low + BATCH, first + count)) for low in range(first, first + count, BATCH)]
+    left = [index for index in range(first, first + count) if index not in done]
+    size = max(min(BATCH, len(left) // (4 * jobs)), 50)
+    ranges = [left[low : low + size] for low in range(0, len(left), size)]
     with concurrent.futures.ThreadPoolExecutor(jobs) as pool:
-        for found, its_most in pool.map(lambda indices: batch(seed, indices, limits), ranges):
+        waiting = [pool.submit(batch, plan, indices, limits) for indices in ranges]
+        for future in concurrent.futures.as_completed(waiting):
+            found, its_most = future.result()
             outcomes += found
             most = max(most, its_most)
             tell(outcomes, most, len(found))
@@ -252,13 +303,35 @@ def table(outcomes, most):
     lines = [f"{'kind':<8} {'inputs':>7} {'faults':>7} {'worst s':>8} {'mean ms':>8}  exit codes"]
     for kind in sorted({outcome.kind for outcome in outcomes}):
         ours = [outcome for outcome in outcomes if outcome.kind == kind]
-        codes = collections.Counter(outcome.code for outcome in ours)
+        skipped = sum(outcome.code == SKIPPED for outcome in ours)
+        codes = collections.Counter(outcome.code for outcome in ours if outcome.code != SKIPPED)
         shown = "  ".join(f"{code}: {number}" for code, number in sorted(codes.items()))
+        shown += f"  skipped: {skipped} ({_packages(ours)})" if skipped else ""
         faults = sum(bool(outcome.fault) for outcome in ours)
         worst = max(outcome.seconds for outcome in ours)
         mean = 1000 * sum(outcome.seconds for outcome in ours) / len(ours)
         lines.append(f"{kind:<8} {len(ours):>7} {faults:>7} {worst:>8.2f} {mean:>8.1f}  {shown}")
     return "\n".join([*lines, f"peak memory {most / 1024:.0f} MB"])
+
+
+def _packages(outcomes):
+    return ", ".join(sorted({outcome.missing for outcome in outcomes if outcome.missing})) + " missing"
+
+
+def logged(path, asked):
+    """The outcomes of a run that was stopped; the first line says what it was."""
+    told = {"seed": asked.seed, "kinds": asked.kind, "seconds": asked.seconds, "memory": asked.memory}
+    if path is None:
+        return []
+    if not path.exists():
+        path.write_text(json.dumps(told) + "\n")
+    first, *lines = path.read_text().splitlines()
+    if json.loads(first) != told:
+        sys.exit(f"{path} is the log of another run: {first}")
+    whole = [line for line in lines if line.endswith("}")]
+    return list(
+        {outcome.index: outcome for outcome in (Outcome(**json.loads(line)) for line in whole)}.values()
+    )
 
 
 def main():
@@ -270,6 +343,8 @@ def main():
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--memory", type=int, default=1024, help="MB beyond what the program needs")
     parser.add_argument("--jobs", type=int, default=1, help="processes at a time")
+    parser.add_argument("--kind", action="append", default=[], choices=list(fuzz_inputs.KINDS))
+    parser.add_argument("--log", type=Path, help="outcomes, a line each; what is in it is not run again")
     parser.add_argument("--keep", default="fuzz-failures")
     asked = parser.parse_args()
     started = time.monotonic()
@@ -281,16 +356,23 @@ def main():
             for outcome in outcomes[-new:]
             if outcome.fault
         ]
-        print(*faults, sep="\n", end="\n" * bool(faults))
+        print(*faults, sep="\n", end="\n" * bool(faults), flush=True)
+        if asked.log is not None:
+            with asked.log.open("a") as lines:
+                lines.writelines(json.dumps(asdict(outcome)) + "\n" for outcome in outcomes[-new:])
         if len(outcomes) // EVERY > (len(outcomes) - new) // EVERY:
             spent = f"{time.monotonic() - started:.0f} s, {sum(os.times()[:4]):.0f} s of processor time"
             print(f"{len(outcomes)} inputs from {asked.first} on, seed {asked.seed}, {spent}")
             print(table(outcomes, most), flush=True)
 
-    limits = Limits(asked.seconds, asked.memory)
-    outcomes, most = fuzz(asked.count, asked.seed, limits, first=asked.first, jobs=asked.jobs, tell=tell)
+    limits, wanted = Limits(asked.seconds, asked.memory), range(asked.first, asked.first + asked.count)
+    before = [outcome for outcome in logged(asked.log, asked) if outcome.index in wanted]
+    done = frozenset(outcome.index for outcome in before)
+    how = {"first": asked.first, "jobs": asked.jobs, "kinds": asked.kind, "done": done, "tell": tell}
+    outcomes, most = fuzz(asked.count, asked.seed, limits, **how)
+    outcomes = [*before, *outcomes]
     failed = [outcome for outcome in outcomes if outcome.fault]
-    keep(asked.keep, asked.seed, failed)
+    keep(asked.keep, Plan(asked.seed, tuple(asked.kind)), failed)
     print(f"in all {len(outcomes)} inputs, {len(failed)} faults, seed {asked.seed}")
     print(table(outcomes, most))
     sys.exit(1 if failed else 0)

@@ -4,7 +4,7 @@ Everything follows from one `random.Random`; nothing is read but the specificati
 """
 
 import random
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from itertools import islice
@@ -14,9 +14,11 @@ from fuzz_files import extended, imports
 from fuzz_foreign import foreign
 from fuzz_grammar import specification
 from fuzz_mutation import WORDS, corpus, mutated, soup
+from fuzz_runs import a_run
 from fuzz_specs import SMALL, SYSTEM, TRAINED, monster
 from fuzz_systems import monstrous_yaml
 from fuzz_traces import archived, small_trace, table
+from fuzz_valid import FORMATS, SPEC, WAVE, battered
 
 
 @dataclass
@@ -29,12 +31,20 @@ class Input:
     kind: str
     arguments: list[str] = field(default_factory=list)
     files: dict[str, bytes] = field(default_factory=dict)
+    typed: bytes = b""
+    """The standard input."""
+    missing: str = ""
+    """A package that is not installed, without which the input cannot be made."""
 
 
-def draw(rng: random.Random) -> Input:
-    """One input."""
-    maker = rng.choices([_text, _spec, _system, _trace, _files, _line], weights=[24, 23, 22, 25, 3, 3])[0]
-    return maker(rng)
+def draw(rng: random.Random, kinds: tuple[str, ...] = ()) -> Input:
+    """One input, of one of these kinds if any are named; all of them follow from the numbers alone."""
+    known = kinds or tuple(KINDS)
+    (kind,) = rng.choices(known, weights=[KINDS[name][1] for name in known])
+    try:
+        return KINDS[kind][0](rng)
+    except ModuleNotFoundError as error:
+        return Input(kind, missing=str(error.name))
 
 
 def _text(rng: random.Random) -> Input:
@@ -187,6 +197,58 @@ def _files(rng: random.Random) -> Input:
     return Input("files", _on_spec(rng), {"t.npz": small_trace(), **imports(rng)})
 
 
+def _of(form: str) -> Callable[[random.Random], Input]:
+    """A sound file of a format, damaged, and a command that reads it."""
+
+    def make(rng: random.Random) -> Input:
+        suffix, data = FORMATS[form](rng)
+        name = f"t{suffix}"
+        choices = [[], [], ["--resample", "0.1s"], ["--at", "all", "--json"], ["--chunk", "7"]]
+        if suffix in (".bag", ".db3", ".mcap"):
+            topic = "robot.state" if suffix != ".mcap" or b"robot" in data else "state"
+            inner = "position." if topic == "robot.state" else ""
+            choices = [
+                ["--resample", "0.1s", "--map", f"x={topic}.{inner}x", "--map", f"y={topic}.{inner}y"],
+                [],
+            ]
+        arguments = ["check", "a.stl", name, *rng.choice(choices)]
+        if suffix == ".npz" and rng.random() < 0.2:
+            arguments = rng.choice([["check", name], ["explain", name]])
+        return Input(form, arguments, {"a.stl": SPEC.encode(), name: data})
+
+    return make
+
+
+def _stream(rng: random.Random) -> Input:
+    """Samples that come line by line: a table or JSON, for what is usual or for anything."""
+    roll = rng.random()
+    if roll < 0.5:
+        spec = SPEC.encode()
+    elif roll < 0.95:
+        spec = _some(SMALL, rng).encode()
+    else:
+        spec = (SMALL.split("##")[0] + soup(rng)).encode()
+    names = ["t", "x", "y", "z", "n", "flag", "mode", "q[0]", "q[1]", "q[2]"]
+    if rng.random() < 0.5:
+        lines = [",".join(names), *(f"{k / 10!r},{v!r},1,0,0,1,go,1,1,1" for k, v in enumerate(WAVE))]
+        text = "\n".join(lines)
+    else:
+        rest = '"z": 0, "n": 1, "flag": true, "mode": "go", "q": [1, 2, 3]'
+        samples = (f'{{"t": {k / 10}, "x": {v!r}, "y": 1, {rest}}}' for k, v in enumerate(WAVE))
+        text = "\n".join(samples)
+    typed = text.encode()
+    if rng.random() < 0.8:
+        typed = battered(typed, rng) if rng.random() < 0.4 else mutated(typed, rng)
+    more = rng.choice([[], [], [], ["--json"], ["--end", "truncate"], ["--tolerance", "0"]])
+    return Input("stream", ["check", "a.stl", "-", *more], {"a.stl": spec}, typed)
+
+
+def _run(rng: random.Random) -> Input:
+    """The folder of a run."""
+    arguments, files = a_run(rng)
+    return Input("run", arguments, files)
+
+
 # -------------------------------------------------------------------------- command lines
 
 
@@ -218,3 +280,11 @@ def _line(rng: random.Random) -> Input:
         words = ["--no-such-option", *words]
     files = {"a.stl": SMALL.encode(), "t.npz": small_trace(), "b.yaml": corpus("examples/*.yaml")[0]}
     return Input("line", [*front, *words], files)
+
+
+KINDS: dict[str, tuple[Callable[[random.Random], Input], int]] = {
+    **{"text": (_text, 20), "spec": (_spec, 15), "system": (_system, 18), "trace": (_trace, 12)},
+    **{"files": (_files, 3), "line": (_line, 3), "stream": (_stream, 8), "run": (_run, 5)},
+    **{form: (_of(form), 1 if form == "bomb" else 2) for form in FORMATS},
+}
+"""How inputs of each kind are made, and how often they come."""

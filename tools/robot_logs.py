@@ -5,6 +5,7 @@ import io
 import sqlite3
 import struct
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 START = 1_700_000_000_000_000_000
@@ -57,8 +58,8 @@ def _record(content: bytes, **fields: bytes) -> bytes:
     return _text(head) + _text(content)
 
 
-def bag(values: list[float], *, compression: str = "bz2") -> bytes:
-    """A bag of ROS 1 with one topic, `/robot/state`, in one chunk."""
+def bag(values: list[float], *, compression: str = "bz2", change: Callable[[bytes], bytes] = bytes) -> bytes:
+    """A bag of ROS 1 with one topic, `/robot/state`, in one chunk, which is changed before it is packed."""
     facts = {
         "type": b"demo/State",
         "md5sum": b"0" * 32,
@@ -71,6 +72,7 @@ def bag(values: list[float], *, compression: str = "bz2") -> bytes:
     for k, x in enumerate(values):
         stamp = struct.pack("<II", *divmod(START + k * STEP, 10**9))
         chunk += _record(message(x, k), op=b"\2", conn=struct.pack("<I", 0), time=stamp)
+    chunk = change(chunk)
     packed = {"bz2": bz2.compress, "none": bytes}[compression](chunk)
     body = _record(packed, op=b"\5", compression=compression.encode(), size=struct.pack("<I", len(chunk)))
     place = 13 + 4096 + len(body)

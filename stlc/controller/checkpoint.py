@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
@@ -89,7 +90,10 @@ def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpo
                     note=(f"{word} now {wanted[:12]}, of the checkpoint {str(facts.get(key))[:12]}",),
                 )
             )
-    return Checkpoint(load_tensors(data), facts)
+    try:
+        return Checkpoint(load_tensors(data), facts)
+    except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise RunError(_damaged(folder, str(error)[:100])) from error
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], bytes]:

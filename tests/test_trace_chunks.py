@@ -1,0 +1,44 @@
+"""Traces that are read in pieces: the same as they are as a whole, or a diagnostic."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stlc.diagnostics import StlcError, TraceError
+from stlc.trace import Reading, load_trace
+from stlc.trace_chunks import pieces
+
+TIMES = {
+    "seconds": [repr(k / 10) for k in range(23)],
+    "dates": [str(np.datetime64("2026-01-31T23:59:59", "ns") + np.timedelta64(k, "s")) for k in range(23)],
+}
+
+
+@pytest.mark.parametrize("kind", TIMES)
+def test_pieces_are_the_whole(tmp_path: Path, kind: str) -> None:
+    rows = [f"{t},{k % 5},go" for k, t in enumerate(TIMES[kind])]
+    (tmp_path / "a.csv").write_text("\n".join(["t,x,word", *rows]))
+    whole = load_trace(tmp_path / "a.csv")
+    parts = list(pieces(tmp_path / "a.csv", 7, Reading()))
+    assert [part.samples for part in parts] == [7, 7, 7, 2]
+    assert np.array_equal(np.concatenate([part.data["x"][0] for part in parts]), whole.data["x"][0])
+    np.testing.assert_allclose(np.concatenate([part.times for part in parts]), whole.times, atol=1e-9)
+
+
+@pytest.mark.parametrize("row", ["x,1,go", "5,1,go", "2026-01-31T23:59:59,1,go", "2026-02-01,1,go"])
+@pytest.mark.parametrize("kind", TIMES)
+def test_a_clock_that_changes_between_pieces(tmp_path: Path, kind: str, row: str) -> None:
+    rows = [f"{t},{k % 5},go" for k, t in enumerate(TIMES[kind][:14])]
+    (tmp_path / "a.csv").write_text("\n".join(["t,x,word", *rows, row]))
+    with pytest.raises(TraceError) as caught:
+        list(pieces(tmp_path / "a.csv", 7, Reading()))
+    assert caught.value.diagnostics[0].code in ("E602", "E603")
+
+
+def test_pieces_of_what_cannot_be_cut(tmp_path: Path) -> None:
+    (tmp_path / "a.mat").write_bytes(b"")
+    with pytest.raises(StlcError, match="cannot be read in pieces"):
+        list(pieces(tmp_path / "a.mat", 7, Reading()))
