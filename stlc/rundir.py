@@ -33,6 +33,13 @@ LATEST = "latest"
 RECORD = "run.json"
 ROWS = "train.jsonl"
 
+_KINDS: Mapping[str, type] = {
+    **dict.fromkeys(("status", "spec", "spec_path", "system", "system_path", "device", "started"), str),
+    **dict.fromkeys(("seed", "threads"), int),
+    "overrides": dict,
+}
+"""What a record must hold under a name, if it holds anything."""
+
 _NUMBERED = re.compile(r"(\d{4,})-(.+)")
 
 
@@ -144,7 +151,7 @@ class RunDir:
         """The content of the JSON file `name`. Raises RunError (R101) if it is missing or damaged."""
         try:
             return json.loads((self.path / name).read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise RunError(self._damaged(name, error)) from error
 
     def record(self) -> dict[str, Any]:
@@ -152,6 +159,12 @@ class RunDir:
         record = self.read_json(RECORD)
         if not isinstance(record, dict):
             raise RunError(self._damaged(RECORD, ValueError("it is no JSON object")))
+        for key, kind in _KINDS.items():
+            value = record.get(key)
+            if key in record and (not isinstance(value, kind) or isinstance(value, bool)):
+                raise RunError(self._damaged(RECORD, ValueError(f"its `{key}` is {value!r:.40}")))
+        if not all(isinstance(text, str) for text in record.get("overrides", {}).values()):
+            raise RunError(self._damaged(RECORD, ValueError("its `overrides` are no texts")))
         return record
 
     def update(self, facts: Mapping[str, object]) -> dict[str, Any]:
@@ -206,9 +219,12 @@ class RunDir:
             return []
         lines = data[: data.rfind(b"\n") + 1].splitlines()
         try:
-            return [json.loads(line) for line in lines if line]
-        except ValueError as error:
+            rows = [json.loads(line) for line in lines if line]
+        except (ValueError, RecursionError) as error:
             raise RunError(self._damaged(name, error)) from error
+        if not all(isinstance(row, dict) for row in rows):
+            raise RunError(self._damaged(name, ValueError("a line is no JSON object")))
+        return rows
 
     def keep_rows(self, wanted: Callable[[dict[str, Any]], bool], name: str = ROWS) -> None:
         """Drop the rows that are not `wanted`, as a resumed run does with those past its checkpoint."""

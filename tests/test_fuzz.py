@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 import itertools
+import json
 import random
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -21,6 +24,7 @@ import fuzz  # noqa: E402
 import fuzz_bombs  # noqa: E402
 import fuzz_grammar  # noqa: E402
 import fuzz_inputs  # noqa: E402
+import fuzz_valid  # noqa: E402
 from fuzz_laws import HangError, laws, stage  # noqa: E402
 from fuzz_specs import SYSTEM  # noqa: E402
 
@@ -77,19 +81,47 @@ def test_a_hang_is_noticed() -> None:
         endless()
 
 
-def run(count: int, seed: int) -> list[fuzz.Outcome]:
-    outcomes, _ = fuzz.fuzz(count, seed, fuzz.Limits(SECONDS, 1024))
+LIGHT = tuple(kind for kind in fuzz_inputs.KINDS if kind not in ("run", "bomb"))
+"""Kinds that need no training, and nothing that takes long to make."""
+
+
+def run(count: int, seed: int, kinds: tuple[str, ...] = LIGHT) -> list[fuzz.Outcome]:
+    outcomes, _ = fuzz.fuzz(count, seed, fuzz.Limits(SECONDS, 1024), kinds=kinds)
     assert [(outcome.index, outcome.fault) for outcome in outcomes if outcome.fault] == []
     assert len(outcomes) == count
     return outcomes
 
 
 def test_random_inputs_through_the_program() -> None:
-    kinds = {outcome.kind for outcome in run(40, seed=3)}
-    assert {"text", "spec", "system", "trace"} <= kinds
+    kinds = {outcome.kind for outcome in run(60, seed=3)}
+    assert {"text", "spec", "system", "trace", "stream", "csv", "bag"} <= kinds
+
+
+def test_a_run_that_was_stopped_goes_on(tmp_path: Path) -> None:
+    asked = argparse.Namespace(seed=3, kind=["csv"], seconds=2.0, memory=1024)
+    assert fuzz.logged(tmp_path / "log", asked) == []
+    first = [fuzz.Outcome(0, "csv", 3, 0.1), fuzz.Outcome(2, "csv", 0, 0.1, "hang")]
+    with (tmp_path / "log").open("a") as lines:
+        lines.writelines(json.dumps(asdict(outcome)) + "\n" for outcome in first)
+        lines.write('{"index": 1, "ki')
+    assert fuzz.logged(tmp_path / "log", asked) == first
+    asked.seed = 4
+    with pytest.raises(SystemExit, match="another run"):
+        fuzz.logged(tmp_path / "log", asked)
+
+
+def test_what_is_not_installed_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(_: random.Random) -> tuple[str, bytes]:
+        raise ModuleNotFoundError("No module named 'nothing'", name="nothing")
+
+    monkeypatch.setitem(fuzz_valid.FORMATS, "parquet", absent)
+    given = fuzz_inputs.draw(random.Random(1), ("parquet",))
+    assert (given.kind, given.missing) == ("parquet", "nothing")
+    outcome = fuzz.run_one(fuzz.Plan(1, ("parquet",)), 0, fuzz.Limits(SECONDS, 1024))
+    assert "skipped: 1 (nothing missing)" in fuzz.table([outcome], 0)
 
 
 @pytest.mark.slow
 def test_many_random_inputs_through_the_program() -> None:
     """All 100,000 take an hour: `python tools/fuzz.py --count 100000`."""
-    run(10_000, seed=4)
+    run(10_000, seed=4, kinds=())

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -24,12 +24,14 @@ from stlc.provenance import sha256
 from stlc.rundir import RunDir
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
 
 FOLDER = "ckpt"
 POINTER = "last.json"
+_DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RuntimeError)
+"""What comes of a text or a tensor that is not what was written."""
 _NAME = re.compile(r"step-\d{6,}\.safetensors")
 
 
@@ -92,8 +94,17 @@ def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpo
             )
     try:
         return Checkpoint(load_tensors(data), facts)
-    except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
+    except (SafetensorError, *_DAMAGE) as error:
         raise RunError(_damaged(folder, str(error)[:100])) from error
+
+
+@contextmanager
+def restoring(run: RunDir) -> Iterator[None]:
+    """Raise RunError (R101) where what a checkpoint holds does not fit what is made of it."""
+    try:
+        yield
+    except _DAMAGE as error:
+        raise RunError(_damaged(run.path / FOLDER, f"{type(error).__name__}: {error}"[:200])) from error
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], bytes]:
@@ -113,7 +124,7 @@ def _read(folder: Path) -> tuple[dict[str, Any], bytes]:
                 note=("nothing has been saved yet, or the run ended before that",),
             )
         ) from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, *_DAMAGE) as error:
         raise RunError(_damaged(folder, str(error))) from error
     if sha256(data) != facts.get("sha256"):
         raise RunError(_damaged(folder, f"`{name}` is not what was written"))

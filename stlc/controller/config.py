@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Literal, get_args
 
 import torch
 
@@ -113,6 +113,38 @@ class Engine:
     samples: int = 0
     clock: Clock = "wall"
     ranks: int = 1
+
+
+_MOST = {
+    **dict.fromkeys(("hidden", "plans", "threads", "ranks"), 65_536),
+    **dict.fromkeys(("batch", "hard", "pool", "most", "held_out", "samples"), 10**8),
+    **dict.fromkeys(("warmup", "average"), 1.0),
+    "hold": 0.999,
+}
+"""Greatest values, of shares and of what decides how much memory is taken."""
+_POSITIVE = ("hidden", "plans", "batch", "pool", "every", "ranks")
+
+
+def checked_engine(engine: Engine) -> Engine:
+    """The same engine. Raises ValueError where a number is of another kind than it must be, or too large."""
+    words = {"method": get_args(Method), "clock": get_args(Clock)}
+    for field in fields(Engine):
+        value = getattr(engine, field.name)
+        if field.name in words:
+            fits = value in words[field.name]
+        else:
+            kinds = (int, float) if field.type == "float" else (int,)
+            most = _MOST.get(field.name, 1e12)
+            each = value if field.name == "hidden" else (value,)
+            least = 1 if field.name in _POSITIVE else 0
+            fits = all(_is_number(number, kinds) and least <= number <= most for number in each)
+        if not fits:
+            raise ValueError(f"`{field.name}` is {value!r:.40}")
+    return engine
+
+
+def _is_number(value: object, kinds: tuple[type, ...]) -> bool:
+    return isinstance(value, kinds) and not isinstance(value, bool)
 
 
 def decide(task: Task, config: TrainConfig) -> Engine:

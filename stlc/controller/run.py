@@ -10,7 +10,7 @@ import torch
 
 from stlc.compile.modules import file_of
 from stlc.controller.checkpoint import load_checkpoint, weights
-from stlc.controller.config import Engine
+from stlc.controller.config import Engine, checked_engine
 from stlc.controller.policy import Mlp, network_of
 from stlc.controller.task import Task
 from stlc.diagnostics import Diagnostic, RunError
@@ -161,8 +161,8 @@ def load_engine(folder: RunDir) -> Engine:
         values: dict[str, Any] = json.loads((folder.path / CONFIG).read_text())
         known = {field.name for field in fields(Engine)}
         engine = {key: value for key, value in values.items() if key in known}
-        return Engine(**{**engine, "hidden": tuple(engine["hidden"])})
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        return checked_engine(Engine(**{**engine, "hidden": tuple(engine["hidden"])}))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise RunError(
             Diagnostic("R101", f"`{folder.shown}/{CONFIG}` is missing or damaged: {error}")
         ) from error

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from stlc.controller.autopsy import Step, autopsy
-from stlc.controller.checkpoint import load_checkpoint
+from stlc.controller.checkpoint import load_checkpoint, restoring
 from stlc.controller.config import Engine, TrainConfig, decide
 from stlc.controller.conflict import conflict
 from stlc.controller.held_out import Score, score
@@ -155,16 +155,17 @@ def resume(
     if engine.threads:
         torch.set_num_threads(engine.threads)
     place = find_device(ranks.device(device))
-    trainer = Trainer(task, engine, steps=int(saved.facts["steps"]), device=place, ranks=ranks)
-    trainer.restore(saved.tensors, saved.facts)
-    record = folder.record()
-    schedule = StepSchedule.parse(str(saved.facts.get("schedule", trainer.steps)))
+    seconds = (row.get("seconds") for row in folder.rows())
+    before = max((spent for spent in seconds if isinstance(spent, int | float)), default=0.0)
+    with restoring(folder):
+        trainer = Trainer(task, engine, steps=int(saved.facts["steps"]), device=place, ranks=ranks)
+        trainer.restore(saved.tensors, saved.facts)
+        schedule = StepSchedule.parse(str(saved.facts.get("schedule", trainer.steps)))
+        before = float(saved.facts.get("seconds", before))
+        allowed = 0.0 if steps is not None else float(folder.record().get("seconds_allowed") or 0.0)
     if steps is not None:
         schedule = schedule.with_steps(trainer.step, steps)
         trainer.steps = steps
-    before = max((row.get("seconds", 0.0) for row in folder.rows()), default=0.0)
-    before = float(saved.facts.get("seconds", before))
-    allowed = 0.0 if steps is not None else float(record.get("seconds_allowed") or 0.0)
     if budget is not None:
         allowed = before + budget
         schedule = schedule.with_steps(trainer.step, trainer.step + PROVISIONAL)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
-from stlc.controller.checkpoint import load_checkpoint, save_checkpoint
+from stlc.controller.checkpoint import load_checkpoint, restoring, save_checkpoint
+from stlc.controller.run import load_engine
 from stlc.diagnostics import MissingError, RunError
+from stlc.provenance import sha256
 from stlc.rundir import RunDir
 
 HASHES = {"spec_hash": "a" * 64, "system_hash": "b" * 64}
@@ -87,3 +91,68 @@ def test_damage_is_diagnosed(run: RunDir, spoil: object) -> None:
     with pytest.raises(RunError) as caught:
         load_checkpoint(run, **HASHES)
     assert caught.value.diagnostics[0].code == "R101"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda data: b"\xff" * 8 + data[8:],
+        lambda data: data[:8] + data[8:].replace(b"F32", b"F99"),
+        lambda data: data[:8] + data[8:].replace(b'"w"', b'"\xff"'),
+        lambda data: data + b"more",
+        lambda data: data[:5],
+    ],
+)
+def test_weights_that_are_damaged_with_a_sum_that_fits(run: RunDir, change: Callable[[bytes], bytes]) -> None:
+    pointer = run.path / "ckpt" / "last.json"
+    facts = json.loads(pointer.read_text())
+    data = change((run.path / "ckpt" / facts["file"]).read_bytes())
+    (run.path / "ckpt" / facts["file"]).write_bytes(data)
+    pointer.write_text(json.dumps({**facts, "sha256": sha256(data)}))
+    with pytest.raises(RunError) as caught:
+        load_checkpoint(run, **HASHES)
+    assert caught.value.diagnostics[0].code == "R101"
+
+
+def test_what_does_not_fit_is_the_fault_of_the_checkpoint(run: RunDir) -> None:
+    for broken in (int, lambda: {}["step"], lambda: [][0], lambda: torch.zeros(2).copy_(torch.zeros(3))):
+        with pytest.raises(RunError, match=r"R101: the checkpoint in .* is damaged"), restoring(run):
+            broken("no number") if broken is int else broken()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *[("ranks", [1]), ("hold", 1.0), ("hold", []), ("hidden", 3), ("hidden", [10**9]), ("every", 0)],
+        *[
+            ("method", "magic"),
+            ("lr", None),
+            ("seed", True),
+            ("seed", 1e308),
+            ("plans", 10**30),
+            ("share", "x"),
+        ],
+    ],
+)
+def test_an_engine_that_is_none(run: RunDir, name: str, value: object) -> None:
+    engine = {"method": "guided", "seed": 0, "hidden": [4], "plans": 1, "batch": 2, "hard": 0, "lr": 0.1}
+    (run.path / "config.resolved.yaml").write_text(json.dumps(engine))
+    assert load_engine(run).hidden == (4,)
+    (run.path / "config.resolved.yaml").write_text(json.dumps({**engine, name: value}))
+    with pytest.raises(RunError) as caught:
+        load_engine(run)
+    assert caught.value.diagnostics[0].code == "R101"
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 9000, "[]", '{"overrides": []}', '{"overrides": {"a": 1}}', '{"seed": null}']
+)
+def test_records_that_are_damaged(run: RunDir, text: str) -> None:
+    (run.path / "run.json").write_text(text)
+    with pytest.raises(RunError) as caught:
+        run.record()
+    assert caught.value.diagnostics[0].code == "R101"
+    for rows in ("3\n", "[" * 9000 + "\n"):
+        (run.path / "train.jsonl").write_text(rows)
+        with pytest.raises(RunError):
+            run.rows()

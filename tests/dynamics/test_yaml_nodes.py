@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+import random
+from pathlib import Path
 
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
+from stlc.dynamics import yaml_nodes
 from stlc.dynamics.yaml_nodes import Mapping, Node, Scalar, Sequence, as_bool, as_float, as_int, load_yaml
 from stlc.source import Source
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
 def load(text: str) -> Mapping:
@@ -175,3 +180,57 @@ def test_any_text_is_read_or_refused(text: str) -> None:
     else:
         assert math.isfinite(node.size)
         assert node.span.source is source
+
+
+# ------------------------------------------------------------------- the parser in C
+
+
+def read_by(text: str, fast: object, monkeypatch: pytest.MonkeyPatch) -> object:
+    """The document, or what is said about it, as one parser gives it."""
+    monkeypatch.setattr(yaml_nodes, "_FAST", fast)
+    sink: list[Diagnostic] = []
+    try:
+        return yaml_nodes.load_node(Source("a.yaml", text), sink=sink), sink
+    except SystemFileError as error:
+        return [(d.code, d.message, d.span and (d.span.start, d.span.end)) for d in error.diagnostics]
+
+
+ODD = (
+    *(
+        "a: |\n  x\n  y\n\nb: >-\n  z\n\n",
+        "a: \"x\\n y\"\nb: 'it''s'\n",
+        "a:\n- 1\n-\n- 3\n",
+        "a: \n",
+        "a:\n\n\n",
+    ),
+    *(
+        "é: ü\nb: 💩\nc: d # é\n",
+        "a: 1\r\nb: |\r\n  x\r\n",
+        "\ufeffa: 1\nb: 2",
+        "? a\n: b\n",
+        "a: &x 1\nb: *x\n",
+    ),
+    *("a: !!str 1", "--- \na: 1\n...\n", "a: 1\n---\nb: 1", "%YAML 1.1\n---\na: 1", "a: x\x85y\nb: 1\n"),
+    *("a: x\u2028y\nb: z\n", "k: [a,\n  b]\n\n# c\n", "a: b: c", "a: {b:1, c}", "a: [x:y]", '{"a":1}'),
+    *("doc\t: x\n", "u: {sq?uash: tanh}\n", "a: 5 m \t  # c\n"),
+    *("a: 1\na: 2\n", "a: &a [*a]", "[" * 99, "a: - 1", 'a: "b" c', "", "#", "a: \ud800", "a\0b", "\t a: 1"),
+)
+
+
+@pytest.mark.skipif(yaml_nodes._FAST is None, reason="PyYAML has no parser in C here")
+@pytest.mark.parametrize("part", range(2))
+def test_both_parsers_give_the_same_document(part: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, fast = random.Random(part), yaml_nodes._FAST
+    texts = [path.read_text() for path in sorted(EXAMPLES.glob("*.yaml"))]
+    for k in range(25):
+        text = rng.choice(texts)[: rng.choice([300, 1000, 4000])]
+        for _ in range(rng.choice([0, 1, 1, 3])):
+            at = rng.randrange(len(text) + 1)
+            text = (
+                text[:at]
+                + rng.choice([*"\n\t :-#[]{}'\"|>&*!%@`é", "  ", "- ", ": ", *ODD])
+                + text[at + k % 3 :]
+            )
+        assert read_by(text, fast, monkeypatch) == read_by(text, None, monkeypatch), text
+    for text in ODD[part::2]:
+        assert read_by(text, fast, monkeypatch) == read_by(text, None, monkeypatch), text
