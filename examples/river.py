@@ -6,8 +6,8 @@ or the next two; metres, seconds.
 
 * `SafeRiver`: an obstacle of radius 1 every 7.5 m. A ship has passed one when it is beside its centre.
 * `TrackRiver`: obstacles on the centreline, 15 to 25 m apart. A ship has passed one when it is 1 m ahead of
-  its centre. An obstacle that comes into view (8 m) renews the allowance: 15 steps of it if its radius is
-  less than .8, 20 if less than 1, else 25.
+  its centre. A ship knows of an obstacle when it is in view (8 m); that renews the allowance: 15 steps of
+  it if its radius is less than .8, 20 if less than 1, else 25.
 * `ShiftedRiver`: what the paper tests the backup policy with. Obstacles every 12 m, the first 4 m ahead and
   .25 m off the centreline, the others .2 m, the second half as large again, and an allowance of 20 or 25
   steps. Ships start .3 to 1.8 m off the line, straight ahead at 5 m/s; their allowance ran out 5 steps ago.
@@ -26,19 +26,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from stlc.controller.sketch import (
-    BANK,
-    NOTE,
-    STONE,
-    WATER,
-    deciders,
-    numbers,
-    outlines,
-    plans,
-    scale_bar,
-    tails,
-    violations,
-)
+from stlc.controller.sketch import BANK, NOTE, STONE, WATER, deciders, outlines, tails
 from stlc.controller.streams import Streams
 
 OBSTACLES = 100
@@ -115,10 +103,6 @@ class River(ABC):
             "half": np.float64(self.half),
         }
 
-    def charted(self, states: torch.Tensor) -> np.ndarray:
-        """Planned states (agents, k, n) as places (agents, k, 2)."""
-        return states[..., [self.at["x"], self.at["y"]]].numpy()
-
     KEYS: ClassVar = {"obstacle": STONE}
 
     @staticmethod
@@ -128,23 +112,13 @@ class River(ABC):
         rows, pitch = max(int(ships[..., 0].max() // FOLD) + 1, 2), 2 * half + 1.8
         for row in range(rows):
             draw_row(axes, row, scene["obstacles"][index], half, pitch)
-
-        def folded(places: np.ndarray, axis: int) -> np.ndarray:
-            """Places (..., 2) in their rows; a line along `axis` breaks where it goes on to the next one."""
-            row = np.clip(places[..., 0] // FOLD, 0, rows - 1)
-            placed = np.stack((places[..., 0] - row * FOLD, places[..., 1] - row * pitch), -1)
-            begin = np.take(row, [0], axis)
-            return np.where(np.diff(row, axis=axis, prepend=begin)[..., None] != 0, np.nan, placed)
-
-        tails(axes, folded(ships[..., :2], 0), scene, index, frames=WAKE)
-        plans(axes, scene, index, lambda places: folded(places, 1))
-        here = folded(ships[index : index + 1, :, :2], 0)[0]
-        outlines(axes, HULL, np.c_[here, ships[index, :, 2]], deciders(scene, index, ships.shape[1]))
-        numbers(axes, here)
-        violations(axes, here, scene, index)
-        bottom = -(rows - 0.5) * pitch - 0.9
-        scale_bar(axes, FOLD - 5, bottom + 0.3, 5)
-        axes.set(xlim=(-3.4, FOLD + 0.5), ylim=(bottom - 0.4, pitch / 2 - 0.5), aspect="equal")
+        row = np.clip(ships[..., 0] // FOLD, 0, rows - 1)
+        placed = np.stack((ships[..., 0] - row * FOLD, ships[..., 1] - row * pitch), -1)
+        turned = np.diff(row, axis=0, prepend=row[:1])[..., None] != 0  # on to the next row
+        tails(axes, np.where(turned, np.nan, placed), scene, index, frames=WAKE)
+        poses = np.concatenate((placed[index], ships[index, :, 2:]), 1)
+        outlines(axes, HULL, poses, deciders(scene, index, ships.shape[1]))
+        axes.set(xlim=(-3.4, FOLD + 0.5), ylim=(-(rows - 0.5) * pitch + 0.5, pitch / 2 - 0.5), aspect="equal")
         axes.set_axis_off()
 
     # ------------------------------------------------------------- what rivers differ in
@@ -214,7 +188,7 @@ class TrackRiver(River):
     """The river of `ship_track.yaml`."""
 
     def reset(self) -> torch.Tensor:
-        self.view = float(self.system.decl.constants["view"][0])
+        self.view, self.no_obs = (float(self.system.decl.constants[name][0]) for name in ("view", "no_obs"))
         x = super().reset()
         self.given = x[:, self.at["tau"]] >= 0.0
         self.late = torch.zeros_like(self.given)
@@ -222,8 +196,8 @@ class TrackRiver(River):
 
     def advance(self, x: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """The same; an obstacle that comes into view renews the allowance."""
-        saw, now, tau = self._in_view(x), super().advance(x, action), self.at["tau"]
-        comes = self._in_view(now) & (self.switched | ~saw)
+        saw, now, tau = self._in_view(x, self.next), super().advance(x, action), self.at["tau"]
+        comes = self._in_view(now, self.next) & (self.switched | ~saw)
         now[:, tau] = torch.where(comes, self.chain.allowance[self.next], now[:, tau])
         self.given |= comes
         self.late |= self.given & (now[:, tau] < -1e-6)
@@ -253,9 +227,17 @@ class TrackRiver(River):
     def _passed(self, x: torch.Tensor, obstacle: torch.Tensor) -> torch.Tensor:
         return obstacle - x < -BEHIND
 
-    def _in_view(self, states: torch.Tensor) -> torch.Tensor:
-        """Whether ships see their next obstacle, (agents,)."""
-        return states[:, self.at["x1"]] - states[:, self.at["x"]] <= self.view
+    def _facing(self, states: torch.Tensor, front: torch.Tensor | None = None) -> torch.Tensor:
+        """The same; what is not in view yet is not known: then no obstacle is, as in training."""
+        front = self.next if front is None else front
+        facing, x1 = super()._facing(states, front), self.at["x1"]
+        none = states[:, self.at["x"]] + self.no_obs
+        facing[:, x1] = torch.where(self._in_view(states, front), facing[:, x1], none)
+        return facing
+
+    def _in_view(self, states: torch.Tensor, front: torch.Tensor) -> torch.Tensor:
+        """Whether ships (k, n) see the obstacle that is their next, index `front` (k,)."""
+        return self.chain.x[front] - states[:, self.at["x"]] <= self.view
 
 
 class ShiftedRiver(TrackRiver):

@@ -1,5 +1,6 @@
 """`make demo`: from nothing to a trained, checked and reported controller, with the seconds of each stage."""
 
+import json
 import platform
 import subprocess
 import sys
@@ -9,7 +10,7 @@ import environment
 
 SPEC = "specs/traffic.stl"
 SYSTEM = "car.yaml"
-VERDICTS = {0: "satisfied", 1: "violated in some window, see above", 4: "inconclusive, see above"}
+VERDICTS = {0: "satisfied", 1: "violated, see above", 4: "inconclusive, see above"}
 STAGES = (
     ("train", [SPEC, "--system", SYSTEM, "--budget", "60s"], f"{SPEC} + examples/{SYSTEM}", (0,)),
     ("simulate", ["--backup"], "closed loop with the backup policy", (0,)),
@@ -30,24 +31,35 @@ def stage(name, arguments, answers):
     return code, time.monotonic() - started
 
 
-def report_path():
-    """Where the newest run's report is, relative to the tree."""
-    newest = (environment.ROOT / "runs" / "latest").resolve()
-    return (newest / "report.html").relative_to(environment.ROOT)
+def newest():
+    """The folder of the newest run."""
+    return (environment.ROOT / "runs" / "latest").resolve()
+
+
+def drives(run):
+    """What became of the drives of a run, in a sentence."""
+    guards = json.loads((run / "eval" / "simulate.json").read_text())["guards"]
+    with_guard, without = guards["paper"]["drives"], guards["none"]["drives"]
+    sentence = f"{with_guard['obeyed']} of {with_guard['count']} drives obeyed every rule"
+    if with_guard["lost"]:
+        sentence += f" ({with_guard['lost']} were lost from the start)"
+    return f"{sentence}; without the guard {without['obeyed']}"
 
 
 def main():
-    """Run all stages and print the table."""
+    """Run all stages and print the table, then how many drives obeyed every rule."""
     seconds = environment.ensure()
     rows = [("environment", f".venv (Python {platform.python_version()})", seconds)]
     for name, arguments, text, answers in STAGES:
         code, seconds = stage(name, arguments, answers)
         if name == "check":
-            text = f"{text}: {VERDICTS[code]}"
-        rows.append((name, text or str(report_path()), seconds))
+            text = f"{text}: {VERDICTS[code]} (exit code {code})"
+        report = (newest() / "report.html").relative_to(environment.ROOT)
+        rows.append((name, text or str(report), seconds))
     print()
     for name, text, seconds in rows:
         print(f"  {name:<13} {text:<58} {seconds:4.0f} s")
+    print(f"\n  {drives(newest())}")
     print(f"\n  Next:  open the report · stlc compile {SPEC} · docs/quickstart.md")
 
 

@@ -32,7 +32,6 @@ class Function:
         fold: the value for numbers (`Fraction`s stay exact where `exact`); None for samplers.
         exact: rational arguments give a rational result.
         whole: whole arguments give a whole result.
-        integral: every argument gives a whole result.
         symbol: how an operator is written.
     """
 
@@ -44,11 +43,7 @@ class Function:
     fold: Callable[..., Any] | None = None
     exact: bool = False
     whole: bool = False
-    integral: bool = False
     symbol: str = ""
-
-
-_INTEGRAL = ("floor", "ceil", "round", "sign")
 
 
 def _sign(x: Any) -> int:
@@ -73,11 +68,11 @@ def _build() -> Mapping[str, Function]:
 
     def operators(*rows: tuple[str, str, int, Rule, Callable[..., Any], bool]) -> None:
         for name, symbol, arity, rule, fold, whole in rows:
-            table[name] = Function(name, arity, arity, rule, "operator", fold, True, whole, symbol=symbol)
+            table[name] = Function(name, arity, arity, rule, "operator", fold, True, whole, symbol)
 
     def functions(*rows: tuple[str, int, int | None, Rule, Callable[..., Any], bool, bool]) -> None:
         for name, least, most, rule, fold, exact, whole in rows:
-            table[name] = Function(name, least, most, rule, "function", fold, exact, whole, name in _INTEGRAL)
+            table[name] = Function(name, least, most, rule, "function", fold, exact, whole)
 
     operators(
         ("add", "+", 2, "same", operator.add, True),

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from stlc.view.html import Child, Html, classed, el, join, table
+from stlc.view.animate import STILL, current, seen_in
+from stlc.view.html import Child, Html, classed, el, figure, join, table, video
 from stlc.view.material import Material
 from stlc.view.page import Section
-from stlc.view.words import count, seconds, share, spread
+from stlc.view.words import count, drives_of, seconds, share, spread
 
 Record = Mapping[str, Any]
 
@@ -63,7 +65,14 @@ SHARES = {
     ),
 }
 HOLDS = "holds."
-FORESEEN = "driven safely, where the world did as the model says"
+MOST_BROKEN = 12
+"""Drives that broke rules and are listed."""
+WORLD = (
+    "The first seed; the colours say who decided. Over time: for how many agents the guard acted, and the "
+    "least margin of each requirement over the agents that the picture names, judged from each instant on "
+    "(red: violated)."
+)
+BARE = "What was driven, over time."
 SOURCES = ("policy", "polished", "backup", "safest", "")
 
 
@@ -75,10 +84,13 @@ def deployment_tiles(material: Material) -> list[tuple[str, str]]:
     name, guard = list(guards.items())[-1]
     metrics = guard.get("metrics") or {}
     beside = GUARDS.get(name, name)
-    foreseen, all_ = _mean(metrics, "foreseen_safe_starts"), _mean(metrics, "executed_safe_starts")
+    each = {
+        GUARDS.get(name, name): f"{drives['obeyed']:,} of {drives['count']:,}"
+        for name, drives in drives_of(material.simulation).items()
+    }
     tiles = [
+        *((obeyed, f"drives obeyed, {guard}") for guard, obeyed in reversed(each.items())),
         (share(_mean(metrics, "plan_accuracy")), f"of deployed plans, {beside}"),
-        (share(all_), "of starts driven safely") if foreseen is None else (share(foreseen), FORESEEN),
     ]
     return [tile for tile in tiles if tile[0]]
 
@@ -90,13 +102,30 @@ def deployment_section(material: Material) -> Section | None:
         return None
     body = join(
         el("p", _setting(material.simulation or {})),
-        _unforeseen(guards),
-        _compared("", guards, _share_rows(guards)),
-        _compared("Requirements as driven", guards, _requirement_rows(guards)),
+        _compared("", guards, _drive_rows(guards)),
+        _broken(material.simulation),
         _compared("Progress", guards, _progress_rows(guards)),
         _compared("Decisions", guards, _decision_rows(guards)),
+        _compared("Plans and starts, window by window", guards, _share_rows(guards)),
+        _unforeseen(guards),
+        _compared("Requirements of plans, as driven", guards, _requirement_rows(guards)),
     )
     return Section("deployment", "How it drives", body)
+
+
+def film_section(material: Material) -> Section | None:
+    """The animation of the first seed."""
+    if material.trace is None:
+        return None
+    found = current(material.run)
+    if found is None:
+        return None
+    alt = f"Animation of the deployment; a still is in {STILL}."
+    caption = BARE if seen_in(material.run) is None else WORLD
+    path, show = (found.gif, figure) if found.mp4 is None else (found.mp4, video)
+    kind = "image/gif" if found.mp4 is None else "video/mp4"
+    uri = f"data:{kind};base64," + base64.b64encode(path.read_bytes()).decode()
+    return Section("film", "What it looks like", show(uri, alt, caption, kind="film"))
 
 
 def _compared(title: str, guards: Mapping[str, Record], rows: list[tuple[Child, ...]]) -> Html | None:
@@ -136,6 +165,49 @@ def _unforeseen(guards: Mapping[str, Record]) -> Html | None:
 def _mean(metrics: Record, name: str) -> float | None:
     found = metrics.get(name)
     return float(found["mean"]) if found else None
+
+
+def _drive_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
+    """Drives that obeyed every rule, those of them that could, and rule by rule."""
+    each = [drives_of({"guards": {name: guard}}).get(name) for name, guard in guards.items()]
+    known = [drives for drives in each if drives is not None]
+    if not known:
+        return []
+    meaning = el("small", "a drive is one agent over one seed, judged from its first instant to its last")
+    whole = [None if d is None else _of(d["obeyed"], d["count"]) for d in each]
+    rows: list[tuple[Child, ...]] = [(join("drives that obeyed every rule", meaning), *whole)]
+    if any(drives["lost"] for drives in known):
+        others = el("small", "without those from whose start no safe plan is known")
+        viable = [None if d is None else _of(d["obeyed"], d["count"] - d["lost"]) for d in each]
+        rows.append((join("of those that were not lost from the start", others), *viable))
+    for rule in known[-1]["rules"]:
+        kept = [None if d is None else d["rules"].get(rule) for d in each]
+        cells = [None if k is None else _of(k["obeyed"], sum(k.values())) for k in kept]
+        rows.append((rule, *cells))
+    return rows
+
+
+def _of(some: int, all_: int) -> str:
+    return f"{some:,} of {all_:,}"
+
+
+def _broken(simulation: Record | None) -> Html | None:
+    """Who broke which rule with the guard, and when."""
+    each = list(drives_of(simulation).values())
+    broken = each[-1]["broken"] if each else []
+    if not broken:
+        return None
+    rows: list[tuple[Child, ...]] = []
+    for drive in broken[:MOST_BROKEN]:
+        rules = ", ".join(
+            name if time is None else f"{name} ({time:.3g} s)" for name, time in drive["rules"].items()
+        )
+        rows.append((f"seed {drive['seed']}, agent {drive['agent']}", rules, "yes" if drive["lost"] else ""))
+    more = len(broken) - MOST_BROKEN
+    note = el("p", f"{more} more are in eval/simulate.json.") if more > 0 else None
+    return join(
+        el("h3", "Who broke a rule, and when"), table(("drive", "rules", "lost from its start"), rows), note
+    )
 
 
 def _names(guards: Mapping[str, Record]) -> list[str]:

@@ -15,34 +15,24 @@ from stlc.view.page import Section
 from stlc.view.words import count, interval, number, obeyed_sentence, seconds, share, viable_sentence
 
 
-def headline(material: Material) -> Html:
-    """What came out, in one sentence: how drives did, where there were any; then what plans are worth."""
-    record, result = material.record, material.result
+def headline(material: Material, tiles: list[tuple[str, str]]) -> Html:
+    """What came out, in one sentence and a few numbers; `tiles` adds those of the deployment.
+
+    A run that was deployed is judged by its drives, one that was not by its plans.
+    """
+    record, result, simulation = material.record, material.result, material.simulation or {}
+    driven, lost = obeyed_sentence(simulation), viable_sentence(simulation)
     names = dict.fromkeys((material.spec, str(record.get("system", "")), f"run {material.run.name}"))
-    plans, drives = _verdict(material), _drives(material)
-    lead, below = (drives[0], (*drives[1:], f"{plans}.")) if drives else (plans, ())
     return join(
         classed("p", "eyebrow", " · ".join(name for name in names if name)),
-        el("h1", lead),
-        [el("p", words) for words in below],
-        el("p", _beside(result)) if result else None,
+        el("h1", driven or _verdict(material)),
+        el("p", f"{lost}.") if lost else None,
+        el("p", f"{_verdict(material)}. {_beside(result)}" if driven else _beside(result))
+        if result
+        else None,
         _advice(material),
+        _tiles([*_training_tiles(result), *tiles]),
     )
-
-
-def numbers(material: Material, tiles: list[tuple[str, str]]) -> Html | None:
-    """The same in a few numbers; `tiles` adds those of the deployment."""
-    return _tiles([*_training_tiles(material.result), *tiles])
-
-
-def _drives(material: Material) -> list[str]:
-    """How many drives obeyed the rules, and how many could not have; nothing where there were none."""
-    simulation = material.simulation or {}
-    guards = simulation.get("guards")
-    if not isinstance(guards, Mapping) or not guards or not all("drives" in each for each in guards.values()):
-        return []
-    lost = viable_sentence(simulation)
-    return [obeyed_sentence(simulation), *([f"{lost}."] if lost else [])]
 
 
 def _verdict(material: Material) -> str:

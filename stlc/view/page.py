@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -24,7 +22,7 @@ class Section:
 
     Attributes:
         anchor: its name in links; also the file name of its picture.
-        title: its heading; nothing for one that stands at the head of the page.
+        title: its heading.
         body: its content.
         picture: the one drawn figure in it, if any.
     """
@@ -37,13 +35,10 @@ class Section:
     @property
     def html(self) -> Html:
         """The markup."""
-        heading = el("h2", self.title) if self.title else None
-        return el("section", heading, self.body, attrs={"id": self.anchor})
+        return el("section", el("h2", self.title), self.body, attrs={"id": self.anchor})
 
 
-def page(
-    title: str, head: Child, sections: Sequence[Section], foot: Child, script: Html | None = None
-) -> str:
+def page(title: str, head: Child, sections: Sequence[Section], foot: Child) -> str:
     """The whole document.
 
     Args:
@@ -51,13 +46,9 @@ def page(
         head: what stands above the links.
         sections: in order.
         foot: the last line.
-        script: what runs in the page; nothing else may.
     """
     links = el("nav", [el("a", part.title, attrs={"href": f"#{part.anchor}"}) for part in sections])
-    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-    if script is not None:
-        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-        policy += f"; script-src 'sha256-{digest}'"
+    policy = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'"
     html = el(
         "html",
         el(
@@ -68,11 +59,7 @@ def page(
             el("title", title),
             el("style", Html(_sheet())),
         ),
-        el(
-            "body",
-            el("main", head, links, [part.html for part in sections], el("footer", foot)),
-            el("script", script) if script is not None else None,
-        ),
+        el("body", el("main", head, links, [part.html for part in sections], el("footer", foot))),
         attrs={"lang": "en"},
     )
     return str(join(Html("<!doctype html>\n"), html, "\n"))

@@ -54,28 +54,40 @@ def count(many: int, what: str) -> str:
     return f"{many:,} {what}{'' if many == 1 else 's'}"
 
 
+def drives_of(simulation: Mapping[str, Any] | None) -> dict[str, Mapping[str, Any]]:
+    """Guard -> what became of its drives, from the document of a deployment; none in an older one."""
+    guards = (simulation or {}).get("guards")
+    each = guards.items() if isinstance(guards, Mapping) else ()
+    found = {name: guard.get("drives") for name, guard in each if isinstance(guard, Mapping)}
+    return {name: drives for name, drives in found.items() if isinstance(drives, Mapping)}
+
+
 def obeyed_sentence(simulation: Mapping[str, Any]) -> str:
     """`198 of 200 drives obeyed every rule; without the guard 150`, from the document of a deployment.
 
     A drive is one agent over one seed. Without a specification of drives it is judged as plans are: from
-    every start by the one that they are made for.
+    every start by the one that they are made for. "" for a document that says nothing of drives.
     """
-    guards: Mapping[str, Any] = simulation["guards"]
-    name, last = list(guards.items())[-1]
-    drives = last["drives"]
+    each = drives_of(simulation)
+    if not each:
+        return ""
+    name, drives = list(each.items())[-1]
     planned = f"satisfied {simulation['spec']} from every start"
     did = "obeyed every rule" if simulation.get("judge") else planned
     words = f"{drives['obeyed']} of {count(drives['count'], 'drive')} {did}"
     if drives["undecided"]:
         words += f", {drives['undecided']} ended too early to say"
-    if name != "none" and "none" in guards:
-        words += f"; without the guard {guards['none']['drives']['obeyed']}"
+    if name != "none" and "none" in each:
+        words += f"; without the guard {each['none']['obeyed']}"
     return words
 
 
 def viable_sentence(simulation: Mapping[str, Any]) -> str:
     """How many drives no plan could have kept safe, and how many of the others obeyed; "" for none."""
-    drives = list(simulation["guards"].values())[-1]["drives"]
+    each = list(drives_of(simulation).values())
+    if not each:
+        return ""
+    drives = each[-1]
     lost, others = drives["lost"], drives["count"] - drives["lost"]
     if not lost:
         return ""

@@ -109,7 +109,22 @@ def test_the_next_obstacle_of_ship_track_comes_one_metre_behind_the_last() -> No
     before = move(world, put(world, x=first + 1 - 0.6001, **still))
     assert (before["x1"] == first).all()
     after = move(world, put(world, x=first + 1 - 0.5999, **still))
-    assert (after["x1"] == second).all()
+    assert after["x1"] == pytest.approx(after["x"] - 5.0)  # not in view yet: none is known
+    far = move(world, put(world, x=second - 8.6001, **still))
+    assert far["x1"] == pytest.approx(far["x"] - 5.0)
+    near = move(world, put(world, x=second - 8.5999, **still))
+    assert (near["x1"] == second).all()
+
+
+def test_ships_know_of_no_obstacle_that_training_never_showed_them() -> None:
+    for name in ("ship_track", "ship_track shifted"):
+        for seed in range(3):
+            world, start = river(name, seed)
+            x = torch.from_numpy(np.stack([start[column] for column in world.system.names], 1))
+            for _ in range(60):
+                ahead = x[:, world.at["x1"]] - x[:, world.at["x"]]
+                assert bool(((ahead >= -5.0 - 1e-9) & (ahead <= 8.0)).all())
+                x = world.advance(x, torch.zeros(len(x), 2, dtype=torch.float64))
 
 
 def test_an_obstacle_in_view_renews_the_allowance_once() -> None:
