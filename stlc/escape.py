@@ -188,9 +188,14 @@ def dot(text: str) -> str:
 # ---------------------------------------------------------------- pictures and logs
 
 
+LABEL = 60
+"""Letters of a label in a picture."""
+
+
 def picture(text: str) -> str:
-    """A label in the legend of a picture, which leaves out what begins with an underline."""
-    return f"\N{THIN SPACE}{visible(text)}" if text.startswith("_") else visible(text)
+    """A label in a picture, cut where it is endless; a legend leaves out what begins with an underline."""
+    words = visible(text if len(text) <= LABEL else f"{text[: LABEL - 1]}…")
+    return f"\N{THIN SPACE}{words}" if words.startswith("_") else words
 
 
 def tag(name: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 
 from stlc.controller.stage import Stage, Staged
 from stlc.diagnostics import StlcError
+from stlc.escape import file_part, picture
 from stlc.rundir import RunDir
 from stlc.trace import Trace, load_trace
 from stlc.view import bullet
@@ -58,7 +58,7 @@ def film_of(run: RunDir, *, title: str | None = None) -> Film | None:
 
 def film_name(run: RunDir) -> str:
     """File name of the run's animation, without a suffix: that of its specification."""
-    return re.sub(r"[^\w-]+", "-", str(run.record().get("spec", "deployment"))).strip("-")
+    return file_part(str(run.record().get("spec", "")), empty="deployment")
 
 
 def animate(run: RunDir, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_BYTES) -> Animation | None:
@@ -198,4 +198,4 @@ def _load_scene(path: Path) -> Scene | None:
 
 def _title(run: RunDir) -> str:
     spec = str(run.record().get("spec", ""))
-    return " · ".join(part for part in (spec, _scenario(run), run.name) if part)
+    return picture(" · ".join(part for part in (spec, _scenario(run), run.name) if part))

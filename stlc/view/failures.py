@@ -124,7 +124,7 @@ def _draw_margins(axes: Axes, held: HeldOut, weakness: Weakness, units: Mapping[
     axes.set_yscale("symlog", linthresh=10)
     axes.set_ylim(bottom=0)
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-    axes.set_title(f"robustness of {name}")
+    axes.set_title(picture(f"robustness of {name}"))
     unit = f" [{units[name]}]" if units.get(name) else ""
     axes.set_xlabel(f"robustness of the plan{unit}")
     axes.set_ylabel("starts", color=MUTED)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from stlc.compile.semantics import TOLERANCE
 from stlc.controller.sketch import DECIDED, DECIDERS
+from stlc.escape import picture
 from stlc.signature import Column
 from stlc.trace import Trace
 from stlc.view.style import (
@@ -163,7 +164,7 @@ def _name_row(axes: Axes, kind: str, name: str, trace: Trace, units: Mapping[str
     elif kind == "robustness":
         unit = units.get(name, "")
     label = f"{name} [{unit}]" if unit not in ("", "1") else name
-    axes.set_ylabel(label, rotation=0, ha="right", va="center", labelpad=6)
+    axes.set_ylabel(picture(label), rotation=0, ha="right", va="center", labelpad=6)
     axes.yaxis.set_label_coords(-0.085, 0.5)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from stlc.compile.semantics import TOLERANCE
 from stlc.controller.sketch import DECIDED
+from stlc.escape import picture
 from stlc.view.signals import margin_limits
 from stlc.view.style import BLUE, FAINT, INK, MUTED, PAPER, RED
 
@@ -152,7 +153,8 @@ def _veil(axes: Axes, times: NDArray[np.float64]) -> Mover:
 
 def _name(axes: Axes, name: str) -> None:
     axes.axhspan(*axes.get_ylim(), color=FAINT, alpha=0.25, lw=0, zorder=0)
-    axes.text(-0.012, 0.5, name, transform=axes.transAxes, ha="right", va="center", fontsize=8, color=INK)
+    label = picture(name)
+    axes.text(-0.012, 0.5, label, transform=axes.transAxes, ha="right", va="center", fontsize=8, color=INK)
 
 
 def _value(axes: Axes) -> Text:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import io
 import re
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -82,7 +83,9 @@ def look() -> Iterator[None]:
     require_drawing()
     import matplotlib as mpl
 
-    with mpl.rc_context(_RC):
+    with mpl.rc_context(_RC), warnings.catch_warnings():
+        for met in ("Glyph .* missing", "constrained_layout not applied"):  # names in other scripts, or long
+            warnings.filterwarnings("ignore", message=met)
         yield
 
 
