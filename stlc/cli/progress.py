@@ -62,6 +62,7 @@ class Summary:
         folder: of the run.
         learning: the verdict on the training, with what to do next.
         steps: of the optimiser.
+        searched: held-out starts that the policy solves or that were searched; 0 where that is unknown.
         where: where the worst requirement fails, in words, or "".
         unsolved: what remains, in words, or "".
         picture: that shows it, or "".
@@ -77,6 +78,7 @@ class Summary:
     folder: str = ""
     learning: Learning | None = None
     steps: int = 0
+    searched: int = 0
     where: str = ""
     unsolved: str = ""
     picture: str = ""
@@ -318,7 +320,10 @@ def final_screen(summary: Summary, spark: str = "") -> list[str]:
     ]
     if summary.feasible:
         share = percent(summary.accuracy / summary.feasible)
-        lines.append(f"known feasible  {summary.feasible:.3f}   of which {share} are satisfied")
+        estimate = ""
+        if 0 < summary.searched < summary.held_out:
+            estimate = f" (an estimate: {summary.searched:,} starts were searched or solved)"
+        lines.append(f"known feasible  {summary.feasible:.3f}   of which {share} are satisfied{estimate}")
     learning = summary.learning
     if learning is not None:
         lines.append(f"verdict         {learning.level}: {learning.sentence}")

@@ -45,6 +45,8 @@ def report(
     else:
         if learning is not None:
             say(f"{learning.level}: {learning.sentence}")
+            if learning.worst:
+                say(learning.worst)
         for advice in () if learning is None else learning.advice:
             say(f"what helps: {advice}")
         emit(visible(path))

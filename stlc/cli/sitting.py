@@ -184,6 +184,7 @@ def _summary(outcome: Outcome, *, pictures: bool) -> Summary:
         seconds=outcome.seconds,
         folder=folder.shown,
         steps=outcome.steps,
+        searched=int(score.searched.sum()),
         learning=learning,
         where=where,
         unsolved=unsolved,

@@ -24,7 +24,7 @@ from stlc.view.words import share
 
 Level: TypeAlias = Literal["infeasible", "undertrained", "partly trained", "trained"]
 
-UNDERTRAINED, TRAINED = 0.5, 0.9
+UNDERTRAINED, TRAINED = 0.5, 0.95
 """Shares of what is known to be feasible: below is undertrained; from there on is trained."""
 MUCH_INFEASIBLE = 0.5
 """Share of the starts without a known plan from which on that is said first."""
@@ -61,7 +61,8 @@ class Learning:
         level: in a word.
         share: accuracy over what is known to be feasible; None where nothing is.
         sentence: the same as a sentence.
-        advice: what would help, a sentence each; empty for a policy that is trained.
+        worst: the worst requirement and where it fails, as a sentence; "" where none fails.
+        advice: what would help, a sentence each.
         command: what to do next.
     """
 
@@ -70,6 +71,7 @@ class Learning:
     sentence: str
     advice: tuple[str, ...]
     command: str
+    worst: str = ""
 
     def summary(self) -> dict[str, object]:
         """For JSON documents."""
@@ -77,6 +79,7 @@ class Learning:
             "level": self.level,
             "share_of_feasible": self.share,
             "sentence": self.sentence,
+            "worst": self.worst,
             "advice": list(self.advice),
             "next": self.command,
         }
@@ -158,22 +161,25 @@ def learning_of(
     level: Level = (
         "trained" if part >= TRAINED else "partly trained" if part >= UNDERTRAINED else "undertrained"
     )
+    searched, held_out = int(result.get("searched") or 0), int(result.get("held_out") or 0)
+    sampled = 0 < searched < held_out
+    estimate = f", by an estimate from {searched:,} of the {held_out:,} starts" if sampled else ""
     sentence = (
         f"the policy's plan satisfies the specification from {share(accuracy)} of the starts; some plan that "
-        f"does is known for {share(feasible)}"
+        f"does is known for {share(feasible)}{estimate}"
     )
+    worst, hard = _worst(result, where), _hard_starts(feasible, sampled=sampled)
     if level == "trained":
-        return Learning(level, part, sentence, _hard_starts(feasible), commands.simulate)
+        return Learning(level, part, sentence, hard, commands.simulate, worst)
     curve = forecast(rows, accuracy, feasible)
     longer = _longer(curve, float(result.get("seconds") or 0.0), commands)
-    advice = (longer[0], *_worst(result, where), *_hard_starts(feasible))
     if level == "partly trained":
-        return Learning(level, part, sentence, advice, commands.simulate)
+        return Learning(level, part, sentence, (longer[0], *hard), commands.simulate, worst)
     guard = (
         f"`{commands.simulate}` shows what the guard makes of it: it replaces rejected plans where it finds "
         "better ones, and the policy stays as it is"
     )
-    return Learning(level, part, sentence, (*advice, guard), longer[1] or commands.report)
+    return Learning(level, part, sentence, (longer[0], *hard, guard), longer[1] or commands.report, worst)
 
 
 def forecast(rows: Sequence[Mapping[str, Any]], accuracy: float, feasible: float) -> Curve:
@@ -230,19 +236,20 @@ def _longer(curve: Curve, seconds: float, commands: Commands) -> tuple[str, str]
     return f"{told}: `{twice}`", twice
 
 
-def _worst(result: Mapping[str, Any], where: str) -> tuple[str, ...]:
+def _worst(result: Mapping[str, Any], where: str) -> str:
     shares: Mapping[str, float] = result.get("requirements") or {}
     if not shares or min(shares.values()) >= 1.0:
-        return ()
+        return ""
     worst = min(shares, key=shares.__getitem__)
     there = f": it {where}" if where else ""
-    return (f"the worst requirement is {worst}, {share(shares[worst])} satisfied{there}",)
+    return f"the worst requirement is {worst}, {share(shares[worst])} satisfied{there}"
 
 
-def _hard_starts(feasible: float) -> tuple[str, ...]:
+def _hard_starts(feasible: float, *, sampled: bool) -> tuple[str, ...]:
     if feasible > MUCH_INFEASIBLE:
         return ()
-    told = f"for {share(1.0 - feasible)} of the starts no satisfying plan was found by search either"
+    about = "about " if sampled else ""
+    told = f"for {about}{share(1.0 - feasible)} of the starts search finds no satisfying plan either"
     return (f"{told}: a narrower `init`, a longer `horizon` or later deadlines would change that",)
 
 

@@ -49,10 +49,18 @@ def _beside(result: Mapping[str, Any]) -> str:
     parts = [f"The 95 % interval is {interval(ends)}." if ends else ""]
     if feasible and accuracy is not None:
         parts.append(
-            f"Some satisfying plan is known for {share(feasible)} of them; the policy finds "
-            f"{share(accuracy / feasible)} of what is known to be feasible."
+            f"Some satisfying plan is known for {share(feasible)} of them{_sampled(result)}; the policy "
+            f"finds {share(accuracy / feasible)} of what is known to be feasible."
         )
     return " ".join(part for part in parts if part)
+
+
+def _sampled(result: Mapping[str, Any]) -> str:
+    """That not all starts were searched, where it is so."""
+    searched, held_out = result.get("searched"), result.get("held_out")
+    if not searched or not held_out or searched >= held_out:
+        return ""
+    return f" (an estimate: {searched:,} were searched or solved)"
 
 
 def _advice(material: Material) -> Html | None:
@@ -63,7 +71,8 @@ def _advice(material: Material) -> Html | None:
     if learning is None or not learning.advice:
         return None
     level = f"{learning.level[0].upper()}{learning.level[1:]}."
-    items = [el("li", *_spoken(advice)) for advice in learning.advice]
+    told = (*learning.advice[:1], *filter(None, [learning.worst]), *learning.advice[1:])
+    items = [el("li", *_spoken(advice)) for advice in told]
     return join(el("p", el("strong", level), " What helps:"), el("ul", items))
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -28,7 +30,7 @@ from stlc.controller.pace import (
 from stlc.controller.run import spec_hash, system_hash
 from stlc.controller.task import Task
 from stlc.controller.train import Watch, resume, train
-from stlc.rundir import RunDir
+from stlc.rundir import RunDir, every_run
 
 EVERY = 50
 
@@ -263,3 +265,26 @@ def test_a_run_that_goes_on_past_its_end_is_repeated_too(car_task: Task, tmp_pat
     again = _folder(car_task, tmp_path / "b", told)
     train(car_task, told, again)
     assert _same(folder, again)
+
+
+@pytest.mark.bench
+@pytest.mark.parametrize("busy", [0, 4])
+@pytest.mark.parametrize("spec", ["traffic", "ship_track", "navigation"])
+def test_half_a_minute_is_half_a_minute_on_an_idle_machine_and_on_a_busy_one(
+    spec: str, busy: int, tmp_path: Path
+) -> None:
+    """Within a tenth for what trains and judges; and the whole command ends in time, pictures included."""
+    path = Path(__file__).parents[2] / "specs" / f"{spec}.stl"
+    words = ["train", str(path), "--budget", "30s", "--runs", str(tmp_path)]
+    others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(busy)]
+    try:
+        began = time.monotonic()
+        subprocess.run([sys.executable, "-m", "stlc", *words], check=True, capture_output=True)
+        whole = time.monotonic() - began
+    finally:
+        for other in others:
+            other.kill()
+            other.wait()
+    (run,) = every_run(tmp_path)
+    assert run.record()["result"]["seconds"] == pytest.approx(30.0, rel=0.1)
+    assert whole <= 1.2 * 30.0 + 10.0
