@@ -94,7 +94,12 @@ print(json.dumps(results))
 
 def install(wheel: Path, root: Path, *extras: str) -> Installed:
     """An environment with a wheel, what it requires, and what these extras require."""
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", "--symlinks", str(root)], check=True)
+    base = Path(sys.executable).resolve()
+    folder = root / f"lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packages"
+    for place in (root / "bin", folder):
+        place.mkdir(parents=True)
+    (root / "bin/python").symlink_to(base)
+    (root / "pyvenv.cfg").write_text(f"home = {base.parent}\ninclude-system-site-packages = false\n")
     made = Installed(root)
     for part in _unpacked(wheel).iterdir():
         (made.packages / part.name).symlink_to(part)

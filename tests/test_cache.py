@@ -137,7 +137,7 @@ def test_what_is_used_is_not_old(kept):
 
 
 @as_root
-@pytest.mark.parametrize("home", [None, "", "/", "/nonexistent", "/root", "/proc"])
+@pytest.mark.parametrize("home", [None, "/nonexistent", "/root"])
 def test_commands_of_a_user_without_a_home_or_a_name(home, tmp_path):
     tmp_path.chmod(0o755)
     variables = {**os.environ, "TMPDIR": str(tmp_path / "none"), "XDG_CACHE_HOME": str(tmp_path)}
