@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.signature import Column, Kind, Signature
 from stlc.trace_csv import write_csv
+from stlc.trace_extras import needed
 from stlc.trace_formats import read_recording
 from stlc.trace_meta import TraceMeta, meta_array
 from stlc.trace_npz import write_npz
@@ -218,7 +219,14 @@ def save_trace(path: Path | str, trace: Trace) -> None:
 
 
 def check_writable(path: Path | str) -> None:
-    """Raise UsageError (U101) where the suffix of a file is none that traces are written with."""
+    """Whether a trace can be written there is known before there is one.
+
+    Raises:
+        UsageError: U101, the suffix is none that traces are written with.
+        MissingError: R301, an `.mcap` needs a package that is not installed.
+    """
+    if Path(path).suffix.lower() == ".mcap":
+        needed("mcap.writer")
     if Path(path).suffix.lower() not in WRITTEN and not Path(path).is_char_device():
         message = f"`{path}`: a trace is written as {', '.join(WRITTEN[:-1])} or {WRITTEN[-1]}"
         raise UsageError(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import math
+import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -156,3 +158,25 @@ def test_memory_is_that_of_the_text_and_the_numbers(choose: Callable[[int], None
         tracemalloc.stop()
     assert table.rows == 100_000
     assert peak < 2.5 * 16 * table.rows  # of text 14 bytes a line, of numbers 16
+
+
+@pytest.mark.bench
+def test_without_a_compiler_a_table_takes_as_long_as_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [",".join(map(repr, row)) for row in np.random.default_rng(0).normal(size=(280_000, 9)).tolist()]
+    data = "\n".join(["t,a,b,c,d,e,f,g,h", *rows]).encode()
+    gaps = "\n".join(
+        ["t,a,b,c,d,e,f,g,h", *(row.replace(",", ",,", 1).rpartition(",")[0] for row in rows)]
+    ).encode()
+    monkeypatch.setattr(trace_cells, "_library", lambda: None)
+    begun = time.process_time()
+    np.loadtxt(io.BytesIO(data), delimiter=",", skiprows=1)
+    by_numpy = time.process_time() - begun
+    print(f"\n{len(data) / 1e6:.0f} MB: np.loadtxt {by_numpy:.2f} s")  # noqa: T201
+    for arrow in (None, trace_cells._arrow()):
+        monkeypatch.setattr(trace_cells, "_arrow", lambda arrow=arrow: arrow)
+        for name, text in (("numbers", data), ("with a gap in every line", gaps)):
+            begun = time.process_time()
+            table_of_text(NAME, text)
+            spent = time.process_time() - begun
+            print(f"{'Arrow' if arrow else 'NumPy'}, {name}: {spent:.2f} s, {spent / by_numpy:.2f} times")  # noqa: T201
+            assert name != "numbers" or spent < 1.5 * by_numpy
