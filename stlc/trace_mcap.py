@@ -136,6 +136,8 @@ def add_mcap(log: Log, path: Path) -> Mapping[str, str] | None:
                     file.take(part)
             elif type(record).__name__ == "Metadata" and record.name == OURS:
                 ours = record.metadata
+            elif type(record).__name__ == "DataEnd":  # what follows is an index
+                break
             else:
                 file.take(record)
     return ours

@@ -49,6 +49,8 @@ def a_log(
 
 def test_json(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_bytes(robot_logs.json_mcap(X.tolist()))
+    (tmp_path / "b.mcap").write_bytes((tmp_path / "a.mcap").read_bytes()[:-60])  # without all of its index
+    assert load_trace(tmp_path / "b.mcap").samples == 21
     trace = load_trace(tmp_path / "a.mcap")
     assert (trace.dt, trace.samples, trace.meta.origin) == (0.1, 21, robot_logs.START)
     np.testing.assert_array_equal(trace.data["robot.state.position.x"][0], X)

@@ -40,7 +40,7 @@ from fuzz_specs import SMALL, SYSTEM
 from fuzz_traces import small_trace
 from fuzz_valid import FORMATS
 
-BATCH = 1000
+BATCH = 250
 EVERY = 5000
 """Inputs after which the table so far is printed."""
 PATIENCE = 60

@@ -216,7 +216,7 @@ def _chunked(data: bytes, rng: random.Random) -> bytes:
             content = head + packed
         out += data[at : at + 1] + len(content).to_bytes(8, "little") + content
         at += 9 + size
-    return out
+    return out + data[at:]
 
 
 def bag(rng: random.Random) -> tuple[str, bytes]:
