@@ -57,6 +57,7 @@ class SlopeWriter(NumberWriter):
         self._soft = soft
         self._slopes: dict[str, tuple[Slope, ...]] = {}
         self._inputs: dict[str, str] = {}
+        self._constants: set[str] = set()
 
     def backward(self, seeds: Mapping[str, str]) -> tuple[list[str], dict[str, str]]:
         """Statements that take a gradient back to columns.
@@ -95,7 +96,7 @@ class SlopeWriter(NumberWriter):
     def _inside(self) -> SlopeWriter:
         inner = SlopeWriter(self._place, soft=self._soft)
         inner.lines, inner._texts = self.lines, self._texts
-        inner._slopes, inner._inputs = self._slopes, self._inputs
+        inner._slopes, inner._inputs, inner._constants = self._slopes, self._inputs, self._constants
         return inner
 
     def _indicator(self, cond: ir.Formula) -> str:
@@ -115,6 +116,8 @@ class SlopeWriter(NumberWriter):
 
     def _apply(self, name: str, args: list[str]) -> str:
         register = super()._apply(name, args)
+        if not any(map(self._varies, args)):
+            self._constants.add(register)
         if name == "norm":
             slopes = [(arg, f"({register} > 0.0 ? {arg} / {register} : 0.0)") for arg in args]
         elif name in LESS:
@@ -131,13 +134,17 @@ class SlopeWriter(NumberWriter):
 
     def _shares(self, name: str, first: str, second: str) -> tuple[str, str]:
         """The derivatives of an extremum by its operands: equal ones share it, a constant has none of it."""
-        registers, sign = set(self._texts.values()), LESS[name]
-        if second not in registers:
+        sign = LESS[name]
+        if not self._varies(second):
             return f"(double)!({second} {sign} {first})", "0.0"
-        if first not in registers:
+        if not self._varies(first):
             return "0.0", f"(double)!({first} {sign} {second})"
         equal = f"0.5 * ({first} == {second})"
         return f"(({first} {sign} {second}) + {equal})", f"(({second} {sign} {first}) + {equal})"
+
+    def _varies(self, operand: str) -> bool:
+        """Whether an operand depends on a column: literals and functions of literals do not."""
+        return operand in self._texts.values() and operand not in self._constants
 
     def _clipped(self, x: str, low: str, high: str) -> list[Slope]:
         """The derivatives of `min(max(x, low), high)`."""
