@@ -181,7 +181,7 @@ def test_two_processes_agree_on_the_steps_of_a_budget(tiny: Task, tmp_path: Path
         return int(outcome.run.dir.record()["steps"])
 
     first, second = together(work)
-    assert first == second >= TINY["every"]
+    assert first == second >= 1
 
 
 def test_whoever_does_not_come_is_missed(monkeypatch: pytest.MonkeyPatch) -> None:
