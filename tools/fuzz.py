@@ -43,7 +43,7 @@ from fuzz_valid import FORMATS
 BATCH = 250
 EVERY = 5000
 """Inputs after which the table so far is printed."""
-PATIENCE = 60
+PATIENCE = 180
 """Seconds of the clock without a sign of life, after which a worker is taken for hung in foreign code."""
 
 ANSWERS = frozenset(range(6))
