@@ -48,9 +48,7 @@ def apply(name: str, args: Sequence[Number], span: Span, scope: Scope) -> Number
         _check_divisor(function, typed_args[1], span, scope)
     if function.fold is not None and all(arg.constant is not None for arg in typed_args):
         return _fold(function, typed_args, shell, scope)
-    kind: Kind = "int" if function.whole and all(arg.kind == "int" for arg in typed_args) else "real"
-    if name == "bernoulli":
-        kind = "bool"
+    kind: Kind = "bool" if name == "bernoulli" else "int" if _whole(function, typed_args, shell) else "real"
     if name == "choice" and len({(arg.kind, arg.labels) for arg in typed_args}) == 1:
         return replace(shell, num=_op(name, typed_args), kind=typed_args[0].kind, labels=typed_args[0].labels)
     return replace(shell, num=_op(name, typed_args), kind=kind)
@@ -226,8 +224,22 @@ def _fold(function: Function, args: Sequence[Number], shell: Number, scope: Scop
     exact = Fraction(result) if isinstance(result, Fraction | int) else None
     if exact is not None and max(exact.numerator.bit_length(), exact.denominator.bit_length()) > _MAX_BITS:
         exact = None
-    whole = function.whole and all(arg.kind == "int" for arg in args)
-    return replace(shell, num=ir.Lit(value), exact=exact, kind="int" if whole else "real")
+    return replace(
+        shell, num=ir.Lit(value), exact=exact, kind="int" if _whole(function, args, shell) else "real"
+    )
+
+
+def _whole(function: Function, args: Sequence[Number], shell: Number) -> bool:
+    """Whether the result is a whole number, whatever the arguments are at the moment.
+
+    `floor` and its like make whole numbers of SI units: in kilometres these need not be whole.
+    """
+    if function.integral:
+        return shell.unit.ratio == 1
+    if function.name == "pow":
+        exponent = args[1].exact
+        return args[0].kind == "int" and exponent is not None and exponent.denominator == 1 and exponent >= 0
+    return function.whole and all(arg.kind == "int" for arg in args)
 
 
 def _verb(function: Function) -> str:

@@ -155,4 +155,4 @@ def _indicator(call: ast.Call, values: Sequence[Value], scope: Scope) -> Number:
     cond = as_state_formula(values[0], call.args[0].value, Need("`ind`", "argument 1"), scope)
     if isinstance(cond, ir.Truth):
         return replace(literal(int(cond.value), call.span), flexible=False, bare=False)
-    return Number(ir.Ind(cond, sharpness), span=call.span)
+    return Number(ir.Ind(cond, sharpness), kind="int", span=call.span)

@@ -149,7 +149,7 @@ def _real_equality(a: Number, b: Number, left: ast.Expr, right: ast.Expr, place:
         place,
         label,
         help=(f"{gap} <= {tolerance}",),
-        note=("`==` is exact and allowed on int, bool and enum signals",),
+        note=("`==` is exact and allowed on whole numbers, truth values and enums",),
     )
 
 

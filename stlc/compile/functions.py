@@ -32,6 +32,7 @@ class Function:
         fold: the value for numbers (`Fraction`s stay exact where `exact`); None for samplers.
         exact: rational arguments give a rational result.
         whole: whole arguments give a whole result.
+        integral: every argument gives a whole result.
         symbol: how an operator is written.
     """
 
@@ -43,7 +44,11 @@ class Function:
     fold: Callable[..., Any] | None = None
     exact: bool = False
     whole: bool = False
+    integral: bool = False
     symbol: str = ""
+
+
+_INTEGRAL = ("floor", "ceil", "round", "sign")
 
 
 def _sign(x: Any) -> int:
@@ -68,11 +73,11 @@ def _build() -> Mapping[str, Function]:
 
     def operators(*rows: tuple[str, str, int, Rule, Callable[..., Any], bool]) -> None:
         for name, symbol, arity, rule, fold, whole in rows:
-            table[name] = Function(name, arity, arity, rule, "operator", fold, True, whole, symbol)
+            table[name] = Function(name, arity, arity, rule, "operator", fold, True, whole, symbol=symbol)
 
     def functions(*rows: tuple[str, int, int | None, Rule, Callable[..., Any], bool, bool]) -> None:
         for name, least, most, rule, fold, exact, whole in rows:
-            table[name] = Function(name, least, most, rule, "function", fold, exact, whole)
+            table[name] = Function(name, least, most, rule, "function", fold, exact, whole, name in _INTEGRAL)
 
     operators(
         ("add", "+", 2, "same", operator.add, True),

@@ -157,7 +157,7 @@ def compile_spec(
     if interface is not None and purpose == "check":
         given = {item.name for item in spec.items if isinstance(item, ast.Param)} & (overrides or {}).keys()
         interface = _without(interface, given)
-    resolved = resolve(spec, interface=interface, overrides=overrides or {}, sink=sink)
+    resolved = resolve(spec, interface=interface, overrides=overrides or {}, grid=grid, sink=sink)
     ranges = nominal(resolved.signature.columns)
     stage = _Stage(grid, purpose, Ledger(_taken(resolved, interface)), sink, ranges)
     requirements = tuple(map(stage.rule, resolved.requirements))

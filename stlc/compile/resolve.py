@@ -19,7 +19,7 @@ from stlc.compile.declare import Declared
 from stlc.compile.expressions import evaluate
 from stlc.compile.formulas import resolve_formula
 from stlc.compile.imported import File, declared, signature_of, with_facts
-from stlc.compile.interface import Interface
+from stlc.compile.interface import Grid, Interface
 from stlc.compile.modules import load_modules
 from stlc.compile.names import check_names
 from stlc.compile.overrides import read_overrides
@@ -43,6 +43,7 @@ def resolve(
     *,
     interface: Interface | None = None,
     overrides: Mapping[str, str] | None = None,
+    grid: Grid | None = None,
     sink: list[Diagnostic],
 ) -> typed.Spec:
     """Bind names, check sorts and units, expand macros.
@@ -51,6 +52,8 @@ def resolve(
         spec: as parsed.
         interface: what the system offers; signals and constants are matched with it.
         overrides: constant -> expression that replaces its value (`--set`).
+        grid: of time, as far as it is known; None where what comes out is not compiled further, so that
+            times among samples (`shift(x, 0.1 s)`) need not be whole numbers of steps.
         sink: warnings are appended here.
 
     Raises:
@@ -59,7 +62,8 @@ def resolve(
     """
     values = read_overrides(overrides or {}, spec, interface)
     findings = Findings()
-    scope = Scope(sink=findings, temporal=True, time_unit=spec.time_unit, elsewhere=_elsewhere(interface))
+    elsewhere = _elsewhere(interface)
+    scope = Scope(sink=findings, temporal=True, time_unit=spec.time_unit, elsewhere=elsewhere, grid=grid)
     file = declared(spec, load_modules(spec), interface, values, scope)
     _adopt_units(spec, values, file.found, file.scope)
     signature, parameters = signature_of(file, interface)

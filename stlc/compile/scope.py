@@ -10,6 +10,7 @@ from typing import Any, Literal, NoReturn, TypeAlias
 
 from stlc.compile import ir
 from stlc.compile.functions import callable_names, sampler_names
+from stlc.compile.interface import Grid
 from stlc.compile.meter import Cost, Meter
 from stlc.compile.values import Label, Number, Origin, Value, Vector
 from stlc.diagnostics import Diagnostic, Findings, SpecError, StlcError, SystemFileError, tell
@@ -116,6 +117,7 @@ class Scope:
         elsewhere: names that only the system knows, with the advice to give.
         modules: what imported files know, by alias.
         product: `x in [lo, hi]` is `(x - lo) (hi - x)` (`@product`).
+        grid: of time, as far as it is known; None where nobody asks for what depends on it.
         locals: arguments of the macro and quantifier variables at hand, with what they cost.
     """
 
@@ -129,6 +131,7 @@ class Scope:
     elsewhere: Mapping[str, str] = field(default_factory=dict)
     modules: Mapping[str, Scope] = field(default_factory=dict, compare=False)
     product: bool = False
+    grid: Grid | None = None
     locals: Mapping[str, tuple[Value, Cost]] = field(default_factory=dict)
     meter: Meter = field(default_factory=Meter, compare=False, repr=False)
     cache: dict[str, tuple[Value, Cost] | None] = field(default_factory=dict, compare=False, repr=False)

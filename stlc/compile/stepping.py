@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 
 from stlc.compile import typed
+from stlc.compile.bounds import in_steps, in_words
+from stlc.compile.moments import moment
 from stlc.compile.samples import later
 from stlc.compile.scope import Scope
 from stlc.compile.sorts import Need, as_formula, as_number
@@ -15,7 +18,9 @@ from stlc.compile.vectors import broadcast
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.source import Span
+from stlc.units import SYMBOLS, same_dims
 
+_SECOND = SYMBOLS["s"]
 _MOST = 1_000_000
 """How many samples `shift` may be away."""
 
@@ -71,16 +76,51 @@ def _vector(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> Vector:
 
 
 def _steps(value: Value, expr: ast.Expr, scope: Scope) -> int:
-    """`3`, `-1` or `3 steps`."""
+    """A number of samples: `3`, `-1`, `3 steps`, or a time that is a whole number of steps: `0.1 s`.
+
+    Raises Failed: E205 where it is none, E311 where nobody says how long a step is.
+    """
     match value:
-        case Moment(seconds, steps, horizons, False) if not seconds and not horizons:
-            exact: Fraction | None = steps
+        case Moment(end=False):
+            exact = _on_grid(value, expr, scope)
         case Number(bare=True, exact=known) if known is not None:
             exact = known
+        case Number(bare=False, flexible=False) if value.constant is not None and same_dims(
+            value.unit, _SECOND
+        ):
+            exact = _on_grid(moment(expr, value, scope), expr, scope)
         case _:
-            exact = None
-    if exact is None or exact.denominator != 1 or abs(exact) > _MOST:
-        message = "`shift` goes a whole number of samples, known at compile time"
-        help_ = ("shift(x, 2) is x two samples later, shift(x, -2) two samples earlier",)
-        scope.fail(Diagnostic("E205", message, expr.span, help=help_))
+            return scope.fail(
+                _no_steps("`shift` goes a whole number of samples, known at compile time", expr)
+            )
+    if exact.denominator != 1:
+        return scope.fail(_off_grid(exact, expr, scope))
+    if abs(exact) > _MOST:
+        return scope.fail(_no_steps(f"`shift` goes {_MOST:,} samples at most", expr))
     return int(exact)
+
+
+def _on_grid(time: Moment, expr: ast.Expr, scope: Scope) -> Fraction:
+    """A time in steps; any whole number where nobody asks."""
+    if scope.grid is None:
+        return time.steps if not (time.seconds or time.horizons) else Fraction(1)
+    found: list[Diagnostic] = []
+    steps = in_steps(
+        typed.Time(time.seconds, time.steps, time.horizons, expr.span), scope.grid, found, expr.span
+    )
+    return steps if steps is not None else scope.fail(found[0])
+
+
+def _off_grid(exact: Fraction, expr: ast.Expr, scope: Scope) -> Diagnostic:
+    """E205: between two samples, with the times of both."""
+    if scope.grid is None or scope.grid.dt is None:
+        return _no_steps("`shift` goes a whole number of samples, known at compile time", expr)
+    low, high = (in_words(Fraction(n), scope.grid) for n in (math.floor(exact), math.ceil(exact)))
+    message = f"{in_words(exact, scope.grid)} is not a whole number of {float(scope.grid.dt):g} s steps"
+    label = "there is no sample at this time"
+    return Diagnostic("E205", message, expr.span, label, help=(f"use {low} or {high}, or a dt that fits",))
+
+
+def _no_steps(message: str, expr: ast.Expr) -> Diagnostic:
+    help_ = ("shift(x, 2) is x two samples later, shift(x, -0.1 s) what it was a tenth of a second before",)
+    return Diagnostic("E205", message, expr.span, help=help_)

@@ -82,7 +82,7 @@ FUNCTIONS: Mapping[str, str] = MappingProxyType(
         "prev": "`prev(p)`: p at the sample before this one.",
         "rise": "`rise(p)`: p has just become true; false at the first sample.",
         "fall": "`fall(p)`: p has just become false; false at the first sample.",
-        "shift": "`shift(x, time)`: the value of a signal that much later.",
+        "shift": "`shift(x, 2)`, `shift(x, 0.2 s)`: a signal so many samples, or so much time, later.",
         "delta": "`delta(x)`: how much a signal has changed since the sample before.",
         "sweep": "`sweep(p)`: the straight segment from a point's sample to the next one.",
     }

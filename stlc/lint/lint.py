@@ -79,11 +79,12 @@ def _compiled(spec: ast.Spec, within: Surroundings | None) -> Sequence[Diagnosti
     """What the compiler says."""
     warnings: list[Diagnostic] = []
     try:
-        resolve(spec, interface=within.interface if within else None, sink=warnings)
+        if within is None:
+            resolve(spec, sink=warnings)
+            return warnings
+        resolve(spec, interface=within.interface, grid=within.grid, sink=warnings)
     except SpecError as error:
         return [*warnings, *error.diagnostics]
-    if within is None:
-        return warnings
     from stlc.compile.pipeline import compile_spec
 
     try:

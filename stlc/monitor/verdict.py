@@ -79,8 +79,9 @@ class Monitor:
         try:
             self._compile(Times(self._asked.dt, self._asked.horizon).or_else(self._system))
         except SpecError as error:
-            if any(finding.code != "E311" for finding in error.diagnostics):
-                raise
+            wrong = [finding for finding in error.diagnostics if finding.code != "E311"]
+            if wrong:  # the time step may still be said by the first trace
+                raise SpecError(*wrong) from error
 
     @property
     def requirements(self) -> tuple[str, ...]:
