@@ -19,7 +19,17 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from stlc.controller.sketch import DECIDED, GOAL, NOTE, STONE, deciders, tails
+from stlc.controller.sketch import (
+    DECIDED,
+    GOAL,
+    NOTE,
+    STONE,
+    deciders,
+    plans,
+    scale_bar,
+    tails,
+    violations,
+)
 from stlc.controller.stage import Ball, Stage
 from stlc.controller.streams import Streams
 
@@ -119,6 +129,11 @@ class Goals:
             "post": np.array([*self.post, self.r_post, self.r_goal]),
         }
 
+    def charted(self, states: torch.Tensor) -> np.ndarray:
+        """Where the flanges of planned states (agents, k, n) are, (agents, k, 3)."""
+        agents, count = states.shape[:2]
+        return self._flange(states.flatten(0, 1)).reshape(agents, count, 3)
+
     KEYS: ClassVar = {"goal": GOAL, "obstacle": STONE}
 
     @staticmethod
@@ -132,6 +147,10 @@ class Goals:
         for floor, up in ((0.0, 2), (ABOVE, 1)):
             seen = arms[..., [0, up]] + np.stack((bases, np.full_like(bases, floor)), -1)[:, None]
             tails(axes, seen[:, :, -1], scene, index, frames=TAIL)
+            origin = np.stack((bases, np.full_like(bases, floor)), -1)[:, None]
+            sides = [0, up]
+            plans(axes, scene, index, lambda places, s=sides, o=origin: places[..., s] + o)
+            violations(axes, seen[index, :, -1], scene, index)
             for base, arm, goal, source in zip(bases, seen[index], goals, who, strict=True):
                 color = DECIDED[source]
                 axes.add_patch(
@@ -148,6 +167,7 @@ class Goals:
             axes.text(
                 -REACH - 0.15, height, words, rotation=90, ha="center", va="center", size=7.5, color=NOTE
             )
+        scale_bar(axes, bases[-1] + REACH - 0.5, ABOVE - REACH - 0.15, 0.5)
         axes.set(xlim=(-REACH - 0.3, bases[-1] + REACH), ylim=(ABOVE - REACH - 0.25, 1.25), aspect="equal")
         axes.set_axis_off()
 

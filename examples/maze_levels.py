@@ -19,7 +19,18 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from stlc.controller.sketch import DECIDED, GOAL, GROUND, NOTE, WALL, deciders, tails
+from stlc.controller.sketch import (
+    DECIDED,
+    GOAL,
+    GROUND,
+    NOTE,
+    WALL,
+    deciders,
+    plans,
+    scale_bar,
+    tails,
+    violations,
+)
 from stlc.controller.streams import Streams
 
 LEVELS = 200
@@ -90,6 +101,11 @@ class MazeLevels:
             "shape": np.array([self.width, self.h, self.d, self.r]),
         }
 
+    def charted(self, states: torch.Tensor) -> np.ndarray:
+        """Planned states (agents, k, n) as x and height, (agents, k, 2)."""
+        height = states[..., self.at["dy"]] + self.d * (self.passed[:, None] + 1)
+        return torch.stack((states[..., self.at["x"]], height), -1).numpy()
+
     KEYS: ClassVar = {"goal": GOAL, "obstacle": WALL}
 
     @staticmethod
@@ -105,9 +121,17 @@ class MazeLevels:
         left = pitch * np.arange(balls.shape[1])
         seen = np.stack((balls[..., 0] + left, balls[..., 1] - balls[index, :, 1]), -1)
         tails(axes, np.where(seen[..., 1:] > -BELOW, seen, np.nan), scene, index, frames=TAIL)
+        origin = np.stack((left, -balls[index, :, 1]), -1)[:, None]
+        plans(axes, scene, index, lambda places: places + origin)
         for at, source in zip(seen[index], who, strict=True):
             axes.add_patch(Circle(at, 0.2, fc=DECIDED[source], ec="white", lw=0.6, zorder=3))
-        axes.set(xlim=(-0.3, len(who) * pitch - 0.1), ylim=(-BELOW, ABOVE), aspect="equal")
+        for shaft, start in enumerate(left):
+            axes.text(
+                start + width / 2, -BELOW - 0.2, f"ball {shaft}", ha="center", va="top", size=7.5, color=NOTE
+            )
+        violations(axes, seen[index], scene, index)
+        scale_bar(axes, width + 0.3, -BELOW - 0.6, 2)
+        axes.set(xlim=(-0.3, len(who) * pitch - 0.1), ylim=(-BELOW - 1.1, ABOVE), aspect="equal")
         axes.set_axis_off()
 
     def _first(self, level: torch.Tensor, generator: torch.Generator) -> torch.Tensor:

@@ -26,7 +26,19 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from stlc.controller.sketch import BANK, NOTE, STONE, WATER, deciders, outlines, tails
+from stlc.controller.sketch import (
+    BANK,
+    NOTE,
+    STONE,
+    WATER,
+    deciders,
+    numbers,
+    outlines,
+    plans,
+    scale_bar,
+    tails,
+    violations,
+)
 from stlc.controller.streams import Streams
 
 OBSTACLES = 100
@@ -103,6 +115,10 @@ class River(ABC):
             "half": np.float64(self.half),
         }
 
+    def charted(self, states: torch.Tensor) -> np.ndarray:
+        """Planned states (agents, k, n) as places (agents, k, 2)."""
+        return states[..., [self.at["x"], self.at["y"]]].numpy()
+
     KEYS: ClassVar = {"obstacle": STONE}
 
     @staticmethod
@@ -112,13 +128,23 @@ class River(ABC):
         rows, pitch = max(int(ships[..., 0].max() // FOLD) + 1, 2), 2 * half + 1.8
         for row in range(rows):
             draw_row(axes, row, scene["obstacles"][index], half, pitch)
-        row = np.clip(ships[..., 0] // FOLD, 0, rows - 1)
-        placed = np.stack((ships[..., 0] - row * FOLD, ships[..., 1] - row * pitch), -1)
-        turned = np.diff(row, axis=0, prepend=row[:1])[..., None] != 0  # on to the next row
-        tails(axes, np.where(turned, np.nan, placed), scene, index, frames=WAKE)
-        poses = np.concatenate((placed[index], ships[index, :, 2:]), 1)
-        outlines(axes, HULL, poses, deciders(scene, index, ships.shape[1]))
-        axes.set(xlim=(-3.4, FOLD + 0.5), ylim=(-(rows - 0.5) * pitch + 0.5, pitch / 2 - 0.5), aspect="equal")
+
+        def folded(places: np.ndarray, axis: int) -> np.ndarray:
+            """Places (..., 2) in their rows; a line along `axis` breaks where it goes on to the next one."""
+            row = np.clip(places[..., 0] // FOLD, 0, rows - 1)
+            placed = np.stack((places[..., 0] - row * FOLD, places[..., 1] - row * pitch), -1)
+            begin = np.take(row, [0], axis)
+            return np.where(np.diff(row, axis=axis, prepend=begin)[..., None] != 0, np.nan, placed)
+
+        tails(axes, folded(ships[..., :2], 0), scene, index, frames=WAKE)
+        plans(axes, scene, index, lambda places: folded(places, 1))
+        here = folded(ships[index : index + 1, :, :2], 0)[0]
+        outlines(axes, HULL, np.c_[here, ships[index, :, 2]], deciders(scene, index, ships.shape[1]))
+        numbers(axes, here)
+        violations(axes, here, scene, index)
+        bottom = -(rows - 0.5) * pitch - 0.9
+        scale_bar(axes, FOLD - 5, bottom + 0.3, 5)
+        axes.set(xlim=(-3.4, FOLD + 0.5), ylim=(bottom - 0.4, pitch / 2 - 0.5), aspect="equal")
         axes.set_axis_off()
 
     # ------------------------------------------------------------- what rivers differ in

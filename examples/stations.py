@@ -21,7 +21,20 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from stlc.controller.sketch import CHARGE, DECIDED, GOAL, GROUND, NOTE, WALL, deciders, tails
+from stlc.controller.sketch import (
+    CHARGE,
+    DECIDED,
+    GOAL,
+    GROUND,
+    NOTE,
+    WALL,
+    deciders,
+    numbers,
+    plans,
+    scale_bar,
+    tails,
+    violations,
+)
 from stlc.controller.streams import Streams
 
 STATES = 100  # of the stations and of each rover that are drawn as in training
@@ -128,6 +141,10 @@ class Stations:
             "shape": np.array([self.size, self.near]),
         }
 
+    def charted(self, states: torch.Tensor) -> np.ndarray:
+        """Planned states (agents, k, n) as places (agents, k, 2)."""
+        return self._place(states).numpy()
+
     KEYS: ClassVar = {"destination": GOAL, "charging station": CHARGE, "wall": WALL, "battery left": NOTE}
 
     @staticmethod
@@ -143,17 +160,21 @@ class Stations:
             axes.add_patch(Circle(place, near, color=CHARGE, lw=0, alpha=0.8)).set_clip_path(ground)
         rovers, goals = scene["rovers"], scene["destinations"][index]
         tails(axes, rovers, scene, index, frames=TAIL)
+        plans(axes, scene, index)
         most = max(float(scene["battery"].max()), 1e-9)
         who = deciders(scene, index, rovers.shape[1])
         for at, goal, left, source in zip(rovers[index], goals, scene["battery"][index], who, strict=True):
             axes.plot(*np.transpose((at, goal)), color=GOAL, lw=0.8, ls=(0, (2, 3)), zorder=2)
             axes.add_patch(Circle(goal, near, fc="none", ec=GOAL, lw=1.4, zorder=2)).set_clip_path(ground)
-            axes.add_patch(Circle(at, 0.17, fc=DECIDED[source], ec="white", lw=0.6, zorder=3))
+            axes.add_patch(Circle(at, 0.22, fc=DECIDED[source], ec="white", lw=0.6, zorder=3))
             full = 360 * min(max(left / most, 0.0), 1.0)
             axes.add_patch(Arc(at, 0.62, 0.62, theta1=90 - full, theta2=90, color=NOTE, lw=1.6, zorder=3))
             high = at[1] + (0.4 if at[1] + 0.8 < size else -0.65)  # on the map
             axes.text(at[0], high, f"{left:.1f} s", size=7.5, ha="center", color=NOTE, zorder=4)
-        axes.set(xlim=(-0.1, size + 0.1), ylim=(-0.1, size + 0.1), aspect="equal")
+        numbers(axes, rovers[index])
+        violations(axes, rovers[index], scene, index)
+        scale_bar(axes, size - 2, -0.45, 2)
+        axes.set(xlim=(-0.1, size + 0.1), ylim=(-0.7, size + 0.1), aspect="equal")
         axes.set_axis_off()
 
     def _first(self, states: torch.Tensor) -> int:
@@ -173,7 +194,7 @@ class Stations:
         return self.list[torch.arange(self.agents), self.number]
 
     def _place(self, states: torch.Tensor) -> torch.Tensor:
-        return states[:, [self.at["x"], self.at["y"]]]
+        return states[..., [self.at["x"], self.at["y"]]]
 
     def _at_station(self, states: torch.Tensor) -> torch.Tensor:
         """Whether rovers are at the station that they chose, (agents,); on the circle is at it."""

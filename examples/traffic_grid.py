@@ -18,14 +18,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
-from stlc.controller.sketch import deciders, outlines, pieces, tails
+from stlc.controller.sketch import (
+    GOAL,
+    NOTE,
+    ROAD,
+    STOP_LIGHT,
+    deciders,
+    outlines,
+    plans,
+    scale_bar,
+    segments,
+    tails,
+    violations,
+)
 
 COLUMNS, ROWS = 4, 5
 COLUMN_SPACING = (13.0, 15.0, 18.0, 21.0)
@@ -41,8 +53,8 @@ LEFT, STRAIGHT, RIGHT = 1, 0, -1
 RADIUS = {LEFT: 0.75 * WIDTH, RIGHT: 0.25 * WIDTH}
 SPAN = {STRAIGHT: WIDTH, LEFT: math.pi / 2 * RADIUS[LEFT], RIGHT: math.pi / 2 * RADIUS[RIGHT]}
 STEP, BEFORE = 0.1, 2.0  # m: resolution of the conflict tables, and how long before the box they begin
-ROAD = {"color": "#e3e5e8", "lw": 0}
-SHOWN = {-1: "#4a4f57", 0: "#d43d3d", 1: "#2f9e57"}  # stop sign, red, green
+LANES = {"color": ROAD, "lw": 0}
+SHOWN = {-1: NOTE, 0: STOP_LIGHT, 1: GOAL}  # stop sign, red, green
 SEEN = np.array([(0.0, -1.0), (1.0, 0.0)])  # a point of the map in the picture: a quarter turn to the right
 CAR = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (0.9 * LENGTH_CAR, 0.9 * WIDTH_CAR)
 TAIL = 12  # frames of a way that are seen
@@ -110,17 +122,25 @@ def conflicts(relative: int, mine: int, other: int) -> tuple[tuple[float, ...], 
 
 def draw_roads(axes: Any, places: np.ndarray, shows: np.ndarray) -> None:
     """Roads between junctions (20, 2) of the picture, and the stop lines with what they show (20, 2)."""
+    from matplotlib.collections import PolyCollection
+
     low, high = places.min(0), places.max(0)
-    for x in set(places[:, 0]):
-        axes.fill_between((x - WIDTH / 2, x + WIDTH / 2), low[1] - WIDTH / 2, high[1] + WIDTH / 2, **ROAD)
-    for y in set(places[:, 1]):
-        axes.fill_between((low[0] - WIDTH / 2, high[0] + WIDTH / 2), y - WIDTH / 2, y + WIDTH / 2, **ROAD)
+    (left, bottom), (right, top) = low - WIDTH / 2, high + WIDTH / 2
+    roads = [(x - WIDTH / 2, x + WIDTH / 2, bottom, top) for x in set(places[:, 0])]
+    roads += [(left, right, y - WIDTH / 2, y + WIDTH / 2) for y in set(places[:, 1])]
+    corners = [[(a, c), (b, c), (b, d), (a, d)] for a, b, c, d in roads]
+    axes.add_collection(PolyCollection(corners, **LANES))
+    marks, lines = list[np.ndarray](), dict[int, list[np.ndarray]]()
     for direction, forward in enumerate(WIDTH * DIRECTIONS @ SEEN):
         known = (np.abs(places - forward - (low + high) / 2) < (high - low) / 2 + 1).all(1)
-        pieces(axes, places[known], np.outer((-0.6, -1.1), forward), "white", 1.0)
+        marks.append(places[known][:, None] + np.outer((-0.6, -1.1), forward))
         line = np.outer((0.06, 0.44), WIDTH * right_of(direction) @ SEEN) - forward / 2
-        for state, color in SHOWN.items():
-            pieces(axes, places[known & (shows[:, direction % 2] == state)], line, color, 2.4)
+        for state in SHOWN:
+            shown = places[known & (shows[:, direction % 2] == state)]
+            lines.setdefault(state, []).append(shown[:, None] + line)
+    segments(axes, np.concatenate(marks), "white", 1.0)
+    for state, color in SHOWN.items():
+        segments(axes, np.concatenate(lines[state]), color, 2.4)
 
 
 @dataclass(slots=True)
@@ -193,10 +213,8 @@ class Grid:
 
     def pose(self, car: Car) -> tuple[float, float, float]:
         """Place and heading of a car."""
-        s, turn = car.s - self.length[car.past, car.here], STRAIGHT
-        if car.inside:
-            s, turn = car.s, self.turn(*car.way)
-        x, y, angle = turn_pose(self.heading[car.past, car.here], turn, s)
+        s = car.s - (0.0 if car.inside else self.length[car.past, car.here])
+        x, y, angle = turn_pose(self.heading[car.past, car.here], self.turn(*car.way), s)
         return x + float(self.places[car.here][0]), y + float(self.places[car.here][1]), angle
 
 
@@ -264,6 +282,15 @@ class TrafficGrid:
         shows = np.where(self.grid.light[:, None], np.array(green, dtype=np.int8), np.int8(-1))
         return {"pose": self._poses(), "junctions": self.grid.places, "shows": shows}
 
+    def charted(self, states: torch.Tensor) -> np.ndarray:
+        """Planned states (agents, k, n) as places on the way of each car, (agents, k, 2)."""
+        x = states[..., self.at["x"]].numpy()
+        places = np.full((*x.shape, 2), np.nan)
+        for car, own, row in zip(self.cars, x, places, strict=True):
+            if np.isfinite(own).all():
+                row[:] = [self.grid.pose(replace(car, s=car.s + float(s - own[0])))[:2] for s in own]
+        return places
+
     KEYS: ClassVar = {"red light": SHOWN[0], "green light": SHOWN[1], "stop sign": SHOWN[-1]}
 
     @staticmethod
@@ -273,6 +300,10 @@ class TrafficGrid:
         draw_roads(axes, scene["junctions"][index] @ SEEN, scene["shows"][index])
         tails(axes, poses[..., :2], scene, index, frames=TAIL)
         outlines(axes, CAR, poses[index], deciders(scene, index, poses.shape[1]))
+        plans(axes, scene, index, lambda places: places @ SEEN)
+        violations(axes, poses[index, :, :2], scene, index)
+        right, bottom = axes.get_xlim()[1], axes.get_ylim()[0]
+        scale_bar(axes, right - 14, bottom - 2, 10)
         axes.set_aspect("equal")
         axes.set_axis_off()
 

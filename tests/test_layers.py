@@ -82,7 +82,7 @@ HOMES = {
     "click": (),
     "yaml": ("stlc.dynamics.yaml_nodes",),
     "pydantic": (),
-    "matplotlib": ("stlc.view",),
+    "matplotlib": ("stlc.view", "stlc.controller.sketch"),  # what worlds draw with, while they draw
     "pygls": ("stlc.editor",),
     "gymnasium": ("stlc.gym",),
     "lsprotocol": ("stlc.editor",),

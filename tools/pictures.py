@@ -1,22 +1,49 @@
-"""The pictures of the worlds in docs/img: a still of each, and traffic in motion.
+"""The pictures in docs/img: the film at the head of the README, a still of each world, traffic in motion.
 
     python tools/pictures.py --runs runs
 
-deploys the newest run of every specification once (seed 0, with the paper's backup policy) and takes the
-instant in which most agents were guarded.
+deploys the newest run of every specification (seed 0, with the paper's backup policy, and without it to
+compare) and takes the instant in which most agents were guarded. The film shows the ships of `ship_track.stl`
+under its scenario `shifted`: four ships of each of the seeds 0 to 9 are driven, and the first is shown in
+which a ship leaves the safety requirements without the guard and every ship can be saved, as far as a search
+for plans can tell.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
+import json
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.patches import Circle, Rectangle
+from numpy.typing import NDArray
 
 from stlc.cli.app import main as stlc
+from stlc.controller.sketch import (
+    BANK,
+    DECIDED,
+    NOTE,
+    STONE,
+    VIOLATED,
+    WATER,
+    deciders,
+    numbers,
+    outlines,
+    plans,
+    tails,
+    violations,
+)
+from stlc.files import write_atomic
 from stlc.rundir import RunDir
-from stlc.view.animate import film_of
-from stlc.view.film import save_film, save_still
+from stlc.view.animate import RESULT, Seen, film_of, seen_in
+from stlc.view.film import Film, frames_in, save_film, save_still, wipe
+from stlc.view.style import INK, MUTED
 
 ROOT = Path(__file__).resolve().parent.parent
 WORLDS = (
@@ -31,15 +58,20 @@ WORLDS = (
 MOVING = "traffic"
 MAX_BYTES = 700_000
 
+SHIPS, SEEDS = 4, range(10)
+SECONDS = 12.0
+BEHIND, AHEAD = 5.0, 17.0  # m of the river around the ships
+LARGE, BOLD, SMALL = 17, 14.5, 13  # points: half as large on a telephone
+LEAD_BYTES = 950_000
+
 
 def draw(spec: str, scenario: str | None, runs: Path, folder: Path) -> Iterator[Path]:
     """Deploy the newest run of `spec` and draw it; yields what was written."""
     run = RunDir.open(spec, runs)
-    under = [] if scenario is None else ["--scenario", scenario]
-    code = stlc(["simulate", str(run.path), "--backup", "--seeds", "1", "--no-pictures", *under])
+    _simulate(run, scenario, "--seeds", "1")
     film = film_of(run, title=" · ".join(part for part in (spec, scenario) if part))
-    if code or film is None:
-        raise SystemExit(f"{run.shown} could not be deployed")
+    if film is None:
+        raise SystemExit(f"{run.shown} could not be drawn")
     name = "-".join(part for part in (spec, scenario) if part)
     yield save_still(film, folder / f"{name}.webp")
     if name == MOVING:
@@ -48,17 +80,189 @@ def draw(spec: str, scenario: str | None, runs: Path, folder: Path) -> Iterator[
         yield path
 
 
+def _simulate(run: RunDir, scenario: str | None, *more: str) -> None:
+    under = [] if scenario is None else ["--scenario", scenario]
+    if stlc(["simulate", str(run.path), "--backup", "--no-pictures", *under, *more]):
+        raise SystemExit(f"{run.shown} could not be deployed")
+
+
+# ------------------------------------------------------------------------------- the film
+
+
+@dataclass(frozen=True, slots=True)
+class Unsafe:
+    """Ships of a seed that left the safety requirements, without and with the guard; who is lost anyway."""
+
+    without: set[int]
+    guarded: set[int]
+    lost: set[int]
+
+
+def lead(runs: Path, folder: Path) -> Iterator[Path]:
+    """The film at the head of the README; yields what was written."""
+    run = RunDir.open("ship_track", runs)
+    size = ("--agents", str(SHIPS), "--steps", str(round(SECONDS / 0.15)))
+    _simulate(run, "shifted", "--seeds", str(len(SEEDS)), *size)
+    unsafe = unsafe_in(run)
+    told = ", ".join(f"{sum(len(getattr(u, name)) for u in unsafe)} {word}" for name, word in _TOLD.items())
+    print(f"of {SHIPS * len(SEEDS)} ships: {told}", file=sys.stderr)
+    seed = next(seed for seed, found in zip(SEEDS, unsafe, strict=True) if found.without and not found.lost)
+    print(f"shown is seed {seed}", file=sys.stderr)
+    _simulate(run, "shifted", "--seeds", "1", "--seed", str(seed), *size)
+    without, guarded = seen_in(run, guarded=False), seen_in(run)
+    assert without is not None
+    assert guarded is not None
+    path = folder / "guard.webp"
+    pictures = list(frames_in(lead_film(without, guarded), range(without.frames), 100))
+    for quality in range(80, 20, -8):
+        buffer = io.BytesIO()
+        pictures[0].save(
+            buffer,
+            format="webp",
+            save_all=True,
+            append_images=pictures[1:],
+            duration=round(1000 * without.dt),
+            loop=0,
+            quality=quality,
+            method=5,
+        )
+        if len(buffer.getvalue()) <= LEAD_BYTES:
+            break
+    write_atomic(path, buffer.getvalue())
+    yield path
+
+
+_TOLD = {"without": "unsafe without the guard", "guarded": "with it", "lost": "cannot be saved"}
+
+
+def unsafe_in(run: RunDir) -> list[Unsafe]:
+    """What the newest deployment says of each seed."""
+    document = json.loads((run.path / RESULT).read_text(encoding="utf-8"))
+    found = []
+    for seed in document["seeds"]:
+        each = {
+            guard: [ship for ship in measured["unsafe"] if ship["seed"] == seed]
+            for guard, measured in document["guards"].items()
+        }
+        lost = {ship["agent"] for ships in each.values() for ship in ships if not ship["savable"]}
+        without, guarded = ({ship["agent"] for ship in each[guard]} for guard in ("none", "paper"))
+        found.append(Unsafe(without, guarded, lost))
+    return found
+
+
+def lead_film(without: Seen, guarded: Seen) -> Film:
+    """Both drives, one above the other; the picture follows the ships of both."""
+    middle = np.mean([seen.scene["ships"][..., 0].mean(1) for seen in (without, guarded)], 0)
+    hits = [first_hits(seen) for seen in (without, guarded)]
+    counts = [sum(np.isfinite(hit)) for hit in hits]
+    words = f"{SHIPS} ships on a river the policy has not seen:\n{_sentence(*counts)}"
+
+    def begin(figure: Any) -> Any:
+        figure.set_layout_engine("none")
+        figure.text(0.02, 0.975, words, fontsize=LARGE, weight="bold", color=INK, va="top", linespacing=1.25)
+        clock = figure.text(0.98, 0.05, "", fontsize=SMALL, color=INK, ha="right", va="center")
+        panels, told = [], []
+        for row, title in enumerate(("without the guard", "with the guard")):
+            foot = 0.5 - 0.39 * row
+            figure.text(0.02, foot + 0.335, title, fontsize=BOLD, weight="bold", color=INK, va="center")
+            told.append(
+                figure.text(0.98, foot + 0.335, "", fontsize=BOLD, weight="bold", ha="right", va="center")
+            )
+            panels.append(figure.add_axes((0, foot, 1, 0.3)))
+        _legend(figure)
+
+        def turn(index: int) -> None:
+            clock.set_text(f"{index * without.dt:.1f} s")
+            for axes, seen, hit, text in zip(panels, (without, guarded), hits, told, strict=True):
+                wipe(axes)
+                _river(axes, seen, index, float(middle[index]), hit <= index)
+                aground = int((hit <= index).sum())
+                text.set_text(f"{aground} aground" if aground else "none aground")
+                text.set_color(VIOLATED if aground else MUTED)
+
+        return turn
+
+    return Film(without.frames, without.dt, (7.8, 5.6), begin, words.replace("\n", " "), without.frames // 3)
+
+
+def _sentence(without: int, guarded: int) -> str:
+    run = "runs" if without == 1 else "run"
+    return f"{without} {run} aground without the guard, {guarded or 'none'} with it"
+
+
+def first_hits(seen: Seen) -> NDArray[np.float64]:
+    """When each ship first leaves the safety requirements, (ships,) frames; infinity for never."""
+    assert seen.judged is not None
+    hits = np.full(seen.scene["ships"].shape[1], np.inf)
+    for event in seen.events:
+        if event.requirement in seen.judged.marked:
+            hits[event.agent] = min(hits[event.agent], event.sample)
+    return hits
+
+
+def _river(axes: Any, seen: Seen, index: int, middle: float, aground: NDArray[np.bool_]) -> None:
+    """The stretch around `middle`, in metres."""
+    left, right, half = middle - BEHIND, middle + AHEAD, float(seen.scene["half"][index])
+    axes.add_patch(Rectangle((left, -half - 1), right - left, 2 * half + 2, color=BANK, lw=0))
+    axes.add_patch(Rectangle((left, -half), right - left, 2 * half, color=WATER, lw=0))
+    axes.plot((-100, 400), (0, 0), color="white", lw=1.2, ls=(0, (8, 8)), zorder=1.5)
+    for x, y, r in seen.scene["obstacles"][index]:
+        if left - r < x < right + r:
+            axes.add_patch(Circle((x, y), r, color=STONE, lw=0, zorder=2))
+    ships = seen.scene["ships"]
+    tails(axes, ships[..., :2], seen.scene, index, frames=16)
+    plans(axes, seen.scene, index)
+    hull = sys.modules[seen.world.__module__].HULL  # in metres, as the world has it
+    outlines(axes, hull, ships[index], deciders(seen.scene, index, ships.shape[1]))
+    for x, y in ships[index][aground, :2]:
+        axes.plot(x, y, "o", ms=24, mfc="none", mec=VIOLATED, mew=1.2, zorder=3.2)
+    numbers(axes, ships[index, :, :2])
+    violations(axes, ships[index, :, :2], seen.scene, index)
+    axes.set(xlim=(left, right), ylim=(-half - 0.35, half + 0.35), aspect="equal")
+    axes.set_axis_off()
+
+
+def _legend(figure: Any) -> None:
+    from matplotlib.lines import Line2D
+
+    handles = [
+        Line2D([], [], marker="o", ls="", ms=10, mew=0, color=DECIDED[0], label="policy"),
+        Line2D([], [], color=DECIDED[1], lw=3, label="guard's plan"),
+        Line2D([], [], color=VIOLATED, lw=2.4, ls=(0, (2.5, 1.5)), label="rejected plan"),
+        Line2D([], [], marker="o", ls="", ms=11, mew=2.4, mfc="none", mec=VIOLATED, label="aground"),
+    ]
+    figure.legend(
+        handles=handles,
+        loc="center left",
+        bbox_to_anchor=(0.0, 0.05),
+        ncols=4,
+        fontsize=SMALL,
+        handlelength=1.3,
+        handletextpad=0.3,
+        columnspacing=0.8,
+        frameon=False,
+        labelcolor=INK,
+    )
+    axes = figure.add_axes((0.72, 0.02, 0.17, 0.07))
+    axes.set(xlim=(0, 0.17 * (BEHIND + AHEAD)), ylim=(-0.5, 1), aspect="equal")
+    axes.set_axis_off()
+    axes.plot((0.4, 2.4), (0, 0), color=NOTE, lw=2)
+    axes.text(2.6, 0, "2 m", fontsize=SMALL, color=NOTE, va="center")
+
+
 def main() -> int:
     """Draw them all, or those that are named."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     parser.add_argument("--output", type=Path, default=ROOT / "docs/img")
-    parser.add_argument("specs", nargs="*", help="specifications; by default all that have a world")
+    parser.add_argument("names", nargs="*", help="specifications, or `guard` for the film; by default all")
     given = parser.parse_args()
+    written = [lead(given.runs, given.output)] if not given.names or "guard" in given.names else []
     for spec, scenario in WORLDS:
-        if not given.specs or spec in given.specs:
-            for path in draw(spec, scenario, given.runs, given.output):
-                print(f"{path.stat().st_size / 1000:6.0f} kB  {path}", file=sys.stderr)
+        if not given.names or spec in given.names:
+            written.append(draw(spec, scenario, given.runs, given.output))
+    for path in (path for some in written for path in some):
+        print(f"{path.stat().st_size / 1000:6.0f} kB  {path}", file=sys.stderr)
     return 0
 
 

@@ -16,6 +16,7 @@ from stlc.compile.semantics import TOLERANCE
 from stlc.escape import operand, shell, visible
 from stlc.monitor.explain import Cause
 from stlc.monitor.judgement import Judgement, Verdict
+from stlc.monitor.prepared import beside
 
 
 def describe_result(result: Checked, *, color: bool) -> str:
@@ -99,7 +100,9 @@ def _where(judged: Judgement, result: Checked) -> str:
     cause = result.causes.get(judged.name)
     words = [f"trace {trace}"] if result.verdict.traces > 1 else []
     if cause is not None:
-        words.append(result.verdict.subject.moment(cause.sample))
+        moment = result.verdict.subject.moment
+        start = cause.start if judged.instants > 1 else cause.sample
+        words.append(beside(moment(cause.sample), moment(start)))
     elif judged.instants > 1:
         words.append(f"from {result.verdict.subject.moment(sample)}")
     return ", ".join(words)

@@ -308,13 +308,15 @@ def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rule
 
 def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rules | None) -> Record:
     """Write trace, scene and figures into the run's folder; returns what was measured."""
-    from stlc.controller.archive import RESULT, SCENE, save_scene, save_trace_of
+    from stlc.controller.archive import RESULT, SCENE, save_scene, save_trace_of, save_unguarded
     from stlc.controller.disturbance import errors_of
     from stlc.controller.evaluate import as_json
 
     last = list(found.values())[-1]
     save_trace_of(run, last.recording, order.setting, order.record, rules=rules)
     save_scene(run.dir.path / SCENE, last.recording.scene)
+    beside = found["none"].recording if "none" in found and len(found) > 1 else None
+    save_unguarded(run, beside, order.setting, rules)
     world = run.task.system.decl.test.world
     facts = {
         "spec": run.task.compiled.name,

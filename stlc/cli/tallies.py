@@ -15,6 +15,7 @@ from stlc.cli.output import table
 from stlc.cli.render import render_place
 from stlc.compile.semantics import TOLERANCE
 from stlc.escape import visible
+from stlc.monitor.prepared import beside
 from stlc.source import Source
 
 if TYPE_CHECKING:
@@ -89,7 +90,8 @@ def robustness_text(tally: Tally) -> str:
 def _row(name: str, tally: Tally, online: Online, cause: Cause | None) -> Row:
     where = f"from t = {online.time(tally.worst):.10g} s" if tally.instants > 1 else ""
     if cause is not None:
-        where = f"t = {cause.time:.10g} s"
+        start = online.time(tally.worst) if tally.instants > 1 else cause.time
+        where = beside(f"t = {cause.time:.10g} s", f"t = {start:.10g} s")
         return Row(name, tally.status, robustness_text(tally), where, cause.because)
     if tally.status == "satisfied":
         return Row(name, tally.status, robustness_text(tally), where)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 
 TRACE = "trace.npz"
 SCENE = "scene.npz"
+UNGUARDED = ("eval/unguarded_trace.npz", "eval/unguarded_scene.npz")
+"""Trace and scene of the first seed without the guard, beside those with it."""
 RESULT = "eval/simulate.json"
 
 
@@ -77,6 +80,27 @@ def save_trace_of(
     for path in paths:
         save_trace(path, trace)
     return paths
+
+
+def save_unguarded(
+    run: Run, recording: Recording | None, setting: Setting, rules: Rules | None = None
+) -> None:
+    """Write what the first seed drove without a guard, or remove what an older deployment left of it.
+
+    Raises:
+        MissingError: R201, a file cannot be written.
+    """
+    trace_path, scene_path = (run.dir.path / name for name in UNGUARDED)
+    if recording is None:
+        for path in (trace_path, scene_path):
+            path.unlink(missing_ok=True)
+        return
+    trace = trace_of(run, recording, setting, rules)
+    first = slice(0, recording.agents)
+    data = {name: rows[first] for name, rows in trace.data.items()}
+    extras = {name: rows[first] for name, rows in trace.extras.items()}
+    save_trace(trace_path, replace(trace, data=data, extras=extras))
+    save_scene(scene_path, recording.scene)
 
 
 def _meta(run: Run, setting: Setting, rules: Rules | None) -> TraceMeta:

@@ -38,6 +38,7 @@ class Decision:
         rho: (agents,) float64, robustness of `plan`.
         safe: (agents,) bool, whether `plan` satisfies phi_safe.
         policy_rho: (agents,) float64, robustness of what the policy planned; -inf where that is no number.
+        proposed: (agents, T, m), what the policy planned, whether it was followed or not.
     """
 
     action: Tensor
@@ -47,6 +48,7 @@ class Decision:
     rho: Tensor
     safe: Tensor
     policy_rho: Tensor
+    proposed: Tensor
 
     def later(self, steps: int | Tensor = 1) -> Decision:
         """The same decision so many steps later, (agents,) or one number: what is left of the plans.
@@ -144,7 +146,7 @@ class Guard:
             plan = plan.index_copy(0, failing, found.plan)
             source, t0 = source.index_copy(0, failing, found.source), t0.index_copy(0, failing, found.t0)
             rho, safe = rho.index_copy(0, failing, found.rho), safe.index_copy(0, failing, found.safe)
-        decision = Decision(plan[:, 0], plan, source, t0, rho, safe, judged.rho)
+        decision = Decision(plan[:, 0], plan, source, t0, rho, safe, judged.rho, fresh)
         return decision if self.strict is self.task else self._plainly(decision, x, fresh)
 
     def _plainly(self, decision: Decision, x: Tensor, fresh: Tensor) -> Decision:

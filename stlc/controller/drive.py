@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from stlc.compile.semantics import TOLERANCE
 from stlc.controller.worlds import Setting, Worlds
 from stlc.diagnostics import Diagnostic, RunError
 
@@ -39,7 +40,10 @@ class Recording:
         safe: (rows, steps), whether the plan that was followed satisfies phi_safe.
         progress: of each seed.
         units: of entries of `progress`.
-        scene: snapshots of the first seed, stacked over time, and `decision` (frames, agents).
+        scene: snapshots of the first seed, stacked over time, and `decision` (frames, agents). Where a world
+            says where planned states are in its picture also `rejected` and `taken`, float32
+            (frames, agents, horizon + 1, 2 or 3): the policy's plan that a guard replaced, and the plan that
+            was followed; NaN where none was replaced.
         quiet: (rows, steps), whether the world did nothing but what the truth of the dynamics does; None
             where nobody has looked.
         options: (rows, steps, k, n), among which agents chose; None where the world leaves no choice.
@@ -76,6 +80,7 @@ class Recorder:
     frames: list[Frame] = field(default_factory=list)
     options: list[Tensor] = field(default_factory=list)
     quiet: list[Tensor] = field(default_factory=list)
+    replaced: list[Frame] = field(default_factory=list)
     progress: tuple[Mapping[str, float], ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
 
@@ -108,6 +113,9 @@ class Recorder:
         scene = {name: np.stack([frame[name] for frame in frames]) for name in frames[0]}
         decided = columns["source"][: self.agents].T
         scene["decision"] = np.concatenate((decided, decided[-1:])).astype(np.int8)
+        for name in self.replaced[0] if len(self.replaced) >= steps else ():
+            plans = np.stack([frame[name] for frame in self.replaced[:steps]])
+            scene[name] = np.concatenate((plans, np.full_like(plans[:1], np.nan)))
         return Recording(
             self.agents,
             torch.stack(self.states[: steps + 1], 1).numpy(force=True),
@@ -214,6 +222,9 @@ def drive(
             recorder.chosen(x, options)
         decision, action = pilot.decide(x, seen, due)
         seconds = perf_counter() - begun
+        replaced = _replaced(worlds, guard, decision, seen, due)
+        if replaced is not None:
+            recorder.replaced.append(replaced)
         _require_numbers(action, x, step, guard)
         if watch is not None:
             watch(Moment(step, setting.steps, x, decision, len(due), seconds))
@@ -223,6 +234,29 @@ def drive(
         recorder.progress = worlds.progress()
     if watch is not None:
         watch(Moment(setting.steps, setting.steps, x, None))
+
+
+def _replaced(
+    worlds: Worlds, guard: Guard, decision: Decision, seen: Tensor, due: Tensor
+) -> dict[str, NDArray[np.float32]] | None:
+    """Where the plans of the first seed lead that a guard has just replaced, and those in their place.
+
+    None without a guard, and where the world does not say where planned states are in its picture.
+    """
+    if guard.backup is None or not worlds.charting:
+        return None
+    agents = worlds.size[0]
+    new = due[due < agents]
+    rows = new[(decision.source[new] > 0) & ~(decision.policy_rho[new] >= -TOLERANCE)]
+    found = {}
+    for name, plans in (("rejected", decision.proposed), ("taken", decision.plan)):
+        steps = guard.task.horizon + 1
+        states = torch.full((agents, steps, worlds.size[1]), torch.nan, dtype=torch.float64)
+        if len(rows):
+            foreseen = guard.task.rollout(seen[rows], plans[rows].to(torch.float64))
+            states[rows] = foreseen[..., : worlds.size[1]].to(states)
+        found[name] = worlds.charted(states).astype(np.float32)
+    return found
 
 
 def _require_numbers(action: Tensor, x: Tensor, step: int, guard: Guard) -> None:

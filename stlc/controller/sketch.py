@@ -1,11 +1,11 @@
-"""What worlds draw with: the colours of who decided, and the paths behind the agents.
+"""What worlds draw with: the colours of who decided, paths behind and plans ahead of the agents, violations.
 
 Only NumPy is needed here; axes are those of matplotlib that `World.draw` is given.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -17,10 +17,13 @@ DECIDED = ("#0072b2", "#e69f00", "#cc79a7", "#56b4e9")
 """Colours by `stlc.controller.deploy.SOURCES`; told apart by the colour-blind, too."""
 DECIDERS = ("policy", "backup", "safest prefix", "polished plan")
 """The same in words."""
+VIOLATED = "#c4161c"
+"""Of what is violated, and of a plan that was rejected; far darker than the backup's orange."""
 GROUND, WALL, STONE, GOAL, WATER, BANK, CHARGE = (
     *("#f1f3f5", "#9aa0aa", "#8a8f98", "#009e73", "#e8f0f7", "#c9d2bf", "#f0d58a"),
 )
 """What stands around: floors, walls and obstacles in greys, what is to be reached in green."""
+ROAD, STOP_LIGHT = "#e3e5e8", "#e5383b"
 NOTE = "#4a4f57"
 """Of small writing."""
 FADED = 0.75
@@ -58,19 +61,76 @@ def tails(axes: Any, paths: NDArray[np.float64], scene: Scene, index: int, *, fr
             axes.plot(*stretches.T, color=color, lw=1.1, alpha=FADED, zorder=2.5, solid_capstyle="round")
 
 
+Placed: TypeAlias = "Callable[[NDArray[np.float64]], NDArray[np.float64]]"
+
+
+def plans(axes: Any, scene: Scene, index: int, placed: Placed | None = None) -> None:
+    """Draw what guards replaced at frame `index`: the rejected plan dashed, the one in its place solid.
+
+    Args:
+        axes: to draw on.
+        scene: for its `rejected` and `taken`, (frames, agents, k, 2 or 3), where they were recorded.
+        index: the present frame.
+        placed: places of the world, (agents, k, 2 or 3), in the picture, (agents, k, 2); NaN breaks a line.
+    """
+    if "rejected" not in scene:
+        return
+    who = deciders(scene, index, scene["rejected"].shape[1])
+    for name, style, width in (("taken", "-", 1.6), ("rejected", (0, (3, 2)), 1.2)):
+        places = np.asarray(scene[name][index], dtype=np.float64)
+        lines = places if placed is None else placed(places)
+        for line, source in zip(lines, who, strict=True):
+            if np.isfinite(line).any():
+                color = VIOLATED if name == "rejected" else DECIDED[source]
+                axes.plot(*line.T, color=color, lw=width, ls=style, zorder=2.8)
+
+
+def violations(axes: Any, places: NDArray[np.float64], scene: Scene, index: int) -> None:
+    """A ring and the agent's number where what is driven is violated, of agents at places (agents, 2)."""
+    if "violated" not in scene:
+        return
+    for agent in np.flatnonzero(scene["violated"][index]):
+        if np.isfinite(places[agent]).all():
+            axes.plot(*places[agent], "o", ms=17, mfc="none", mec=VIOLATED, mew=2.2, zorder=6)
+            words = {"color": VIOLATED, "weight": "bold", "size": 8, "zorder": 6}
+            axes.annotate(str(agent), places[agent], (9, 7), textcoords="offset points", **words)
+
+
+def scale_bar(axes: Any, left: float, height: float, length: float, unit: str = "m") -> None:
+    """Draw a line of that length, in units of the picture, from (left, height) on, with its length above."""
+    ends = (left, left, left, left + length, left + length, left + length)
+    axes.plot(ends, height + 0.09 * length * np.array([-1, 1, 0, 0, 1, -1]), color=NOTE, lw=1.2, zorder=5)
+    words = {"ha": "center", "va": "bottom", "size": 7.5, "color": NOTE}
+    middle = (left + length / 2, height)
+    axes.annotate(f"{length:g} {unit}", middle, (0, 3), textcoords="offset points", **words)
+
+
+NUMBERED = 8
+"""Agents that carry their number; more of them are too many to be told apart by it."""
+
+
+def numbers(axes: Any, places: NDArray[np.float64]) -> None:
+    """Write the number of each agent on it, at places (agents, 2), where there are few."""
+    if len(places) <= NUMBERED:
+        for agent, (x, y) in enumerate(places):
+            words = {"ha": "center", "va": "center", "size": 6.5, "weight": "bold", "color": "white"}
+            axes.text(x, y, str(agent), zorder=3.5, clip_on=True, **words)
+
+
 def outlines(
     axes: Any, shape: NDArray[np.float64], poses: NDArray[np.float64], who: NDArray[np.int64]
 ) -> None:
     """Draw agents as polygons: `shape` (points, 2) ahead and aside, at poses (agents, 3) of x, y, heading."""
+    from matplotlib.collections import PolyCollection
+
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     turned = shape @ np.stack([np.stack([cos, sin], 1), np.stack([-sin, cos], 1)], 1)
-    for place, points, source in zip(poses[:, None, :2], turned, who, strict=True):
-        axes.fill(*(place + points).T, fc=DECIDED[source], ec="white", lw=0.4, zorder=3)
+    colors = [DECIDED[source] for source in who]
+    placed = poses[:, None, :2] + turned
+    axes.add_collection(PolyCollection(placed, fc=colors, ec="white", lw=0.6, alpha=0.92, zorder=3))
 
 
-def pieces(
-    axes: Any, places: NDArray[np.float64], piece: NDArray[np.float64], color: str, width: float
-) -> None:
-    """Draw the same short line `piece` (2, 2) at many places (k, 2), as one line with gaps."""
-    lines = np.pad(places[:, None] + piece, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
-    axes.plot(*lines.reshape(-1, 2).T, color=color, lw=width, zorder=2)
+def segments(axes: Any, lines: NDArray[np.float64], color: str, width: float) -> None:
+    """Draw short lines (k, 2, 2), all as one with gaps."""
+    gaps = np.pad(lines, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+    axes.plot(*gaps.reshape(-1, 2).T, color=color, lw=width, zorder=2)

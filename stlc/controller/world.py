@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from stlc.controller.events import Events
@@ -67,6 +68,17 @@ class Choosing(Protocol):
         """Every agent takes an option, (agents,) int64; returns the states, (agents, n)."""
 
 
+@runtime_checkable
+class Charting(Protocol):
+    """What a world has, too, where plans can be drawn into its picture."""
+
+    def charted(self, states: Tensor) -> NDArray[np.float64]:
+        """Where planned states (agents, k, n) are in the picture as things are now, (agents, k, 2 or 3).
+
+        Row by row for the agents, from their present state on; NaN where the states are.
+        """
+
+
 class WorldType(Protocol):
     """How a world is made: everything random in it comes from `generator`."""
 
@@ -110,6 +122,10 @@ class ModelWorld:
     def snapshot(self) -> Scene:
         """The states, (agents, n), and the names of their columns, (n,)."""
         return {"state": self._x.numpy(force=True), "names": np.array(self._system.names)}
+
+    def charted(self, states: Tensor) -> NDArray[np.float64]:
+        """The first two columns of planned states, (agents, k, 2)."""
+        return states[..., [0, min(1, states.shape[2] - 1)]].numpy(force=True)
 
     @staticmethod
     def draw(axes: Any, scene: Scene, index: int) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -13,7 +14,7 @@ from torch import Tensor
 from stlc.controller.disturbance import Disturbance
 from stlc.controller.faults import blamed, require_numbers, scene_of, states_of, wrong
 from stlc.controller.spare import Spare
-from stlc.controller.world import Choosing
+from stlc.controller.world import Charting, Choosing
 
 if TYPE_CHECKING:
     from stlc.controller.task import Task
@@ -155,3 +156,19 @@ class Worlds:
             given = world.snapshot()
         self._scene = scene_of(world, given, self._scene)
         return self._scene
+
+    @property
+    def charting(self) -> bool:
+        """Whether plans can be drawn into the picture of the first seed."""
+        return isinstance(self.worlds[0], Charting)
+
+    def charted(self, states: Tensor) -> NDArray[np.float64]:
+        """Where planned states of the first seed, (agents, k, n), are in its picture, (agents, k, 2 or 3)."""
+        world = self.worlds[0]
+        assert isinstance(world, Charting)
+        with blamed(world, "charted", "say where plans are"):
+            places = np.asarray(world.charted(states), dtype=np.float64)
+        if places.ndim != 3 or places.shape[:2] != states.shape[:2] or places.shape[2] not in (2, 3):
+            agents, count = states.shape[:2]
+            raise wrong(world, "charted", f"gives places of shape {places.shape}, not ({agents}, {count}, 2)")
+        return places

@@ -38,7 +38,7 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Why one requirement is violated, at the worst start of the worst trace.
+    """Why one requirement is violated by one trace in one window.
 
     Attributes:
         judgement: of the requirement.
@@ -85,6 +85,16 @@ def explain(verdict: Verdict, name: str) -> Cause | None:
     return _cause(judgement, verdict.subject, _definitions(verdict.subject.compiled.spec))
 
 
+def explain_at(verdict: Verdict, name: str, trace: int, start: int) -> Cause:
+    """The cause of a violation of one requirement by a trace in the window that begins at a sample.
+
+    Raises:
+        UsageError: U101, there is no such requirement.
+    """
+    definitions = _definitions(verdict.subject.compiled.spec)
+    return _cause(verdict[name], verdict.subject, definitions, (trace, start))
+
+
 def explain_all(verdict: Verdict) -> dict[str, Cause]:
     """The causes of violated requirements, by their names; of the first `MOST` where there are more."""
     definitions = _definitions(verdict.subject.compiled.spec)
@@ -92,8 +102,13 @@ def explain_all(verdict: Verdict) -> dict[str, Cause]:
     return {judgement.name: _cause(judgement, verdict.subject, definitions) for judgement in violated[:MOST]}
 
 
-def _cause(judgement: Judgement, subject: Prepared, definitions: dict[str, ast.Expr]) -> Cause:
-    rule, (trace, start) = judgement.rule, judgement.worst
+def _cause(
+    judgement: Judgement,
+    subject: Prepared,
+    definitions: dict[str, ast.Expr],
+    at: tuple[int, int] | None = None,
+) -> Cause:
+    rule, (trace, start) = judgement.rule, judgement.worst if at is None else at
     record = Record(
         {name: column[:, trace : trace + 1] for name, column in subject.record.env.items()},
         subject.record.ops,

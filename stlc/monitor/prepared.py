@@ -42,3 +42,8 @@ class Prepared:
     def moment(self, sample: int) -> str:
         """The same in words: `t = 4.6 s`."""
         return f"sample {sample}" if self.dt is None else f"t = {self.time(sample):.10g} s"
+
+
+def beside(moment: str, start: str) -> str:
+    """An instant, and the start of its window where that is another: `t = 4.6 s (window from 2 s)`."""
+    return moment if moment == start else f"{moment} (window from {start.removeprefix('t = ')})"

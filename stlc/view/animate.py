@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stlc.controller.stage import Stage, Staged
 from stlc.diagnostics import StlcError
@@ -17,10 +18,11 @@ from stlc.rundir import RunDir
 from stlc.trace import Trace, load_trace
 from stlc.view import bullet
 from stlc.view.chart import Chart, chart_film, chart_of
-from stlc.view.driven import monitor_of
-from stlc.view.film import MAX_BYTES, MAX_FRAMES, Film, save_film, save_still
-from stlc.view.margins import strip_of
-from stlc.view.scene import Scene, Staging, scene_film
+from stlc.view.driven import monitor_of, trace_names
+from stlc.view.events import Event, events_of, marks
+from stlc.view.film import MAX_BYTES, MAX_FRAMES, Film, Taped, save_film, save_still
+from stlc.view.margins import Judged, judged_in, strip_of
+from stlc.view.scene import Key, Scene, Staging, frames_of, keys_of, ratio_of, scene_film
 from stlc.view.signal_film import signal_film
 from stlc.view.strip import Strip
 from stlc.view.video import encoder
@@ -33,6 +35,10 @@ TRACE = "trace.npz"
 SYSTEM = "system.yaml"
 RESULT = "eval/simulate.json"
 STILL = "scene.png"
+UNGUARDED = ("eval/unguarded_trace.npz", "eval/unguarded_scene.npz")
+"""Trace and scene of the same seed without the guard."""
+PANEL = 5.8
+"""Inches across one drive of a page."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,14 +93,11 @@ def animate(run: RunDir, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_B
     return Animation(gif, mp4)
 
 
-def current(run: RunDir) -> Animation | None:
-    """The animation of the newest deployment, drawn now if it is not there yet."""
+def current(run: RunDir) -> bool:
+    """Whether the animation in the folder is that of the newest deployment."""
     gif = run.path / f"{film_name(run)}.gif"
     recorded = [run.path / name for name in (SCENE, TRACE) if (run.path / name).exists()]
-    if gif.exists() and all(gif.stat().st_mtime >= record.stat().st_mtime for record in recorded):
-        mp4 = gif.with_suffix(".mp4")
-        return Animation(gif, mp4 if mp4.exists() else None)
-    return animate(run)
+    return gif.exists() and all(gif.stat().st_mtime >= record.stat().st_mtime for record in recorded)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,28 +105,54 @@ class Seen:
     """A recorded scene with its world.
 
     Attributes:
-        scene: snapshots stacked to (frames, …).
+        scene: snapshots stacked to (frames, …), and `violated` (frames, agents) where that could be judged.
         world: what draws them.
         dt: seconds between them.
+        judged: what was driven; None where it cannot be judged.
+        events: its violations, those of all requirements.
     """
 
     scene: Scene
     world: WorldType
     dt: float
+    judged: Judged | None = None
+    events: tuple[Event, ...] = ()
 
     @property
     def stage(self) -> Stage | None:
         """The robots in space; None where the world has none."""
         return self.world.stage(self.scene) if isinstance(self.world, Staged) else None
 
+    @property
+    def own_keys(self) -> Mapping[str, str]:
+        """What the world adds to the legend."""
+        return getattr(self.world, "KEYS", {})
 
-def seen_in(run: RunDir) -> Seen | None:
-    """The scene of the run's deployment; None without one, or where its world cannot be loaded."""
+    @property
+    def frames(self) -> int:
+        """How many instants there are."""
+        return frames_of(self.scene)
+
+    @property
+    def strip(self) -> Strip | None:
+        """What is shown over time; None where it is not known."""
+        decisions = self.scene.get("decision")
+        if self.judged is None or decisions is None:
+            return None
+        return strip_of(self.judged, decisions.astype(np.int64))
+
+
+def seen_in(run: RunDir, *, guarded: bool = True) -> Seen | None:
+    """The scene of the run's deployment; None without one, or where its world cannot be loaded.
+
+    With `guarded` false that of the same seed without the guard, where it was driven to compare.
+    """
     from stlc.controller.world import world_type
     from stlc.dynamics.scenario import under
     from stlc.dynamics.schema import load_system_decl
 
-    scene = _load_scene(run.path / SCENE)
+    trace_name, scene_name = (TRACE, SCENE) if guarded else UNGUARDED
+    scene = _load_scene(run.path / scene_name)
     if scene is None:
         return None
     try:
@@ -133,30 +162,170 @@ def seen_in(run: RunDir) -> Seen | None:
         world = None if decl.test.world is None else world_type(decl)
     except StlcError:
         return None
-    return None if world is None else Seen(scene, world, float(decl.dt))
+    if world is None:
+        return None
+    judged = _judged(run, trace_name, scene)
+    if judged is None:
+        return Seen(scene, world, float(decl.dt))
+    events = events_of(judged.drove, judged.drove.traces)
+    marked = marks(events, frames_of(scene), judged.drove.traces, judged.marked)
+    return Seen({**scene, "violated": marked}, world, float(decl.dt), judged, tuple(events))
+
+
+def _judged(run: RunDir, trace_name: str, scene: Scene) -> Judged | None:
+    """What the agents of a scene drove; None for a trace of another deployment, or one without a verdict."""
+    decisions = scene.get("decision")
+    if decisions is None:
+        return None
+    try:
+        trace = load_trace(run.path / trace_name)
+        if trace.samples != frames_of(scene) or trace.traces < decisions.shape[1]:
+            return None
+        return judged_in(trace, decisions.shape[1], system=run.path / SYSTEM)
+    except StlcError:
+        return None
 
 
 def _scene_film(run: RunDir, title: str) -> Film | None:
     seen = seen_in(run)
     if seen is None:
         return None
-    keys: Mapping[str, str] = getattr(seen.world, "KEYS", {})
-    strip = _strip(run, seen)
     try:
         stage = seen.stage if bullet.available() else None
         draw = seen.world.draw if stage is None else bullet.stage_drawing(stage)
-        return scene_film(seen.scene, Staging(draw, seen.dt, title, keys, strip))
+        return scene_film(seen.scene, Staging(draw, seen.dt, title, seen.own_keys, seen.strip))
     except Exception:  # whatever a world's own code raises: there are other pictures
         return None
 
 
-def _strip(run: RunDir, seen: Seen) -> Strip | None:
-    """What is shown over time; None where it is not known."""
+# ------------------------------------------------------------------------------ for a page
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One drive as a page shows it.
+
+    Attributes:
+        title: under which guard; nothing where there is only one drive.
+        alt: what is seen, in words.
+        frames: how many instants there are.
+        dt: seconds between them.
+        t0: of the first one.
+        keys: of the legend.
+        strip: what is shown over time.
+        events: violations.
+        names: of the agents.
+        requirements: names of those that were judged.
+        taped: records some frames.
+    """
+
+    title: str
+    alt: str
+    frames: int
+    dt: float
+    t0: float
+    keys: tuple[Key, ...]
+    strip: Strip | None
+    events: tuple[Event, ...]
+    names: tuple[str, ...]
+    requirements: tuple[str, ...]
+    taped: Callable[[range], Taped]
+
+    def time(self, sample: int) -> float:
+        """Of a sample, in seconds."""
+        return self.t0 + sample * self.dt
+
+
+WITHOUT, WITH = "without the guard", "with the guard"
+
+
+def shots_of(run: RunDir) -> list[Shot]:
+    """What a page shows of the newest deployment: the first seed without and with the guard.
+
+    One shot where there is nothing to compare; the signals of a trace where no world draws; none where
+    nothing was recorded.
+    """
+    shots = []
+    for guarded, title in ((False, WITHOUT), (True, WITH)):
+        seen = seen_in(run, guarded=guarded)
+        if seen is not None:
+            shots.append((seen, title))
+    if shots and shots[-1][1] == WITH:
+        same = len(shots) > 1 and shots[0][0].frames == shots[1][0].frames
+        chosen = shots if same else shots[-1:]
+        try:
+            return [_scene_shot(seen, title if same else "") for seen, title in chosen]
+        except Exception:  # whatever a world's own code raises: there are other pictures
+            pass
+    return _trace_shots(run)
+
+
+def _scene_shot(seen: Seen, title: str) -> Shot:
+    judged, agents = seen.judged, seen.scene["decision"].shape[1] if "decision" in seen.scene else 0
+    ratio = ratio_of(seen.world.draw, seen.scene)
+    size = (PANEL, round(PANEL * ratio, 2))
+
+    def record(shown: range) -> Taped:
+        from stlc.view.tape import taped
+
+        return taped(lambda axes, index: seen.world.draw(axes, seen.scene, index), shown, size)
+
+    record(range(1))  # what a world cannot draw shows here, and not while the page is written
+    return Shot(
+        title=title,
+        alt=f"{agents} agents drive {title}".strip(),
+        frames=seen.frames,
+        dt=seen.dt,
+        t0=0.0 if judged is None else judged.trace.t0,
+        keys=tuple(keys_of(seen.scene, seen.own_keys)),
+        strip=seen.strip,
+        events=seen.events,
+        names=tuple(f"agent {agent}" for agent in range(agents)),
+        requirements=() if judged is None else tuple(j.name for j in judged.drove),
+        taped=record,
+    )
+
+
+def _trace_shots(run: RunDir) -> list[Shot]:
+    """The signals of the trace, or its paths over places, as one shot."""
+    film = _signal_film(run, "")
+    if film is None:
+        return []
+    trace = load_trace(run.path / TRACE)
+
+    def record(shown: range) -> Taped:
+        from stlc.view.tape import taped_film
+
+        return taped_film(film, shown)
+
     try:
-        trace = load_trace(run.path / TRACE)
-        return strip_of(seen.scene, trace, seen.dt, system=run.path / SYSTEM)
+        judged = judged_in(trace, trace.traces, system=run.path / SYSTEM)
     except StlcError:
+        judged = None
+    return [
+        Shot(
+            title="",
+            alt=film.alt,
+            frames=film.frames,
+            dt=film.dt,
+            t0=trace.t0,
+            keys=(),
+            strip=None if judged is None else strip_of(judged, _decisions(trace)),
+            events=() if judged is None else tuple(events_of(judged.drove, trace.traces)),
+            names=tuple(trace_names(trace)),
+            requirements=() if judged is None else tuple(j.name for j in judged.drove),
+            taped=record,
+        )
+    ]
+
+
+def _decisions(trace: Trace) -> NDArray[np.int64] | None:
+    """Who decided, (samples, traces); None where that was not recorded."""
+    recorded = trace.extras.get("decision")
+    if recorded is None or recorded.shape != (trace.traces, trace.samples - 1):
         return None
+    decided = recorded.T.astype(np.int64)
+    return np.concatenate((decided, decided[-1:]))
 
 
 def _scenario(run: RunDir) -> str | None:

@@ -129,7 +129,6 @@ def chart_film(chart: Chart, *, title: str = "") -> Film:
                 area.set_facecolor(_tint(chart.color(place), strength))
             for cursor in cursors:
                 cursor.set_xdata([now, now])
-            figure.canvas.draw()
 
         return turn
 
@@ -281,7 +280,7 @@ class _Moving:
         across, up = chart.paths
         self._across, self._up = across[chosen], up[chosen]
         self._tail = max(1, round(TAIL / chart.trace.dt))
-        (self._whole,) = axes.plot([], [], color=MUTED, lw=0.5, alpha=0.35, zorder=3)
+        axes.plot(_joined(self._across), _joined(self._up), color=MUTED, lw=0.5, alpha=0.25, zorder=3)
         (self._recent,) = axes.plot([], [], color=INK, lw=1.1, alpha=0.85, zorder=4)
         colors = [RED if violated else INK for violated in chart.violated[chosen]]
         self._points = axes.scatter(
@@ -290,7 +289,6 @@ class _Moving:
 
     def turn(self, index: int) -> None:
         """Show this sample."""
-        whole, recent = slice(0, index + 1), slice(max(0, index - self._tail), index + 1)
-        self._whole.set_data(_joined(self._across[:, whole]), _joined(self._up[:, whole]))
+        recent = slice(max(0, index - self._tail), index + 1)
         self._recent.set_data(_joined(self._across[:, recent]), _joined(self._up[:, recent]))
         self._points.set_offsets(np.column_stack([self._across[:, index], self._up[:, index]]))

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from stlc.view.animate import STILL, current, seen_in
-from stlc.view.html import Child, Html, classed, el, figure, join, table, video
+from stlc.view.html import Child, Html, classed, el, join, table
 from stlc.view.material import Material
 from stlc.view.page import Section
 from stlc.view.words import count, drives_of, seconds, share, spread
@@ -67,12 +65,6 @@ SHARES = {
 HOLDS = "holds."
 MOST_BROKEN = 12
 """Drives that broke rules and are listed."""
-WORLD = (
-    "The first seed; the colours say who decided. Over time: for how many agents the guard acted, and the "
-    "least margin of each requirement over the agents that the picture names, judged from each instant on "
-    "(red: violated)."
-)
-BARE = "What was driven, over time."
 SOURCES = ("policy", "polished", "backup", "safest", "")
 
 
@@ -111,21 +103,6 @@ def deployment_section(material: Material) -> Section | None:
         _compared("Requirements of plans, as driven", guards, _requirement_rows(guards)),
     )
     return Section("deployment", "How it drives", body)
-
-
-def film_section(material: Material) -> Section | None:
-    """The animation of the first seed."""
-    if material.trace is None:
-        return None
-    found = current(material.run)
-    if found is None:
-        return None
-    alt = f"Animation of the deployment; a still is in {STILL}."
-    caption = BARE if seen_in(material.run) is None else WORLD
-    path, show = (found.gif, figure) if found.mp4 is None else (found.mp4, video)
-    kind = "image/gif" if found.mp4 is None else "video/mp4"
-    uri = f"data:{kind};base64," + base64.b64encode(path.read_bytes()).decode()
-    return Section("film", "What it looks like", show(uri, alt, caption, kind="film"))
 
 
 def _compared(title: str, guards: Mapping[str, Record], rows: list[tuple[Child, ...]]) -> Html | None:

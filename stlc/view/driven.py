@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,10 +14,10 @@ from stlc.diagnostics import StlcError
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
 from stlc.monitor.explain import Cause, explain_all
+from stlc.monitor.prepared import beside
 from stlc.monitor.verdict import Judgement, Monitor, Verdict
 from stlc.source import Source
 from stlc.trace import Trace
-from stlc.trace_meta import Carried
 from stlc.view.chart import chart_of, draw_chart
 from stlc.view.html import Child, Html, classed, el, figure, join, table
 from stlc.view.material import Material, untagged
@@ -47,14 +48,15 @@ def driven_section(material: Material) -> Section | None:
         )
         return Section("driven", TITLE, reason)
     names = trace_names(trace)
+    causes = explain_all(verdict)
     choices = choose_traces(_per_trace(verdict), names, acted_in(trace))
     picture = draw_signals(trace, margins, choices, units_of(verdict))
     body = join(
         _rules_part(material, trace, names),
         el("p", _summary(verdict)),
-        _verdict_table(verdict, names),
+        _verdict_table(verdict, causes, names),
         figure(picture.data_uri(), picture.alt, _caption(trace, judged_once(verdict))),
-        causes_of(verdict, names, monitor.spec),
+        causes_of(causes, names, monitor.spec),
     )
     return Section("driven", TITLE, body, picture)
 
@@ -64,34 +66,36 @@ def _rules_part(material: Material, trace: Trace, names: list[str]) -> Html | No
     if not trace.meta.judge_text:
         return None
     try:
-        monitor = _monitor_of(trace.meta.carried, material.run.path / "system.yaml")
+        monitor = monitor_of(trace, system=material.run.path / "system.yaml", drives=True)
         verdict = monitor.check(trace)
     except StlcError as error:
         said = "; ".join(d.message for d in error.diagnostics)
         return el("p", "The drives could not be judged by their rules: ", said, ".")
     obeyed = f"{verdict.satisfied_traces:,} of {count(verdict.traces, 'drive')} obeyed every rule of "
+    causes = explain_all(verdict)
     return join(
         el("p", obeyed, el("code", monitor.compiled.name), ", judged from the first instant to the last."),
-        _verdict_table(verdict, names),
-        causes_of(verdict, names, monitor.spec),
+        _verdict_table(verdict, causes, names),
+        causes_of(causes, names, monitor.spec),
         el("h3", "Window by window, as plans are judged"),
     )
 
 
-def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None) -> Monitor:
-    """What judges the windows of a trace: the specification that plans were made for, or else `text`.
+def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None, drives: bool = False) -> Monitor:
+    """What judges a trace: by the specification that it carries, or else by `text`.
 
-    `system` is the system file, which provides the functions that a specification takes from outside.
+    Args:
+        trace: what was recorded.
+        text: of a specification, where the trace carries none.
+        system: the system file, which provides the functions that a specification takes from outside.
+        drives: judge by the rules of drives where the trace carries them, not by what plans are made for.
 
     Raises:
         SpecError: the specification is invalid.
     """
-    planned = trace.meta.planned
-    return _monitor_of(planned if planned.text else replace(planned, text=text), system)
-
-
-def _monitor_of(carried: Carried, system: Path | None) -> Monitor:
-    spec = replace(parse(Source("spec.stl", carried.text)), library=carried.library or None)
+    carried = trace.meta.carried if drives else trace.meta.planned
+    source = Source("spec.stl", carried.text or text)
+    spec = replace(parse(source), library=carried.library or None)
     outside = any(isinstance(item, ast.Extern) for item in spec.items)
     used = system if outside and system is not None and system.is_file() else None
     return Monitor(spec, system=used, overrides=carried.overrides)
@@ -163,7 +167,7 @@ def _summary(verdict: Verdict) -> str:
     return f"{whole}; from {share(verdict.share)} of all starts what was driven satisfies all of them."
 
 
-def _verdict_table(verdict: Verdict, names: list[str]) -> Html:
+def _verdict_table(verdict: Verdict, causes: Mapping[str, Cause], names: list[str]) -> Html:
     header = (
         "requirement",
         "verdict",
@@ -174,7 +178,7 @@ def _verdict_table(verdict: Verdict, names: list[str]) -> Html:
     )
     rows: list[tuple[Child, ...]] = []
     for judgement in verdict:
-        trace, sample = judgement.worst
+        trace, _ = judgement.worst
         violating = judgement.statuses.count("violated")
         rows.append(
             (
@@ -183,10 +187,19 @@ def _verdict_table(verdict: Verdict, names: list[str]) -> Html:
                 f"{violating:,} of {verdict.traces:,}",
                 share(judgement.share, 2),
                 _least(judgement),
-                f"{names[trace]}, t = {verdict.subject.time(sample):.3g} s",
+                ", ".join(filter(None, (names[trace], where_of(judgement, verdict, causes)))),
             )
         )
     return table(header, rows, numeric=(2, 3, 4))
+
+
+def where_of(judgement: Judgement, verdict: Verdict, causes: Mapping[str, Cause]) -> str:
+    """The instant of the worst violation; without one the start of the window with least to spare."""
+    moment, cause = verdict.subject.moment, causes.get(judgement.name)
+    if cause is None:
+        return f"from {moment(judgement.worst[1])}" if judgement.instants > 1 else ""
+    start = cause.start if judgement.instants > 1 else cause.sample
+    return beside(moment(cause.sample), moment(start))
 
 
 _KINDS = {"satisfied": "good", "violated": "bad"}
@@ -224,13 +237,12 @@ def _key(word: str, color: str) -> Html:
     return join(classed("span", "whole", swatch, word), "  ")
 
 
-def causes_of(verdict: Verdict, names: list[str], spec: ast.Spec) -> Html | None:
+def causes_of(causes: Mapping[str, Cause], names: list[str], spec: ast.Spec) -> Html | None:
     """Of each violated requirement its worst violation: which part, when, with which values."""
-    causes = list(explain_all(verdict).values())
     if not causes:
         return None
     declared = {item.name: item for item in spec.items if isinstance(item, ast.Require)}
-    told = [_cause_html(cause, names, declared.get(cause.judgement.name)) for cause in causes]
+    told = [_cause_html(cause, names, declared.get(cause.judgement.name)) for cause in causes.values()]
     return join(el("h3", "What failed, and why"), told)
 
 

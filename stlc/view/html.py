@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 from stlc.escape import html as text_of
 
-_VOID = frozenset({"br", "hr", "img", "meta"})
+_VOID = frozenset({"br", "hr", "img", "input", "meta"})
 
 
 class Html(str):
@@ -72,13 +72,6 @@ def figure(uri: str, alt: str, caption: Child = None, *, kind: str = "plain") ->
     """A picture with its words."""
     image = classed("div", "scroll", el("img", attrs={"src": uri, "alt": alt}))
     return classed("figure", kind, image, el("figcaption", caption) if caption else None)
-
-
-def video(uri: str, alt: str, caption: Child = None, *, kind: str = "plain") -> Html:
-    """A film with its words, which begins by itself, without sound, and can be stopped."""
-    switches = dict.fromkeys(("controls", "autoplay", "loop", "muted", "playsinline"), "")
-    shown = el("video", attrs={"src": uri, "aria-label": alt, **switches})
-    return classed("figure", kind, shown, el("figcaption", caption) if caption else None)
 
 
 def facts(pairs: Iterable[tuple[str, Child]]) -> Html:

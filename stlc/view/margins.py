@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.monitor.verdict import Monitor, Verdict
 from stlc.trace import Trace
 from stlc.view.driven import margins_of, monitor_of, units_of
-from stlc.view.scene import Scene
 from stlc.view.strip import Strip
 
 Floats = NDArray[np.float64]
@@ -22,31 +22,56 @@ ENOUGH = 0.4
 AS_FORESEEN = "least margin from each instant on, of the agents for which the world did as the model says"
 
 
-def strip_of(scene: Scene, trace: Trace, dt: float, *, system: Path) -> Strip | None:
-    """What is shown over time of the agents of a scene, those of the first seed of a trace.
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """What the agents of a scene drove, those of the first seed, and the verdict on it.
 
-    None where the trace is of another deployment, or nobody recorded who decided.
+    Attributes:
+        trace: theirs.
+        monitor: what judged it by the specification that plans are made for.
+        verdict: by it.
+        drove: the verdict by the rules of drives, where the trace carries them; else the same.
+        foreseen: from which samples on the world did as the model says, (agents, samples); None: not known.
+    """
+
+    trace: Trace
+    monitor: Monitor
+    verdict: Verdict
+    drove: Verdict
+    foreseen: Mask | None
+
+    @property
+    def marked(self) -> set[str]:
+        """Whose violations a picture marks: all rules of drives, else what is tagged `@safety`, if any is."""
+        names = {judgement.name for judgement in self.drove if "safety" in judgement.rule.tags}
+        ruled = bool(self.trace.meta.judge_text)
+        return names if names and not ruled else {judgement.name for judgement in self.drove}
+
+
+def judged_in(trace: Trace, agents: int, *, system: Path) -> Judged:
+    """The first `agents` of a trace, judged by the specification that it carries.
 
     Raises:
         StlcError: the trace cannot be judged.
     """
-    frames = min(len(values) for values in scene.values())
-    decisions = scene.get("decision")
-    if decisions is None or trace.samples != frames:
-        return None
-    times = np.arange(frames, dtype=np.float64) * np.float64(dt)
-    shown = decisions.shape[1]
-    first = {name: values[:shown] for name, values in trace.data.items()}
+    first = {name: values[:agents] for name, values in trace.data.items()}
     monitor, seen = monitor_of(trace, system=system), replace(trace, data=first, extras={})
-    verdict = monitor.check(seen)
-    rows, units = margins_of(monitor, verdict, seen), units_of(verdict)
-    counts = as_foreseen(trace, shown)
+    verdict = drove = monitor.check(seen)
+    if trace.meta.judge_text:
+        drove = monitor_of(trace, system=system, drives=True).check(seen)
+    return Judged(seen, monitor, verdict, drove, as_foreseen(trace, agents))
+
+
+def strip_of(judged: Judged, decisions: NDArray[np.int64] | None) -> Strip:
+    """What is shown over time, with who decided, (frames, agents)."""
+    trace, verdict = judged.trace, judged.verdict
+    rows, units = margins_of(judged.monitor, verdict, trace), units_of(verdict)
     every = {name: least(rho) for name, rho in rows.items()}
-    if counts is not None:
-        margins = {name: least(rho, counts) for name, rho in rows.items()}
+    if judged.foreseen is not None:
+        margins = {name: least(rho, judged.foreseen) for name, rho in rows.items()}
         if _known(margins) >= ENOUGH * _known(every):
-            return Strip(times, margins, decisions.astype(np.int64), AS_FORESEEN, units)
-    return Strip(times, every, decisions.astype(np.int64), units=units)
+            return Strip(trace.times, margins, decisions, AS_FORESEEN, units)
+    return Strip(trace.times, every, decisions, units=units)
 
 
 def as_foreseen(trace: Trace, agents: int) -> Mask | None:

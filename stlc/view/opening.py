@@ -15,8 +15,8 @@ from stlc.view.page import Section
 from stlc.view.words import count, interval, number, obeyed_sentence, seconds, share, viable_sentence
 
 
-def headline(material: Material, tiles: list[tuple[str, str]]) -> Html:
-    """What came out, in one sentence and a few numbers; `tiles` adds those of the deployment.
+def headline(material: Material) -> Html:
+    """What came out, in one sentence.
 
     A run that was deployed is judged by its drives, one that was not by its plans.
     """
@@ -31,8 +31,12 @@ def headline(material: Material, tiles: list[tuple[str, str]]) -> Html:
         if result
         else None,
         _advice(material),
-        _tiles([*_training_tiles(result), *tiles]),
     )
+
+
+def numbers(material: Material, tiles: list[tuple[str, str]]) -> Html | None:
+    """The same in a few numbers; `tiles` adds those of the deployment."""
+    return _tiles([*_training_tiles(material.result), *tiles])
 
 
 def _verdict(material: Material) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -22,7 +24,7 @@ class Section:
 
     Attributes:
         anchor: its name in links; also the file name of its picture.
-        title: its heading.
+        title: its heading; nothing for one that stands at the head of the page.
         body: its content.
         picture: the one drawn figure in it, if any.
     """
@@ -35,10 +37,13 @@ class Section:
     @property
     def html(self) -> Html:
         """The markup."""
-        return el("section", el("h2", self.title), self.body, attrs={"id": self.anchor})
+        heading = el("h2", self.title) if self.title else None
+        return el("section", heading, self.body, attrs={"id": self.anchor})
 
 
-def page(title: str, head: Child, sections: Sequence[Section], foot: Child) -> str:
+def page(
+    title: str, head: Child, sections: Sequence[Section], foot: Child, script: Html | None = None
+) -> str:
     """The whole document.
 
     Args:
@@ -46,9 +51,13 @@ def page(title: str, head: Child, sections: Sequence[Section], foot: Child) -> s
         head: what stands above the links.
         sections: in order.
         foot: the last line.
+        script: what runs in the page; nothing else may.
     """
     links = el("nav", [el("a", part.title, attrs={"href": f"#{part.anchor}"}) for part in sections])
-    policy = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'"
+    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+    if script is not None:
+        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        policy += f"; script-src 'sha256-{digest}'"
     html = el(
         "html",
         el(
@@ -59,7 +68,11 @@ def page(title: str, head: Child, sections: Sequence[Section], foot: Child) -> s
             el("title", title),
             el("style", Html(_sheet())),
         ),
-        el("body", el("main", head, links, [part.html for part in sections], el("footer", foot))),
+        el(
+            "body",
+            el("main", head, links, [part.html for part in sections], el("footer", foot)),
+            el("script", script) if script is not None else None,
+        ),
         attrs={"lang": "en"},
     )
     return str(join(Html("<!doctype html>\n"), html, "\n"))

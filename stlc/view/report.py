@@ -1,7 +1,8 @@
 """`report.html`: one page that says what a run achieved, how, where it fails and how to repeat it.
 
-The page is whole by itself: style and pictures stand inside it, it needs no script and no network, and it
-follows the reader's light or dark scheme. What a run does not have (a deployment, say) is left out.
+It begins with a film of the newest deployment that can be scrubbed through. The page is whole by itself:
+style, pictures and the one script stand inside it, it needs no network, shows a still where scripts do not
+run, and follows the reader's light or dark scheme. What a run does not have (a deployment, say) is left out.
 """
 
 from __future__ import annotations
@@ -13,11 +14,13 @@ from stlc.rundir import RunDir
 from stlc.version import __version__
 from stlc.view import require_drawing
 from stlc.view.closing import failures_section, repeat_section, texts_section
-from stlc.view.deployment import deployment_section, deployment_tiles, film_section
+from stlc.view.deployment import deployment_section, deployment_tiles
 from stlc.view.driven import driven_section, map_section
+from stlc.view.html import join
 from stlc.view.material import Material, gather
-from stlc.view.opening import headline, requirements_section, training_section
+from stlc.view.opening import headline, numbers, requirements_section, training_section
 from stlc.view.page import Section, page
+from stlc.view.player import player_section, script
 
 REPORT = "report.html"
 
@@ -45,7 +48,6 @@ def sections_of(material: Material) -> list[Section]:
     parts = (
         requirements_section(material),
         deployment_section(material),
-        film_section(material),
         map_section(material),
         driven_section(material),
         failures_section(material),
@@ -58,9 +60,16 @@ def sections_of(material: Material) -> list[Section]:
 
 def render_report(material: Material, sections: list[Section]) -> str:
     """The page of `material`."""
+    film = player_section(material)
+    head = join(
+        headline(material),
+        film.html if film is not None else None,
+        numbers(material, deployment_tiles(material)),
+    )
     return page(
         f"{material.spec} · {material.run.name}",
-        headline(material, deployment_tiles(material)),
+        head,
         sections,
         f"Written by stlc {__version__} from {material.run.shown}",
+        script() if film is not None else None,
     )

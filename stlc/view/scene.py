@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.controller.sketch import DECIDED, DECIDERS
-from stlc.view.film import Film, speed_of
+from stlc.controller.sketch import DECIDED, DECIDERS, VIOLATED
+from stlc.view.film import Film, speed_of, wipe
 from stlc.view.strip import Mover, Strip, draw_strip
 from stlc.view.style import INK, MUTED, look, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
     from matplotlib.text import Text
 
 Scene = Mapping[str, NDArray[Any]]
@@ -28,6 +29,21 @@ _HEAD, _KEYS, _EDGE = 0.36, 0.24, 0.12
 _ROW, _GAP, _FOOT = 0.27, 0.07, 0.42
 _NAMES, _VALUES = 1.15, 0.62
 _BESIDE = 3.8
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """An entry of a legend.
+
+    Attributes:
+        word: what it is.
+        color: of it.
+        kind: `dot`, `ring`, or a line, `dash` or `solid`.
+    """
+
+    word: str
+    color: str
+    kind: Literal["dot", "ring", "dash", "solid"] = "dot"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +74,16 @@ class _Plan:
     rows: tuple[tuple[float, float, float, float], ...]
 
 
+def frames_of(scene: Scene) -> int:
+    """How many instants there are."""
+    return min(len(values) for values in scene.values())
+
+
 def scene_film(scene: Scene, staging: Staging) -> Film:
     """The film of arrays (instants, …)."""
-    frames = min(len(values) for values in scene.values())
-    keys = _keys(scene, staging)
-    plan = _planned(_ratio(staging.draw, scene), 0 if staging.strip is None else staging.strip.height, keys)
+    frames = frames_of(scene)
+    keys = keys_of(scene, staging.keys)
+    plan = _planned(ratio_of(staging.draw, scene), 0 if staging.strip is None else staging.strip.height, keys)
     seconds, speed = (frames - 1) * staging.dt, speed_of(frames, staging.dt)
 
     def begin(figure: Figure) -> Callable[[int], None]:
@@ -78,7 +99,7 @@ def scene_film(scene: Scene, staging: Staging) -> Film:
         ground = canvas.copy_from_bbox(figure.bbox)
 
         def turn(index: int) -> None:
-            axes.clear()
+            wipe(axes)
             staging.draw(axes, scene, index)
             pace = f"   {speed}x" if speed > 1 else ""
             clock.set_text(f"{index * staging.dt:.1f} s{pace}")
@@ -91,7 +112,7 @@ def scene_film(scene: Scene, staging: Staging) -> Film:
         return turn
 
     alt = f"{staging.title}: {seconds:.0f} s of deployment."
-    return Film(frames, staging.dt, plan.size, begin, alt, _moment(scene, frames))
+    return Film(frames, staging.dt, plan.size, begin, alt, _moment(scene, frames), draws=True)
 
 
 def _moment(scene: Scene, frames: int) -> int:
@@ -108,7 +129,7 @@ def _moment(scene: Scene, frames: int) -> int:
     return int(best[np.abs(best - middle).argmin()])
 
 
-def _ratio(draw: DrawScene, scene: Scene) -> float:
+def ratio_of(draw: DrawScene, scene: Scene) -> float:
     """Height over width of what the world draws."""
     with look():
         axes = new_figure(4, 4).add_subplot()
@@ -119,7 +140,7 @@ def _ratio(draw: DrawScene, scene: Scene) -> float:
     return min(max(ratio, 0.15), 1.6)
 
 
-def _planned(ratio: float, rows: int, keys: Mapping[str, str]) -> _Plan:
+def _planned(ratio: float, rows: int, keys: list[Key]) -> _Plan:
     head = _HEAD + (_KEYS if keys else 0.0)
     width = WIDTH - 2 * _EDGE
     high = rows * (_ROW + _GAP) + _FOOT + 0.2 if rows else 0.0
@@ -149,31 +170,43 @@ def _panel(figure: Figure, plan: _Plan, box: tuple[float, float, float, float]) 
     return figure.add_axes((left / width, bottom / height, wide / width, high / height))
 
 
-def _keys(scene: Scene, staging: Staging) -> dict[str, str]:
-    """Who decided, where that was recorded, and what the world adds."""
+def keys_of(scene: Scene, own: Mapping[str, str]) -> list[Key]:
+    """Who decided, as far as it was recorded, what was rejected and violated, and what the world adds."""
     sources = {0, *np.unique(scene["decision"]).tolist()} if "decision" in scene else set()
-    who = {DECIDERS[source]: DECIDED[source] for source in sorted(sources)}
-    return {**who, **staging.keys}
+    keys = [Key(DECIDERS[source], DECIDED[source]) for source in sorted(sources)]
+    if "rejected" in scene and np.isfinite(scene["rejected"]).any():
+        keys.append(Key("rejected plan", VIOLATED, "dash"))
+    if "violated" in scene and scene["violated"].any():
+        keys.append(Key("violated", VIOLATED, "ring"))
+    return keys + [Key(word, color) for word, color in own.items()]
 
 
-def _head(figure: Figure, plan: _Plan, title: str, keys: Mapping[str, str]) -> Text:
-    """The title, the clock and the legend; returns the clock."""
+def _handle(key: Key) -> Line2D:
     from matplotlib.lines import Line2D
 
+    if key.kind in ("dash", "solid"):
+        style: Any = (0, (2.5, 1.5)) if key.kind == "dash" else "-"
+        return Line2D([], [], color=key.color, lw=1.6, ls=style)
+    face = "none" if key.kind == "ring" else key.color
+    return Line2D([], [], marker="o", ls="", ms=7, mew=1.8 if face == "none" else 0, mfc=face, mec=key.color)
+
+
+def _head(figure: Figure, plan: _Plan, title: str, keys: list[Key]) -> Text:
+    """The title, the clock and the legend; returns the clock."""
     width, height = plan.size
     top = 1 - 0.5 * _HEAD / height
     figure.text(_EDGE / width, top, title, color=INK, va="center", weight="bold", fontsize=10)
     clock = figure.text(1 - _EDGE / width, top, "", color=INK, va="center", ha="right", fontsize=10)
     if keys:
-        dots = [Line2D([], [], marker="o", ls="", ms=6, mew=0, color=color) for color in keys.values()]
         figure.legend(
-            dots,
-            list(keys),
+            [_handle(key) for key in keys],
+            [key.word for key in keys],
             loc="center left",
             bbox_to_anchor=(0.0, 1 - (_HEAD + 0.4 * _KEYS) / height),
             ncols=len(keys),
-            handletextpad=0.1,
-            columnspacing=1.2,
+            handlelength=1.5,
+            handletextpad=0.3,
+            columnspacing=1.0,
             borderpad=0.2,
             fontsize=8,
             labelcolor=INK,

@@ -9,7 +9,8 @@ import numpy as np
 
 from stlc.trace import Trace
 from stlc.view.film import Film
-from stlc.view.style import BLUE, FAINT, INK
+from stlc.view.strip import veil
+from stlc.view.style import BLUE, INK
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,7 +36,6 @@ def signal_film(trace: Trace, *, title: str = "") -> Film:
             head.set_text(f"{title}   {trace.times[index]:.1f} s")
             for panel in panels:
                 panel(index)
-            figure.canvas.draw()
 
         return turn
 
@@ -45,19 +45,18 @@ def signal_film(trace: Trace, *, title: str = "") -> Film:
 
 
 def _panel(axes: Axes, trace: Trace, name: str) -> Callable[[int], None]:
-    """One signal of at most `MOST_AGENTS` agents; all curves are one line with gaps, which draws fast."""
+    """One signal of at most `MOST_AGENTS` agents; all curves are one line with gaps, veiled from now on."""
     values = trace.data[name][:MOST_AGENTS]
     gap = np.full((len(values), 1), np.nan)
     unit = trace.signature[name].unit.text
     axes.set_ylabel(f"{name}\n[{unit}]" if unit not in ("", "1") else name)
     times = np.broadcast_to(trace.times, values.shape)
-    axes.plot(np.hstack([times, gap]).ravel(), np.hstack([values, gap]).ravel(), color=FAINT, lw=0.8)
-    (past,) = axes.plot([], [], color=INK, lw=0.8, alpha=0.7)
-    (present,) = axes.plot([], [], "o", color=BLUE, ms=3)
+    axes.plot(np.hstack([times, gap]).ravel(), np.hstack([values, gap]).ravel(), color=INK, lw=0.8, alpha=0.7)
+    (present,) = axes.plot([], [], "o", color=BLUE, ms=3, zorder=5)
+    cover = veil(axes, trace.times)
 
     def turn(index: int) -> None:
-        until = slice(0, index + 1)
-        past.set_data(np.hstack([times[:, until], gap]).ravel(), np.hstack([values[:, until], gap]).ravel())
         present.set_data(times[:, index], values[:, index])
+        cover.turn(index)
 
     return turn

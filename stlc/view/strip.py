@@ -80,7 +80,7 @@ def draw_strip(strip: Strip, panels: list[Axes]) -> list[Mover]:
         movers.append(_draw_decisions(strip, free.pop(0)))
     movers += [_draw_margin(strip, name, axes) for name, axes in zip(strip.rows, free, strict=True)]
     for axes in panels:
-        movers.append(_veil(axes, strip.times))
+        movers.append(veil(axes, strip.times))
         axes.grid(visible=False)
         axes.set_yticks([])
         axes.spines["left"].set_visible(False)
@@ -133,7 +133,7 @@ def _draw_margin(strip: Strip, name: str, axes: Axes) -> Mover:
     return Mover(turn, (value,))
 
 
-def _veil(axes: Axes, times: NDArray[np.float64]) -> Mover:
+def veil(axes: Axes, times: NDArray[np.float64]) -> Mover:
     """What has not happened yet shows faintly behind the present."""
     from matplotlib.patches import Rectangle
 

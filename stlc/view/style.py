@@ -15,6 +15,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stlc.controller.sketch import (
+    BANK,
+    CHARGE,
+    GROUND,
+    NOTE,
+    ROAD,
+    STONE,
+    STOP_LIGHT,
+    VIOLATED,
+    WALL,
+    WATER,
+)
 from stlc.escape import screen
 from stlc.files import atomic_path
 from stlc.view import require_drawing
@@ -23,9 +35,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours, and three greys. The second colour is used on dark paper.
+# Okabe and Ito's colours, three greys, and a red far darker than their orange. `ON_DARK` is for dark paper.
 INK, PAPER, MUTED, FAINT = "#1f2430", "#ffffff", "#6a7280", "#e4e7eb"
-BLUE, ORANGE, GREEN, RED, SKY, PINK = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7"
+BLUE, ORANGE, GREEN, RED, SKY, PINK = "#0072b2", "#e69f00", "#009e73", VIOLATED, "#56b4e9", "#cc79a7"
 ON_DARK = {
     INK: "#e6e8ec",
     PAPER: "#14171c",
@@ -34,10 +46,22 @@ ON_DARK = {
     BLUE: "#5db3ec",
     ORANGE: "#f0b43c",
     GREEN: "#34c398",
-    RED: "#f2793a",
+    RED: "#ff6b66",
     SKY: "#8fd0f5",
     PINK: "#e39cc2",
 }
+_SCENERY = {  # of worlds: grounds, walls and what stands around, as `stlc.controller.sketch` has them
+    GROUND: "#1d2229",
+    WALL: "#5a616d",
+    STONE: "#7b828e",
+    WATER: "#15232f",
+    BANK: "#3a4334",
+    CHARGE: "#6e5a1e",
+    NOTE: "#b4bbc6",
+    ROAD: "#2b3038",
+    STOP_LIGHT: "#ff6b66",
+}
+SCENES_ON_DARK = ON_DARK | _SCENERY
 SERIES = (BLUE, GREEN, PINK, SKY, ORANGE)  # requirements, in order; RED is kept for violations
 
 _RC: Any = {

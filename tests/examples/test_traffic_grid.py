@@ -267,14 +267,15 @@ def test_a_frame_shows_every_car(system: System) -> None:
     scene["decision"] = np.tile(np.arange(7) % 3, (3, 1))
     axes = figures.Figure().add_subplot()
     world.draw(axes, scene, 2)
-    cars = [patch for patch in axes.patches if patch.get_zorder() == 3]
+    (drawn,) = [collection for collection in axes.collections if collection.get_zorder() == 3]
+    cars = [path.vertices for path in drawn.get_paths()]
     assert len(cars) == 7
-    assert len({patch.get_facecolor() for patch in cars}) == 3
+    assert len(np.unique(drawn.get_facecolor(), axis=0)) == 3
     (low, high), places = axes.get_xlim(), scene["junctions"][0]
     assert low < places[:, 1].min() - 3  # north is to the right
     assert high > places[:, 1].max() + 3
     for car, (x, y, angle) in zip(cars, scene["pose"][2], strict=True):
-        corners = car.get_xy()[:4]
+        corners = car[:4]
         np.testing.assert_allclose(corners.mean(0), (y, -x), atol=1e-9)
         ahead = corners[0] - corners[1]
         np.testing.assert_allclose(

@@ -13,6 +13,15 @@ from stlc.signature import Column, Signature
 from stlc.trace import Trace, TraceMeta, save_trace
 from stlc.units import parse_unit
 
+FRAMES = 4
+
+
+@pytest.fixture(autouse=True)
+def _few_frames(monkeypatch):
+    """Reports whose films have few instants: each takes a tenth of a second to draw."""
+    monkeypatch.setattr("stlc.view.player.MOST_FRAMES", FRAMES)
+
+
 ROOT = Path(__file__).parents[2]
 SPEC = (ROOT / "specs/traffic.stl").read_text()
 SYSTEM = (ROOT / "examples/car.yaml").read_text()

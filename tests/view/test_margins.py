@@ -7,7 +7,7 @@ from stlc.signature import Column, Signature
 from stlc.trace import Trace, TraceMeta
 from stlc.units import parse_unit
 from stlc.view.driven import judged_once, margins_of, monitor_of, units_of
-from stlc.view.margins import AS_FORESEEN, as_foreseen, least, strip_of
+from stlc.view.margins import AS_FORESEEN, as_foreseen, judged_in, least, strip_of
 
 
 def test_margins_count_where_the_world_did_as_the_model_says():
@@ -22,14 +22,16 @@ def test_margins_count_where_the_world_did_as_the_model_says():
 
 
 def test_the_agents_of_the_first_seed_are_shown(recording, tmp_path):
-    scene = {"decision": recording.extras["decision"][:10].T.astype(np.int8)}
-    scene["decision"] = np.concatenate([scene["decision"], scene["decision"][-1:]])
-    strip = strip_of(scene, recording, 0.1, system=tmp_path / "none.yaml")
+    decisions = recording.extras["decision"][:10].T.astype(np.int64)
+    decisions = np.concatenate([decisions, decisions[-1:]])
+    judged = judged_in(recording, 10, system=tmp_path / "none.yaml")
+    strip = strip_of(judged, decisions)
+    assert judged.verdict.traces == 10
+    assert judged.marked == {"no_collision", "give_way", "red_light"}
     assert strip.rows == ["no_collision", "stop_sign", "give_way", "red_light"]
     assert strip.decisions.shape == (151, 10)
     assert strip.words != AS_FORESEEN  # nobody recorded whether it was so
     assert np.isnan(strip.margins["red_light"][-25:]).all()
-    assert strip_of({"decision": scene["decision"][1:]}, recording, 0.1, system=tmp_path) is None
 
 
 def test_what_is_judged_once_is_shown_as_it_was_judged():
@@ -68,7 +70,7 @@ def test_a_margin_has_the_unit_of_its_predicates():
 def test_where_little_goes_as_foreseen_all_agents_count(recording, tmp_path, right):
     extras = {**recording.extras, "foreseen": np.full((20, 150), right, dtype=np.int8)}
     told = Trace(recording.signature, 0.1, recording.data, extras=extras, meta=recording.meta)
-    scene = {"decision": np.zeros((151, 10), dtype=np.int8)}
-    strip = strip_of(scene, told, 0.1, system=tmp_path / "none.yaml")
+    judged = judged_in(told, 10, system=tmp_path / "none.yaml")
+    strip = strip_of(judged, np.zeros((151, 10), dtype=np.int64))
     assert (strip.words == AS_FORESEEN) is bool(right)
     assert np.isfinite(strip.margins["red_light"][0])

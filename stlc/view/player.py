@@ -1,0 +1,364 @@
+"""The film at the head of the report: played, scrubbed through, and left at the instant of a violation.
+
+Without scripts the page shows a still. What is drawn travels as commands (`stlc.view.tape`), not as pixels:
+it is sharp at every width and follows the light or dark scheme of the reader; `player.js` replays it.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.semantics import TOLERANCE
+from stlc.controller.sketch import DECIDED
+from stlc.escape import script_json
+from stlc.jsontext import dumps
+from stlc.monitor.prepared import beside
+from stlc.view.animate import STILL, Shot, current, film_name, film_of, shots_of
+from stlc.view.events import Event
+from stlc.view.film import Taped, in_the_dark, speed_of, still_bytes
+from stlc.view.html import Child, Html, classed, el, join, table
+from stlc.view.material import Material
+from stlc.view.page import Section
+from stlc.view.signals import margin_limits
+from stlc.view.strip import Strip
+from stlc.view.style import SCENES_ON_DARK
+from stlc.view.words import count
+
+SCRIPT = "player.js"
+MOST_FRAMES = 160
+"""Instants of the page's film; others are left out evenly."""
+MOST_ROWS = 60
+"""Events of a requirement that are listed."""
+_WIDE, _HIGH = 1000, 40  # of a track
+
+
+@dataclass(frozen=True, slots=True)
+class _Track:
+    """What is known over time: its name, its curve, and what it is at every frame."""
+
+    name: str
+    curve: Html
+    values: list[str | None]
+
+
+def player_section(material: Material) -> Section | None:
+    """The film of the newest deployment; None where nothing was recorded."""
+    shots = shots_of(material.run)
+    if not shots:
+        return None
+    frames = min(shot.frames for shot in shots)
+    shown = range(0, frames, -(-frames // MOST_FRAMES))
+    tapes = [shot.taped(shown) for shot in shots]
+    tracks = [_tracks(shot, shown) for shot in shots]
+    body = join(
+        _stage(shots, tapes, material),
+        _data(shots, tapes, tracks, shown),
+    )
+    tables = _events(shots)
+    head = classed(
+        "div",
+        "player",
+        _keys(shots),
+        body,
+        _controls(len(shown)),
+        _columns(shots, tracks),
+    )
+    return Section("film", "", join(_dressed(head), _files(material), tables))
+
+
+def script() -> Html:
+    """What runs in the page; it reads nothing but the page."""
+    return Html((files("stlc.view") / SCRIPT).read_text(encoding="utf-8"))
+
+
+def _dressed(head: Html) -> Html:
+    return Html(head.replace('<div class="player">', '<div class="player" tabindex="0">', 1))
+
+
+# ------------------------------------------------------------------------------- stage
+
+
+def _stage(shots: Sequence[Shot], tapes: Sequence[Taped], material: Material) -> Html:
+    """A canvas for each drive, and a still for readers without scripts."""
+    panels = [
+        el(
+            "figure",
+            el("figcaption", shot.title) if shot.title else None,
+            el(
+                "canvas",
+                attrs={
+                    "role": "img",
+                    "aria-label": shot.alt,
+                    "width": str(tape.width),
+                    "height": str(tape.height),
+                },
+            ),
+        )
+        for shot, tape in zip(shots, tapes, strict=True)
+    ]
+    wide = " wide" if len(shots) > 1 and tapes[0].width > 2 * tapes[0].height else ""
+    kind = f"panels{wide}" if len(shots) > 1 else "panels one"
+    return join(classed("div", kind, panels), el("noscript", _still(material)))
+
+
+def _still(material: Material) -> Html | None:
+    """The picture of the animation's most telling instant, which may have been drawn already."""
+    path = material.run.path / STILL
+    if current(material.run) and path.is_file():
+        kind, content = "png", path.read_bytes()
+    else:
+        film = film_of(material.run)
+        if film is None:
+            return None
+        kind, content = "webp", still_bytes(film)
+    address = f"data:image/{kind};base64," + base64.b64encode(content).decode()
+    return el("img", attrs={"src": address, "alt": "the deployment at its most telling instant"})
+
+
+def _controls(frames: int) -> Html:
+    slide = {
+        "type": "range",
+        "min": "0",
+        "max": str(frames - 1),
+        "step": "1",
+        "value": "0",
+        "aria-label": "time",
+    }
+    return classed(
+        "div",
+        "controls",
+        el("button", "Play", attrs={"class": "play", "type": "button"}),
+        el("button", "-1", attrs={"type": "button", "data-step": "-1", "aria-label": "one step back"}),
+        el("button", "+1", attrs={"type": "button", "data-step": "1", "aria-label": "one step on"}),
+        el("input", attrs=slide),
+        el("output", "0 s"),
+    )
+
+
+def _keys(shots: Sequence[Shot]) -> Html:
+    """The legend of all drives."""
+    keys = {key.word: key for shot in shots for key in shot.keys}
+    swatches = [
+        classed(
+            "span",
+            "whole",
+            el("span", attrs={"class": f"key {key.kind}", "style": _inks(key.color)}),
+            key.word,
+        )
+        for key in keys.values()
+    ]
+    return classed("p", "keys", swatches)
+
+
+def _inks(color: str) -> str:
+    """A colour on light and on dark paper."""
+    return f"--day:{color};--dusk:{SCENES_ON_DARK.get(color, color)}"
+
+
+def _files(material: Material) -> Html | None:
+    """The animation as files beside the page."""
+    name = film_name(material.run)
+    there = [
+        f"{name}{suffix}" for suffix in (".gif", ".mp4") if (material.run.path / f"{name}{suffix}").exists()
+    ]
+    if not there:
+        return None
+    links = [join(el("a", path, attrs={"href": path}), " ") for path in there]
+    return classed("p", "quiet", "The same as a file: ", links)
+
+
+# ------------------------------------------------------------------------------ tracks
+
+
+def _columns(shots: Sequence[Shot], tracks: Sequence[Sequence[_Track]]) -> Html:
+    columns = []
+    for shot, own in zip(shots, tracks, strict=True):
+        if not own:
+            continue
+        rows = [
+            classed(
+                "div",
+                "track",
+                classed("span", "name", track.name),
+                classed("div", "plot", track.curve, classed("div", "cursor")),
+                classed("span", "value"),
+            )
+            for track in own
+        ]
+        times = shot.strip.times if shot.strip is not None else np.zeros(1)
+        foot = classed("div", "track axis", el("span"), classed("div", "ends", _ends(times)), el("span"))
+        words = shot.strip.words if shot.strip is not None else ""
+        columns.append(
+            classed("div", "tracks", classed("p", "quiet", _titled(shot.title, words)), rows, foot)
+        )
+    return classed("div", "columns", columns)
+
+
+def _titled(title: str, words: str) -> str:
+    return f"{title}: {words}" if title else words
+
+
+def _ends(times: NDArray[np.float64]) -> list[Html]:
+    return [el("span", f"{times[0]:g} s"), el("span", f"{times[-1]:g} s")]
+
+
+def _tracks(shot: Shot, shown: range) -> list[_Track]:
+    strip = shot.strip
+    if strip is None:
+        return []
+    rows = [_acted(strip, shown)] if strip.acted.any() else []
+    return rows + [_margin(strip, name, shown) for name in strip.rows]
+
+
+def _acted(strip: Strip, shown: range) -> _Track:
+    assert strip.decisions is not None
+    agents = strip.decisions.shape[1]
+    top, base, areas = max(int(strip.acted.max()), 1), np.zeros(len(strip.times)), []
+    for source, color in enumerate(DECIDED[1:], start=1):
+        more = base + (strip.decisions == source).sum(1)
+        if (more > base).any():
+            path = _area(strip.times, _up(base, top), _up(more, top))
+            areas.append(el("path", attrs={"d": path, "class": "acted", "style": _inks(color)}))
+        base = more
+    values: list[str | None] = [f"{int(strip.acted[index])} of {agents}" for index in shown]
+    return _Track("guard acted", _svg(areas), values)
+
+
+def _margin(strip: Strip, name: str, shown: range) -> _Track:
+    rho = np.where(np.isfinite(strip.margins[name]), strip.margins[name], np.nan)
+    low, high = margin_limits(rho)
+    fails = rho < -TOLERANCE
+
+    def up(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return _up(np.clip(values, low, high) - low, high - low)
+
+    zero = up(np.zeros(len(rho)))
+    good, bad = np.where(fails, np.nan, rho), np.where(fails, rho, np.nan)
+    parts = [
+        el("path", attrs={"d": f"M0 {zero[0]:.1f}H{_WIDE}", "class": "zero"}),
+        el("path", attrs={"d": _area(strip.times, zero, up(good)), "class": "spare"}),
+        el("path", attrs={"d": _area(strip.times, zero, up(bad)), "class": "lost"}),
+        el("path", attrs={"d": _line(strip.times, up(rho)), "class": "line"}),
+        el("path", attrs={"d": _line(strip.times, up(bad)), "class": "line lost"}),
+    ]
+    unit = f" {strip.units[name]}" if strip.units.get(name) else ""
+    words = [f"{rho[index]:+.2f}{unit}".replace("-0.00", "+0.00") for index in shown]
+    values: list[str | None] = [
+        None if np.isnan(rho[index]) else word for index, word in zip(shown, words, strict=True)
+    ]
+    return _Track(f"{name} [{strip.units[name]}]" if strip.units.get(name) else name, _svg(parts), values)
+
+
+def _svg(parts: Iterable[Html]) -> Html:
+    box = {"viewBox": f"0 0 {_WIDE} {_HIGH}", "preserveAspectRatio": "none", "aria-hidden": "true"}
+    return el("svg", parts, attrs=box)
+
+
+def _up(values: NDArray[np.float64], span: float) -> NDArray[np.float64]:
+    """Heights of a track, from its upper edge."""
+    return np.asarray(_HIGH - _HIGH * values / (span or 1.0))
+
+
+def _across(times: NDArray[np.float64]) -> NDArray[np.float64]:
+    span = float(times[-1] - times[0]) or 1.0
+    return np.asarray(_WIDE * (times - times[0]) / span)
+
+
+def _line(times: NDArray[np.float64], heights: NDArray[np.float64]) -> str:
+    """A staircase, with gaps where nothing is known."""
+    words, last = list[str](), np.nan
+    for x, y in zip(_across(times), heights, strict=True):
+        if np.isnan(y):
+            if not np.isnan(last):
+                words.append(f"H{x:.1f}")
+        elif np.isnan(last):
+            words.append(f"M{x:.1f} {y:.1f}")
+        elif y != last:
+            words.append(f"H{x:.1f}V{y:.1f}")
+        last = y
+    if not np.isnan(last):
+        words.append(f"H{_WIDE}")
+    return "".join(words)
+
+
+def _area(times: NDArray[np.float64], base: NDArray[np.float64], heights: NDArray[np.float64]) -> str:
+    """What lies between two staircases."""
+    x = np.append(_across(times), _WIDE)
+    words, begin = list[str](), 0
+    same = (heights[1:] == heights[:-1]) & (base[1:] == base[:-1])
+    edges = [0, *(np.flatnonzero(~same) + 1).tolist(), len(heights)]
+    for begin, end in pairwise(edges):
+        if np.isfinite(heights[begin]) and heights[begin] != base[begin]:
+            words.append(
+                f"M{x[begin]:.1f} {base[begin]:.1f}V{heights[begin]:.1f}H{x[end]:.1f}V{base[begin]:.1f}z"
+            )
+    return "".join(words)
+
+
+# ------------------------------------------------------------------------------ events
+
+
+def _events(shots: Sequence[Shot]) -> Html | None:
+    """What was violated, requirement by requirement; each line leads to its instant."""
+    names = list(dict.fromkeys(name for shot in shots for name in shot.requirements))
+    if not names:
+        return None
+    blocks = []
+    for name in names:
+        rows = [(shot, event) for shot in shots for event in shot.events if event.requirement == name]
+        rows.sort(key=lambda row: row[1].sample)
+        counts = [sum(1 for own, _ in rows if own is shot) for shot in shots]
+        told = ", ".join(
+            f"{count(number, 'violation')} {shot.title}".strip()
+            for number, shot in zip(counts, shots, strict=True)
+        )
+        summary = el("summary", name, " ", classed("span", "bad" if rows else "quiet", told))
+        if rows:
+            blocks.append(el("details", summary, _event_table(rows[:MOST_ROWS], len(rows))))
+        else:
+            blocks.append(classed("p", "none", el("strong", name), " ", classed("span", "quiet", told)))
+    return classed("div", "events", el("h3", "Violations in this film"), blocks)
+
+
+def _event_table(rows: list[tuple[Shot, Event]], count_: int) -> Html:
+    several = any(shot.title for shot, _ in rows)
+    header = ["when", *(["drive"] if several else []), "who", "why"]
+    cells: list[list[Child]] = []
+    for shot, event in rows:
+        moment, start = (f"t = {shot.time(sample):.10g} s" for sample in (event.sample, event.start))
+        at = {"type": "button", "data-at": f"{shot.time(event.sample) - shot.time(0):.9g}"}
+        button = el("button", f"{shot.time(event.sample):.4g} s", attrs=at)
+        window = beside(moment, start).removeprefix(moment).strip()
+        when: Child = join(button, el("small", window) if window else None)
+        drive: list[Child] = [shot.title] if several else []
+        cells.append([when, *drive, shot.names[event.agent], event.because])
+    more = el("p", f"and {count_ - len(rows):,} more") if count_ > len(rows) else None
+    return join(table(header, cells, kind="jump"), more)
+
+
+# -------------------------------------------------------------------------------- data
+
+
+def _data(
+    shots: Sequence[Shot], tapes: Sequence[Taped], tracks: Sequence[Sequence[_Track]], shown: range
+) -> Html:
+    """Everything that is replayed, as JSON that no text in it can end."""
+    dt = shots[0].dt
+    document: dict[str, Any] = {
+        "times": [round(index * dt, 9) for index in shown],
+        "digits": 1 if dt >= 0.1 else 2,
+        "pace": speed_of(shots[0].frames, dt),
+        "dark": dict(in_the_dark(tapes, SCENES_ON_DARK)),
+        "panels": [tape.as_json() for tape in tapes],
+        "rows": [track.values for own in tracks for track in own],
+    }
+    text = script_json(dumps(document))
+    return el("script", Html(text), attrs={"type": "application/json", "id": "film-data"})

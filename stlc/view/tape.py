@@ -1,0 +1,201 @@
+"""A film as what is drawn, not as pixels: paths, letters and pictures, for a page that replays it.
+
+`Tape` is what matplotlib draws on here instead of a canvas. What frames share is kept once. Coordinates are
+whole quarters of a dot from the upper left.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.backend_bases import RendererBase
+from matplotlib.backends.backend_agg import RendererAgg
+from matplotlib.colors import to_hex
+from matplotlib.path import Path as Outline
+from matplotlib.transforms import Affine2D
+
+from stlc.view.film import Command, Film, Taped, wipe
+from stlc.view.style import look, new_figure
+
+if TYPE_CHECKING:
+    pass
+
+FINE = 4
+"""Steps of a coordinate in a dot."""
+DPI = 100
+PICTURE = 720
+"""The most dots across an embedded picture; its quality is that of WebP."""
+QUALITY = 60
+_LETTERS = {Outline.MOVETO: "m", Outline.LINETO: "l", Outline.CURVE3: "q", Outline.CURVE4: "c"}
+
+
+def taped(draw: Callable[[Any, int], None], frames: Sequence[int], size: tuple[float, float]) -> Taped:
+    """Draw frames by `draw(axes, index)`, on axes that fill a figure of that size in inches."""
+    with look():
+        figure = new_figure(*size)
+        figure.set_dpi(DPI)
+        figure.set_layout_engine("none")
+        axes = figure.add_axes((0, 0, 1, 1))
+        tape = Tape(round(size[0] * DPI), round(size[1] * DPI))
+        for index in frames:
+            wipe(axes)
+            draw(axes, index)
+            tape.begin()
+            axes.draw(tape)
+    return tape.taped()
+
+
+def taped_film(film: Film, frames: Sequence[int]) -> Taped:
+    """The same of a whole picture, as `film` draws it."""
+    with look():
+        figure = new_figure(*film.size)
+        figure.set_dpi(DPI)
+        turn = film.begin(figure)
+        tape = Tape(round(film.size[0] * DPI), round(film.size[1] * DPI))
+        for index in frames:
+            turn(index)
+            tape.begin()
+            figure.draw(tape)
+    return tape.taped()
+
+
+class Tape(RendererBase):
+    """What matplotlib draws on: whatever comes is entered into the present frame."""
+
+    def __init__(self, width: int, height: int) -> None:
+        super().__init__()
+        self.width, self.height = width, height
+        self._known: dict[Command, int] = {}
+        self._frames: list[list[int]] = []
+        self._letters: Any = _measuring(width, height, DPI)
+
+    def begin(self) -> None:
+        """Another frame."""
+        self._frames.append([])
+
+    def taped(self) -> Taped:
+        """All that was drawn."""
+        frames = tuple(tuple(frame) for frame in self._frames)
+        return Taped(self.width, self.height, tuple(self._known), frames)
+
+    def _enter(self, command: Command) -> None:
+        self._frames[-1].append(self._known.setdefault(command, len(self._known)))
+
+    # ------------------------------------------------------------- what matplotlib asks of a renderer
+
+    def draw_path(self, gc: Any, path: Any, transform: Any, rgbFace: Any = None) -> None:  # noqa: N803
+        """An outline, filled where it has a face."""
+        line = None if gc.get_linewidth() == 0 else _color(gc.get_rgb(), gc)
+        face = None if rgbFace is None else _color(rgbFace, gc)
+        text = self._path(path, transform)
+        if text and (line or face):
+            width = round(self.points_to_pixels(gc.get_linewidth()), 2)
+            self._enter(("p", text, face, line, width if line else 0, self._dash(gc), self._clip(gc)))
+
+    def draw_image(self, gc: Any, x: float, y: float, im: Any, transform: Any = None) -> None:  # noqa: ARG002
+        """A picture, made smaller where it is large."""
+        from PIL import Image
+
+        height, width = im.shape[:2]
+        picture = Image.fromarray(np.ascontiguousarray(im[::-1]))
+        paper = Image.new("RGB", picture.size, "white")
+        paper.paste(picture, mask=picture.getchannel("A"))
+        if paper.width > PICTURE:
+            paper = paper.resize((PICTURE, round(PICTURE * height / width)))
+        buffer = io.BytesIO()
+        paper.save(buffer, format="webp", quality=QUALITY)
+        address = "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
+        self._enter(("i", round(x), round(self.height - y - height), width, height, address))
+
+    def draw_text(
+        self,
+        gc: Any,
+        x: float,
+        y: float,
+        s: str,
+        prop: Any,
+        angle: float,
+        ismath: Any = False,
+        mtext: Any = None,
+    ) -> None:
+        """A line of letters; `align` says where (x, y) is in it, on its foot."""
+        wide, _, _ = self.get_text_width_height_descent(s, prop, ismath)
+        align = "left" if mtext is None else mtext.get_horizontalalignment()
+        along = {"left": 0.0, "center": 0.5, "right": 1.0}[align] * wide
+        turn = np.radians(angle)
+        at = (round(FINE * (x + along * np.cos(turn))), round(FINE * (y - along * np.sin(turn))))
+        size = round(self.points_to_pixels(prop.get_size_in_points()), 1)
+        bold = prop.get_weight() in ("bold", 700)
+        self._enter(("t", *at, s, size, _color(gc.get_rgb(), gc), align, round(-angle), int(bold)))
+
+    def get_text_width_height_descent(self, s: str, prop: Any, ismath: Any) -> tuple[float, float, float]:
+        """As letters are on a canvas."""
+        wide, high, deep = self._letters.get_text_width_height_descent(s, prop, ismath)
+        return float(wide), float(high), float(deep)
+
+    def get_canvas_width_height(self) -> tuple[float, float]:
+        """In dots."""
+        return self.width, self.height
+
+    def points_to_pixels(self, points: Any) -> Any:
+        """Dots of a length in points."""
+        return points * DPI / 72
+
+    def flipy(self) -> bool:
+        """Letters and pictures are placed from above."""
+        return True
+
+    def option_image_nocomposite(self) -> bool:
+        """Pictures stay apart."""
+        return True
+
+    # ------------------------------------------------------------------------------------- pieces
+
+    def _path(self, path: Any, transform: Any) -> str:
+        """An outline as SVG writes it, in steps from point to point."""
+        flip = transform + Affine2D().scale(FINE, -FINE).translate(0, FINE * self.height)
+        words: list[str] = []
+        x = y = 0
+        begun = (0, 0)
+        for points, code in path.iter_segments(flip, simplify=False, remove_nans=True):
+            if code == Outline.CLOSEPOLY:
+                words.append("z")
+                x, y = begun
+                continue
+            ends = np.rint(np.clip(points, -99_999, 99_999)).astype(int).reshape(-1, 2)
+            if code == Outline.MOVETO:
+                begun = (int(ends[0, 0]), int(ends[0, 1]))
+                if words and (x, y) == begun and words[-1] != "z":
+                    continue  # the line goes on
+                words.append(f"M{begun[0]} {begun[1]}")
+            else:
+                words.append(_LETTERS[code] + " ".join(f"{a - x} {b - y}" for a, b in ends.tolist()))
+            x, y = ends[-1].tolist()
+        return "".join(words)
+
+    def _dash(self, gc: Any) -> str | None:
+        _, pattern = gc.get_dashes()
+        if pattern is None:
+            return None
+        return " ".join(f"{self.points_to_pixels(length):.3g}" for length in pattern)
+
+    def _clip(self, gc: Any) -> str | None:
+        """The outline that something is cut to, where it is not the frame of the axes."""
+        path, transform = gc.get_clip_path()
+        return None if path is None else self._path(path, transform)
+
+
+_measuring: Any = RendererAgg
+"""What knows how wide letters are."""
+
+
+def _color(color: Any, gc: Any) -> str | None:
+    """`#rrggbb`, with two more digits where it can be seen through; None where it cannot be seen."""
+    alpha = gc.get_alpha() if gc.get_forced_alpha() else color[3] if len(color) > 3 else 1.0
+    if not alpha:
+        return None
+    return to_hex((*color[:3], alpha), keep_alpha=alpha < 1)
