@@ -58,6 +58,8 @@ def draw_benchmarks(panels: Sequence[Panel]) -> Picture | None:
         grid = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
         for axes, panel in zip(grid, shown, strict=False):
             _draw_panel(axes, panel)
+        for axes in grid[::columns]:
+            axes.set_ylabel("plan accuracy, share of starts")
         for axes in grid[len(shown) :]:
             axes.set_visible(False)
         grid[0].legend(loc="lower right", handlelength=1.2)

@@ -85,6 +85,7 @@ def _legend(axes: Axes, rows: int) -> None:
 
 def _draw_accuracy(axes: Axes, rows: Rows) -> None:
     axes.set_title("plan accuracy")
+    axes.set_ylabel("share of starts")
     seconds, accuracy = _column(rows, "accuracy")
     label = f"policy  {_even(accuracy)[-1]:.3f}"
     _draw_share(axes, seconds, accuracy, color=BLUE, lw=1.8, zorder=3, label=label)

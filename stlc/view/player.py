@@ -195,7 +195,7 @@ def _columns(shots: Sequence[Shot], tracks: Sequence[Sequence[_Track]]) -> Html:
         ]
         times = shot.strip.times if shot.strip is not None else np.zeros(1)
         foot = classed("div", "track axis", el("span"), classed("div", "ends", _ends(times)), el("span"))
-        words = shot.strip.words if shot.strip is not None else ""
+        words = f"{shot.strip.words}, red where violated" if shot.strip is not None else ""
         columns.append(
             classed("div", "tracks", classed("p", "quiet", _titled(shot.title, words)), rows, foot)
         )

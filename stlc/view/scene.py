@@ -221,7 +221,8 @@ def _draw_over_time(figure: Figure, plan: _Plan, strip: Strip | None) -> list[Mo
     movers = draw_strip(strip, [_panel(figure, plan, box) for box in plan.rows])
     (width, height), (left, bottom, wide, high) = plan.size, plan.rows[0]
     narrow = wide < WIDTH / 2
-    words = strip.words.replace(", ", ",\n") if narrow else strip.words
+    words = f"{strip.words}, red where violated"
+    words = words.replace(", ", ",\n") if narrow else words
     at = ((left - (_NAMES - 0.2 if narrow else 0.0)) / width, (bottom + high + 0.05) / height)
     figure.text(*at, words, color=MUTED, fontsize=7.5, va="bottom")
     return movers

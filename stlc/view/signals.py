@@ -32,6 +32,7 @@ from stlc.view.style import (
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Margins: TypeAlias = Mapping[str, NDArray[np.float64]]
 
@@ -93,7 +94,7 @@ def draw_signals(
     rows = _rows(trace, margins)
     heights = [_HEIGHTS[kind] for kind, _ in rows]
     with look():
-        figure = new_figure(9, sum(heights) + 0.07 * len(rows) + 0.55)
+        figure = new_figure(9, sum(heights) + 0.07 * len(rows) + 0.8)
         narrow_gaps(figure)
         grid = figure.subplots(
             len(rows), len(choices), squeeze=False, sharex=True, sharey="row", height_ratios=heights
@@ -107,8 +108,27 @@ def draw_signals(
         for axes, (kind, name) in zip(grid[:, 0], rows, strict=True):
             _name_row(axes, kind, name, trace, units or {})
         grid[0][0].set_xlim(trace.times[0], trace.times[-1])
+        _legend(figure, trace, bool(margins))
     shown = " and ".join(choice.title for choice in choices)
     return Picture(figure, f"Signals, decisions and robustness per requirement; {shown}.")
+
+
+def _legend(figure: Figure, trace: Trace, judged: bool) -> None:
+    """What the colours are: margins that hold and do not, and who decided."""
+    from matplotlib.patches import Patch
+
+    handles = []
+    if judged:
+        handles += [
+            Patch(color=BLUE, alpha=0.5, lw=0, label="to spare"),
+            Patch(color=RED, lw=0, label="violated"),
+        ]
+    decisions = _decisions(trace)
+    for source in sorted(set() if decisions is None else {*np.unique(decisions).tolist()} - {POLICY}):
+        word, color = DECISIONS.get(int(source), ("", MUTED))
+        handles.append(Patch(color=color, lw=0, label=f"{word} decided"))
+    if handles:
+        figure.legend(handles=handles, loc="outside upper right", ncols=len(handles), handlelength=1.0)
 
 
 @dataclass(frozen=True, slots=True)
