@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics import TOLERANCE
-from stlc.controller.backup import Backup, Found
+from stlc.controller.backup import Backup, Found, finite
 from stlc.controller.closest import Closest
 from stlc.controller.policy import Mlp
 from stlc.controller.polish import FullBackup, Limits
@@ -195,6 +195,24 @@ class Guard:
 
     def _score(self, judged: Judged) -> Tensor:
         return rank(judged.rho, self.strict.cost(judged), judged.safe)
+
+    @torch.no_grad()
+    def carried_on(self, x: Tensor, begun: Decision, taken: Tensor) -> Decision:
+        """What is left of plans for (agents, n) states, the policy's own from their end on.
+
+        `taken`: how many steps of each are behind it, (agents,); so many of its last actions are replaced.
+        """
+        x, plan = x.to(torch.float64), begun.plan.clone()
+        length = plan.shape[1]
+        for steps in dict.fromkeys(taken.tolist()):
+            rows = torch.nonzero(taken == steps).squeeze(1)
+            left = length - steps
+            if not 0 < left < length:
+                continue
+            end = self.task.rollout(x[rows], plan[rows, :left])[:, -1]
+            tail = finite(self.policy.plan(end).to(plan.dtype), self.task)
+            plan[rows] = torch.cat((plan[rows, :left], tail[:, : length - left]), 1)
+        return replace(begun, plan=plan, action=plan[:, 0])
 
     def _kept(self, x: Tensor, begun: Decision | None, fresh: Tensor, judged: Judged) -> Found:
         """The policy's plans, or what is left of those that were begun."""

@@ -180,13 +180,13 @@ class _Pilot:
         """Which option everybody takes, (rows,); those who do not plan now stay with theirs."""
         pick = torch.zeros(len(options), dtype=torch.int64)
         if len(due):
-            pick[due] = self.guard.prefer(options[due], self._begun(due))
+            pick[due] = self.guard.prefer(options[due], self._begun(due, options[:, 0]))
         return pick
 
     def decide(self, x: Tensor, seen: Tensor, due: Tensor) -> tuple[Decision, Tensor]:
         """Decisions, and actions (rows, m), where those in rows `due` plan for what they see of `x`."""
         if len(due):
-            new = self.guard.decide(seen[due], self._begun(due))
+            new = self.guard.decide(seen[due], self._begun(due, seen))
             whole = self.decision is None or len(due) == len(x)
             self.decision = new if self.decision is None or whole else self.decision.with_new(due, new)
             self.age = torch.zeros(len(x), dtype=torch.int64) if whole else self.age.index_fill(0, due, 0)
@@ -195,8 +195,16 @@ class _Pilot:
         self.age, self.before = self.age + 1, x
         return self.decision, action
 
-    def _begun(self, due: Tensor) -> Decision | None:
-        return None if self.decision is None else self.decision.of(due).later(self.age[due])
+    def _begun(self, due: Tensor, seen: Tensor) -> Decision | None:
+        """What is left of the plans of those in rows `due`, who see `seen` (rows, n).
+
+        Where several steps of a plan are taken before the next is made, the policy goes on from its end: the
+        last action held for that long may run into a wall, and then nobody would go on with the plan.
+        """
+        if self.decision is None:
+            return None
+        left = self.decision.of(due).later(self.age[due])
+        return left if self.replan == 1 else self.guard.carried_on(seen[due], left, self.age[due])
 
 
 def drive(

@@ -65,6 +65,35 @@ def test_a_plan_that_is_no_number_is_never_executed_under_guard(car_task: Task) 
     assert torch.isneginf(Guard(car_task, broken, "none").decide(x).rho).all()
 
 
+class Slowing:
+    """A policy that brakes the harder the faster it is."""
+
+    def __init__(self, task: Task) -> None:
+        self.horizon = task.horizon
+
+    def plan(self, x0: Tensor) -> Tensor:
+        return -x0[:, 1, None, None].expand(-1, self.horizon, 1)
+
+
+def test_a_plan_of_which_several_steps_were_taken_is_carried_on_by_the_policy(car_task: Task) -> None:
+    """The last action held on may break what the plan promises: then nobody would go on with it."""
+    policy, length = Slowing(car_task), car_task.horizon
+    guard = Guard(car_task, policy, "none")
+    x = car_task.sample(4, seed=6).double()
+    begun, taken = guard.decide(x), torch.tensor([0, 3, length - 1, length + 2])
+    left = begun.later(taken)
+    found = guard.carried_on(x, left, taken)
+    assert torch.equal(found.action, found.plan[:, 0])
+    for row, steps in enumerate(taken.tolist()):
+        kept = length - steps
+        if steps == 0 or kept <= 0:
+            assert torch.equal(found.plan[row], left.plan[row])
+            continue
+        assert torch.equal(found.plan[row, :kept], begun.plan[row, steps:])
+        end = car_task.rollout(x[row : row + 1], left.plan[row : row + 1, :kept])[:, -1]
+        assert torch.equal(found.plan[row, kept:], policy.plan(end)[0, :steps])
+
+
 def test_the_rest_of_a_plan_holds_its_last_action(car_task: Task) -> None:
     guard = Guard(car_task, Rule(car_task, 10.0))
     decision = guard.decide(car_task.sample(30, seed=5))
