@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from stlc.compile.modules import file_of, library_of
 from stlc.compile.pipeline import compile_spec
 from stlc.controller.run import INDEX, read_library, save_library
+from stlc.controller.savable import solvable
 from stlc.diagnostics import Diagnostic, RunError, SystemFileError, UsageError
 from stlc.dynamics.schema import load_system_decl
 from stlc.files import read_source, write_atomic
@@ -86,7 +88,8 @@ class Drives:
     Attributes:
         rules: rule -> status of each drive, (rows,): `satisfied`, `violated` or `inconclusive`.
         broken: the drives that broke a rule, in order.
-        viable: (rows,), who obeyed, or from whose start a safe plan is known.
+        viable: (rows,), who obeyed, or from whose start a plan is known: a safe one where a rule was broken
+            that is tagged `@safety`, else one that satisfies all that plans are made for.
     """
 
     rules: Mapping[str, NDArray[np.str_]]
@@ -247,8 +250,21 @@ def judge_drives(rules: Rules, task: Task, recording: Recording, savable: NDArra
     columns = np.moveaxis(recording.states, -1, 0)
     verdict = monitor.check(dict(zip(task.names, columns, strict=True)))
     found = {judgement.name: np.array(judgement.statuses) for judgement in verdict}
-    viable = savable | obeying(found, len(savable))
-    return Drives(found, tuple(_broken(verdict, found)), viable)
+    safety = {rule.name for rule in verdict.subject.compiled.safety}
+    unsafe = _violating({name: each for name, each in found.items() if name in safety}, len(savable))
+    late = np.flatnonzero(_violating(found, len(savable)) & ~unsafe)
+    viable = savable.copy()
+    if len(late):  # nothing was hit: could all that plans are asked for have been kept?
+        viable[late] = solvable(task, torch.from_numpy(recording.states[late, 0])).numpy()
+    return Drives(found, tuple(_broken(verdict, found)), viable | obeying(found, len(savable)))
+
+
+def _violating(rules: Mapping[str, NDArray[np.str_]], rows: int) -> NDArray[np.bool_]:
+    """(rows,), who violates any rule."""
+    found = np.zeros(rows, dtype=bool)
+    for statuses in rules.values():
+        found |= statuses == "violated"
+    return found
 
 
 def drives_of_plans(held: Mapping[str, NDArray[np.bool_]], savable: NDArray[np.bool_], dt: float) -> Drives:
@@ -290,13 +306,11 @@ def drives_json(drives: Drives, seeds: Sequence[int], agents: int) -> dict[str, 
     """The entry `drives` of a guard in `eval/simulate.json`.
 
     `count` drives, of which `obeyed` kept every rule and `undecided` ended too early to say; `lost` of the
-    others have no start from which a safe plan is known. `rules`: the same for each rule. `broken`: who broke
-    which, and when (seconds from the start, null where nobody has looked).
+    others began where no plan is known that keeps what they broke (`Drives.viable`). `rules`: the same for
+    each rule. `broken`: who broke which, and when (seconds from the start, null where nobody has looked).
     """
     obeyed, rows = drives.obeyed, len(drives.viable)
-    violated = np.zeros(rows, dtype=bool)
-    for statuses in drives.rules.values():
-        violated |= statuses == "violated"
+    violated = _violating(drives.rules, rows)
     return {
         "count": rows,
         "obeyed": int(obeyed.sum()),

@@ -154,7 +154,7 @@ def _drive_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
     whole = [None if d is None else _of(d["obeyed"], d["count"]) for d in each]
     rows: list[tuple[Child, ...]] = [(join("drives that obeyed every rule", meaning), *whole)]
     if any(drives["lost"] for drives in known):
-        others = el("small", "without those from whose start no safe plan is known")
+        others = el("small", "without those from whose start no plan is known")
         viable = [None if d is None else _of(d["obeyed"], d["count"] - d["lost"]) for d in each]
         rows.append((join("of those that were not lost from the start", others), *viable))
     for rule in known[-1]["rules"]:

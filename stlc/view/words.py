@@ -83,7 +83,7 @@ def obeyed_sentence(simulation: Mapping[str, Any]) -> str:
 
 
 def viable_sentence(simulation: Mapping[str, Any]) -> str:
-    """How many drives no plan could have kept safe, and how many of the others obeyed; "" for none."""
+    """How many drives began where no plan is known, and how many of the others obeyed; "" for none."""
     each = list(drives_of(simulation).values())
     if not each:
         return ""
@@ -92,6 +92,6 @@ def viable_sentence(simulation: Mapping[str, Any]) -> str:
     if not lost:
         return ""
     return (
-        f"{count(lost, 'drive')} {'was' if lost == 1 else 'were'} lost from the start, where no safe plan is "
+        f"{count(lost, 'drive')} {'was' if lost == 1 else 'were'} lost from the start, where no plan is "
         f"known: {drives['obeyed']} of the {others} others obeyed"
     )

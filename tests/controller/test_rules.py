@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from stlc.controller.config import TrainConfig
 from stlc.controller.drive import Recording
@@ -36,8 +37,8 @@ scenario: {far: {judge: far.stl}, same: {doc: nothing else}}
 PLAN = "spec cart\nsignal x [m]\nconst wall = 4 m\n@safety require near: always[0, T] x < wall\n"
 RULES = (
     'spec cart_rules\nimport "parts/limit.stl" as limit\nsignal x [m]\nconst wall = 3 m\n'
-    "## Never at the wall.\nrequire stay: always x < wall\n"
-    "require home: always[1 s, end] prev(x) > limit.low\n"
+    "## Never at the wall.\n@safety\nrequire stay: always x < wall\n"
+    "@safety\nrequire home: always[1 s, end] prev(x) > limit.low\n"
 )
 LIMIT = "const low = -2 m\n"
 FAR = "spec far\nsignal x [m]\nrequire far: always x < 9 m\n"
@@ -207,6 +208,23 @@ def test_drives_are_counted(home: Path) -> None:
             {"seed": 8, "agent": 0, "lost": True, "rules": {"home": 1.0}},
         ],
     }
+
+
+def test_who_only_comes_late_is_lost_where_no_plan_keeps_all(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "spec go\nsignal x [m]\n@safety\nrequire near: always x < 3\nrequire go: always[1 s, end] x > 0\n"
+    rules, asked = Rules(parse(text_of(home, text)), "go.stl"), []
+
+    def searched(_: Task, x0: torch.Tensor) -> torch.Tensor:
+        asked.append(x0[:, 0].tolist())
+        return x0[:, 0] > -1
+
+    monkeypatch.setattr("stlc.controller.rules.solvable", searched)
+    recording = driven([[0, 1, 2], [-2, -1, 0.5], [-0.5, -0.5, 1], [-3, -1, 3.5]])
+    drives = judge_drives(rules, opened(run_of(home)).task, recording, savable(4, 0, 1))
+    assert asked == [[-2.0, -0.5]]  # neither who obeyed nor who hit something
+    assert drives.viable.tolist() == [True, False, True, True]
 
 
 def test_a_drive_that_ends_too_early_is_neither(home: Path) -> None:

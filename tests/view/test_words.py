@@ -75,10 +75,10 @@ def test_how_many_drives_obeyed():
         "0 of 1 drive satisfied traffic from every start, 1 ended too early to say"
     )
     assert viable_sentence(alone) == (
-        "1 drive was lost from the start, where no safe plan is known: 0 of the 0 others obeyed"
+        "1 drive was lost from the start, where no plan is known: 0 of the 0 others obeyed"
     )
     some = {**simulation, "guards": {"full": drives(190, 8)}}
     assert obeyed_sentence(some) == "190 of 200 drives obeyed every rule"
     assert viable_sentence(some) == (
-        "8 drives were lost from the start, where no safe plan is known: 190 of the 192 others obeyed"
+        "8 drives were lost from the start, where no plan is known: 190 of the 192 others obeyed"
     )
