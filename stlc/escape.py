@@ -122,9 +122,14 @@ def c_comment(text: str) -> str:
 # ----------------------------------------------------------------------- markup
 
 
+def lawful(text: str) -> str:
+    """The characters that HTML and XML 1.0 may hold, and signs for the others; nothing is escaped."""
+    return _KEPT_IN_MARKUP.sub(_sign, text)
+
+
 def html(text: str) -> str:
     """Text, or the value of an attribute between double quotes, in HTML."""
-    return _html.escape(_KEPT_IN_MARKUP.sub(_sign, text), quote=True)
+    return _html.escape(lawful(text), quote=True)
 
 
 def script_json(text: str) -> str:
@@ -141,8 +146,7 @@ _KEPT_IN_MARKUP = re.compile(
 
 def xml(text: str) -> str:
     """Text, or the value of an attribute between double quotes, in XML 1.0; line breaks and tabs are kept."""
-    escaped = _html.escape(_KEPT_IN_MARKUP.sub(_sign, text), quote=True)
-    return escaped.replace("\n", "&#10;").replace("\t", "&#9;")
+    return html(text).replace("\n", "&#10;").replace("\t", "&#9;")
 
 
 def markdown(text: str) -> str:

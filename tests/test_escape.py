@@ -149,7 +149,7 @@ class _Reader(HTMLParser):
 
 def seen_in_markup(name: str) -> str:
     """A name as markup may show it: what it may not hold is a sign."""
-    return escape._KEPT_IN_MARKUP.sub(escape._sign, name)
+    return escape.lawful(name)
 
 
 def test_html_and_xml_have_one_element_and_its_text() -> None:

@@ -202,7 +202,7 @@ def test_documents_hold_every_name(judged: list[str], said: Said) -> None:
 
 
 def seen_in_markup(name: str) -> str:
-    return escape._KEPT_IN_MARKUP.sub(escape._sign, name)
+    return escape.lawful(name)
 
 
 def test_a_csv_gives_names_back_or_refuses_them() -> None:

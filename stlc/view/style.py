@@ -27,7 +27,7 @@ from stlc.controller.sketch import (
     WALL,
     WATER,
 )
-from stlc.escape import screen
+from stlc.escape import lawful
 from stlc.files import atomic_path
 from stlc.view import require_drawing
 
@@ -153,7 +153,7 @@ class Picture:
 
         buffer = io.StringIO()
         for text in self.figure.findobj(Text):
-            text.set_text(screen(text.get_text()))  # its comments may hold what XML may not
+            text.set_text(lawful(text.get_text()))  # its comments may hold what XML may not
         with look():
             self.figure.savefig(
                 buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None}

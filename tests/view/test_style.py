@@ -70,3 +70,12 @@ def test_missing_package_says_how_to_get_it(monkeypatch):
 
 def test_available_here():
     assert stlc.view.available()
+
+
+def test_an_svg_is_xml_whatever_its_labels_hold():
+    """Noncharacters and controls may stand in no XML, not even in a comment."""
+    with look():
+        figure = new_figure(2, 1)
+        figure.text(0, 0, "\x1b[31m\ufffe\uffff--> <b>&$x$")
+    root = ET.fromstring(Picture(figure, "").svg())
+    assert root.tag.endswith("svg")
