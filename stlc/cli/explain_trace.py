@@ -88,9 +88,12 @@ def _readings(node: Blame, cause: Cause, result: Checked) -> Sequence[str]:
 
     subject = result.verdict.subject
     found = []
-    for name in node.signals:
-        value = float(subject.record.env[name][node.sample, cause.trace])
-        found.append(f"{name} = {shown(value, subject.compiled.signature[name])}")
+    for name, later in node.reads:
+        if not 0 <= node.sample + later < subject.record.samples:
+            continue
+        value = float(subject.record.env[name][node.sample + later, cause.trace])
+        when = f" at {subject.moment(node.sample + later)}" if later else ""
+        found.append(f"{name} = {shown(value, subject.compiled.signature[name])}{when}")
     return found
 
 

@@ -1,15 +1,16 @@
 """Why a formula fails at an instant: the least tree of sub-formulas, instants and signals that explains it.
 
 A conjunction fails because of one part, a disjunction because of all; `always` fails at one instant,
-`eventually` at every one, of which the closest is shown. Where there is a choice, the part that decides the
-robustness is taken, so that the values at the leaf are those behind the number.
+`eventually` at every one, of which the closest is shown. The main path goes from minimum to maximum to the
+parts that attain them, down to one predicate at one instant: its value is the robustness. Where several
+values are equal to it, one is taken whose own change changes the robustness, if there is such a one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import assert_never
+from typing import TypeAlias, assert_never
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,16 +18,22 @@ from numpy.typing import NDArray
 from stlc.compile import ir, typed
 from stlc.compile.defined import defined
 from stlc.compile.graph import evaluate_parts
-from stlc.compile.horizon import columns, parts
+from stlc.compile.horizon import numbers, parts
 from stlc.compile.interface import Grid
 from stlc.compile.lower import lower
-from stlc.compile.samples import columns_of
+from stlc.compile.samples import columns_of, leaves
 from stlc.compile.thaw import thaw
 from stlc.compile.walk import from_now, on_clock
 from stlc.monitor.values import Record, bounds, granted, history
 from stlc.source import Span
 
 Floats = NDArray[np.float64]
+
+MOST_TIED = 64
+"""Values that are equal to the robustness, of which one is looked for that decides alone."""
+
+_MOST_NUMBERS = 1 << 26
+"""Values of predicates that are kept for that."""
 
 _MOST_LATER = 64
 """How many instants after the last sample are looked at where past operators still know something there."""
@@ -42,7 +49,7 @@ class Blame:
         sample: where.
         rho: its robustness there, by whose sign it `holds`.
         until: for an operator that fails at every instant of a window: the last one.
-        signals: names of the signals that it reads; of a predicate alone.
+        reads: the signals that it reads, and how many samples later; of a predicate alone.
         parts: why; empty for a predicate.
         main: which of the parts decides.
         premise: it is the left side of an implication.
@@ -53,10 +60,15 @@ class Blame:
     sample: int
     rho: float
     until: int | None = None
-    signals: tuple[str, ...] = ()
+    reads: tuple[tuple[str, int], ...] = ()
     parts: tuple[Blame, ...] = ()
     main: int = 0
     premise: bool = False
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Names of the signals that it reads; of a predicate alone."""
+        return tuple(dict.fromkeys(name for name, _ in self.reads))
 
     @property
     def span(self) -> Span:
@@ -74,6 +86,76 @@ class Blame:
         return tuple(leaf for part in self.parts for leaf in part.leaves) if self.parts else (self,)
 
 
+Spot: TypeAlias = tuple[ir.Formula, int]
+"""A predicate, or a formula that freezes values, at an instant."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Tied:
+    """A formula over the values of its predicates, of which one may be raised by the least there is.
+
+    Attributes:
+        record: the trace.
+        names: predicate -> its column.
+        env: column -> values (samples, 1); columns of predicates that come later are added.
+        raised: which value is more than it is.
+    """
+
+    record: Record
+    names: dict[ir.Formula, str]
+    env: dict[str, Floats]
+    raised: Spot | None = None
+
+    @property
+    def columns(self) -> dict[str, Floats]:
+        """The columns where that value is raised."""
+        return self.env if self.raised is None else self._with(self.raised)
+
+    def _with(self, spot: Spot) -> dict[str, Floats]:
+        name, column = self.names[spot[0]], self.env[self.names[spot[0]]].copy()
+        column[spot[1]] = np.nextafter(column[spot[1]], np.inf)
+        return {**self.env, name: column}
+
+    def coded(self, formula: ir.Formula) -> ir.Formula:
+        """The formula over the columns."""
+        for leaf in _leaves_of(formula):
+            if leaf not in self.names:
+                self.names[leaf] = f"#{len(self.names)}"
+                values = self.record.values([leaf], range(self.record.samples), "upper")[0]
+                self.env[self.names[leaf]] = np.asarray(values, np.float64)
+        return _over_columns(formula, self.names)
+
+    def worth(self, formula: ir.Formula, sample: int, raised: Sequence[Spot]) -> float:
+        """The robustness where a value is raised."""
+        coded = self.coded(formula)
+        env = self._with(raised[0]) if raised else self.env
+        record = replace(self.record, env=env)
+        return float(record.values([coded], range(sample, sample + 1), "upper")[0][0, 0])
+
+
+def _leaves_of(formula: ir.Formula) -> dict[ir.Formula, None]:
+    """The predicates of a formula; what freezes values is one."""
+    if isinstance(formula, (ir.Atom, ir.Freeze)):
+        return {formula: None}
+    return {leaf: None for part in parts(formula) for leaf in _leaves_of(part)}
+
+
+def _over_columns(formula: ir.Formula, names: Mapping[ir.Formula, str]) -> ir.Formula:
+    match formula:
+        case ir.Truth():
+            return formula
+        case ir.Atom() | ir.Freeze():
+            return ir.Atom(ir.Col(names[formula]))
+        case ir.Join(items=items):
+            return replace(formula, items=tuple(_over_columns(item, names) for item in items))
+        case ir.Over() | ir.Past() | ir.Shift() | ir.AtStart():
+            return replace(formula, body=_over_columns(formula.body, names))
+        case ir.Until() | ir.Since():
+            left, right = _over_columns(formula.left, names), _over_columns(formula.right, names)
+            return replace(formula, left=left, right=right)
+    assert_never(formula)
+
+
 @dataclass(frozen=True, slots=True)
 class Blamer:
     """Explains failures on one trace.
@@ -83,12 +165,65 @@ class Blamer:
         grid: of time.
         cache: formulas, or their negations, as lowered.
         known: the most that lowered formulas can be, at which instants.
+        tied: values of predicates that are taken instead of those of the trace, one of them a trifle more.
     """
 
     record: Record
     grid: Grid
     cache: dict[tuple[typed.Formula, bool], ir.Formula] = field(default_factory=dict)
     known: dict[ir.Formula, list[tuple[range, Floats]]] = field(default_factory=dict)
+    tied: _Tied | None = None
+
+    # --------------------------------------------------------------------- ties
+
+    def why(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> tuple[Blame, bool]:
+        """Why `formula` is not `wanted`, and whether the value at the end of the path decides alone.
+
+        Where other values are equal to it, the path leads to one whose own change changes the robustness, if
+        there is such a one among the first `MOST_TIED`.
+        """
+        tree = self.blame(formula, sample, wanted=wanted)
+        lowered = self._lowered(formula, wanted)
+        worth = self._margin(formula, sample, wanted)
+        equal = self._equal(lowered, worth) if np.isfinite(worth) else []
+        if len(equal) < 2:
+            return tree, len(equal) == 1
+        tied = self._tied(lowered, equal)
+        if tied is None or tied.worth(lowered, sample, ()) != worth:
+            return tree, False
+        leaf = tree.leaf
+        own = _leaves_of(self._lowered(leaf.formula, not leaf.holds))
+        first = [each for each in equal if each[1] == leaf.sample and each[0] in own]
+        for chosen in (*first, *equal[:MOST_TIED]):
+            if tied.worth(lowered, sample, (chosen,)) > worth:
+                if chosen in first:
+                    return tree, True
+                raised = replace(self, cache={}, known={}, tied=replace(tied, raised=chosen))
+                return raised.blame(formula, sample, wanted=wanted), True
+        return tree, False
+
+    def _equal(self, lowered: ir.Formula, worth: float) -> list[Spot]:
+        """The predicates of a formula, and the instants, at which they are worth the same as it."""
+        wanted = _leaves_of(lowered)
+        found = {
+            (node, its.start + int(k)): None
+            for node, entries in self.known.items()
+            if node in wanted
+            for its, values in entries
+            for k in np.flatnonzero(values == worth)
+        }
+        return sorted(found, key=lambda spot: spot[1])
+
+    def _tied(self, lowered: ir.Formula, equal: Sequence[Spot]) -> _Tied | None:
+        """The values of its predicates as columns; None where some lie beyond the last sample."""
+        leaves = list(_leaves_of(lowered))
+        samples = self.record.samples
+        if any(instant >= samples for _, instant in equal) or samples * len(leaves) > _MOST_NUMBERS:
+            return None
+        values = self.record.values(leaves, range(samples), "upper")
+        names = {leaf: f"#{k}" for k, leaf in enumerate(leaves)}
+        env = {name: np.asarray(x, np.float64) for name, x in zip(names.values(), values, strict=True)}
+        return _Tied(self.record, names, env)
 
     def blame(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> Blame:
         """Why `formula` is not `wanted` at `sample`."""
@@ -115,7 +250,8 @@ class Blamer:
             case typed.Edge():
                 return self._edge(formula, sample, wanted)
             case typed.Freeze(_, _, body):
-                return self.blame(thaw(body, self._values(formula, sample)), sample, wanted=wanted)
+                thawed = thaw(body, self._values(formula, sample))
+                return replace(self, cache={}, known={}, tied=None).why(thawed, sample, wanted=wanted)[0]
         assert_never(formula)
 
     # ------------------------------------------------------------------- values
@@ -147,11 +283,12 @@ class Blamer:
     def _margins(self, formula: typed.Formula, wanted: bool, instants: range) -> Floats:
         """By how much the formula is as wanted, at best, at consecutive instants: (instants,)."""
         lowered = self._lowered(formula, wanted)
+        if self.tied is not None:
+            lowered = self.tied.coded(lowered)
         found = self._found(lowered, instants)
         if found is None:
-            for node, its, values in evaluate_parts(
-                lowered, self.record.env, instants, ops=self.record.ops, end="upper"
-            ):
+            env = self.record.env if self.tied is None else self.tied.columns
+            for node, its, values in evaluate_parts(lowered, env, instants, ops=self.record.ops, end="upper"):
                 self.known.setdefault(node, []).append((its, values[:, 0]))
             found = self._found(lowered, instants)
         assert found is not None
@@ -174,13 +311,28 @@ class Blamer:
         return Blame(formula, not wanted, sample, margin if wanted else -margin)
 
     def _predicate(self, formula: typed.Formula, sample: int, wanted: bool) -> Blame:
-        read = tuple(sorted(columns(self._lowered(formula, wanted))))
-        return replace(self._node(formula, wanted, sample), signals=read)
+        found = {
+            (leaf.name, self._later(leaf, sample))
+            for num in numbers(self._lowered(formula, wanted))
+            for leaf in leaves(num)
+            if isinstance(leaf, (ir.Col, ir.At))
+        }
+        return replace(self._node(formula, wanted, sample), reads=tuple(sorted(found)))
+
+    def _later(self, leaf: ir.Col | ir.At, sample: int) -> int:
+        """How many samples after an instant a predicate reads a signal."""
+        if isinstance(leaf, ir.Col):
+            return 0
+        there = sample + leaf.steps
+        return min(max(there, 0), self.record.samples - 1) - sample if leaf.clamped else leaf.steps
 
     def _least(self, parts: Sequence[tuple[typed.Formula, int, bool]]) -> tuple[typed.Formula, int, bool]:
         """The part that is farthest from what is wanted of it."""
-        margins = [self._margins(f, wanted, range(k, k + 1))[0] for f, k, wanted in parts]
-        return parts[int(np.argmin(margins))]
+        return parts[int(np.argmin([self._margin(*part) for part in parts]))]
+
+    def _margin(self, formula: typed.Formula, sample: int, wanted: bool) -> float:
+        """By how much the formula is as wanted, at best, at one instant."""
+        return float(self._margins(formula, wanted, range(sample, sample + 1))[0])
 
     # ---------------------------------------------------------------- connectives
 
@@ -204,8 +356,11 @@ class Blamer:
             return replace(node, parts=(self.blame(part, there, wanted=its),))
         parts = tuple(self.blame(part, there, wanted=its) for part, there, its in items)
         if formula.op == "->":
-            return replace(node, parts=(replace(parts[0], premise=True), parts[1]), main=1)
-        return replace(node, parts=parts, main=int(np.argmin([abs(part.rho) for part in parts])))
+            main = int(self._margin(*items[1]) >= self._margin(*items[0]))
+            return replace(node, parts=(replace(parts[0], premise=True), parts[1]), main=main)
+        margins = np.array([self._margin(*item) for item in items])
+        known = np.where(np.isposinf(margins), -np.inf, margins)
+        return replace(node, parts=parts, main=int(np.argmax(known)))
 
     def _is_true(self, formula: typed.Formula, sample: int) -> bool:
         return bool(self._margins(formula, True, range(sample, sample + 1))[0] >= 0)
@@ -219,7 +374,9 @@ class Blamer:
         if wanted:
             part, there, its = self._least(parts)
             return replace(node, parts=(self.blame(part, there, wanted=its),))
-        return replace(node, parts=tuple(self.blame(part, there, wanted=its) for part, there, its in parts))
+        main = int(np.argmax([self._margin(*part) for part in parts]))
+        found = tuple(self.blame(part, there, wanted=its) for part, there, its in parts)
+        return replace(node, parts=found, main=main)
 
     # ------------------------------------------------------------------- windows
 
@@ -262,28 +419,41 @@ class Blamer:
             return self._unless(formula, sample, wanted)
         node = self._node(formula, wanted, sample)
         instants = self._instants(formula, sample, wanted)
-        if not instants:
+        past, beyond = formula.op == "since", self._looks_beyond(formula, sample, wanted)
+        if not instants and not beyond:
             return node
-        past = formula.op == "since"
-        held = range(instants[0], sample + 1) if past else range(sample, instants[-1] + 1)
-        left = self._margins(formula.left, wanted, held)
-        right = self._margins(formula.right, wanted, instants)
+        if past:
+            held = range(instants[0], sample + 1)
+        else:
+            held = range(sample, instants[-1] + 1 if instants else max(self.record.samples, sample))
+        left = self._margins(formula.left, wanted, held) if held else np.zeros(0)
+        right = self._margins(formula.right, wanted, instants) if instants else np.zeros(0)
+        if beyond:
+            left, right = np.append(left, np.inf), np.append(right, np.inf)
         left = left[::-1] if past else left
         right = right[::-1] if past else right
         if (formula.op == "release") is wanted:
-            met, far = _released(left, right)
+            met, far, main = _released(left, right)
             there = (sample - far, sample - met) if past else (sample + far, sample + met)
             parts = (
                 self.blame(formula.left, there[0], wanted=wanted),
                 self.blame(formula.right, there[1], wanted=wanted),
             )
-            return replace(node, parts=parts, main=1)
+            return replace(node, parts=parts, main=main)
         offset, is_left = _unmet(left, right)
         there_ = sample - offset if past else sample + offset
         part = self.blame(formula.left if is_left else formula.right, there_, wanted=wanted)
-        if is_left:
+        if is_left or beyond or (right >= 0).any():
             return replace(node, parts=(part,))
         return replace(node, sample=instants[0], until=instants[-1], parts=(part,))
+
+    def _looks_beyond(self, formula: typed.Until, sample: int, wanted: bool) -> bool:
+        """Whether the window goes on where nothing is known any more."""
+        lowered = self._lowered(formula, wanted)
+        if not isinstance(lowered, ir.Until) or lowered.window.hi is None:
+            return False
+        instants = self._instants(formula, sample, wanted)
+        return not instants or instants[-1] < sample + lowered.window.hi
 
     def _unless(self, formula: typed.Until, sample: int, wanted: bool) -> Blame:
         """`always[0, b] left or left until[a, b] right`."""
@@ -294,21 +464,21 @@ class Blamer:
 
 
 def _unmet(left: Floats, right: Floats) -> tuple[int, bool]:
-    """Why `until` fails: an offset from now, and whether it is the left side that fails there.
+    """Where `until` comes closest: an offset from now, and whether it is the left side that decides there.
 
-    Where the right side is never met, it is shown where it comes closest; where it is, the left side did not
-    hold up to there.
+    It is worth the most, over the instants of the right side, of the least of that and the left side so far.
     """
     skipped = len(left) - len(right)
-    met = np.flatnonzero(right >= 0)
-    if not len(met):
-        return skipped + int(np.argmax(right)), False
-    return int(np.argmin(left[: skipped + int(met[0]) + 1])), True
+    held = np.minimum.accumulate(left)[skipped:]
+    best = int(np.argmax(np.minimum(held, right)))
+    if held[best] < right[best]:
+        return int(np.argmin(left[: skipped + best + 1])), True
+    return skipped + best, False
 
 
-def _released(left: Floats, right: Floats) -> tuple[int, int]:
-    """Where `release` fails: offset of the right side, and the best the left side did up to there."""
+def _released(left: Floats, right: Floats) -> tuple[int, int, int]:
+    """Where `release` fails: offset of the right side, of the best of the left side so far, which decides."""
     skipped = len(left) - len(right)
     freed = np.maximum.accumulate(left)[skipped:]
     worst = int(np.argmin(np.maximum(freed, right)))
-    return skipped + worst, int(np.argmax(left[: skipped + worst + 1]))
+    return skipped + worst, int(np.argmax(left[: skipped + worst + 1])), int(right[worst] >= freed[worst])

@@ -53,6 +53,7 @@ class Cause:
         labels: what else to underline.
         because: one line in words.
         tree: the whole explanation.
+        alone: a change of the value that decides, towards the side that is wanted, raises the robustness.
     """
 
     judgement: Judgement
@@ -67,6 +68,7 @@ class Cause:
     labels: tuple[Label, ...]
     because: str
     tree: Blame
+    alone: bool
 
 
 MOST = 500
@@ -116,7 +118,7 @@ def _cause(
     window = window_of(rule, subject.horizon)
     record = record if window is None else record.cut(start + window + 1)
     formula = recorded(rule.typed.formula) if rule.absolute else rule.typed.formula
-    tree = Blamer(record, subject.compiled.grid).blame(formula, start)
+    tree, alone = Blamer(record, subject.compiled.grid).why(formula, start)
     words = _Words(subject, record, rule.typed.written, definitions)
     leaf = tree.leaf
     place, *labels = words.labels(tree)
@@ -133,6 +135,7 @@ def _cause(
         labels=tuple(labels[: _MOST_LABELS - 1]),
         because=words.because(tree),
         tree=tree,
+        alone=alone,
     )
 
 
@@ -147,14 +150,18 @@ class _Words:
     definitions: dict[str, ast.Expr]
 
     def readings(self, blame: Blame) -> tuple[Reading, ...]:
-        """The signals that the predicates below read, each at its instant."""
+        """The signals that the predicates below read, each at the instants where they do."""
         seen: dict[tuple[str, int], Reading] = {}
         read = self.subject.compiled.signature
         for leaf in blame.leaves:
-            for name in filter(read.__contains__, _in_order(leaf)):
-                value = float(self.record.env[name][leaf.sample, 0])
-                text = f"{name} = {shown(value, read[name])}"
-                seen.setdefault((name, leaf.sample), Reading(name, value, text))
+            for name, later in _in_order(leaf):
+                sample = leaf.sample + later
+                if name not in read or not 0 <= sample < self.record.samples:
+                    continue
+                value = float(self.record.env[name][sample, 0])
+                when = f" at {self.subject.moment(sample)}" if later else ""
+                text = f"{name} = {shown(value, read[name])}{when}"
+                seen.setdefault((name, sample), Reading(name, value, text))
         return tuple(seen.values())
 
     def labels(self, tree: Blame) -> list[Label]:
@@ -214,10 +221,13 @@ class _Words:
         return None
 
 
-def _in_order(leaf: Blame) -> list[str]:
+def _in_order(leaf: Blame) -> list[tuple[str, int]]:
     """The signals of a predicate as its text has them; those behind a name come last."""
     words = re.findall(r"\w+(?:\[\d+\])?", leaf.span.text)
-    return sorted(leaf.signals, key=lambda name: (words.index(name) if name in words else len(words), name))
+    places = {word: place for place, word in reversed(list(enumerate(words)))}
+    return sorted(
+        leaf.reads, key=lambda read: (places.get(read[0], len(words)), read[0], abs(read[1]), read[1])
+    )
 
 
 def _told(tree: Blame) -> Iterator[Blame]:
@@ -237,10 +247,11 @@ def _telling(tree: Blame) -> Blame:
 
 
 def _closest(tree: Blame) -> bool:
-    """Whether the predicate that decides is the best of a window in which nothing succeeds."""
-    if tree.until is not None:
-        return True
-    return bool(tree.parts) and _closest(tree.parts[tree.main])
+    """Whether the predicate that decides is what a window looks for, the best in it, and nothing succeeds."""
+    if not tree.parts:
+        return False
+    part = tree.parts[tree.main]
+    return _closest(part) or (tree.until is not None and not part.parts)
 
 
 def _body(formula: typed.Formula) -> typed.Formula:

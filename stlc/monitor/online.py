@@ -20,7 +20,7 @@ from stlc.monitor.judgement import Status, unknown_requirement
 from stlc.monitor.kept import Kept
 from stlc.monitor.needs import Need, needs_of
 from stlc.monitor.paced import Paced
-from stlc.monitor.recall import Recall
+from stlc.monitor.recall import Recall, Worst
 from stlc.monitor.signals import arrange
 from stlc.monitor.tally import Flags, Judged, Tally
 from stlc.monitor.tracking import Tracker, Trackers
@@ -145,7 +145,7 @@ class Online:
         self._trackers = Trackers(compiled.grid.horizon)
         self._watched = [self._watch(rule) for rule in rules]
         self._scope = [self._watch(rule, once=True) for rule in compiled.assumptions]
-        self._recall = Recall(compiled, rules, self.how.t0) if self.how.reasons else None
+        self._recall = Recall(compiled, self.how.t0) if self.how.reasons else None
 
     def _watch(self, rule: Rule, *, once: bool = False) -> Watched:
         horizon = self.compiled.grid.horizon
@@ -208,8 +208,6 @@ class Online:
                 continue
             watched.grow(self._kept)
             self._count(watched, self._settled(watched))
-            if self._recall is not None and not (watched.over or watched.everywhere):
-                self._recall_last(watched, watched.judged(*self._pending(watched)))
         self._count_scope()
         self._trim()
 
@@ -223,6 +221,11 @@ class Online:
         if self._recall is not None:
             self._recall.take(columns, count)
         self._kept.take(columns, count)
+        if self._recall is not None and self._recall.full:
+            for watched in self._watched:
+                if (worst := self._worst(watched)) is not None:
+                    self._recall.remember(watched.rule, worst)
+            self._recall.forget()
 
     def _trim(self) -> None:
         alive = [watched for watched in (*self._watched, *self._scope) if not watched.over]
@@ -244,8 +247,6 @@ class Online:
             new = known.copy()
             new[: len(watched.decided)] &= ~watched.decided
             found += [self._decision(watched.rule, judged, start, i) for i in np.flatnonzero(new).tolist()]
-        if not watched.everywhere:
-            self._recall_last(watched, judged)
         count = self._count(watched, judged)
         watched.decided = known[count:]
 
@@ -253,10 +254,6 @@ class Online:
         status: Status = "violated" if judged.fails[i] else "satisfied"
         low, high = float(judged.low[i]), float(judged.high[i])
         return Decision(rule.name, start + i, self.time(start + i), status, low, high, self.samples - 1)
-
-    def _recall_last(self, watched: Watched, judged: Judged) -> None:
-        if self._recall is not None and judged.fails.any():
-            self._recall.note_last(watched.rule, watched.tally.first, float(judged.high[0]))
 
     def _settled(self, watched: Watched) -> Judged:
         start, stop = self._pending(watched)
@@ -272,11 +269,7 @@ class Online:
     def _count(self, watched: Watched, judged: Judged) -> int:
         """Count what is settled of instants that are not counted yet: how many."""
         count = min(max(self._countable(watched) - watched.tally.next, 0), len(judged.low))
-        tally = watched.tally
-        known = tally.high_at if tally.fails else None
-        tally.add(judged, count)
-        if self._recall is not None and tally.fails and tally.high_at != known:
-            self._recall.note(watched.rule, tally.high_at)
+        watched.tally.add(judged, count)
         return count
 
     def _count_scope(self) -> None:
@@ -350,29 +343,43 @@ class Online:
         """
         if not self.samples:
             raise TraceError(Diagnostic("E605", "there are no samples"))
-        horizon = self.compiled.grid.horizon
         found: dict[str, Tally] = {}
         refused: list[Diagnostic] = []
         for watched in self._watched:
-            watched.grow(self._kept)
-            starts = starts_of(watched.rule, self.samples, horizon, self.how.at)
+            starts = self._starts(watched)
             if self.how.end == "strict":
                 finding = check_length(watched.rule, self.samples, starts, self.compiled.grid)
                 refused += [] if finding is None else [finding]
-            rest = range(min(watched.tally.next, starts.stop), starts.stop)
-            found[watched.rule.name] = watched.tally.with_more(watched.ended(rest)) if rest else watched.tally
+            found[watched.rule.name] = self._ended(watched, starts)
         if refused:
             raise TraceError(*refused)
         return found
 
+    def _starts(self, watched: Watched) -> range:
+        return starts_of(watched.rule, self.samples, self.compiled.grid.horizon, self.how.at)
+
+    def _ended(self, watched: Watched, starts: range) -> Tally:
+        """A requirement where the trace is over."""
+        watched.grow(self._kept)
+        rest = range(min(watched.tally.next, starts.stop), starts.stop)
+        return watched.tally.with_more(watched.ended(rest)) if rest else watched.tally
+
+    def _worst(self, watched: Watched) -> Worst | None:
+        """Where a requirement would be violated most if the trace were over."""
+        if not self.samples or (isinstance(self.how.at, int) and self.how.at >= self.samples):
+            return None
+        tally = self._ended(watched, self._starts(watched))
+        return Worst(tally.high_at, tally.high) if tally.fails else None
+
     def cause(self, name: str) -> Cause | None:
         """Why a requirement is violated at its worst start so far, as `explain` says it of a recording.
 
-        Of what runs to the end of the stream only that is explained that has to hold always. None without
-        `reasons`, and where more samples say it than may be kept.
+        The cause is remembered however long ago it was. None without `reasons`, where nothing is violated,
+        and where the samples that say why are gone: about two million numbers are kept.
         """
-        rule = self._find(name).rule
-        return None if self._recall is None else self._recall.cause(rule)
+        watched = self._find(name)
+        worst = None if self._recall is None else self._worst(watched)
+        return None if self._recall is None or worst is None else self._recall.cause(watched.rule, worst)
 
     def _find(self, name: str) -> Watched:
         for watched in self._watched:

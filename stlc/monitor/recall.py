@@ -1,10 +1,8 @@
-"""What is kept of a stream to explain a violation: the samples around the worst start of a requirement."""
+"""What is kept of a stream to explain a violation: its last samples, and causes that lie before them."""
 
 from __future__ import annotations
 
-import math
-from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,122 +14,104 @@ from stlc.monitor.asked import Floats
 from stlc.monitor.explain import Cause, explain
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.judgement import Judgement, Verdict
+from stlc.monitor.kept import Kept
 from stlc.monitor.prepared import Prepared
 from stlc.monitor.signals import Signals
 from stlc.monitor.streams import endless, looks_on
 from stlc.monitor.values import Record, history
 
-_MOST = 1_000_000
-"""Samples around a start that are kept at most: what reads more is not explained."""
+_MOST = 1 << 21
+"""Numbers that are kept at least, and twice as many at most; causes are worked out before samples go."""
 
 
 @dataclass(frozen=True, slots=True)
-class Excerpt:
-    """Consecutive samples, and where in them a requirement is judged.
+class Worst:
+    """The start at which a requirement is violated most.
 
     Attributes:
-        first: number of the first sample.
-        start: number of the sample from which on the excerpt says why the requirement is violated.
-        env: columns (samples, 1).
-        begin: the sample at which it was judged, where that is an earlier one.
+        start: its sample.
+        high: its greatest robustness over all continuations.
     """
 
-    first: int
     start: int
-    env: Mapping[str, Floats]
-    begin: int | None = None
+    high: float
 
 
 @dataclass(slots=True)
 class Recall:
-    """The last samples, and excerpts of those around violated starts.
+    """The last samples, and the causes that were found before samples were forgotten.
 
     Attributes:
         compiled: the specification.
-        rules: the requirements that are judged.
         t0: time of the first sample in seconds.
     """
 
     compiled: Compiled
-    rules: Sequence[Rule]
     t0: float
-    samples: int = 0
-    _reads: dict[str, tuple[int, int]] = field(default_factory=dict)
-    _span: int = 0
-    _pieces: deque[tuple[int, Mapping[str, Floats]]] = field(default_factory=deque)
-    _excerpts: dict[str, Excerpt] = field(default_factory=dict)
-    _worst: dict[str, float] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for rule in self.rules:
-            reads = _around(rule, self.compiled.grid.horizon)
-            if reads is not None and sum(reads) < _MOST:
-                self._reads[rule.name] = reads
-        self._span = max((back + ahead + 2 for back, ahead in self._reads.values()), default=0)
+    _kept: Kept = field(default_factory=Kept)
+    _found: dict[str, tuple[Worst, Cause]] = field(default_factory=dict)
+    _wide: int = 1
 
     def take(self, columns: Mapping[str, Floats], count: int) -> None:
-        """Keep samples, as long as a start may still be explained by them."""
-        self._pieces.append((self.samples, columns))
-        self.samples += count
-        while len(self._pieces) > 1 and self._pieces[1][0] <= self.samples - count - self._span:
-            self._pieces.popleft()
+        """Keep samples."""
+        self._wide = len(columns)
+        self._kept.take(columns, count)
 
-    def note(self, rule: Rule, start: int) -> None:
-        """Keep what says why a requirement is violated at a start that was just counted."""
-        if rule.name not in self._reads or endless_always(rule):
-            return
-        back, ahead = self._reads[rule.name]
-        first = max(start - back, 0)
-        if first >= self._pieces[0][0]:
-            self._excerpts[rule.name] = Excerpt(first, start, self._cut(first, start + ahead + 1))
+    @property
+    def full(self) -> bool:
+        """Whether samples have to be forgotten."""
+        return (self._kept.samples - self._kept.first) * self._wide > 2 * _MOST
 
-    def note_last(self, rule: Rule, begin: int, high: float) -> None:
-        """The same for what has to hold to the end of the stream, where it fails by more than ever before."""
-        known = self._worst.get(rule.name, math.inf)
-        if rule.name not in self._reads or high >= known or not endless_always(rule):
-            return
-        first = self._pieces[0][0]
-        start = max(first + self._reads[rule.name][0] if first else 0, begin)
-        self._worst[rule.name] = high
-        self._excerpts[rule.name] = Excerpt(first, start, self._cut(first, self.samples), begin)
+    def forget(self) -> None:
+        """Forget the older half of the samples; causes that lie there have to be `remember`ed before."""
+        self._kept.forget(self._kept.samples - _MOST // self._wide)
 
-    def cause(self, rule: Rule) -> Cause | None:
-        """Why a requirement is violated; None where the samples that say it were not kept."""
-        found = self._excerpts.get(rule.name)
+    def remember(self, rule: Rule, worst: Worst) -> None:
+        """Work out why a requirement is violated while the samples that say it are there."""
+        cause = self.cause(rule, worst)
+        if cause is not None:
+            self._found[rule.name] = worst, cause
+
+    def cause(self, rule: Rule, worst: Worst) -> Cause | None:
+        """Why a requirement is violated; None where the samples that say it are gone."""
+        known = self._found.get(rule.name)
+        if known is not None and known[0] == worst:
+            return known[1]
+        excerpt = self._excerpt(rule, worst)
+        if excerpt is None:
+            return None
+        first, start, env = excerpt
+        record = Record(env, NUMPY)
+        low, high = rule_bounds(rule, record, range(start, start + 1), self.compiled.grid.horizon, "open")
+        if first and high[0, 0] != worst.high:
+            return None
         dt = self.compiled.grid.dt
-        if found is None or (dt is None and found.first):
-            return None
-        record, start = Record(found.env, NUMPY), found.start - found.first
-        horizon = self.compiled.grid.horizon
-        if start >= record.samples:
-            return None
-        low, high = rule_bounds(rule, record, range(start, start + 1), horizon, "open")
-        if endless_always(rule) and high[0, 0] >= 0:
-            return None
         step = None if dt is None else float(dt)
-        t0 = self.t0 + found.first * (step or 0.0)
-        signals = Signals(found.env, (), record.samples, NUMPY, dt=step, t0=t0)
+        signals = Signals(env, (), record.samples, NUMPY, dt=step, t0=self.t0 + first * (step or 0.0))
         fails = np.ones((1, 1), dtype=np.bool_)
         judgement = Judgement(rule, start, low, high, ~fails, fails, ())
         cause = explain(Verdict((judgement,), Prepared(self.compiled, (rule,), signals, record)), rule.name)
         if cause is None:
             return None
-        sample = found.first + cause.sample
-        begun = found.start if found.begin is None else found.begin
+        sample = first + cause.sample
         time = float(sample) if step is None else self.t0 + sample * step
-        return replace(cause, start=begun, sample=sample, time=time)
+        return replace(cause, start=worst.start, sample=sample, time=time)
 
-    def _cut(self, first: int, stop: int) -> dict[str, Floats]:
-        """Columns from one sample to another one, as far as they are there."""
-        names = self._pieces[0][1]
-        parts = [
-            (max(first - begin, 0), stop - begin, columns)
-            for begin, columns in self._pieces
-            if begin < stop and begin + len(next(iter(columns.values()))) > first
-        ]
-        return {
-            name: np.concatenate([columns[name][low:high] for low, high, columns in parts]) for name in names
-        }
+    def _excerpt(self, rule: Rule, worst: Worst) -> tuple[int, int, dict[str, Floats]] | None:
+        """The number of the first sample, that of the start from there on, and columns (samples, 1)."""
+        kept = self._kept
+        reads = _around(rule, self.compiled.grid.horizon)
+        if reads is None or endless_always(rule):
+            if kept.first == 0:
+                return 0, worst.start, kept.columns()
+            if reads is None or self.compiled.grid.dt is None:
+                return None
+            start = max(kept.first + reads[0], worst.start)
+            return (kept.first, start - kept.first, kept.columns()) if start < kept.samples else None
+        first = max(worst.start - reads[0], 0)
+        if first < kept.first or (first and self.compiled.grid.dt is None):
+            return None
+        return first, worst.start - first, kept.columns(first, worst.start + reads[1] + 1)
 
 
 def endless_always(rule: Rule) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from stlc.monitor import recall
 from stlc.monitor.explain import Cause, explain
 from stlc.monitor.online import How, Online
 from stlc.monitor.verdict import Monitor
@@ -19,8 +20,6 @@ REQUIREMENTS = {
     "later": "always[0.5 s, inf] b > -1",
     "response": "always (a > 1.5 -> eventually[0 s, 0.4 s] b > 1)",
     "lasting_past": "always (a < 1.5 or historically[0 s, 0.5 s] b > -1)",
-}
-UNEXPLAINED = {
     "whole_past": "always (historically a > -1)",
     "never_met": "eventually a > 5",
     "nested": "always eventually a > 5",
@@ -65,23 +64,32 @@ def test_a_stream_is_explained_as_the_recording(name: str, step: int) -> None:
     assert compared
 
 
-@pytest.mark.parametrize("name", UNEXPLAINED)
-def test_what_more_samples_say_than_are_kept(name: str) -> None:
-    whole = {signal: np.random.default_rng(0).normal(size=SAMPLES) for signal in ("a", "b")}
-    assert fed(monitor_of(UNEXPLAINED[name]).online(How(reasons=True)), whole, 1) is None
+LONG = {
+    "response": "always (a > 2.4 -> eventually[0 s, 0.4 s] b > 9)",
+    "whole_past": "always (historically a > -3)",
+    "never_met": "eventually a > 5",
+    "since": "always (b < 3 since a > -9)",
+}
+
+
+@pytest.mark.parametrize("name", LONG)
+def test_a_cause_is_remembered_when_its_samples_are_gone(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recall, "_MOST", 100)
+    monitor = monitor_of(LONG[name])
+    whole = {signal: np.random.default_rng(3).normal(size=900) for signal in ("a", "b")}
+    whole["a"][30], whole["b"][31] = -4.0 if name == "whole_past" else 4.9, 3.9
+    online = monitor.online(How(reasons=True))
+    for k in range(900):
+        online.push({signal: float(values[k]) for signal, values in whole.items()})
+    wanted, found = explain(monitor.check(whole), "r"), online.cause("r")
+    assert online._recall is not None
+    assert online._recall._kept.samples - online._recall._kept.first <= 202
+    assert wanted is not None
+    assert found is not None
+    assert (found.sample, found.because, found.readings) == (wanted.sample, wanted.because, wanted.readings)
 
 
 def test_reasons_are_asked_for() -> None:
     whole = {signal: np.random.default_rng(0).normal(size=SAMPLES) for signal in ("a", "b")}
     online = monitor_of(REQUIREMENTS["lasting"]).online()
     assert fed(online, whole, 1) is None
-
-
-def test_few_samples_are_kept() -> None:
-    online = monitor_of(REQUIREMENTS["response"]).online(How(reasons=True))
-    for k in range(2_000):
-        online.push({"a": float(k % 7), "b": -k / 1000})
-    recall = online._recall
-    assert recall is not None
-    assert len(recall._pieces) < 20
-    assert sum(len(excerpt.env["a"]) for excerpt in recall._excerpts.values()) < 20
