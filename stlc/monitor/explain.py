@@ -186,6 +186,15 @@ class _Words:
         return f"{word} at {moment} ({values})" if values else f"{word} at {moment}"
 
     def because(self, tree: Blame) -> str:
+        """Why, in words: where a premise decides, what the conclusion was is told, too."""
+        text = self.reason(tree)
+        while tree.parts:
+            if tree.parts[0].premise and tree.main == 0:
+                return f"{text}; {self.reason(tree.parts[1])}"
+            tree = tree.parts[tree.main]
+        return text
+
+    def reason(self, tree: Blame) -> str:
         """`before_junction means x < x_inter / 2, and x = 0.27 m at t = 4.6 s (line 17)`."""
         leaf = tree.leaf
         moment, truth = self.subject.moment(leaf.sample), "true" if leaf.holds else "false"

@@ -293,10 +293,10 @@ def test_the_document(capsys: pytest.CaptureFixture[str]) -> None:
     give_way = {entry["name"]: entry for entry in result["requirements"]}["give_way"]
     assert give_way["tags"] == ["safety"]
     assert give_way["robustness"]["min"] == -0.5
-    assert give_way["robustness"]["argmin"] == {"trace": 1, "start": 0.5, "time": 3.0}
+    assert give_way["robustness"]["argmin"] == {"trace": 1, "start": 0.5, "time": 0.5}
     cause = give_way["cause"]
-    assert (cause["signal"], cause["value"], cause["predicate"]) == ("x", 0.27, "x < x_inter / 2")
-    assert cause["span"]["line"] == 20
+    assert (cause["signal"], cause["value"], cause["predicate"]) == ("sign", 0.0, "sign == stop")
+    assert cause["span"]["line"] == 33
     assert "before_junction means" in cause["because"]
 
 
