@@ -54,9 +54,7 @@ def test_every_node_is_what_it_is_said_to_be(formula: typed.Formula, env: dict[s
 
 @settings(max_examples=60)
 @given(formula=formulas(), env=traces(low=3, batch=1))
-def test_the_cause_is_the_value_behind_the_number(
-    formula: typed.Formula, env: dict[str, np.ndarray]
-) -> None:
+def test_the_cause_is_the_value_behind_the_number(formula: typed.Formula, env: dict[str, np.ndarray]) -> None:
     """The path of minima and maxima ends at it; where it decides alone, changing it changes the number."""
 
     def worth(signals: dict[str, np.ndarray]) -> float:
