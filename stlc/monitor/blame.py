@@ -347,8 +347,7 @@ class Blamer:
                 items = [(left, sample, not wanted), (right, sample, wanted)]
                 all_needed = not wanted
             case "<->" | "xor":
-                items = [(item, sample, not self._is_true(item, sample)) for item in formula.items]
-                all_needed = False
+                items, all_needed = self._least_of_both(formula, sample, wanted), False
             case _:
                 assert_never(formula.op)
         if all_needed:
@@ -362,8 +361,14 @@ class Blamer:
         known = np.where(np.isposinf(margins), -np.inf, margins)
         return replace(node, parts=parts, main=int(np.argmax(known)))
 
-    def _is_true(self, formula: typed.Formula, sample: int) -> bool:
-        return bool(self._margins(formula, True, range(sample, sample + 1))[0] >= 0)
+    def _least_of_both(
+        self, formula: typed.Logic, sample: int, wanted: bool
+    ) -> list[tuple[typed.Formula, int, bool]]:
+        """Of the two ways in which an equivalence is as wanted, what is farthest from it in each."""
+        left, right = formula.items
+        same = (formula.op == "<->") is wanted
+        ways = [[(left, sample, its), (right, sample, its is same)] for its in (True, False)]
+        return sorted(map(self._least, ways), key=lambda item: item[0] is right)
 
     def _edge(self, formula: typed.Edge, sample: int, wanted: bool) -> Blame:
         node = self._node(formula, wanted, sample)
