@@ -115,3 +115,11 @@ def test_few_agents_carry_numbers_and_a_scale_its_length(axes):
     scale_bar(axes, 0, 0, 5)
     numbers(axes, np.zeros((20, 2)))
     assert [text.get_text() for text in axes.texts] == ["0", "1", "5 m"]
+
+
+def test_worlds_of_older_run_folders_find_what_they_import(axes):
+    from stlc.controller.sketch import BANK, CHARGE, GOAL, GROUND, NOTE, STONE, WALL, WATER, pieces
+
+    assert all((BANK, CHARGE, GOAL, GROUND, NOTE, STONE, WALL, WATER))
+    pieces(axes, np.zeros((3, 2)), np.array([(0.0, 0.0), (1.0, 0.0)]), "white", 1.0)
+    assert len(axes.lines) == 1
