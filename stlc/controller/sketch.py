@@ -139,5 +139,5 @@ def segments(axes: Any, lines: NDArray[np.float64], color: str, width: float) ->
 def pieces(
     axes: Any, places: NDArray[np.float64], piece: NDArray[np.float64], color: str, width: float
 ) -> None:
-    """Draw one short line `piece` (2, 2) at many places (k, 2); copies of worlds in older run folders ask for it."""
+    """Draw one short line `piece` (2, 2) at many places (k, 2), for the worlds in older run folders."""
     segments(axes, places[:, None] + piece, color, width)
