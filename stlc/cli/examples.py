@@ -45,6 +45,11 @@ def example_files(name: str) -> dict[str, str]:
     return files
 
 
+def judges(texts: Iterable[str]) -> set[str]:
+    """Names of the specifications by which the systems among these texts judge drives."""
+    return {name for text in texts for name in _JUDGE.findall(text)}
+
+
 def _pairs(specs: Iterable[Path] | None = None) -> Iterator[tuple[Path, str]]:
     """Every specification (of those given) whose system is installed, and the name of that file."""
     for path in sorted(SPECS.glob("*.stl")) if specs is None else specs:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from stlc.cli.examples import EMPTY, FIRST, example_files, examples
+from stlc.cli.examples import EMPTY, FIRST, example_files, examples, judges
 from stlc.cli.options import JsonOption, describe
 from stlc.cli.output import emit, emit_json, say
 from stlc.escape import operand, shell, visible
@@ -55,10 +55,11 @@ def init(
     say(f"next: {here}{_following(files)}")
 
 
-def _following(files: Iterable[Path]) -> str:
-    """What to do with the files."""
+def _following(files: Mapping[Path, str]) -> str:
+    """The command to go on with: training for the first specification that plans are made for."""
+    judging = judges(text for path, text in files.items() if path.suffix == ".yaml")
     for path in files:
-        if path.suffix == ".stl":
+        if path.suffix == ".stl" and path.name not in judging:
             return shell(("stlc", "train", f"specs/{path.name}", "--budget", "60s"))
     return "stlc new system cart"
 

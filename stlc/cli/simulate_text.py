@@ -43,9 +43,13 @@ ROWS = {
 
 
 def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
-    """What was measured, as a person reads it: the drives first; with `windows` plans and starts, too."""
+    """The measured figures, as a person reads them: the drives first; with `windows` plans and starts, too.
+
+    Without a specification of drives these are shown as well: drives are judged as plans are then.
+    """
     from stlc.cli.output import table
 
+    windows = windows or document["judge"] is None
     guards = document["guards"]
     seeds, agents, steps = len(document["seeds"]), document["agents"], document["steps"]
     size = f"{seeds} seed{'s' * (seeds > 1)} x {agents} agents x {steps} steps"
@@ -82,7 +86,9 @@ def _drives(document: Record) -> Iterator[str]:
     if lost:
         yield f"  {lost}"
     judge = document["judge"]
-    if judge is not None:
+    if judge is None:
+        yield f"  {document['system']} names no specification of drives (test: judge); plans' is taken"
+    else:
         yield f"  judged by {judge['path']}"
 
 
