@@ -6,8 +6,8 @@ import gc
 import os
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
-from types import SimpleNamespace
 from typing import Any
 
 import formula_strategies as random_formulas
@@ -20,6 +20,7 @@ from stlc.compile import ir
 from stlc.compile.horizon import reach, uses_end
 from stlc.compile.lower import lower
 from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.pipeline import Rule
 from stlc.compile.simplify import simplify
 from stlc.diagnostics import StlcError, UsageError
 from stlc.monitor import paced, tracking
@@ -39,10 +40,12 @@ EXAMPLES = int(os.environ.get("STLC_CASES", "150"))
 """How many random formulas and traces are tried."""
 
 
-def a_rule(formula: ir.Formula) -> Any:
-    return SimpleNamespace(
-        name="r",
+def a_rule(formula: ir.Formula) -> Rule:
+    like = Monitor("signal x\nrequire r: x > 0\n", dt=0.1).compiled.requirements[0]
+    return replace(
+        like,
         formula=formula,
+        lowered=formula,
         reach=reach(formula).future,
         windowed=False,
         uses_end=uses_end(formula),
@@ -97,7 +100,7 @@ def test_a_stream_gives_what_the_whole_trace_gives(written, trace, ending, steps
         if done < stop:
             found = tracker.live(done, stop)
             known = {name: x[:now] for name, x in trace.items()}
-            certain = range(done, tracker.settled) if ending == "truncate" else range(0)
+            certain = range(done, min(tracker.settled, stop)) if ending == "truncate" else range(0)
             wanted = so_far(formula, known, range(done, stop), certain, cut=ending == "truncate")
             np.testing.assert_array_equal(found, wanted)
         done = max(done, min(tracker.settled, stop)) if everywhere else 0
@@ -128,7 +131,7 @@ def test_frozen_values_and_other_samples_give_what_the_whole_trace_gives(written
         tracker.grow(known, 0, now)
         starts = range(now if everywhere else 1)
         low, high = tracker.live(starts.start, starts.stop)
-        certain = range(tracker.settled) if ending == "truncate" and everywhere else range(0)
+        certain = range(min(tracker.settled, starts.stop)) if ending == "truncate" else range(0)
         wanted = so_far(formula, known, starts, certain, cut=ending == "truncate")
         np.testing.assert_array_equal((low, high), wanted)
     wanted = [end[:, 0] for end in bounds(formula, Record(trace, NUMPY), starts, ending)]
