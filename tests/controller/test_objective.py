@@ -23,7 +23,9 @@ def test_paper_loss_is_the_hinge_on_smooth_robustness_plus_gated_performance(car
     v, tau, sign, position = (x[:, :, car_task.names.index(name)] for name in ("v", "tau", "sign", "x"))
     moving = 0.1 * (5 - v).clamp(min=0) * ((sign == 0) | (tau > 4))
     there = 0.1 * (-1 - position).clamp(min=0)
-    expected = hinge + good * (moving + there).mean(1)
+    stopping = (sign == 0) & (position >= -1) & (position <= 0) & (tau < 1)
+    still = 0.2 * v.clamp(min=0) * stopping
+    expected = hinge + good * (moving + there + still).mean(1)
     near_switch = (tau - 4).abs().min(1).values < 1e-2  # the soft indicator differs there by design
     assert torch.allclose(outcome.total[~near_switch], expected[~near_switch], atol=1e-6)
 

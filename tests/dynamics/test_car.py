@@ -231,14 +231,16 @@ def test_a_leader_is_fast_enough_to_be_avoidable(drawn: dict[str, Tensor]) -> No
     assert (drawn["v_lead"][~lead] == 0).all()
 
 
-def test_the_objective_is_the_benchmarks(car: System) -> None:
+def test_the_objective_is_the_benchmarks_and_stands_still_at_stop_signs(car: System) -> None:
     x0 = car.sample(500, seed=11, dtype=torch.float64)
     u = torch.randn(500, 25, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(12)) * 4
     columns = car.rollout_columns(x0, u)
     sat = (torch.arange(500) % 3 > 0).double()
     x, v, light, tau = (columns[name] for name in ("x", "v", "sign", "tau"))
     green = ((light == 0) | (tau > 4)).double()
-    each = 0.1 * sat * torch.relu(5 - v) * green + 0.1 * sat * torch.relu(-1 - x)
+    paper = 0.1 * sat * torch.relu(5 - v) * green + 0.1 * sat * torch.relu(-1 - x)
+    stopping = ((light == 0) & (x >= -1) & (x <= 0) & (tau < 1)).double()
+    each = paper + 0.2 * sat * torch.relu(v) * stopping
     assert torch.allclose(car.performance(columns, sat, sat), each.mean(0), atol=1e-12)
 
 
