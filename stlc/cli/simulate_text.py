@@ -24,7 +24,7 @@ ERRORS = {
 """Errors of a scenario, in words."""
 TITLES = {"none": "no guard", "paper": "paper's guard", "full": "full guard"}
 COMPARED = ("obeyed every rule", "plan accuracy")
-"""What scenarios are compared by; drives that are lost from their start are not counted."""
+"""What scenarios are compared by; drives that are lost are not counted."""
 
 ROWS = {
     "plan accuracy": "plan_accuracy",
@@ -100,13 +100,15 @@ def _rules(document: Record) -> Iterator[tuple[str, ...]]:
 
 
 def _broken(drives: Record) -> Iterator[str]:
-    """`broken by seed 3, agent 7: full_stop (4.3 s)`, the first few."""
-    for each in drives["broken"][:MOST_BROKEN]:
+    """`broken by seed 3, agent 7: full_stop (4.3 s)`, the first few: first those who could have obeyed."""
+    from stlc.view.words import cause_words
+
+    for each in sorted(drives["broken"], key=lambda each: each["lost"])[:MOST_BROKEN]:
         rules = ", ".join(
             name if time is None else f"{name} ({time:.3g} s)" for name, time in each["rules"].items()
         )
-        lost = "; lost from its start" if each["lost"] else ""
-        yield f"  broken by seed {each['seed']}, agent {each['agent']}: {rules}{lost}"
+        cause = cause_words(each)
+        yield f"  broken by seed {each['seed']}, agent {each['agent']}: {rules}{cause and f'; {cause}'}"
     more = len(drives["broken"]) - MOST_BROKEN
     if more > 0:
         yield f"  broken by {more} more: see eval/simulate.json"
@@ -147,7 +149,7 @@ def compared(document: Record) -> Iterator[str]:
 
 
 def _both(guard: Record) -> list[str]:
-    """Plan accuracy, and the drives that obeyed of those that were not lost from their start."""
+    """Plan accuracy, and the drives that obeyed of those that were not lost."""
     drives = guard["drives"]
     obeyed = f"{drives['obeyed']} of {drives['count'] - drives['lost']}"
     return [obeyed, _number(guard["metrics"]["plan_accuracy"], "", 3)]

@@ -9,15 +9,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
 
 from stlc.compile.modules import file_of, library_of
 from stlc.compile.pipeline import compile_spec
+from stlc.compile.semantics import TOLERANCE
 from stlc.controller.run import INDEX, read_library, save_library
-from stlc.controller.savable import solvable
+from stlc.controller.savable import safely, solvable
 from stlc.diagnostics import Diagnostic, RunError, SystemFileError, UsageError
 from stlc.dynamics.schema import load_system_decl
 from stlc.files import read_source, write_atomic
@@ -69,16 +70,43 @@ class Rules:
 
 
 @dataclass(frozen=True, slots=True)
+class Lost:
+    """The end of what could be done before a rule was broken.
+
+    A plan is known where the one that was followed keeps what plans are asked for (what is tagged `@safety`,
+    where such a rule was broken), or a search finds one.
+
+    Attributes:
+        why: `start`: no plan is known at any instant before. `told`: the plan that was followed was such a
+            plan; then the world did more than move on (an obstacle came into view), and since then none is
+            known. `later`: the same where the world only moved on: a window of plans ended too early to see
+            it, or the model is not the truth. `missed`: a plan was known, and another one was followed.
+        time: since when no plan is known, seconds from the start; of `missed` when the last one was.
+    """
+
+    why: Literal["start", "told", "later", "missed"]
+    time: float
+
+
+@dataclass(frozen=True, slots=True)
 class Broken:
     """A drive that broke rules.
 
     Attributes:
         row: of the recording.
         rules: rule -> when, in seconds from the start; None where nobody has looked.
+        lost: when it was lost, and to what; None where plans were good until a rule was broken, or where
+            nobody has looked.
     """
 
     row: int
     rules: Mapping[str, float | None]
+    lost: Lost | None = None
+
+    @property
+    def excused(self) -> bool:
+        """Whether no controller can be held to it: lost from the start, or to what the world told."""
+        return self.lost is not None and self.lost.why in ("start", "told")
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +116,9 @@ class Drives:
     Attributes:
         rules: rule -> status of each drive, (rows,): `satisfied`, `violated` or `inconclusive`.
         broken: the drives that broke a rule, in order.
-        viable: (rows,), who obeyed, or from whose start a plan is known: a safe one where a rule was broken
-            that is tagged `@safety`, else one that satisfies all that plans are made for.
+        viable: (rows,), who could have obeyed as far as is known: who did, and who was neither lost from the
+            start nor to what the world told later. Of undecided drives those from whose start a safe plan is
+            known.
     """
 
     rules: Mapping[str, NDArray[np.str_]]
@@ -250,13 +279,43 @@ def judge_drives(rules: Rules, task: Task, recording: Recording, savable: NDArra
     columns = np.moveaxis(recording.states, -1, 0)
     verdict = monitor.check(dict(zip(task.names, columns, strict=True)))
     found = {judgement.name: np.array(judgement.statuses) for judgement in verdict}
-    safety = {rule.name for rule in verdict.subject.compiled.safety}
-    unsafe = _violating({name: each for name, each in found.items() if name in safety}, len(savable))
-    late = np.flatnonzero(_violating(found, len(savable)) & ~unsafe)
+    safety = frozenset(rule.name for rule in verdict.subject.compiled.safety)
+    broken = tuple(
+        replace(each, lost=_lost(each, safety, task, recording, bool(savable[each.row])))
+        for each in _broken(verdict, found)
+    )
     viable = savable.copy()
-    if len(late):  # nothing was hit: could all that plans are asked for have been kept?
-        viable[late] = solvable(task, torch.from_numpy(recording.states[late, 0])).numpy()
-    return Drives(found, tuple(_broken(verdict, found)), viable | obeying(found, len(savable)))
+    for each in broken:
+        viable[each.row] = not each.excused
+    return Drives(found, broken, viable | obeying(found, len(savable)))
+
+
+def _lost(
+    broken: Broken, safety: frozenset[str], task: Task, recording: Recording, savable: bool
+) -> Lost | None:
+    """When a drive was lost that broke rules, by the first of those tagged `@safety`, else by the first."""
+    row, unsafe = broken.row, not safety.isdisjoint(broken.rules)
+    asked = safely(task) if unsafe and task.compiled.safety else task
+    times = [time for name, time in broken.rules.items() if not unsafe or name in safety]
+    looked = [time for time in times if time is not None]
+    if not looked:  # nobody has looked when: by the start alone
+        known = savable if unsafe else bool(solvable(task, torch.from_numpy(recording.states[row, :1]))[0])
+        return None if known else Lost("start", 0.0)
+    dt = float(task.system.decl.dt)
+    last = min(round(min(looked) / dt), recording.steps)
+    good = recording.safe[row] if unsafe else recording.rho[row] >= -TOLERANCE
+    followed = np.flatnonzero(good[: last + 1])
+    since = int(followed[-1]) + 1 if len(followed) else 0  # from here on nothing good was followed
+    if since > last:
+        return None
+    states = torch.from_numpy(recording.states[row, since : last + 1])
+    known = solvable(asked, states).numpy()
+    if known.any():
+        return Lost("missed", dt * (since + int(np.flatnonzero(known)[-1])))
+    if not since:
+        return Lost("start", 0.0)
+    told = recording.quiet is not None and not recording.quiet[row, since - 1]
+    return Lost("told" if told else "later", dt * since)
 
 
 def _violating(rules: Mapping[str, NDArray[np.str_]], rows: int) -> NDArray[np.bool_]:
@@ -277,7 +336,13 @@ def drives_of_plans(held: Mapping[str, NDArray[np.bool_]], savable: NDArray[np.b
     names = {row: [name for name in rules if rules[name][row] == "violated"] for row in range(len(savable))}
     first = {name: starts.argmin(0) * dt for name, starts in held.items() if len(starts)}
     broken = (
-        Broken(row, {name: float(first[name][row]) for name in each}) for row, each in names.items() if each
+        Broken(
+            row,
+            {name: float(first[name][row]) for name in each},
+            None if savable[row] else Lost("start", 0.0),
+        )
+        for row, each in names.items()
+        if each
     )
     return Drives(rules, tuple(broken), savable | obeying(rules, len(savable)))
 
@@ -306,8 +371,10 @@ def drives_json(drives: Drives, seeds: Sequence[int], agents: int) -> dict[str, 
     """The entry `drives` of a guard in `eval/simulate.json`.
 
     `count` drives, of which `obeyed` kept every rule and `undecided` ended too early to say; `lost` of the
-    others began where no plan is known that keeps what they broke (`Drives.viable`). `rules`: the same for
-    each rule. `broken`: who broke which, and when (seconds from the start, null where nobody has looked).
+    others could not be driven better as far as is known (`Drives.viable`): `told` of them by what the world
+    told later, the others from their start. `rules`: the same for each rule. `broken`: who broke which, and
+    when (seconds from the start, null where nobody has looked), and `cause`, since when no plan is known and
+    why (`Lost`).
     """
     obeyed, rows = drives.obeyed, len(drives.viable)
     violated = _violating(drives.rules, rows)
@@ -316,6 +383,7 @@ def drives_json(drives: Drives, seeds: Sequence[int], agents: int) -> dict[str, 
         "obeyed": int(obeyed.sum()),
         "undecided": int((~obeyed & ~violated).sum()),
         "lost": int((~drives.viable).sum()),
+        "told": sum(each.lost is not None and each.lost.why == "told" for each in drives.broken),
         "rules": {
             name: {
                 "obeyed": int((statuses == "satisfied").sum()),
@@ -330,6 +398,7 @@ def drives_json(drives: Drives, seeds: Sequence[int], agents: int) -> dict[str, 
                 "agent": each.row % agents,
                 "lost": not bool(drives.viable[each.row]),
                 "rules": dict(each.rules),
+                "cause": None if each.lost is None else {"why": each.lost.why, "time": each.lost.time},
             }
             for each in drives.broken
         ],

@@ -8,7 +8,7 @@ from typing import Any
 from stlc.view.html import Child, Html, classed, el, join, table
 from stlc.view.material import Material
 from stlc.view.page import Section
-from stlc.view.words import count, drives_of, seconds, share, spread
+from stlc.view.words import cause_words, count, drives_of, seconds, share, spread
 
 Record = Mapping[str, Any]
 
@@ -154,9 +154,11 @@ def _drive_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
     whole = [None if d is None else _of(d["obeyed"], d["count"]) for d in each]
     rows: list[tuple[Child, ...]] = [(join("drives that obeyed every rule", meaning), *whole)]
     if any(drives["lost"] for drives in known):
-        others = el("small", "without those from whose start no plan is known")
+        others = el(
+            "small", "without those from whose start no plan is known, or since the world told them something"
+        )
         viable = [None if d is None else _of(d["obeyed"], d["count"] - d["lost"]) for d in each]
-        rows.append((join("of those that were not lost from the start", others), *viable))
+        rows.append((join("of those that were not lost", others), *viable))
     for rule in known[-1]["rules"]:
         kept = [None if d is None else d["rules"].get(rule) for d in each]
         cells = [None if k is None else _of(k["obeyed"], sum(k.values())) for k in kept]
@@ -175,16 +177,14 @@ def _broken(simulation: Record | None) -> Html | None:
     if not broken:
         return None
     rows: list[tuple[Child, ...]] = []
-    for drive in broken[:MOST_BROKEN]:
+    for drive in sorted(broken, key=lambda each: bool(each["lost"]))[:MOST_BROKEN]:
         rules = ", ".join(
             name if time is None else f"{name} ({time:.3g} s)" for name, time in drive["rules"].items()
         )
-        rows.append((f"seed {drive['seed']}, agent {drive['agent']}", rules, "yes" if drive["lost"] else ""))
+        rows.append((f"seed {drive['seed']}, agent {drive['agent']}", rules, cause_words(drive)))
     more = len(broken) - MOST_BROKEN
     note = el("p", f"{more} more are in eval/simulate.json.") if more > 0 else None
-    return join(
-        el("h3", "Who broke a rule, and when"), table(("drive", "rules", "lost from its start"), rows), note
-    )
+    return join(el("h3", "Who broke a rule, and when"), table(("drive", "rules", "why"), rows), note)
 
 
 def _names(guards: Mapping[str, Record]) -> list[str]:

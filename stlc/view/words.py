@@ -82,16 +82,44 @@ def obeyed_sentence(simulation: Mapping[str, Any]) -> str:
     return words
 
 
+CAUSES = {
+    "told": "lost at {}, when the world told of what no plan from there solves",
+    "later": "no plan is known from {} on, although the one followed until then was good",
+    "missed": "a plan is known at {}, and another one was followed",
+}
+"""Why a rule was broken, as `stlc.controller.rules.Lost` has it."""
+
+
 def viable_sentence(simulation: Mapping[str, Any]) -> str:
-    """How many drives began where no plan is known, and how many of the others obeyed; "" for none."""
+    """How many drives nobody could have driven better, and how many of the others obeyed; "" for none."""
     each = list(drives_of(simulation).values())
     if not each:
         return ""
     drives = each[-1]
-    lost, others = drives["lost"], drives["count"] - drives["lost"]
+    lost, told = drives["lost"], drives.get("told", 0)
     if not lost:
         return ""
-    return (
-        f"{count(lost, 'drive')} {'was' if lost == 1 else 'were'} lost from the start, where no plan is "
-        f"known: {drives['obeyed']} of the {others} others obeyed"
-    )
+    parts = []
+    if lost > told:
+        begun = lost - told
+        parts.append(
+            f"{count(begun, 'drive')} {'was' if begun == 1 else 'were'} lost from the start, "
+            "where no plan is known"
+        )
+    if told:
+        of = f"{told:,}" if parts else count(told, "drive")
+        parts.append(
+            f"{of} {'was' if told == 1 else 'were'} lost when the world told of what "
+            "no plan from there solves"
+        )
+    return f"{', and '.join(parts)}: {drives['obeyed']} of the {drives['count'] - lost} others obeyed"
+
+
+def cause_words(broken: Mapping[str, Any]) -> str:
+    """Why a drive that broke a rule could not be driven better, or could: an entry of `broken`."""
+    cause = broken.get("cause")
+    if cause is None:
+        return "lost from its start" if broken["lost"] else ""
+    if cause["why"] == "start":
+        return "lost from its start"
+    return CAUSES[cause["why"]].format(f"{cause['time']:.3g} s")

@@ -14,7 +14,7 @@ import torch
 from stlc.controller.config import TrainConfig
 from stlc.controller.drive import Recording
 from stlc.controller.launch import Launch, open_folder
-from stlc.controller.rules import Rules, drives_json, drives_of_plans, judge_drives, rules_of
+from stlc.controller.rules import Lost, Rules, drives_json, drives_of_plans, judge_drives, rules_of
 from stlc.controller.run import Run, load_task
 from stlc.controller.task import Task
 from stlc.diagnostics import RunError, SpecError, SystemFileError
@@ -80,14 +80,15 @@ def found(run: Run) -> Rules:
     return rules
 
 
-def driven(xs: list[list[float]]) -> Recording:
-    """Drives along these x."""
+def driven(xs: list[list[float]], *, good: bool = True) -> Recording:
+    """Drives along these x, by plans that were good or not."""
     states = np.array(xs, dtype=float)[..., None]
     rows, steps = states.shape[0], states.shape[1] - 1
     whole = np.zeros((rows, steps))
     none = whole.astype(np.int64)
     actions = np.zeros((rows, steps, 1))
-    return Recording(rows, states, actions, none, none, whole, whole, whole == 0, ({},), {}, {})
+    rho, safe = whole - (not good), np.full(whole.shape, good)
+    return Recording(rows, states, actions, none, none, rho, whole, safe, ({},), {}, {})
 
 
 # ------------------------------------------------------------------------ where they are
@@ -189,9 +190,16 @@ def savable(rows: int, *lost: int) -> np.ndarray:
     return able
 
 
-def test_drives_are_counted(home: Path) -> None:
+MISSED = {
+    "why": "missed",
+    "time": 1.0,
+}  # where it was at the wall already, and a search is told that it could
+
+
+def test_drives_are_counted(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     task, rules = opened(run_of(home)).task, found(opened(run_of(home)))
-    recording = replace(driven([[0, 1, 2], [0, 3.5, 1], [-3, 3, 0], [0, 0, 0]]), agents=2)
+    searched(monkeypatch, -1)
+    recording = replace(driven([[0, 1, 2], [0, 3.5, 1], [-3, -2.5, 0], [0, 0, 0]], good=False), agents=2)
     drives = judge_drives(rules, task, recording, savable(4, 2, 3))
     document = drives_json(drives, (7, 8), 2)
     assert json.loads(json.dumps(document)) == {
@@ -199,32 +207,78 @@ def test_drives_are_counted(home: Path) -> None:
         "obeyed": 2,
         "undecided": 0,
         "lost": 1,  # the last one obeyed although no search has found a plan for it
+        "told": 0,
         "rules": {
             "stay": {"obeyed": 3, "broken": 1, "undecided": 0},
             "home": {"obeyed": 3, "broken": 1, "undecided": 0},
         },
         "broken": [
-            {"seed": 7, "agent": 1, "lost": False, "rules": {"stay": 1.0}},
-            {"seed": 8, "agent": 0, "lost": True, "rules": {"home": 1.0}},
+            {"seed": 7, "agent": 1, "lost": False, "rules": {"stay": 1.0}, "cause": MISSED},
+            {
+                "seed": 8,
+                "agent": 0,
+                "lost": True,
+                "rules": {"home": 1.0},
+                "cause": {"why": "start", "time": 0.0},
+            },
         ],
     }
+
+
+GO = "spec go\nsignal x [m]\n@safety\nrequire near: always x < 3\nrequire go: always[1 s, end] x > 0\n"
+
+
+def searched(monkeypatch: pytest.MonkeyPatch, known: float) -> list[tuple[int, list[float]]]:
+    """What is searched from now on, as (requirements, starts): a plan is known where x is more than this."""
+    asked = []
+
+    def solvable(task: Task, x0: torch.Tensor) -> torch.Tensor:
+        asked.append((len(task.rules), x0[:, 0].tolist()))
+        return x0[:, 0] > known
+
+    monkeypatch.setattr("stlc.controller.rules.solvable", solvable)
+    return asked
 
 
 def test_who_only_comes_late_is_lost_where_no_plan_keeps_all(
     home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = "spec go\nsignal x [m]\n@safety\nrequire near: always x < 3\nrequire go: always[1 s, end] x > 0\n"
-    rules, asked = Rules(parse(text_of(home, text)), "go.stl"), []
-
-    def searched(_: Task, x0: torch.Tensor) -> torch.Tensor:
-        asked.append(x0[:, 0].tolist())
-        return x0[:, 0] > -1
-
-    monkeypatch.setattr("stlc.controller.rules.solvable", searched)
-    recording = driven([[0, 1, 2], [-2, -1, 0.5], [-0.5, -0.5, 1], [-3, -1, 3.5]])
+    (home / "car/cart.stl").write_text(PLAN + "require go: always x > -99\n")
+    rules, asked = Rules(parse(text_of(home, GO)), "go.stl"), searched(monkeypatch, -1)
+    recording = driven([[0, 1, 2], [-2, -1, 0.5], [-0.5, -0.5, 1], [-3, -1, 3.5]], good=False)
     drives = judge_drives(rules, opened(run_of(home)).task, recording, savable(4, 0, 1))
-    assert asked == [[-2.0, -0.5]]  # neither who obeyed nor who hit something
+    assert asked == [  # not who obeyed; of who hit something, a safe plan until then
+        (2, [-2.0, -1.0]),
+        (2, [-0.5, -0.5]),
+        (1, [-3.0, -1.0, 3.5]),
+    ]
     assert drives.viable.tolist() == [True, False, True, True]
+    assert [each.lost for each in drives.broken] == [
+        Lost("start", 0.0),
+        Lost("missed", 1.0),
+        Lost("missed", 2.0),
+    ]
+
+
+@pytest.mark.parametrize("quiet", [True, False, None])
+def test_a_drive_can_be_lost_later(home: Path, monkeypatch: pytest.MonkeyPatch, quiet: bool | None) -> None:
+    """The plan of the first instant was good; from the second on none is known; the fourth breaks a rule."""
+    rules, asked = Rules(parse(text_of(home, GO)), "go.stl"), searched(monkeypatch, 9)
+    recording = driven([[1, 2, 2.5, 3.5, 1]], good=False)
+    recording.safe[0, 0] = True
+    recording = replace(recording, quiet=None if quiet is None else np.array([[quiet, True, True, True]]))
+    (broken,) = judge_drives(rules, opened(run_of(home)).task, recording, savable(1)).broken
+    assert asked == [(1, [2.0, 2.5, 3.5])]
+    assert broken.lost == Lost("told" if quiet is False else "later", 1.0)
+    assert broken.excused == (quiet is False)
+
+
+def test_a_plan_that_was_good_until_a_rule_was_broken_is_no_excuse(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rules, asked = Rules(parse(text_of(home, GO)), "go.stl"), searched(monkeypatch, 9)
+    drives = judge_drives(rules, opened(run_of(home)).task, driven([[1, 2, 3.5, 1]]), savable(1, 0))
+    assert (asked, drives.broken[0].lost, drives.viable.tolist()) == ([], None, [True])
 
 
 def test_a_drive_that_ends_too_early_is_neither(home: Path) -> None:

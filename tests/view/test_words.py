@@ -3,6 +3,7 @@
 import pytest
 
 from stlc.view.words import (
+    cause_words,
     count,
     interval,
     number,
@@ -61,8 +62,9 @@ def test_shares_and_counts():
     assert number(23.54, "GiB") == "23.5 GiB"
 
 
-def drives(obeyed, lost=0, undecided=0, count=200):
-    return {"drives": {"count": count, "obeyed": obeyed, "lost": lost, "undecided": undecided}}
+def drives(obeyed, lost=0, undecided=0, count=200, told=0):
+    each = {"count": count, "obeyed": obeyed, "lost": lost, "told": told, "undecided": undecided}
+    return {"drives": each}
 
 
 def test_how_many_drives_obeyed():
@@ -82,3 +84,21 @@ def test_how_many_drives_obeyed():
     assert viable_sentence(some) == (
         "8 drives were lost from the start, where no plan is known: 190 of the 192 others obeyed"
     )
+    told = {**simulation, "guards": {"full": drives(190, 10, told=2)}}
+    assert viable_sentence(told) == (
+        "8 drives were lost from the start, where no plan is known, and 2 were lost when the world told of "
+        "what no plan from there solves: 190 of the 190 others obeyed"
+    )
+    only = {**simulation, "guards": {"full": drives(198, 1, told=1)}}
+    assert viable_sentence(only).startswith("1 drive was lost when the world told of")
+
+
+def test_why_a_rule_was_broken():
+    def words(lost, why=None):
+        return cause_words({"lost": lost, "cause": why and {"why": why, "time": 1.8}})
+
+    assert words(True, "start") == words(True) == "lost from its start"
+    assert words(False) == ""
+    assert words(True, "told") == "lost at 1.8 s, when the world told of what no plan from there solves"
+    assert words(False, "later").startswith("no plan is known from 1.8 s on")
+    assert words(False, "missed") == "a plan is known at 1.8 s, and another one was followed"
