@@ -309,9 +309,9 @@ def _lost(
     if since > last:
         return None
     states = torch.from_numpy(recording.states[row, since : last + 1])
-    known = solvable(asked, states).numpy()
-    if known.any():
-        return Lost("missed", dt * (since + int(np.flatnonzero(known)[-1])))
+    solved = solvable(asked, states).numpy()
+    if solved.any():
+        return Lost("missed", dt * (since + int(np.flatnonzero(solved)[-1])))
     if not since:
         return Lost("start", 0.0)
     told = recording.quiet is not None and not recording.quiet[row, since - 1]
