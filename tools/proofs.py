@@ -38,8 +38,8 @@ import laws
 from emitted import choosing, near_switches, slopes_agree
 from formula_strategies import formulas, traces
 from mission_strategies import bodies, missions
+from proof import blamed, monitored, slopes, streamed
 from proof import missions as states
-from proof import monitored, slopes, streamed
 from proof.cases import Case
 
 from stlc.native import compiler
@@ -173,6 +173,8 @@ PROOFS: dict[str, Callable[[Block], tuple[int, list[str]]]] = {
     "windows": partial(one_by_one, monitored.check_windows),
     "online": partial(one_by_one, streamed.check_online),
     "promises": partial(one_by_one, streamed.check_promise),
+    "causes": partial(one_by_one, blamed.check_cause),
+    "causes-streamed": partial(one_by_one, blamed.check_told_by_stream),
     "missions": partial(by_hypothesis, states.check_mission, {"formula": missions, "seed": _SEEDS}),
     "past": partial(by_hypothesis, states.check_past, {"formula": bodies, "seed": _SEEDS}),
     "recorded": partial(by_hypothesis, states.check_recorded, {"formula": missions, "seed": _SEEDS}),

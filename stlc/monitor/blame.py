@@ -53,6 +53,7 @@ class Blame:
         parts: why; empty for a predicate.
         main: which of the parts decides.
         premise: it is the left side of an implication.
+        moves: a change of the value that decides in it changes it; a frozen value may change along.
     """
 
     formula: typed.Formula
@@ -64,11 +65,17 @@ class Blame:
     parts: tuple[Blame, ...] = ()
     main: int = 0
     premise: bool = False
+    moves: bool = True
 
     @property
     def signals(self) -> tuple[str, ...]:
         """Names of the signals that it reads; of a predicate alone."""
         return tuple(dict.fromkeys(name for name, _ in self.reads))
+
+    @property
+    def instants(self) -> set[tuple[str, int]]:
+        """The signals that it reads, and the samples at which it does; of a predicate alone."""
+        return {(name, self.sample + later) for name, later in self.reads}
 
     @property
     def span(self) -> Span:
@@ -79,6 +86,11 @@ class Blame:
     def leaf(self) -> Blame:
         """The predicate that decides."""
         return self.parts[self.main].leaf if self.parts else self
+
+    @property
+    def path_moves(self) -> bool:
+        """Whether all on the path to the predicate that decides `moves`."""
+        return self.moves and (not self.parts or self.parts[self.main].path_moves)
 
     @property
     def leaves(self) -> tuple[Blame, ...]:
@@ -187,7 +199,7 @@ class Blamer:
         worth = self._margin(formula, sample, wanted)
         equal = self._equal(lowered, worth) if np.isfinite(worth) else []
         if len(equal) < 2:
-            return tree, len(equal) == 1
+            return tree, len(equal) == 1 and tree.path_moves
         tied = self._tied(lowered, equal)
         if tied is None or tied.worth(lowered, sample, ()) != worth:
             return tree, False
@@ -196,10 +208,10 @@ class Blamer:
         first = [each for each in equal if each[1] == leaf.sample and each[0] in own]
         for chosen in (*first, *equal[:MOST_TIED]):
             if tied.worth(lowered, sample, (chosen,)) > worth:
-                if chosen in first:
-                    return tree, True
-                raised = replace(self, cache={}, known={}, tied=replace(tied, raised=chosen))
-                return raised.blame(formula, sample, wanted=wanted), True
+                if chosen not in first:
+                    raised = replace(self, cache={}, known={}, tied=replace(tied, raised=chosen))
+                    tree = raised.blame(formula, sample, wanted=wanted)
+                return tree, tree.path_moves
         return tree, False
 
     def _equal(self, lowered: ir.Formula, worth: float) -> list[Spot]:
@@ -251,10 +263,21 @@ class Blamer:
                 return self._edge(formula, sample, wanted)
             case typed.Freeze(_, _, body):
                 thawed = thaw(body, self._values(formula, sample))
-                return replace(self, cache={}, known={}, tied=None).why(thawed, sample, wanted=wanted)[0]
+                inner = replace(self, cache={}, known={}, tied=None)
+                tree, alone = inner.why(thawed, sample, wanted=wanted)
+                return replace(tree, moves=alone and not self._frozen(formula, sample) & tree.leaf.instants)
         assert_never(formula)
 
     # ------------------------------------------------------------------- values
+
+    def _frozen(self, formula: typed.Freeze, sample: int) -> set[tuple[str, int]]:
+        """The signals that a formula freezes, and the samples at which it reads them."""
+        return {
+            (leaf.name, sample + self._later(leaf, sample))
+            for _, num in formula.bindings
+            for leaf in leaves(num)
+            if isinstance(leaf, (ir.Col, ir.At))
+        }
 
     def _values(self, formula: typed.Freeze, sample: int) -> dict[str, ir.Num]:
         """What the formula binds at a sample; what does not exist becomes a sample beyond the trace."""
@@ -388,16 +411,19 @@ class Blamer:
     def _instants(self, formula: typed.Formula, sample: int, wanted: bool) -> range:
         """The instants of the window of a temporal operator of which something is known, in order of time."""
         lowered = self._lowered(formula, wanted)
-        last = self.record.samples - 1
         match lowered:
             case ir.Over(window=window) | ir.Until(window=window):
-                known = last + min(max(map(history, parts(lowered))), _MOST_LATER)
+                last, known = self.record.samples - 1, self._stop(lowered) - 1
                 high = last if window.hi is None else min(sample + window.hi, known)
                 return range(sample + window.lo, high + 1)
             case ir.Past(window=window) | ir.Since(window=window):
                 low = 0 if window.hi is None else max(sample - window.hi, 0)
                 return range(low, sample - window.lo + 1)
         raise TypeError(f"{type(lowered).__name__} has no window")
+
+    def _stop(self, lowered: ir.Formula) -> int:
+        """The first instant after the last sample at which nothing is known of the parts of a formula."""
+        return self.record.samples + min(max(map(history, parts(lowered))), _MOST_LATER)
 
     def _timed(self, formula: typed.Temporal | typed.Until, sample: int, wanted: bool) -> Blame:
         if on_clock(formula):
@@ -430,11 +456,13 @@ class Blamer:
         if past:
             held = range(instants[0], sample + 1)
         else:
-            held = range(sample, instants[-1] + 1 if instants else max(self.record.samples, sample))
+            stop = instants[-1] + 1 if instants else self._stop(self._lowered(formula, wanted))
+            held = range(sample, max(stop, sample))
         left = self._margins(formula.left, wanted, held) if held else np.zeros(0)
         right = self._margins(formula.right, wanted, instants) if instants else np.zeros(0)
         if beyond:
-            left, right = np.append(left, np.inf), np.append(right, np.inf)
+            left = np.append(left, self._margin(formula.left, held.stop, wanted))
+            right = np.append(right, self._margin(formula.right, held.stop, wanted))
         left = left[::-1] if past else left
         right = right[::-1] if past else right
         if (formula.op == "release") is wanted:

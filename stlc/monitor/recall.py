@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from stlc.compile import ir
+from stlc.compile.horizon import reach
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.pipeline import Compiled, Rule
 from stlc.monitor.asked import Floats
@@ -100,8 +101,12 @@ class Recall:
     def _excerpt(self, rule: Rule, worst: Worst) -> tuple[int, int, dict[str, Floats]] | None:
         """The number of the first sample, that of the start from there on, and columns (samples, 1)."""
         kept = self._kept
-        reads = _around(rule, self.compiled.grid.horizon)
-        if reads is None or endless_always(rule):
+        formula, horizon = rule.lowered, self.compiled.grid.horizon
+        reads = _around(rule, formula, horizon)
+        if reads is None and kept.first:
+            formula = rule.formula
+            reads = _around(rule, formula, horizon)
+        if reads is None or _endless_always(rule, formula):
             if kept.first == 0:
                 return 0, worst.start, kept.columns()
             if reads is None or self.compiled.grid.dt is None:
@@ -114,9 +119,8 @@ class Recall:
         return first, worst.start - first, kept.columns(first, worst.start + reads[1] + 1)
 
 
-def endless_always(rule: Rule) -> bool:
+def _endless_always(rule: Rule, formula: ir.Formula) -> bool:
     """Whether a requirement says that something bounded holds at all samples from one on."""
-    formula = rule.formula
     return (
         isinstance(formula, ir.Over)
         and formula.op == "always"
@@ -126,10 +130,12 @@ def endless_always(rule: Rule) -> bool:
     )
 
 
-def _around(rule: Rule, horizon: int | None) -> tuple[int, int] | None:
-    """How many samples before and after a start say why it fails; None where no number does."""
-    formula = rule.formula
+def _around(rule: Rule, formula: ir.Formula, horizon: int | None) -> tuple[int, int] | None:
+    """How many samples before and after a start say why it fails; None where no number does.
+
+    What is explained is the requirement as it is written: where one part decides, others are told, too.
+    """
     window = window_of(rule, horizon)
-    if rule.absolute or (window is None and endless(formula) and not endless_always(rule)):
+    if rule.absolute or (window is None and endless(formula) and not _endless_always(rule, formula)):
         return None
-    return history(formula), max(rule.reach, window or 0) + looks_on(formula)
+    return history(formula), max(reach(formula).future, window or 0) + looks_on(formula)

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from stlc.compile import ir
-from stlc.compile.horizon import reach
+from stlc.compile.horizon import reach, uses_end
 from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.pipeline import Rule
 from stlc.diagnostics import Diagnostic, UsageError
@@ -128,10 +128,13 @@ class Trackers:
 def without_end(formula: ir.Formula, window: int) -> ir.Formula | None:
     """The formula with `end` so many samples after its instant; None where `end` depends on more than that.
 
-    It does under another window, and where windows with an end of their own reach beyond it.
+    It does under another window, for segments that would leave it (`sweep`), and where windows with an end of
+    their own reach beyond it.
     """
     moved = _ended(formula, window)
-    return moved if moved is not None and not endless(moved) and reach(moved).future <= window else None
+    if moved is None or endless(moved) or uses_end(moved) or reach(moved).future > window:
+        return None
+    return moved
 
 
 def _ended(formula: ir.Formula, window: int) -> ir.Formula | None:

@@ -239,6 +239,8 @@ def test_all_causes_are_those_of_each() -> None:
         ("always (x > 0 -> (y > 0 and false))", "`x > 0` is true where x = 7, at t = 5 s"),
         ("not eventually (y > 3 or true)", "`true` is true whatever the signals are"),
         ("x > 9 and (y > 3 or true)", "`x > 9` is false where x = 2, at t = 0 s"),
+        ("x > 3 until[8 s, 9 s] false", "`false` is false whatever the signals are"),
+        ("x > 3 until[2 s, 9 s] false", "`false` is false whatever the signals are"),
     ],
 )
 def test_a_signal_that_makes_no_difference_need_not_be_there(written: str, because: str) -> None:
@@ -246,6 +248,27 @@ def test_a_signal_that_makes_no_difference_need_not_be_there(written: str, becau
     cause = explain(monitor.check({"x": np.arange(2.0, 8.0)}, end="truncate"), "r")
     assert cause is not None
     assert cause.because.startswith(because)
+
+
+@pytest.mark.parametrize(
+    ("written", "alone"),
+    [
+        ("freeze a = x in x - a > 1", False),
+        ("freeze a = x in eventually[0 s, 2 s] x > a + 1", False),
+        ("freeze a = x in eventually[1 s, 2 s] x > a + 1", True),
+        ("freeze a = x in next(prev(x) > a + 1)", False),
+        ("freeze a = x in (x > a + 9 or always[1 s, 2 s] x > 1.75)", False),
+        ("x > 3 and x < 1", False),
+        ("x > 3 and x < 1.5", True),
+        ("x > 4 and y > 4", False),
+    ],
+)
+def test_a_value_decides_alone_where_its_change_is_enough(written: str, alone: bool) -> None:
+    monitor = Monitor(f"signal x\nsignal y\nrequire r: {written}", dt=1)
+    columns = {"x": np.array([2.0, 1.5, 1.5]), "y": np.array([2.0, 1.5, 1.25])}
+    cause = explain(monitor.check(columns), "r")
+    assert cause is not None
+    assert cause.alone is alone
 
 
 def test_a_window_that_the_end_cuts_is_explained_by_what_there_is() -> None:

@@ -23,6 +23,9 @@ REQUIREMENTS = {
     "whole_past": "always (historically a > -1)",
     "never_met": "eventually a > 5",
     "nested": "always eventually a > 5",
+    "never": "eventually[0.3 s, 0.5 s] (a > 5 and false)",
+    "never_and_edges": "always (rise(a > 0) unless[0 s, 0.4 s] b > 5) and false",
+    "never_and_forever": "always (a > -9 and false and eventually b > 3)",
 }
 SAMPLES = 120
 

@@ -7,11 +7,13 @@ import pytest
 
 from stlc.monitor.online import Online
 from stlc.monitor.paced import Paced
+from stlc.monitor.tracking import Whole
 from stlc.monitor.verdict import Monitor
 from stlc.monitor.windowed import Windowed
 
 REQUIREMENTS = {
     "within": "always[0, T] (a > 0 or eventually[0, end] b > 0)",
+    "swept": "eventually[0, T] sweep([a, b]) in block",
     "with_past": "always[0, T] (once[0 s, 0.2 s] a > 0 or eventually[0, end] b > 0)",
     "beyond": "eventually[0, T] a > 1 and always[0 s, 0.9 s] (b > -1 or eventually[0, end] a > 1)",
     "past_beyond": "(a < 1 release(T - 0.1 s, inf] a >= 1) until[0.2 s, 0.9 s] historically b > -2",
@@ -30,7 +32,7 @@ def judging(online: Online) -> type:
 @pytest.mark.parametrize("name", REQUIREMENTS)
 @pytest.mark.parametrize("step", [1, 4])
 def test_bounds_are_those_of_the_samples_so_far(name: str, step: int) -> None:
-    text = f"signal a\nsignal b\nrequire r: {REQUIREMENTS[name]}\n"
+    text = f"signal a\nsignal b\nregion block = box([-1, -1], [1, 1])\nrequire r: {REQUIREMENTS[name]}\n"
     monitor = Monitor(text, dt=0.1, horizon=0.6)
     rng = np.random.default_rng(7)
     for _ in range(3):
@@ -38,7 +40,7 @@ def test_bounds_are_those_of_the_samples_so_far(name: str, step: int) -> None:
         online = monitor.online()
         for k in range(0, 17, step):
             online.feed({key: values[k : k + step] for key, values in whole.items()})
-            assert judging(online) is Windowed
+            assert judging(online) is (Whole if name == "swept" else Windowed)
             known = {key: values[: k + step] for key, values in whole.items()}
             low, high = monitor.bounds(known)
             tally = online.standing("r")

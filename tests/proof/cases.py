@@ -51,6 +51,16 @@ class Case:
         seen = rows({name: x[:until] for name, x in self.signals.items()})
         return Record(seen, end, 2 * ahead(self.formula) + 8, until, growing=True)
 
+    def columns(self) -> dict[str, Any]:
+        """Column -> its values; a vector has one for each component."""
+        found = {}
+        for name, values in self.signals.items():
+            if np.ndim(values) > 1:
+                found |= {f"{name}[{k}]": values[:, k] for k in range(values.shape[1])}
+            else:
+                found[name] = values
+        return found
+
     def __str__(self) -> str:
         requirement = self.text[self.text.index("region block") :].split("\n", 1)[1]
         return f"case {self.seed}: {requirement.strip()}\non {self.signals}"

@@ -1,0 +1,179 @@
+"""What must be true of the cause that is told of one violated case.
+
+The value at the end of the path is the robustness of the requirement. Where it is said that it decides alone,
+a change of a signal there that brings its predicate closer to what is wanted raises the robustness. What is
+said beside an underlined part is so by the definition of that part, and the numbers told are those of the
+trace.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import reference
+from proof.cases import Case
+from proof.draw import Taste
+from proof.streamed import drawn
+
+from stlc.compile import typed
+from stlc.compile.walk import from_now, on_clock
+from stlc.diagnostics import TraceError
+from stlc.monitor.blame import Blame
+from stlc.monitor.explain import Cause, explain
+from stlc.monitor.instants import window_of
+from stlc.monitor.online import How
+from stlc.monitor.verdict import Monitor
+
+TASTES = (
+    Taste(),
+    Taste(plain=True, constants=False),
+    Taste(windows=True, depth=3),
+    Taste(absolute=True, constants=False, depth=3),
+    Taste(plain=True, constants=False, depth=4),
+)
+CHANGES = (1e-4, -1e-4, 0.6, -0.6, 1.2, -1.2, 3.0, -3.0)
+"""Of a signal at one sample: small ones, and some that are enough for a step of what is made of it."""
+
+
+def check_cause(seed: int) -> bool:
+    """The cause told of a recording. Whether the case is violated."""
+    found = drawn(seed, TASTES)
+    if found is None:
+        return False
+    case, monitor = found
+    verdict = monitor.check(case.signals)
+    cause = explain(verdict, "r")
+    if cause is None:
+        return False
+    wrong = [*_values(case, cause), *_labels(case, monitor, cause), *_change(case, monitor, cause)]
+    assert not wrong, f"{', '.join(wrong)}\n{cause.because}\n{cause.place.text} {cause.labels}\n{case}"
+    return True
+
+
+def check_told_by_stream(seed: int) -> bool:
+    """The cause told of the same samples one by one. Whether the case is violated."""
+    found = drawn(seed, TASTES)
+    if found is None:
+        return False
+    case, monitor = found
+    cause = explain(monitor.check(case.signals), "r")
+    if cause is None:
+        return False
+    online = monitor.online(How(reasons=True))
+    for k in range(case.samples):
+        online.push({name: values[k] for name, values in case.signals.items()})
+    told = online.cause("r")
+    assert told is not None, case
+    assert _told(told) == _told(cause), f"{_told(told)}\n{_told(cause)}\n{case}"
+    return True
+
+
+def _told(cause: Cause) -> tuple[object, ...]:
+    labels = tuple((label.span.text, label.text) for label in (cause.place, *cause.labels))
+    return cause.start, cause.sample, cause.time, cause.because, cause.readings, cause.alone, labels
+
+
+def _rho(cause: Cause) -> float:
+    high = cause.judgement.high
+    return float(high[cause.start - cause.judgement.start, cause.trace])
+
+
+def _values(case: Case, cause: Cause) -> Iterator[str]:
+    """Whether the leaf and the readings have the values that they are told to have."""
+    leaf, rho = cause.tree.leaf, _rho(cause)
+    if not np.isclose(-leaf.rho if leaf.holds else leaf.rho, rho, rtol=0, atol=1e-9):
+        yield f"value: {leaf.rho} at the leaf, {rho} is the robustness"
+    for reading in cause.readings:
+        if reading.value not in case.columns()[reading.signal]:
+            yield f"value: {reading.text}"
+
+
+def _seen(case: Case, monitor: Monitor, cause: Cause) -> reference.Trace:
+    """The trace up to the end of what the cause is about."""
+    (rule,) = monitor.compiled.requirements
+    grid = monitor.compiled.grid
+    window = window_of(rule, grid.horizon)
+    stop = None if window is None else cause.start + window + 1
+    columns = {name: column[:stop].tolist() for name, column in case.columns().items()}
+    return reference.Trace(columns, grid, "open", stop=stop or 0)
+
+
+class _Definition(reference.Robustness):
+    """The definition; what is on the mission clock is at every sample what it is at the first one."""
+
+    def _at(self, node: typed.Formula, t: int, positive: bool) -> reference.Interval | None:
+        if t and isinstance(node, (typed.Temporal, typed.Until)) and on_clock(node):
+            return self.at(from_now(node), 0, positive)
+        return super()._at(node, t, positive)
+
+
+def _labels(case: Case, monitor: Monitor, cause: Cause) -> Iterator[str]:
+    """Whether what is said beside the parts is what the definition says of them."""
+    judge = _Definition(_seen(case, monitor, cause))
+    for node in _said(cause.tree):
+        formula: typed.Formula = node.formula
+        if node.until is not None:
+            formula = _body(formula)
+        for k in range(node.sample, (node.sample if node.until is None else node.until) + 1):
+            ends = judge.at(formula, k, not node.holds)
+            if ends is None or not (ends[0] >= 0 if node.holds else ends[1] <= 0):
+                yield f"label: {formula.span.text} {'true' if node.holds else 'false'} at {k}, not {ends}"
+
+
+def _said(tree: Blame) -> Iterator[Blame]:
+    if tree.until is not None or tree.premise or not tree.parts:
+        yield tree
+    for part in tree.parts:
+        yield from _said(part)
+
+
+def _body(formula: typed.Formula) -> typed.Formula:
+    return formula.right if isinstance(formula, typed.Until) else formula.body  # type: ignore[union-attr]
+
+
+def _change(case: Case, monitor: Monitor, cause: Cause) -> Iterator[str]:
+    """Whether a change that brings the predicate closer to what is wanted raises the robustness."""
+    rho, leaf = _rho(cause), cause.tree.leaf
+    if not cause.alone or not np.isfinite(rho):
+        return
+    own = _margin(leaf, _seen(case, monitor, cause))
+    closer = 0
+    for name, later in leaf.reads:
+        for change in CHANGES:
+            signals = _changed(case.signals, name, leaf.sample + later, change)
+            if signals is None:
+                continue
+            moved = Case(case.seed, TASTES[case.seed % len(TASTES)])
+            moved.signals = signals
+            if _margin(leaf, _seen(moved, monitor, cause)) <= own:
+                continue
+            closer += 1
+            try:
+                judged = monitor.check(signals)["r"]
+            except TraceError:
+                continue
+            if judged.high[cause.start - judged.start, 0] > rho:
+                return
+    if closer:
+        yield f"change: {closer} of `{leaf.formula.span.text}` at {leaf.sample} leave {rho}"
+
+
+def _margin(leaf: Blame, trace: reference.Trace) -> float:
+    ends = _Definition(trace).at(leaf.formula, leaf.sample, not leaf.holds)
+    assert ends is not None
+    return -ends[0] if leaf.holds else ends[1]
+
+
+def _changed(signals: Mapping[str, Any], name: str, sample: int, change: float) -> dict[str, Any] | None:
+    """The signals with one value changed; None where it is none of them."""
+    base, _, component = name.partition("[")
+    if base not in signals or not 0 <= sample < len(signals[base]):
+        return None
+    found = {each: np.array(values, dtype=float) for each, values in signals.items()}
+    if component:
+        found[base][sample, int(component[:-1])] += change
+    else:
+        found[base][sample] += change
+    return found

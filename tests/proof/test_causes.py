@@ -1,0 +1,25 @@
+"""Causes of random violated requirements, of recordings and streams; `tools/proofs.py` tries any number."""
+
+from __future__ import annotations
+
+import pytest
+from proof import blamed
+
+CHECKS = {"recorded": blamed.check_cause, "streamed": blamed.check_told_by_stream}
+
+
+@pytest.mark.parametrize("name", CHECKS)
+def test_the_cause_is_what_it_is_said_to_be(name: str) -> None:
+    assert sum(CHECKS[name](seed) for seed in range(100, 160)) > 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CHECKS)
+def test_many_causes(name: str) -> None:
+    assert sum(CHECKS[name](seed) for seed in range(1000, 6000)) > 2500
+
+
+@pytest.mark.parametrize("name", CHECKS)
+@pytest.mark.parametrize("seed", [7000075, 9101148, 9101178, 9101732, 9102654])
+def test_what_was_wrong_once(name: str, seed: int) -> None:
+    assert CHECKS[name](seed)
