@@ -42,7 +42,7 @@ def drives(run):
     with_guard, without = guards["paper"]["drives"], guards["none"]["drives"]
     sentence = f"{with_guard['obeyed']} of {with_guard['count']} drives obeyed every rule"
     if with_guard["lost"]:
-        sentence += f" ({with_guard['lost']} could not be driven better)"
+        sentence += f" ({with_guard['lost']} were lost)"
     return f"{sentence}; without the guard {without['obeyed']}"
 
 

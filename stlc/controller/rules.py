@@ -105,7 +105,7 @@ class Broken:
 
     @property
     def excused(self) -> bool:
-        """Whether no controller can be held to it: lost from the start, or to what the world told."""
+        """Whether it does not count against a controller: lost from the start, or to what the world told."""
         return self.lost is not None and self.lost.why in ("start", "told")
 
 
@@ -371,7 +371,7 @@ def drives_json(drives: Drives, seeds: Sequence[int], agents: int) -> dict[str, 
     """The entry `drives` of a guard in `eval/simulate.json`.
 
     `count` drives, of which `obeyed` kept every rule and `undecided` ended too early to say; `lost` of the
-    others could not be driven better as far as is known (`Drives.viable`): `told` of them by what the world
+    others were lost (`Drives.viable`): `told` of them by what the world
     told later, the others from their start. `rules`: the same for each rule. `broken`: who broke which, and
     when (seconds from the start, null where nobody has looked), and `cause`, since when no plan is known and
     why (`Lost`).
@@ -398,7 +398,9 @@ def drives_json(drives: Drives, seeds: Sequence[int], agents: int) -> dict[str, 
                 "agent": each.row % agents,
                 "lost": not bool(drives.viable[each.row]),
                 "rules": dict(each.rules),
-                "cause": None if each.lost is None else {"why": each.lost.why, "time": each.lost.time},
+                "cause": None
+                if each.lost is None
+                else {"why": each.lost.why, "time": round(each.lost.time, 9)},
             }
             for each in drives.broken
         ],

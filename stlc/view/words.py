@@ -91,7 +91,7 @@ CAUSES = {
 
 
 def viable_sentence(simulation: Mapping[str, Any]) -> str:
-    """How many drives nobody could have driven better, and how many of the others obeyed; "" for none."""
+    """How many drives were lost, when, and how many of the others obeyed; "" where none was."""
     each = list(drives_of(simulation).values())
     if not each:
         return ""
@@ -116,7 +116,7 @@ def viable_sentence(simulation: Mapping[str, Any]) -> str:
 
 
 def cause_words(broken: Mapping[str, Any]) -> str:
-    """Why a drive that broke a rule could not be driven better, or could: an entry of `broken`."""
+    """Reason for which a drive broke a rule, an entry of `broken`; "" where none is known."""
     cause = broken.get("cause")
     if cause is None:
         return "lost from its start" if broken["lost"] else ""
