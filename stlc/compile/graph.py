@@ -71,17 +71,23 @@ def evaluate(
 
 
 def evaluate_parts(
-    formula: ir.Formula, env: Mapping[str, Array], instants: range, *, ops: Ops, end: End
+    formula: ir.Formula,
+    env: Mapping[str, Array],
+    instants: range,
+    *,
+    ops: Ops,
+    end: End,
+    stop: int | None = None,
 ) -> Iterator[tuple[ir.Formula, range, Array]]:
     """Exact robustness of a formula at consecutive instants, and of its parts where it needs them.
 
-    Where `end` is "lower" or "upper", instants may lie beyond the last sample.
+    Where `end` is "lower" or "upper", instants may lie beyond the last sample; `stop` as in `evaluate`.
 
     Yields:
         Formulas, instants and values `(instants, batch)`, parts first; not what stands in a `Freeze`.
     """
     windows = Windows(Exact(), ops)
-    plan = planned((formula,), Run(instants.start, len(instants)), _extent(env, end, windows))
+    plan = planned((formula,), Run(instants.start, len(instants)), _extent(env, end, windows, stop))
     for step, values in zip(plan.steps, _all_values(plan, env, windows), strict=True):
         yield step.node, range(step.run.start, step.run.last + 1), values
 

@@ -111,12 +111,14 @@ class _Tied:
         names: predicate -> its column.
         env: column -> values (samples, 1); columns of predicates that come later are added.
         raised: which value is more than it is.
+        stop: how many samples there will be, where that are more than are known.
     """
 
     record: Record
     names: dict[ir.Formula, str]
     env: dict[str, Floats]
     raised: Spot | None = None
+    stop: int | None = None
 
     @property
     def columns(self) -> dict[str, Floats]:
@@ -133,7 +135,7 @@ class _Tied:
         for leaf in _leaves_of(formula):
             if leaf not in self.names:
                 self.names[leaf] = f"#{len(self.names)}"
-                values = self.record.values([leaf], range(self.record.samples), "upper")[0]
+                values = self.record.values([leaf], range(self.record.samples), "upper", self.stop)[0]
                 self.env[self.names[leaf]] = np.asarray(values, np.float64)
         return _over_columns(formula, self.names)
 
@@ -142,7 +144,7 @@ class _Tied:
         coded = self.coded(formula)
         env = self._with(raised[0]) if raised else self.env
         record = replace(self.record, env=env)
-        return float(record.values([coded], range(sample, sample + 1), "upper")[0][0, 0])
+        return float(record.values([coded], range(sample, sample + 1), "upper", self.stop)[0][0, 0])
 
 
 def _leaves_of(formula: ir.Formula) -> dict[ir.Formula, None]:
@@ -178,6 +180,7 @@ class Blamer:
         cache: formulas, or their negations, as lowered.
         known: the most that lowered formulas can be, at which instants.
         tied: values of predicates that are taken instead of those of the trace, one of them a trifle more.
+        stop: how many samples there will be, where that are more than are known.
     """
 
     record: Record
@@ -185,6 +188,7 @@ class Blamer:
     cache: dict[tuple[typed.Formula, bool], ir.Formula] = field(default_factory=dict)
     known: dict[ir.Formula, list[tuple[range, Floats]]] = field(default_factory=dict)
     tied: _Tied | None = None
+    stop: int | None = None
 
     # --------------------------------------------------------------------- ties
 
@@ -232,10 +236,10 @@ class Blamer:
         samples = self.record.samples
         if any(instant >= samples for _, instant in equal) or samples * len(leaves) > _MOST_NUMBERS:
             return None
-        values = self.record.values(leaves, range(samples), "upper")
+        values = self.record.values(leaves, range(samples), "upper", self.stop)
         names = {leaf: f"#{k}" for k, leaf in enumerate(leaves)}
         env = {name: np.asarray(x, np.float64) for name, x in zip(names.values(), values, strict=True)}
-        return _Tied(self.record, names, env)
+        return _Tied(self.record, names, env, stop=self.stop)
 
     def blame(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> Blame:
         """Why `formula` is not `wanted` at `sample`."""
@@ -311,7 +315,10 @@ class Blamer:
         found = self._found(lowered, instants)
         if found is None:
             env = self.record.env if self.tied is None else self.tied.columns
-            for node, its, values in evaluate_parts(lowered, env, instants, ops=self.record.ops, end="upper"):
+            found_in = evaluate_parts(
+                lowered, env, instants, ops=self.record.ops, end="upper", stop=self.stop
+            )
+            for node, its, values in found_in:
                 self.known.setdefault(node, []).append((its, values[:, 0]))
             found = self._found(lowered, instants)
         assert found is not None
@@ -414,7 +421,12 @@ class Blamer:
         match lowered:
             case ir.Over(window=window) | ir.Until(window=window):
                 last, known = self.record.samples - 1, self._stop(lowered) - 1
-                high = last if window.hi is None else min(sample + window.hi, known)
+                end = known if self.stop is None else min(self.stop - 1, known)
+                high = (
+                    (last if self.stop is None else end)
+                    if window.hi is None
+                    else min(sample + window.hi, known)
+                )
                 return range(sample + window.lo, high + 1)
             case ir.Past(window=window) | ir.Since(window=window):
                 low = 0 if window.hi is None else max(sample - window.hi, 0)

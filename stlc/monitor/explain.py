@@ -116,9 +116,11 @@ def _cause(
         subject.record.ops,
     )
     window = window_of(rule, subject.horizon)
-    record = record if window is None else record.cut(start + window + 1)
+    stop = None if window is None else start + window + 1
+    record = record if stop is None else record.cut(stop)
+    going_on = stop if stop is not None and stop > record.samples else None
     formula = recorded(rule.typed.formula) if rule.absolute else rule.typed.formula
-    tree, alone = Blamer(record, subject.compiled.grid).why(formula, start)
+    tree, alone = Blamer(record, subject.compiled.grid, stop=going_on).why(formula, start)
     words = _Words(subject, record, rule.typed.written, definitions)
     leaf = tree.leaf
     place, *labels = words.labels(tree)

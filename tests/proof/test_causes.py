@@ -20,6 +20,6 @@ def test_many_causes(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CHECKS)
-@pytest.mark.parametrize("seed", [7000075, 9101148, 9101178, 9101732, 9102654])
+@pytest.mark.parametrize("seed", [7000075, 9101148, 9101178, 9101732, 9200317, 9202142, 9202282, 9201672])
 def test_what_was_wrong_once(name: str, seed: int) -> None:
     assert CHECKS[name](seed)
