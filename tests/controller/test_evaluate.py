@@ -12,7 +12,7 @@ from torch import Tensor
 from traffic_drivers import careful
 
 from stlc.controller.archive import save_scene, save_trace_of
-from stlc.controller.deploy import Guard
+from stlc.controller.deploy import Decision, Guard
 from stlc.controller.drive import Recorder, Recording, Setting, drive
 from stlc.controller.evaluate import (
     METRICS,
@@ -119,18 +119,19 @@ class Signals:
 
 
 def test_who_is_told_something_plans_at_once(car_task: Task) -> None:
-    class Counting(Careful):
-        def plan(self, x0: Tensor) -> Tensor:
-            self.asked = getattr(self, "asked", [])
-            self.asked.append(len(x0))
-            return super().plan(x0)
+    asked: list[int] = []
+
+    class Counting(Guard):
+        def decide(self, x: Tensor, begun: Decision | None = None) -> Decision:
+            asked.append(len(x))
+            return super().decide(x, begun)
 
     class Silent(Signals):
         options = choose = None  # type: ignore[assignment]
 
-    policy, recorder = Counting(car_task), Recorder(3)
-    drive(Guard(car_task, policy, "none"), Silent, Setting((0,), 3, 12, replan=4), recorder)
-    assert policy.asked == [3, 3, 1, 3, 1]  # steps 0, 4, 5, 8, 10
+    guard, recorder = Counting(car_task, Careful(car_task), "none"), Recorder(3)
+    drive(guard, Silent, Setting((0,), 3, 12, replan=4), recorder)
+    assert asked == [3, 3, 1, 3, 1]  # steps 0, 4, 5, 8, 10
     found = recorder.recording()
     assert found is not None
     assert (found.actions[0, 1:4] == -2.0).all()
