@@ -40,3 +40,12 @@ def _plain_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE", "PY_COLORS"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("COLUMNS", "100")
+
+
+@pytest.fixture(autouse=True)
+def _kernels_are_asked_for_again(request):
+    """A test that hides the compiler leaves no "there is no kernel" behind for the next one."""
+    yield
+    module = sys.modules.get("stlc.compile.ops_torch_kernel")
+    if module is not None and "monkeypatch" in request.fixturenames:
+        module._library.cache_clear()

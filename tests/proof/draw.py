@@ -363,7 +363,7 @@ class Drawing:
         c, c_text = self._number()
         options: list[tuple[str, Callable[[Row], float]]] = [
             (f"x % 2 > {c_text}", lambda row: row["x"] - 2 * math.floor(row["x"] / 2) - c),
-            (f"floor(y) > {c_text}", lambda row: math.floor(row["y"]) - c),
+            (f"floor(y) > {c_text}", lambda row: math.floor(row["y"]) - c - (0.5 if c == int(c) else 0.0)),
             (f"x + ind(y > 0) > {c_text}", lambda row: row["x"] + (row["y"] > 0) - c),
             (
                 f"(if y >= z then x else -x) > {c_text}",
