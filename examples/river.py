@@ -79,9 +79,14 @@ class River(ABC):
         self.first = proposed[0, self._allowed(proposed[0])]
         self.chain = self._chain()
         self.next = torch.zeros(self.agents, dtype=torch.int64)
-        x = torch.stack([self._start(own) for own in proposed])
-        self.begin, self.state, self.hit = x[:, self.at["x"]], x, self._touching(x)
-        return x
+        return self._begun(torch.stack([self._start(own) for own in proposed]))
+
+    def redraw(self, rows: torch.Tensor) -> torch.Tensor:
+        """Other starts on the same river for ships `rows` (k,); all states, (agents, n)."""
+        proposed = self._calmed(self.streams.states(self.system, PROPOSED))[rows]
+        return self._begun(
+            self.state.index_copy(0, rows, torch.stack([self._start(own) for own in proposed]))
+        )
 
     def advance(self, x: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Move every ship as the model says for one step; (agents, n), (agents, m) -> (agents, n)."""
@@ -163,6 +168,11 @@ class River(ABC):
 
     # ------------------------------------------------------------------------------ parts
 
+    def _begun(self, x: torch.Tensor) -> torch.Tensor:
+        """The states (agents, n), with which all begins."""
+        self.begin, self.state, self.hit = x[:, self.at["x"]], x, self._touching(x)
+        return x
+
     def _start(self, proposed: torch.Tensor) -> torch.Tensor:
         """The first of the proposed starts (k, n) that is allowed on this river."""
         placed = self._facing(proposed, torch.zeros(len(proposed), dtype=torch.int64))
@@ -215,10 +225,7 @@ class TrackRiver(River):
 
     def reset(self) -> torch.Tensor:
         self.view, self.no_obs = (float(self.system.decl.constants[name][0]) for name in ("view", "no_obs"))
-        x = super().reset()
-        self.given = x[:, self.at["tau"]] >= 0.0
-        self.late = torch.zeros_like(self.given)
-        return x
+        return super().reset()
 
     def advance(self, x: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """The same; an obstacle that comes into view renews the allowance."""
@@ -239,6 +246,11 @@ class TrackRiver(River):
         calm[..., self.at["psi"]] = 0.0
         calm[..., self.at["tau"]] = 15 * self.system.dt
         return calm
+
+    def _begun(self, x: torch.Tensor) -> torch.Tensor:
+        self.given = x[:, self.at["tau"]] >= 0.0
+        self.late = torch.zeros_like(self.given)
+        return super()._begun(x)
 
     def _chain(self) -> Chain:
         gaps = self._uniform(NEAREST, FARTHEST, OBSTACLES)

@@ -324,6 +324,8 @@ def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rule
         "run": run.dir.name,
         "world": world.path.name if world is not None else None,
         "scenario": _laid_over(run),
+        "starts": run.task.system.decl.test.starts,
+        "redrawn": last.recording.redrawn,
         "errors": errors_of(run.task.plain.truth),
         "judge": None if rules is None else {"spec": rules.name, "path": rules.path, "rules": rules.docs},
         "trace": f"{run.dir.shown}/trace.npz",

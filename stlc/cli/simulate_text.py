@@ -56,6 +56,7 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
     world = document["world"] or f"{document['system']} and its events"
     scenario = [f"scenario {document['scenario']}"] if document["scenario"] else []
     yield visible(" · ".join((document["spec"], f"run {document['run']}", f"world {world}", *scenario, size)))
+    yield from _starts(document)
     yield from _wrong(document.get("errors", {}))
     if document.get("margin"):
         spared = ", ".join(f"{name} {margin:.3g}" for name, margin in document["margin"].items())
@@ -75,6 +76,13 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
         yield from _foreseen(last["metrics"].get("foreseen"))
     if document.get("scenarios"):
         yield from compared(document)
+
+
+def _starts(document: Record) -> Iterator[str]:
+    """Which starts were taken, where not all were."""
+    known = {"savable": "a safe plan", "feasible": "a plan that satisfies everything"}.get(document["starts"])
+    if known:
+        yield f"  starts from which {known} is known; {document['redrawn']:,} others were drawn again"
 
 
 def _drives(document: Record) -> Iterator[str]:

@@ -47,6 +47,7 @@ class Recording:
         quiet: (rows, steps), whether the world did nothing but what the truth of the dynamics does; None
             where nobody has looked.
         options: (rows, steps, k, n), among which agents chose; None where the world leaves no choice.
+        redrawn: starts that were drawn again because no plan is known from them.
     """
 
     agents: int
@@ -62,6 +63,7 @@ class Recording:
     scene: Mapping[str, NDArray[Any]]
     options: NDArray[np.float64] | None = None
     quiet: NDArray[np.bool_] | None = None
+    redrawn: int = 0
 
     @property
     def steps(self) -> int:
@@ -83,6 +85,7 @@ class Recorder:
     replaced: list[Frame] = field(default_factory=list)
     progress: tuple[Mapping[str, float], ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
+    redrawn: int = 0
 
     def start(self, x: Tensor, frame: Frame) -> None:
         """The first sample: `x` (rows, n), agents of all seeds one after the other."""
@@ -126,6 +129,7 @@ class Recorder:
             scene=scene,
             options=torch.stack(self.options[:steps], 1).numpy(force=True) if self.options else None,
             quiet=torch.stack(self.quiet[:steps], 1).numpy(force=True) if len(self.quiet) >= steps else None,
+            redrawn=self.redrawn,
         )
 
 
@@ -213,13 +217,15 @@ def drive(
     """Deploy in fresh worlds, one a seed, into `recorder`; `watch` is told every step.
 
     Raises:
-        SystemFileError: S207, a world fails; S302, it gives states that are no numbers.
-        RunError: R402, a plan that is no number would have to be executed.
+        SystemFileError: S207, a world fails; S211, it cannot draw a start again; S302, it gives states that
+            are no numbers.
+        RunError: R405, no start with a known plan is drawn; R402, a plan that is no number would have to be
+            executed.
     """
     worlds, pilot = Worlds(guard.task, make, setting), _Pilot(guard, setting)
     x = worlds.reset()
     recorder.start(x, worlds.snapshot())
-    recorder.units = worlds.units()
+    recorder.units, recorder.redrawn = worlds.units(), worlds.redrawn
     for step in range(setting.steps):
         seen = worlds.disturbance.seen(x, step)
         due = pilot.due(x, seen, step)

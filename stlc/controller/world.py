@@ -69,6 +69,17 @@ class Choosing(Protocol):
 
 
 @runtime_checkable
+class Redrawing(Protocol):
+    """What a world has, too, where an agent may be given another start before anything has moved."""
+
+    def redraw(self, rows: Tensor) -> Tensor:
+        """Draw the starts of some agents again, (k,) int64; returns all states, (agents, n).
+
+        Other agents keep theirs, unless they depend on those.
+        """
+
+
+@runtime_checkable
 class Charting(Protocol):
     """What a world has, too, where plans can be drawn into its picture."""
 
@@ -102,8 +113,14 @@ class ModelWorld:
     def reset(self) -> Tensor:
         """Initial states as in training, (agents, n)."""
         self._begin()
-        drawn = self._system.sample(self._agents, generator=self._generator, dtype=torch.float64)
-        return self._happen(drawn)
+        self._drawn = self._sampled(self._agents)
+        return self._happen(self._drawn)
+
+    def redraw(self, rows: Tensor) -> Tensor:
+        """Other initial states for some agents, (k,) -> (agents, n); what happens at once, happens anew."""
+        self._begin()
+        self._drawn = self._drawn.index_copy(0, rows, self._sampled(len(rows)))
+        return self._happen(self._drawn)
 
     def advance(self, x: Tensor, action: Tensor) -> Tensor:
         """One step of the model, then what happens to whom: (agents, n), (agents, m) -> (agents, n)."""
@@ -140,6 +157,9 @@ class ModelWorld:
             low, high = float(state[..., column].min()), float(state[..., column].max())
             limit(low - 0.05 * (high - low) - 1e-3, high + 0.05 * (high - low) + 1e-3)
         axes.set(xlabel=str(names[0]), ylabel=str(names[second]))
+
+    def _sampled(self, count: int) -> Tensor:
+        return self._system.sample(count, generator=self._generator, dtype=torch.float64)
 
     def _happen(self, x: Tensor) -> Tensor:
         self._x, counts = self._events.apply(x, self._step, self._generator)

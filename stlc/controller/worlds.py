@@ -13,13 +13,19 @@ from torch import Tensor
 
 from stlc.controller.disturbance import Disturbance
 from stlc.controller.faults import blamed, require_numbers, scene_of, states_of, wrong
+from stlc.controller.savable import savable, solvable
 from stlc.controller.spare import Spare
-from stlc.controller.world import Charting, Choosing
+from stlc.controller.world import Charting, Choosing, Redrawing
+from stlc.diagnostics import Diagnostic, RunError, SystemFileError
 
 if TYPE_CHECKING:
     from stlc.controller.task import Task
     from stlc.controller.world import WorldType
+    from stlc.dynamics.decl_deployment import Starts, TestDecl
 
+
+REDRAWN = 50
+"""How often the start of an agent is drawn again, at most."""
 
 SURPRISE = 1e-6
 """What moves a state further than this is no rounding."""
@@ -55,7 +61,7 @@ class Worlds:
     """
 
     def __init__(self, task: Task, make: WorldType, setting: Setting) -> None:
-        self.system, self.names = task.system, task.plain.names
+        self.task, self.system, self.names = task, task.system, task.plain.names
         self.size = (setting.agents, len(self.names))
         self.seeds = setting.seeds
         self.parts = [setting.agents] * len(setting.seeds)
@@ -69,13 +75,47 @@ class Worlds:
         self._scene: dict[str, NDArray[Any]] | None = None
 
     def reset(self) -> Tensor:
-        """The first states, (rows, n); parameters are drawn, timers as at the start of a mission."""
+        """The first states, (rows, n); parameters are drawn, timers as at the start of a mission.
+
+        Where the system takes only starts from which a plan is known (`test: {starts: …}`), the others are
+        drawn again, `redrawn` of them in all.
+
+        Raises:
+            SystemFileError: S211, a world cannot draw the start of an agent again.
+            RunError: R405, no start that it draws has a known plan.
+        """
         given = []
         for world in self.worlds:
             with blamed(world, "reset", "begin"):
                 given.append(world.reset())
         parts = zip(torch.split(self._checked("reset", given, 0), self.parts), self.generators, strict=True)
-        return torch.cat([self.system.begun(x, generator) for x, generator in parts])
+        begun = [self.system.begun(x, generator) for x, generator in parts]
+        self.redrawn = 0
+        if self.task.system.decl.test.starts == "any":
+            return torch.cat(begun)
+        return torch.cat(
+            [self._with_plans(*each) for each in zip(self.worlds, self.seeds, begun, strict=True)]
+        )
+
+    def _with_plans(self, world: object, seed: int, x: Tensor) -> Tensor:
+        """The first states of a seed, (agents, n), drawn again wherever no plan is known from them."""
+        known = savable if self.task.system.decl.test.starts == "savable" else solvable
+        good = known(self.task, x)
+        for _ in range(REDRAWN):
+            if bool(good.all()):
+                return x
+            if not isinstance(world, Redrawing):
+                raise _cannot_redraw(world, self.task.system.decl.test)
+            left = torch.nonzero(~good).squeeze(1)
+            self.redrawn += len(left)
+            with blamed(world, "redraw", "draw starts again"):
+                given = states_of(world, "redraw", world.redraw(left), self.size)
+            require_numbers(world, "redraw", given, (self.names, f"at step 0 (seed {seed})"))
+            again = torch.cat((given, x[:, self.size[1] :]), 1)
+            good &= (again == x).all(1)
+            x, left = again, torch.nonzero(~good).squeeze(1)
+            good[left] = known(self.task, x[left])
+        raise _hopeless(self.task.system.decl.test.starts, seed, int((~good).sum()))
 
     def advance(self, x: Tensor, action: Tensor, step: int) -> Tensor:
         """(rows, n), (rows, m) -> the (rows, n) states after step number `step`.
@@ -172,3 +212,25 @@ class Worlds:
             agents, count = states.shape[:2]
             raise wrong(world, "charted", f"gives places of shape {places.shape}, not ({agents}, {count}, 2)")
         return places
+
+
+def _cannot_redraw(world: object, test: TestDecl) -> SystemFileError:
+    return SystemFileError(
+        Diagnostic(
+            "S211",
+            f"the world `{type(world).__name__}` cannot draw the start of one agent again",
+            None if test.world is None else test.world.span,
+            label="named here",
+            note=(f"`starts: {test.starts}` draws starts again from which no plan is known",),
+            help=("`--set test.starts=any` takes them all", "a method `redraw` gives agents another start"),
+        )
+    )
+
+
+def _hopeless(starts: Starts, seed: int, agents: int) -> RunError:
+    plan = "a safe plan" if starts == "savable" else "a plan that satisfies everything"
+    weaker = ("`--set test.starts=savable` asks for a safe plan",) if starts == "feasible" else ()
+    message = (
+        f"no start from which {plan} is known, in {REDRAWN} draws each, for {agents} agents of seed {seed}"
+    )
+    return RunError(Diagnostic("R405", message, help=(*weaker, "`--set test.starts=any` takes them all")))

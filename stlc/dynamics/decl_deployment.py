@@ -80,6 +80,11 @@ class JudgeRef:
     span: Span = field(compare=False, repr=False)
 
 
+Starts = Literal["any", "savable", "feasible"]
+"""Starts that agents may have: all that are drawn, or those from which a search finds a safe plan, or a
+plan that satisfies everything."""
+
+
 @dataclass(frozen=True, slots=True)
 class TestDecl:
     """A deployment: how long, how many agents, how often they plan, and what happens to them.
@@ -87,6 +92,7 @@ class TestDecl:
     `uncertain`: the constants that `parameters` of a scenario's errors makes wrong; None: those that
     `stlc.dynamics.uncertain` finds.
     `judge`: the specification that drives are judged by; None: the one that plans are made for.
+    `starts`: which of the starts that are drawn are taken; the others are drawn again.
     """
 
     __test__ = False
@@ -99,6 +105,7 @@ class TestDecl:
     world: WorldRef | None = None
     uncertain: tuple[str, ...] | None = None
     judge: JudgeRef | None = None
+    starts: Starts = "any"
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast, get_args
 
 from stlc.compile import ir
 from stlc.compile.scope import Known
 from stlc.compile.values import Number
-from stlc.dynamics.decl_deployment import EventDecl, JudgeRef, TestDecl, WorldRef
+from stlc.dynamics.decl_deployment import EventDecl, JudgeRef, Starts, TestDecl, WorldRef
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import read_sets
 from stlc.dynamics.schema_names import Names, base_name
@@ -18,11 +18,12 @@ from stlc.dynamics.schema_reader import Reader, first_line
 from stlc.dynamics.yaml_nodes import Node, Scalar
 from stlc.grammar import ast
 
-TEST_KEYS = ("steps", "agents", "replan", "events", "metrics", "world", "uncertain", "judge")
+TEST_KEYS = ("steps", "agents", "replan", "events", "metrics", "world", "uncertain", "judge", "starts")
 EVENT_KEYS = ("name", "when", "at", "every", "set")
 METRICS = ("stl_accuracy", "safety", "progress", "latency")
 SPECS = (".stl", ".stlc")
 Edge = Literal["rise", "fall"]
+STARTS: tuple[Starts, ...] = get_args(Starts)
 
 
 def read_test(node: Node | None, reader: Reader, names: Names, dt: Fraction) -> TestDecl:
@@ -45,7 +46,12 @@ def read_test(node: Node | None, reader: Reader, names: Names, dt: Fraction) -> 
         read_world(found.get("world"), reader),
         _uncertain(found["uncertain"], reader, names) if "uncertain" in found else None,
         read_judge(found.get("judge"), reader),
+        _starts(found.get("starts"), reader) or default.starts,
     )
+
+
+def _starts(node: Node | None, reader: Reader) -> Starts | None:
+    return None if node is None else cast("Starts | None", reader.option(node, "`starts`", STARTS))
 
 
 def _uncertain(node: Node, reader: Reader, names: Names) -> tuple[str, ...]:
