@@ -142,7 +142,7 @@ class FullBackup:
 
     def _rescued(self, x: Tensor, until: float) -> Found:
         """Plans for phi_safe that have nothing to do with the policy."""
-        return self._judged(x, self._hunt.plans(x, until)[0])
+        return self._judged(x, self._hunt.plans(x, lambda: perf_counter() >= until)[0])
 
     def _judged(self, x: Tensor, plans: Tensor) -> Found:
         """Plans (agents, T, m) as polished ones."""

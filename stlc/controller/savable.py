@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from itertools import product
-from time import perf_counter
 from typing import TYPE_CHECKING
 
 import torch
@@ -15,6 +13,8 @@ from stlc.controller.search import THOROUGH, Searcher
 from stlc.controller.task import Task
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from torch import Tensor
 
 PASSES = 4
@@ -52,10 +52,10 @@ class Hunt:
         self.bank = extremes(task, torch.Generator().manual_seed(0))
 
     @torch.no_grad()
-    def plans(self, x0: Tensor, until: float = math.inf) -> tuple[Tensor, Tensor]:
+    def plans(self, x0: Tensor, enough: Callable[[], bool] = lambda: False) -> tuple[Tensor, Tensor]:
         """Plans (B, T, m) float64 from states (B, n), and which of them satisfy the specification, (B,).
 
-        No pass begins when `perf_counter()` has come to `until`.
+        No pass begins once `enough` says so.
         """
         generator = torch.Generator().manual_seed(0)
         searcher = Searcher(self.task, generator, enough=ENOUGH)
@@ -64,7 +64,7 @@ class Hunt:
         best, found = start.double().clone(), torch.zeros(len(x0), dtype=torch.bool)
         for _ in range(PASSES):
             still = torch.nonzero(~found).squeeze(1)
-            if not len(still) or perf_counter() >= until:
+            if not len(still) or enough():
                 break
             plans = searcher.repair(x0[still].float(), start[still].clone(), self.bank, tries=tries).plans
             best[still] = plans.double()

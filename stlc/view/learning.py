@@ -233,7 +233,8 @@ def _longer(curve: Curve, seconds: float, commands: Commands) -> tuple[str, str]
             told = "a longer budget alone promises little, the curve is flat: let the policy see what decides"
             return f"{told} (`policy: {{observe: …}}`), or look at where it fails: `{commands.report}`", ""
     told = f"a longer budget: {LEAST_ROUNDS} search rounds are needed to say how long, and there were fewer"
-    return f"{told}: `{twice}`", twice
+    enough = f"{commands.train_on} --budget {budget_text(max(seconds, 60.0))}"
+    return f"{told}: `{enough}`", enough
 
 
 def _worst(result: Mapping[str, Any], where: str) -> str:
@@ -249,8 +250,10 @@ def _hard_starts(feasible: float, *, sampled: bool) -> tuple[str, ...]:
     if feasible > MUCH_INFEASIBLE:
         return ()
     about = "about " if sampled else ""
-    told = f"for {about}{share(1.0 - feasible)} of the starts search finds no satisfying plan either"
-    return (f"{told}: a narrower `init`, a longer `horizon` or later deadlines would change that",)
+    told = f"for {about}{share(1.0 - feasible)} of the starts search found no satisfying plan either"
+    return (
+        f"{told}; where there is none, only a narrower `init`, a longer `horizon` or later deadlines help",
+    )
 
 
 def _rough(seconds: float) -> float:

@@ -6,10 +6,14 @@ from pathlib import Path
 
 import torch
 
-from stlc.controller.config import TrainConfig, decide
+from stlc.controller.config import HELD_OUT_SEED, TrainConfig, decide
 from stlc.controller.held_out import save_states, score
 from stlc.controller.policy import Mlp, PlanNetwork
+from stlc.controller.savable import solvable
 from stlc.controller.task import Task, satisfied
+from stlc.dynamics.system import System
+from stlc.files import read_source
+from stlc.grammar.parser import parse
 from stlc.view.held_out import load_held_out, unsolved_text
 
 
@@ -30,3 +34,19 @@ def test_what_is_known_is_kept_state_by_state(car_task: Task, tmp_path: Path) ->
     assert failing == 60 - int(good.sum())
     assert known == int(found.known.sum()) - int(good.sum())
     assert unsolved_text(held).startswith(f"{failing} of 60 starts; a satisfying plan is known for {known} ")
+
+
+def test_what_is_feasible_hardly_depends_on_the_policy() -> None:
+    """Ships that nobody has trained: where search begins with their plans alone it knows half as many."""
+    root = Path(__file__).parents[2]
+    spec = parse(read_source(root / "specs" / "ship_track.stl"))
+    task = Task.of(spec, System.load(root / "examples" / "ship_track.yaml"))
+    engine = decide(task, TrainConfig())
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        policy = Mlp(task, PlanNetwork(task, hidden=engine.hidden, plans=1))
+    found = score(policy, n=120)
+    assert found.accuracy < 0.05
+    states = task.sample(120, seed=HELD_OUT_SEED, dtype=torch.float64)
+    assert found.feasible >= 0.85 * float(solvable(task, states).double().mean())
+    assert int(found.searched.sum()) == 120

@@ -71,7 +71,7 @@ def test_a_policy_that_reaches_all_that_is_possible_is_trained_however_little_th
     learning = learning_of(result(0.35, 0.36), rows(0.35, 0.36, 0.1), COMMANDS)
     assert learning.level == "trained"
     (hard,) = learning.advice
-    assert hard.startswith("for 64.0 % of the starts search finds no satisfying plan either")
+    assert hard.startswith("for 64.0 % of the starts search found no satisfying plan either")
 
 
 def test_an_estimate_is_called_one() -> None:
