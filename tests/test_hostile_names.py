@@ -332,3 +332,58 @@ def compiled_c(names: list[str]) -> tuple[str, str]:
 def test_kernels_are_the_same_whatever_things_are_called() -> None:
     names = [name for name in NAMES if "[" not in name][::6]
     assert compiled_c(names) == compiled_c([f"plain_{number}" for number in range(len(names))])
+
+
+# ----------------------------------------------------- projects, installations, margins
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in sample(30) if len(name.encode()) < 200 and not name.startswith(("/", "."))]
+)
+def test_a_project_of_any_name_is_one_folder_that_works(name: str, folder: Path, said: Said) -> None:
+    code, text = said("init", "--", name)
+    assert code in (0, 2), text
+    if code == 2:
+        assert not list(folder.iterdir())
+        return
+    specs = sorted(Path(name).rglob("*.stl"))
+    assert specs
+    code, text = said("lint", "--", *map(str, specs))
+    assert code == 0, text
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in sample(30) if "\0" not in name and not escape.unseen(name)]
+)
+def test_new_specifications_and_systems_have_names_that_mean_themselves(
+    name: str, folder: Path, said: Said
+) -> None:
+    for kind in ("spec", "system"):
+        code, text = said("new", kind, "--", name)
+        assert code in (0, 2), text
+    written = [path for path in folder.rglob("*") if path.is_file()]
+    specs = [str(path) for path in written if path.suffix == ".stl"]
+    if specs:
+        code, text = said("lint", "--", *specs)
+        assert code in (0, 1), text
+
+
+@pytest.mark.parametrize(
+    "name", ["\x1b[2J\x1b[31m", "a\nb", "$(touch canary_ran)", "`touch canary_ran`; #", "\u202eabc"]
+)
+def test_an_installation_is_looked_at_whatever_its_folders_are_called(
+    name: str, folder: Path, said: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / name).mkdir()
+    for variable in ("HOME", "XDG_CACHE_HOME", "STLC_CACHE", "CC", "TMPDIR"):
+        monkeypatch.setenv(variable, str(folder / name))
+    code, text = said("doctor", "--quick")
+    assert code in (0, 5), text
+    assert document(said, "doctor", "--quick", "--json")[0] == code
+
+
+def test_margins_for_a_viewer_give_every_name_back(judged: list[str], said: Said) -> None:
+    pytest.importorskip("mcap")
+    save_trace("one.npz", zeros(REQUIRED, traces=1))
+    assert said("check", "h.stl", "one.npz", "--out", "o.mcap")[0] == 1
+    assert sorted(read_recording(Path("o.mcap")).columns) == sorted(judged)
