@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import reduce
 from typing import assert_never
 
 from stlc.compile import ir
@@ -111,8 +110,9 @@ class Forward:
             case Margin():
                 return self._margin(step)
             case Joined(out, run, pick, items):
-                text = reduce(lambda a, b: f"{pick}({a}, {b})", (item["k"] for item in items))
-                return [f"{run.loop()} LANE {out['k']} = {text};"]
+                # one operand a statement: a macro in itself doubles its text each time
+                rest = " ".join(f"most = {pick}(most, {item['k']});" for item in items[1:])
+                return [f"{run.loop()} LANE {{ double most = {items[0]['k']}; {rest} {out['k']} = most; }}"]
             case Extremum() | Meeting() | Moved():
                 return windowed(step, self.plan.samples - 1)
             case Repeated(out, run, body):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from emitted import (
@@ -19,6 +21,7 @@ from formula_strategies import NAMES, formulas
 from stlc import native
 from stlc.compile import ir
 from stlc.compile.c_plan import plan_of
+from stlc.compile.emit_c import emit
 from stlc.compile.graph import evaluate
 from stlc.compile.horizon import nodes
 from stlc.compile.ops_numpy import NUMPY
@@ -158,3 +161,26 @@ def test_windows_to_the_end_are_one_pass() -> None:
     found, _ = kernel.judge(trace[0].copy(), trace[1:].transpose(1, 0, 2).copy())
     env = {name: trace[:, :, i].copy() for i, name in enumerate(NAMES)}
     np.testing.assert_allclose(found.T, np.concatenate(evaluate([rule, since], env, ops=NUMPY)))
+
+
+def test_extrema_of_many_operands_stand_side_by_side() -> None:
+    """A macro that doubles its operand, within itself 40 times, would be a text without end."""
+    columns = [ir.Op("sub", (ir.Col(NAMES[i % 3]), ir.Lit(i / 8))) for i in range(40)]
+    nums = [ir.Op("min", tuple(columns)), ir.Op("max", tuple(columns)), ir.Op("norminf", tuple(columns))]
+    parts = [ir.Over("always", ir.Window(0, i % 9), ir.Atom(column)) for i, column in enumerate(columns)]
+    rules = [*map(ir.Atom, nums), ir.Join("and", tuple(parts)), ir.Join("or", tuple(parts))]
+    assert max(map(_depth, emit(follower(), rules).splitlines())) <= 3
+    values_agree(rules, traces_of(13, 40))
+    gradients_agree(rules, traces_of(14, 40), 15)
+
+
+def _depth(line: str) -> int:
+    """How deep macros that repeat their operands stand in each other."""
+    deepest, around = 0, []
+    for name in re.findall(r"(\w*\()|(\))", line):
+        if name[0]:
+            around.append(name[0] in ("MIN(", "MAX(", "LEAST(", "MOST("))
+        elif around:
+            around.pop()
+        deepest = max(deepest, sum(around))
+    return deepest
