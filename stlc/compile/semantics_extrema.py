@@ -24,6 +24,7 @@ class Exact(Associative):
     idempotent: ClassVar[bool] = True
     associative: ClassVar[bool] = True
     sound: ClassVar[bool] = True
+    bounded: ClassVar[bool] = True
 
     def pair(self, a: Array, b: Array, pick: Pick, ops: Ops) -> Array:
         """The extremum of two values."""
@@ -59,6 +60,7 @@ class LogSumExp(Associative):
     idempotent: ClassVar[bool] = False
     associative: ClassVar[bool] = True
     sound: ClassVar[bool] = False
+    bounded: ClassVar[bool] = True
 
     def pair(self, a: Array, b: Array, pick: Pick, ops: Ops) -> Array:
         """The smooth extremum of two values."""

@@ -32,6 +32,7 @@ class Mean(ABC):
     idempotent: ClassVar[bool] = False
     associative: ClassVar[bool] = False
     sound: ClassVar[bool] = True
+    bounded: ClassVar[bool] = False
 
     @abstractmethod
     def gain(self, x: Array, ops: Ops) -> Array:

@@ -23,12 +23,15 @@ class Semantics(Protocol):
         idempotent: an operand may be counted twice, so that windows may be covered with overlapping pieces.
         associative: the extremum of extrema is that of all their operands.
         sound: no value is positive where the exact one is negative, nor negative where it is positive.
+        bounded: an operand that is not known may be put at its ends, infinite ones included, to bound the
+            value. Means leave infinite operands out, and a finite one counts: their value may be beyond.
     """
 
     exact: ClassVar[bool]
     idempotent: ClassVar[bool]
     associative: ClassVar[bool]
     sound: ClassVar[bool]
+    bounded: ClassVar[bool]
 
     def lift(self, x: Array, pick: Pick, ops: Ops) -> Parts:
         """The parts of every operand alone."""

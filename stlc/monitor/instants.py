@@ -11,6 +11,9 @@ import math
 from collections.abc import Sequence
 from typing import Literal, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
+
 from stlc.compile.defined import defined
 from stlc.compile.graph import robustness_signal
 from stlc.compile.interface import Grid
@@ -57,6 +60,15 @@ def rule_bounds(
     if window is None:
         return bounds(rule.under(record.semantics), record, starts, ends)
     return window_bounds(rule.under(record.semantics), record, starts, window, ends)
+
+
+def rule_known(rule: Rule, samples: int, starts: range, horizon: int | None) -> NDArray[np.bool_]:
+    """Where no value at the judged instants depends on what comes after `samples`, (count,)."""
+    window = window_of(rule, horizon)
+    if window is None:
+        return np.array(defined(rule.formula, samples)[starts.start : starts.stop], dtype=bool)
+    whole = bool(defined(rule.formula, window + 1)[0])
+    return np.array([whole and start + window < samples for start in starts], dtype=bool)
 
 
 def rule_signal(rule: Rule, record: Record, horizon: int | None, end: End) -> Array:

@@ -20,7 +20,15 @@ from stlc.files import read_source
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
 from stlc.monitor.grid import Times, given_times, named_times, recorded_times, system_of
-from stlc.monitor.instants import At, require_length, rule_bounds, rule_signal, rules_at, starts_of
+from stlc.monitor.instants import (
+    At,
+    require_length,
+    rule_bounds,
+    rule_known,
+    rule_signal,
+    rules_at,
+    starts_of,
+)
 from stlc.monitor.judgement import Bools, Judgement, Status, Verdict, unknown_requirement
 from stlc.monitor.needs import needs_of
 from stlc.monitor.prepared import Prepared
@@ -324,7 +332,15 @@ def _judge(rule: Rule, ready: Prepared, starts: range, ends: Ends, tolerance: fl
 
 
 def _told(judgement: Judgement, ready: Prepared, end: Literal["open", "strict", "truncate"]) -> Judgement:
-    """The same judgement with the robustness of another semantics."""
+    """The same judgement with the robustness of another semantics.
+
+    Where something is unknown, a semantics whose extrema are means has only the sign of the exact bounds.
+    """
     starts = range(judgement.start, judgement.start + judgement.instants)
     ends: Ends = "truncate" if end == "truncate" else "open"
-    return replace(judgement, told=rule_bounds(judgement.rule, ready.record, starts, ready.horizon, ends))
+    low, high = rule_bounds(judgement.rule, ready.record, starts, ready.horizon, ends)
+    if low is not high and not ready.record.semantics.bounded:
+        known = rule_known(judgement.rule, ready.signals.samples, starts, ready.horizon)[:, None]
+        low = np.where(known, low, np.where(judgement.low > 0.0, 0.0, -np.inf))
+        high = np.where(known, high, np.where(judgement.high < 0.0, 0.0, np.inf))
+    return replace(judgement, told=(low, high))

@@ -492,3 +492,28 @@ def test_deadlines_far_beyond_a_short_trace() -> None:
     assert finding.code == "E306"
     assert finding.span is not None
     assert Monitor(seen, dt=0.1).check({"a": np.array([1.0, -1.0])}, end="truncate").satisfied
+
+
+# ------------------------------------------------------------- bounds under every semantics
+
+
+@pytest.mark.parametrize("semantics", ["exact", "smooth", "agm", "dgmsr"])
+@pytest.mark.parametrize("formula", [*(name for name in FORMULAS if name != "to_end"), "joined"])
+def test_no_continuation_leaves_the_bounds(formula: str, semantics: str) -> None:
+    """Of a mean a value that is not known yet may be more than all that is: nothing bounds it but its sign.
+
+    (`end` outside of a window of `T` is the last sample that there is, so `to_end` asks something else then.)
+    """
+    text = FORMULAS.get(formula, "(always[0, 0.6 s] a > 0.1 or b > 2) and eventually[0, 0.6 s] b > -3")
+    monitor = Monitor(f"{HEAD}require r: {text}\n", dt=0.1, horizon=T / 10)
+    long = {name: values.copy() for name, values in signals(2 * T + 3, 60).items()}
+    long["a"][::2] = (
+        np.abs(long["a"][::2]) + 0.125
+    )  # where nothing is violated a mean grows with what follows
+    long["a"][::4, 4:] *= 100.0
+    whole = monitor.check(long, end="truncate", semantics=semantics).requirements[0].margins[0][0]
+    for known in (1, 3, T, T + 2):
+        cut = {name: values[:, :known] for name, values in long.items()}
+        low, high = monitor.check(cut, semantics=semantics).requirements[0].margins
+        assert (low[0] <= whole + 1e-9).all()
+        assert (whole <= high[0] + 1e-9).all()
