@@ -13,7 +13,7 @@ from stlc.compile.c_parts import Frame, declared, in_parts
 from stlc.compile.c_plan import plan_of
 from stlc.compile.c_slopes import SlopeWriter
 from stlc.compile.c_unwind import Backward
-from stlc.compile.emit_c import HEAD, Motion, passes, place_in_step, state_column
+from stlc.compile.emit_c import HEAD, Motion, passes, place_in_step, roots_in, state_index
 
 _BUMP = """
 /* e^x for x <= 0, to the last digits, in a form that vectorises. */
@@ -49,8 +49,8 @@ def emit_adjoint(motion: Motion, formulas: Sequence[ir.Formula], *, fixed: Colle
         Untranslatable: the IR holds something that has no C form.
     """
     plan = plan_of(formulas, motion.steps + 1)
-    backward = Backward(plan, state_column(motion))
-    blocks = [[f"LANE g{root['0']} += g[{i}][j];" for i, root in enumerate(plan.roots)]]
+    backward = Backward(plan, state_index(motion))
+    blocks = [roots_in(plan)]
     blocks += [backward.lines([step]) for step in reversed(plan.steps)]
     states, controls, steps = len(motion.states), len(motion.controls), motion.steps
     return "\n".join(

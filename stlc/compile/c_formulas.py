@@ -5,13 +5,13 @@ The innermost loop runs over trajectories, so every line of it becomes vector co
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import assert_never
 
 from stlc.compile import ir
 from stlc.compile.c_index import Stretch
-from stlc.compile.c_numbers import Leaf, NumberWriter, literal
+from stlc.compile.c_numbers import LISTED, Leaf, NumberWriter, literal
 from stlc.compile.c_steps import (
     Buffer,
     Called,
@@ -25,6 +25,7 @@ from stlc.compile.c_steps import (
     Plan,
     Repeated,
     Step,
+    Tabled,
     call_of,
 )
 from stlc.compile.c_windows import windowed
@@ -36,13 +37,13 @@ class Sight:
 
     Attributes:
         plan: what is computed.
-        column: C expression of a state at a sample.
+        index: place of each state among the columns.
         held: buffers of the frozen values.
         indices: C names of samples within the plan -> what they are; they do not depend on the lane.
     """
 
     plan: Plan
-    column: Callable[[str, str], str]
+    index: Mapping[str, int]
     held: Mapping[str, Buffer] = field(default_factory=dict)
     indices: dict[str, str] = field(default_factory=dict)
 
@@ -50,9 +51,9 @@ class Sight:
         """C expression of a leaf; None for a function that is to be written out."""
         match leaf:
             case ir.Col(name):
-                return self.column(name, "k")
+                return column(self.index, name, "k")
             case ir.At(name, steps, clamped):
-                return self.column(name, self._index(steps, clamped=clamped))
+                return column(self.index, name, self._index(steps, clamped=clamped))
             case ir.Held(name):
                 return self.held[name]["0"]
             case ir.Extern(_, args, output):
@@ -93,11 +94,11 @@ class Forward:
 
     Attributes:
         plan: that they belong to.
-        column: C expression of a state at a sample.
+        index: place of each state among the columns.
     """
 
     plan: Plan
-    column: Callable[[str, str], str]
+    index: Mapping[str, int]
 
     def lines(self, steps: Sequence[Step]) -> list[str]:
         """Statements that fill the buffers of all steps."""
@@ -121,11 +122,13 @@ class Forward:
                 return self._called(step)
             case Frozen():
                 return self._frozen(step)
+            case Tabled():
+                return self._tabled(step)
             case _:
                 assert_never(step)
 
     def _margin(self, step: Margin) -> list[str]:
-        sight = Sight(self.plan, self.column, step.held)
+        sight = Sight(self.plan, self.index, step.held)
         writer = NumberWriter(sight)
         margin = writer.number(step.atom.num)
         value = margin if step.atom.sign > 0 else f"(-{margin})"
@@ -135,7 +138,7 @@ class Forward:
         return [f"{sight.head(step.run)} LANE {{ {body} }} }}"]
 
     def _called(self, step: Called) -> list[str]:
-        writer = NumberWriter(columns(self.column))
+        writer = NumberWriter(columns(self.index))
         values = [writer.number(part) for part in components(step)]
         stores = [f"{out['k']} = {value};" for out, value in zip(step.outs, values, strict=True)]
         return [f"{step.run.loop()} LANE {{ {' '.join([*writer.lines, *stores])} }}"]
@@ -153,12 +156,15 @@ class Forward:
         """One turn of the loop: values are frozen, and the steps follow."""
         lines = []
         for buffer, num in step.bindings:
-            sight = Sight(self.plan, self.column, step.held)
+            sight = Sight(self.plan, self.index, step.held)
             writer = NumberWriter(sight)
             value = writer.number(num)
             body = " ".join([*writer.lines, f"{buffer['0']} = {value};"])
             lines.append(f"{{ const int k = {step.index}; {sight.heads()} LANE {{ {body} }} }}")
         return [*lines, *self.lines(step.steps)]
+
+    def _tabled(self, step: Tabled) -> list[str]:
+        return [*table_head(step, self.index), *self.lines(step.steps), *_gathered(step), "}}"]
 
 
 def components(step: Called) -> list[ir.Extern]:
@@ -167,6 +173,46 @@ def components(step: Called) -> list[ir.Extern]:
     return [ir.Extern(call.name, call.args, output, call.function) for output in range(len(step.outs))]
 
 
-def columns(column: Callable[[str, str], str]) -> Callable[[Leaf], str | None]:
+def column(index: Mapping[str, int], name: str, k: str) -> str:
+    """C expression of a state at a sample, of lane `j`; the state may be an entry of a table."""
+    where = name.removeprefix(LISTED) if name.startswith(LISTED) else index[name]
+    return f"x[{where}][{k}][j]"
+
+
+def columns(index: Mapping[str, int]) -> Callable[[Leaf], str | None]:
     """Where columns stand at sample `k`; what else there may be is written out."""
-    return lambda leaf: column(leaf.name, "k") if isinstance(leaf, ir.Col) else None
+    return lambda leaf: column(index, leaf.name, "k") if isinstance(leaf, ir.Col) else None
+
+
+def table_head(step: Tabled, index: Mapping[str, int]) -> list[str]:
+    """The table, and the head of the loop over its rows; two braces end it."""
+    table, row = step.table, step.index
+    places = {name: [index[state] for state in states] for name, states in table.columns.items()}
+    return [
+        "{",
+        *_listed("double", row, {name: map(literal, values) for name, values in table.constants.items()}),
+        *_listed("int", row, {name: map(str, values) for name, values in places.items()}),
+        f"for (int {row} = 0; {row} < {table.rows}; ++{row}) {{",
+        *(f"const double {name} = d{row}[{row}][{i}];" for i, name in enumerate(table.constants)),
+        *(f"const int {name} = i{row}[{row}][{i}];" for i, name in enumerate(table.columns)),
+    ]
+
+
+def _listed(kind: str, row: str, entries: Mapping[str, Iterable[str]]) -> list[str]:
+    """The entries of one type as an array, a row a line."""
+    if not entries:
+        return []
+    rows = [f"{{{', '.join(each)}}}," for each in zip(*entries.values(), strict=True)]
+    return [f"static const {kind} {kind[0]}{row}[{len(rows)}][{len(entries)}] = {{", *rows, "};"]
+
+
+def _gathered(step: Tabled) -> list[str]:
+    """What a row of a table gives, added to what the earlier ones gave."""
+    out, body, row = step.out, step.body, step.index
+    if step.pick is None:
+        return [f"LANE {out[row]} = {body['0']};"]
+    here = out["k"]
+    return [
+        f"if ({row} == 0) {step.run.loop()} LANE {here} = {body['k']};",
+        f"else {step.run.loop()} LANE {here} = {step.pick}({here}, {body['k']});",
+    ]

@@ -44,6 +44,8 @@ BINARY = {
     "max": "MOST({0}, {1})",
 }
 CLIP = "LEAST(MOST({0}, {1}), {2})"
+LISTED = "\0"
+"""How names of frozen values and columns begin that are entries of a table; their C names follow."""
 
 
 class Untranslatable(Exception):  # noqa: N818 - not an error: another back end takes over
@@ -102,6 +104,8 @@ class NumberWriter:
                 return self._indicator(cond)
             case ir.Where(cond, yes, no):
                 return self._choice(cond, self.number(yes), self.number(no))
+            case ir.Held(name) if name.startswith(LISTED):
+                return name.removeprefix(LISTED)
             case ir.Col() | ir.At() | ir.Held() | ir.Extern():
                 place = self._place(num)
                 return self._written_out(num) if place is None else self._load(place)

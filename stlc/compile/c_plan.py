@@ -1,7 +1,8 @@
 """Formulas of the IR -> steps over buffers, which become C forwards and backwards.
 
 Only instants that the roots need are computed, and equal sub-formulas at equal instants once. `freeze` is a
-loop over its instants; what does not read a frozen value is computed outside of it.
+loop over its instants; what does not read a frozen value is computed outside of it. Operands and requirements
+of equal shape are a loop over a table (`c_families`).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from itertools import islice
 from typing import assert_never
 
 from stlc.compile import ir
+from stlc.compile.c_families import Family, families
 from stlc.compile.c_index import Index, Stretch, at, between
 from stlc.compile.c_numbers import Untranslatable
 from stlc.compile.c_steps import (
@@ -27,13 +29,16 @@ from stlc.compile.c_steps import (
     Margin,
     Meeting,
     Moved,
+    Pick,
+    Place,
     Plan,
     Repeated,
     Step,
+    Tabled,
     call_of,
 )
 from stlc.compile.horizon import parts
-from stlc.compile.samples import everything, held_by, reach_of
+from stlc.compile.samples import columns_of, everything, held_by, reach_of
 
 
 def plan_of(formulas: Sequence[ir.Formula], samples: int) -> Plan:
@@ -43,7 +48,7 @@ def plan_of(formulas: Sequence[ir.Formula], samples: int) -> Plan:
         Untranslatable: a window leaves the trajectory.
     """
     planner = _Planner(samples)
-    roots = tuple(planner.value(formula, between(0, 0)) for formula in formulas)
+    roots = planner.roots(formulas)
     return Plan(
         samples, tuple(planner.scopes[0].steps), roots, tuple(planner.buffers), planner.size, planner.calls
     )
@@ -51,9 +56,10 @@ def plan_of(formulas: Sequence[ir.Formula], samples: int) -> Plan:
 
 @dataclass(slots=True)
 class _Scope:
-    """What is computed together: everything, or the inside of one `freeze`."""
+    """What is computed together: everything, or the inside of one `freeze`, or of the loop over a table."""
 
     held: dict[str, Buffer] = field(default_factory=dict)
+    listed: frozenset[str] = frozenset()
     steps: list[Step] = field(default_factory=list)
     own: list[Buffer] = field(default_factory=list)
     known: dict[tuple[ir.Formula, Stretch], Buffer] = field(default_factory=dict)
@@ -74,7 +80,8 @@ class _Planner:
         depth = self._depth(formula)
         if depth < len(self.scopes) - 1:
             inner, self.scopes = self.scopes, self.scopes[: depth + 1]
-            found = self.value(formula, run.settled)
+            frozen = any(not scope.listed for scope in inner[depth + 1 :])
+            found = self.value(formula, run.settled if frozen else run)
             self.scopes = inner
             return found
         known = self.scopes[-1].known
@@ -88,7 +95,8 @@ class _Planner:
         if len(self.scopes) == 1:
             return 0
         read = _frozen_names(formula)
-        return max((depth for depth, scope in enumerate(self.scopes) if read & scope.held.keys()), default=0)
+        known = (scope.held.keys() | scope.listed for scope in self.scopes)
+        return max((depth for depth, names in enumerate(known) if read & names), default=0)
 
     def _value(self, formula: ir.Formula, run: Stretch) -> Buffer:
         match formula:
@@ -98,8 +106,7 @@ class _Planner:
                 self._check(formula.num, run)
                 return self._add(Margin(self._buffer(run), run, formula, self._held()))
             case ir.Join(op, items):
-                parts = tuple(self.value(item, run) for item in items)
-                return self._add(Joined(self._buffer(run), run, PICKS[op], parts))
+                return self._join(PICKS[op], _operands(op, items), run)
             case ir.Over() | ir.Past():
                 return self._window(formula, run)
             case ir.Until() | ir.Since():
@@ -113,6 +120,45 @@ class _Planner:
                 return self._add(Repeated(self._buffer(run), run, first))
             case _:
                 assert_never(formula)
+
+    def roots(self, formulas: Sequence[ir.Formula]) -> tuple[Place, ...]:
+        """Where the robustness of formulas at the first sample stands; those of equal shape side by side."""
+        places: dict[int, Place] = {}
+        for family in self._families(list(map(_split, formulas))):
+            rows = self._tabled(family, between(0, 0), None)
+            places.update((member, Place(rows, row)) for row, member in enumerate(family.members))
+        for i, formula in enumerate(formulas):
+            if i not in places:
+                places[i] = Place(self.value(formula, between(0, 0)), 0)
+        return tuple(places[i] for i in range(len(formulas)))
+
+    def _join(self, pick: Pick, items: Sequence[ir.Formula], run: Stretch) -> Buffer:
+        """The extremum of formulas, those of equal shape first made one."""
+        found = self._families(items)
+        loops = {family.members[0]: family for family in found}
+        taken = {member for family in found for member in family.members[1:]}
+        parts = tuple(
+            self._tabled(loops[i], run, pick) if i in loops else self.value(item, run)
+            for i, item in enumerate(items)
+            if i not in taken
+        )
+        return parts[0] if len(parts) == 1 else self._add(Joined(self._buffer(run), run, pick, parts))
+
+    def _families(self, formulas: Sequence[ir.Formula]) -> list[Family]:
+        found = families(formulas, self._loops + 1)
+        self._loops += len(found)
+        return found
+
+    def _tabled(self, family: Family, run: Stretch, pick: Pick | None) -> Buffer:
+        table = family.table
+        out = self._buffer(run if pick else between(0, table.rows - 1))
+        inner = _Scope(listed=table.names)
+        self.scopes.append(inner)
+        body = self.value(family.shape, run)
+        self.scopes.pop()
+        self._loops += 1
+        steps, own = tuple(inner.steps), tuple(inner.own)
+        return self._add(Tabled(out, run, pick, f"p{self._loops}", table, steps, own, body))
 
     def _window(self, node: ir.Over | ir.Past, run: Stretch) -> Buffer:
         window, back = node.window, isinstance(node, ir.Past)
@@ -207,19 +253,21 @@ class _Planner:
         self.size += buffer.rows
         return buffer
 
-    def _add(self, step: Fill | Margin | Joined | Extremum | Meeting | Moved | Repeated | Frozen) -> Buffer:
+    def _add(
+        self, step: Fill | Margin | Joined | Extremum | Meeting | Moved | Repeated | Frozen | Tabled
+    ) -> Buffer:
         self.scopes[-1].steps.append(step)
         return step.out
 
 
 def _frozen_names(formula: ir.Formula) -> frozenset[str]:
-    """The frozen values that a formula reads and does not bind."""
+    """The frozen values that a formula reads and does not bind, and its columns."""
     match formula:
         case ir.Atom(num):
-            return held_by(num)
+            return held_by(num) | columns_of(num)
         case ir.Freeze(bindings, body):
             inner = _frozen_names(body) - {name for name, _ in bindings}
-            return inner.union(*(held_by(num) for _, num in bindings))
+            return inner.union(*(held_by(num) | columns_of(num) for _, num in bindings))
         case _:
             return frozenset().union(*map(_frozen_names, parts(formula)))
 
@@ -232,8 +280,11 @@ def _split(formula: ir.Formula) -> ir.Formula:
     """A predicate over the extremum of large numbers as a formula over predicates; anything else as it is."""
     if not isinstance(formula, ir.Atom) or formula.guard or not isinstance(formula.num, ir.Op):
         return formula
-    name, args = formula.num.name, formula.num.args
-    if name not in ("min", "max", "neg") or not _large(formula.num):
+    if not _large(formula.num):
+        return formula
+    num = _raised(formula.num)
+    name, args = num.name, num.args
+    if name not in ("min", "max", "neg"):
         return formula
     if name == "neg":
         return _split(replace(formula, num=args[0], sign=-formula.sign, strict=formula.strict))
@@ -241,6 +292,33 @@ def _split(formula: ir.Formula) -> ir.Formula:
         return _split(replace(formula, num=args[0]))
     both = (name == "min") == (formula.sign > 0)
     return ir.Join("and" if both else "or", tuple(replace(formula, num=arg) for arg in args), formula.span)
+
+
+def _raised(num: ir.Op) -> ir.Op:
+    """An extremum plus or minus a number as the extremum of sums: bit for bit, since rounding is monotone."""
+    if num.name not in ("add", "sub") or len(num.args) != 2:
+        return num
+    for i, part in enumerate(num.args):
+        other = num.args[1 - i]
+        if (
+            isinstance(part, ir.Op)
+            and part.name in ("min", "max")
+            and isinstance(other, ir.Lit | ir.Col | ir.Held)
+        ):
+            name = part.name
+            if num.name == "sub" and i == 1:
+                name = "max" if name == "min" else "min"
+            sums = [tuple((arg, other) if i == 0 else (other, arg)) for arg in part.args]
+            return ir.Op(name, tuple(ir.Op(num.name, pair) for pair in sums))
+    return num
+
+
+def _operands(op: str, items: Sequence[ir.Formula]) -> list[ir.Formula]:
+    """The operands of a join, those of joins of the same kind among them."""
+    found: list[ir.Formula] = []
+    for item in map(_split, items):
+        found += _operands(op, item.items) if isinstance(item, ir.Join) and item.op == op else [item]
+    return found
 
 
 def _large(num: ir.Num) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from stlc.compile import ir
+from stlc.compile.c_families import Table
 from stlc.compile.c_index import Stretch
 
 Pick: TypeAlias = Literal["MIN", "MAX"]
@@ -147,7 +148,40 @@ class Frozen:
     body: Buffer
 
 
-Step: TypeAlias = Fill | Margin | Joined | Extremum | Meeting | Moved | Repeated | Called | Frozen
+@dataclass(frozen=True, slots=True)
+class Tabled:
+    """For every row of a table the steps, and then the value of `body`.
+
+    Attributes:
+        out: the extremum of all rows, instant by instant; where `pick` is None the first value of each row.
+        run: the instants of `body`.
+        pick: which extremum.
+        index: C name of the row.
+        table: what differs from row to row.
+        steps: with buffers of their own, filled anew for every row.
+        own: these buffers.
+        body: where the value stands.
+    """
+
+    out: Buffer
+    run: Stretch
+    pick: Pick | None
+    index: str
+    table: Table
+    steps: tuple[Step, ...]
+    own: tuple[Buffer, ...]
+    body: Buffer
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where one value stands: a row of a buffer."""
+
+    buffer: Buffer
+    row: int
+
+
+Step: TypeAlias = Fill | Margin | Joined | Extremum | Meeting | Moved | Repeated | Called | Frozen | Tabled
 CallKey: TypeAlias = tuple[str, tuple[ir.Col, ...]]
 
 
@@ -158,7 +192,7 @@ class Plan:
     Attributes:
         samples: of a trajectory, T + 1.
         steps: parts first.
-        roots: buffers whose first row is the robustness of a formula.
+        roots: where the robustness of each formula stands.
         buffers: all of them.
         size: doubles that they take per lane.
         calls: functions of columns that are computed once -> their components.
@@ -166,7 +200,7 @@ class Plan:
 
     samples: int
     steps: tuple[Step, ...]
-    roots: tuple[Buffer, ...]
+    roots: tuple[Place, ...]
     buffers: tuple[Buffer, ...]
     size: int
     calls: Mapping[CallKey, tuple[Buffer, ...]]

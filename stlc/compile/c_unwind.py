@@ -6,11 +6,11 @@ first gets it. What stands in a `freeze` is computed anew, and only for the inst
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import assert_never
 
-from stlc.compile.c_formulas import Forward, Sight, columns, components
+from stlc.compile.c_formulas import Forward, Sight, columns, components, table_head
 from stlc.compile.c_slopes import SlopeWriter
 from stlc.compile.c_steps import (
     Called,
@@ -24,6 +24,7 @@ from stlc.compile.c_steps import (
     Plan,
     Repeated,
     Step,
+    Tabled,
 )
 from stlc.compile.c_windows import windowed_back
 from stlc.compile.ir import Num
@@ -35,11 +36,11 @@ class Backward:
 
     Attributes:
         plan: that they belong to.
-        column: C expression of a state at a sample.
+        index: place of each state among the columns.
     """
 
     plan: Plan
-    column: Callable[[str, str], str]
+    index: Mapping[str, int]
 
     def lines(self, steps: Sequence[Step]) -> list[str]:
         """Statements that take the gradient back through all steps."""
@@ -61,17 +62,19 @@ class Backward:
                 return self._called(step)
             case Frozen():
                 return self._frozen(step)
+            case Tabled():
+                return self._tabled(step)
             case _:
                 assert_never(step)
 
     def _margin(self, step: Margin) -> list[str]:
         sign = "" if step.atom.sign > 0 else "-"
-        sight = Sight(self.plan, self.column, step.held)
+        sight = Sight(self.plan, self.index, step.held)
         inner = _pulled(step.atom.num, f"{sign}g{step.out['k']}", sight)
         return [sight.head(step.run), *inner, "}"]
 
     def _called(self, step: Called) -> list[str]:
-        writer = SlopeWriter(columns(self.column), soft=False)
+        writer = SlopeWriter(columns(self.index), soft=False)
         seeds: dict[str, str] = {}
         for out, part in zip(step.outs, components(step), strict=True):
             register, own = writer.number(part), f"g{out['k']}"
@@ -82,23 +85,50 @@ class Backward:
 
     def _frozen(self, step: Frozen) -> list[str]:
         index, seed = step.index, f"g{step.out[step.index]}"
-        blank = [f"memset(g{buffer.name}, 0, sizeof(double) * {buffer.rows} * LANES);" for buffer in step.own]
         bound = []
         for buffer, num in step.bindings:
-            sight = Sight(self.plan, self.column, step.held)
+            sight = Sight(self.plan, self.index, step.held)
             inner = _pulled(num, f"g{buffer['0']}", sight)
             bound += [f"{{ const int k = {index}; {sight.heads()}", *inner, "}"]
         return [
             f"for (int {index} = {step.run.first.text}; {index} <= {step.run.last.text}; ++{index}) {{",
             f"int matters = 0; LANE matters |= {seed} != 0.0;",
             "if (!matters) continue;",
-            *Forward(self.plan, self.column).inside(step),
-            *blank,
+            *Forward(self.plan, self.index).inside(step),
+            *_blank(step),
             f"LANE g{step.body[index]} += {seed};",
             *self.lines(step.steps),
             *bound,
             "}",
         ]
+
+    def _tabled(self, step: Tabled) -> list[str]:
+        """Row by row: computed anew, and taken back where a lane has its value from there."""
+        seeds = f"{step.run.loop()} LANE" if step.pick else "LANE"
+        own, body = step.out["k"] if step.pick else step.out[step.index], step.body["k" if step.pick else "0"]
+        asked = f"matters[j] += fabs(g{own});"
+        hits = [
+            f"const double part = {body} == {own} ? g{own} : 0.0;",
+            f"g{own} -= part; g{body} += part; matters[j] += fabs(part);",
+        ]
+        one = [f"g{body} += g{own};", asked]
+        matters = "double matters[LANES] = {0}, any = 0.0;"
+        return [
+            *table_head(step, self.index),
+            matters,
+            *Forward(self.plan, self.index).lines(step.steps),
+            *_blank(step),
+            f"{seeds} {{ {' '.join(hits if step.pick else one)} }}",
+            "LANE any += matters[j];",
+            "if (any == 0.0) continue;",
+            *self.lines(step.steps),
+            "}}",
+        ]
+
+
+def _blank(step: Frozen | Tabled) -> list[str]:
+    """The gradients of what is computed anew in each turn, set to nothing."""
+    return [f"memset(g{buffer.name}, 0, sizeof(double) * {buffer.rows} * LANES);" for buffer in step.own]
 
 
 def _pulled(num: Num, seed: str, sight: Sight) -> list[str]:

@@ -14,7 +14,7 @@ from stlc.compile.c_formulas import Forward
 from stlc.compile.c_numbers import Leaf, NumberWriter
 from stlc.compile.c_parts import Frame, declared, in_parts
 from stlc.compile.c_plan import plan_of
-from stlc.compile.c_steps import Plan
+from stlc.compile.c_steps import Place, Plan
 
 LANES = 16
 
@@ -95,16 +95,16 @@ def emit(motion: Motion, formulas: Sequence[ir.Formula]) -> str:
     )
 
 
-def state_column(motion: Motion) -> Callable[[str, str], str]:
-    """C expression of a state at a sample, of lane `j`."""
-    return lambda name, k: f"x[{motion.states.index(name)}][{k}][j]"
+def state_index(motion: Motion) -> dict[str, int]:
+    """The place of each state among the columns."""
+    return {name: i for i, name in enumerate(motion.states)}
 
 
 def passes(motion: Motion, plan: Plan) -> list[str]:
     """The two passes forward: `roll` fills the states, `check` gives the robustness of each requirement."""
-    forward = Forward(plan, state_column(motion))
+    forward = Forward(plan, state_index(motion))
     blocks = [forward.lines([step]) for step in plan.steps]
-    blocks.append([f"LANE out[{i}][j] = {root['0']};" for i, root in enumerate(plan.roots)])
+    blocks.append(roots_out(plan))
     return [
         "typedef double lane[LANES];",
         f"typedef double lanes[{motion.steps + 1}][LANES];",
@@ -116,6 +116,34 @@ def passes(motion: Motion, plan: Plan) -> list[str]:
         "}",
         *in_parts(CHECK, blocks, declared(plan)),
     ]
+
+
+def roots_out(plan: Plan) -> list[str]:
+    """What the requirements come to, in their order."""
+    return [_along(i, root, rows, "LANE out[{i}][j] = {value};") for i, root, rows in _side_by_side(plan)]
+
+
+def roots_in(plan: Plan) -> list[str]:
+    """The gradients by them, in their order."""
+    return [_along(i, root, rows, "LANE g{value} += g[{i}][j];") for i, root, rows in _side_by_side(plan)]
+
+
+def _side_by_side(plan: Plan) -> list[tuple[int, Place, int]]:
+    """Requirements whose values follow each other: number of the first, where it stands, how many."""
+    runs: list[tuple[int, Place, int]] = []
+    for i, root in enumerate(plan.roots):
+        if runs and root == Place(runs[-1][1].buffer, runs[-1][1].row + runs[-1][2]):
+            runs[-1] = (*runs[-1][:2], runs[-1][2] + 1)
+        else:
+            runs.append((i, root, 1))
+    return runs
+
+
+def _along(first: int, root: Place, rows: int, form: str) -> str:
+    if rows == 1:
+        return form.format(i=first, value=root.buffer[str(root.row)])
+    text = form.format(i=f"{first} + i", value=root.buffer[f"{root.row} + i"])
+    return f"for (int i = 0; i < {rows}; ++i) {text}"
 
 
 CHECK = Frame(
@@ -131,7 +159,7 @@ CHECK = Frame(
 
 def place_in_step(motion: Motion) -> Callable[[Leaf], str | None]:
     """Where states and inputs stand in a step, of lane `j`."""
-    index = {name: i for i, name in enumerate(motion.states)}
+    index = state_index(motion)
 
     def place(leaf: Leaf) -> str | None:
         if not isinstance(leaf, ir.Col):
@@ -145,7 +173,7 @@ def place_in_step(motion: Motion) -> Callable[[Leaf], str | None]:
 
 def _step(motion: Motion) -> list[str]:
     """The body of a step: sample k to sample k + 1 of one lane."""
-    index = {name: i for i, name in enumerate(motion.states)}
+    index = state_index(motion)
     writer = NumberWriter(place_in_step(motion))
     for name, num in motion.lets:
         writer.assign(name, writer.number(num))

@@ -11,7 +11,7 @@ from stlc.compile.c_formulas import Forward
 from stlc.compile.c_numbers import literal
 from stlc.compile.c_parts import declared, in_parts
 from stlc.compile.c_plan import plan_of
-from stlc.compile.emit_c import CHECK, HEAD, passes, state_column
+from stlc.compile.emit_c import CHECK, HEAD, passes, roots_out, state_index
 from stlc.controller.backup import grid_of
 from stlc.controller.kernel import motion_of
 from stlc.controller.prefix import BEYOND, anchored, open_ended
@@ -128,10 +128,7 @@ def _overall(rules: Sequence[Rule], among: Sequence[Rule]) -> list[str]:
 
 def _falling(motion: Motion, plan: Plan) -> list[str]:
     """`fall`: the least robustness of phi_safe on a prefix; row STATES is positive beyond its end."""
-    column = state_column(motion)
-    forward = Forward(
-        plan, lambda name, k: f"x[{len(motion.states)}][{k}][j]" if name == BEYOND else column(name, k)
-    )
+    forward = Forward(plan, state_index(motion) | {BEYOND: len(motion.states)})
     blocks = [forward.lines([step]) for step in plan.steps]
-    blocks.append([f"LANE out[{i}][j] = {root['0']};" for i, root in enumerate(plan.roots)])
+    blocks.append(roots_out(plan))
     return in_parts(replace(CHECK, name="fall"), blocks, declared(plan))
