@@ -177,6 +177,7 @@ PROOFS: dict[str, Callable[[Block], tuple[int, list[str]]]] = {
     "causes-streamed": partial(one_by_one, blamed.check_told_by_stream),
     "missions": partial(by_hypothesis, states.check_mission, {"formula": missions, "seed": _SEEDS}),
     "past": partial(by_hypothesis, states.check_past, {"formula": bodies, "seed": _SEEDS}),
+    "past-margins": partial(by_hypothesis, states.check_margins, {"formula": bodies, "seed": _SEEDS}),
     "recorded": partial(by_hypothesis, states.check_recorded, {"formula": missions, "seed": _SEEDS}),
     "laws": partial(by_hypothesis, _law, _LAW),
     "moved": partial(by_hypothesis, _moved, {"data": st.data(), "env": _SHORT}),

@@ -14,7 +14,7 @@ from stlc.compile.mission import Absolute, Branch, Goal, Leaf, Op, last_step, ob
 from stlc.compile.past import Past
 from stlc.compile.simplify import simplify
 from stlc.compile.timers import Ledger, Timer, tolerant
-from stlc.compile.walk import absolute, is_state_formula, looks_back, normal
+from stlc.compile.walk import absolute, at_hand, is_state_formula, looks_back, normal
 from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
@@ -96,7 +96,7 @@ class _Goals:
                 return self.of(typed.Truth(node.span, True))
         if window.hi is None and op in ("eventually", "until"):
             report(self.sink, _without_deadline(node.span))
-        left, right = (simplify(lower(body, self.grid, self.sink)) for body in operands)
+        left, right = (simplify(lower(at_hand(body), self.grid, self.sink)) for body in operands)
         formula = Absolute(op, window, node.span, *operands, tolerant(left), tolerant(right), right)
         clock = self.ledger.clock(last_step(formula) + (self.grid.horizon or 0) + 1)
         draft = Timer(self.name, "status", 0.0, ir.Lit(0.0), -1.0, 1.0, _about(formula))

@@ -136,6 +136,8 @@ def _number(num: ir.Num, change: Callable[[Entry], ir.Num]) -> ir.Num:
     match num:
         case ir.Col(name) | ir.At(name) if name.startswith(LISTED):  # an entry of the table around
             return num
+        case ir.Col(ir.ELAPSED):
+            return num
         case ir.Lit() | ir.Col() | ir.At():
             return change(num)
         case ir.Held() | ir.Extern():  # a call is computed once, for the columns that it names

@@ -175,6 +175,8 @@ def components(step: Called) -> list[ir.Extern]:
 
 def column(index: Mapping[str, int], name: str, k: str) -> str:
     """C expression of a state at a sample, of lane `j`; the state may be an entry of a table."""
+    if name == ir.ELAPSED:
+        return f"(double)({k})"
     where = name.removeprefix(LISTED) if name.startswith(LISTED) else index[name]
     return f"x[{where}][{k}][j]"
 

@@ -27,7 +27,8 @@ from stlc.compile.c_steps import (
     Tabled,
 )
 from stlc.compile.c_windows import windowed_back
-from stlc.compile.ir import Num
+from stlc.compile.ir import ELAPSED, Col, Num
+from stlc.compile.samples import leaves
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,7 @@ class Backward:
             case Fill():
                 return []
             case Margin():
-                return [] if step.atom.guard else self._margin(step)
+                return [] if step.atom.guard or _fixed(step.atom.num) else self._margin(step)
             case Joined():
                 return _joined(step)
             case Extremum() | Meeting() | Moved():
@@ -129,6 +130,11 @@ class Backward:
 def _blank(step: Frozen | Tabled) -> list[str]:
     """The gradients of what is computed anew in each turn, set to nothing."""
     return [f"memset(g{buffer.name}, 0, sizeof(double) * {buffer.rows} * LANES);" for buffer in step.own]
+
+
+def _fixed(num: Num) -> bool:
+    """Whether a number follows from the first sample and the count of samples: no plan changes it."""
+    return any(isinstance(leaf, Col) and leaf.name == ELAPSED for leaf in leaves(num))
 
 
 def _pulled(num: Num, seed: str, sight: Sight) -> list[str]:

@@ -21,6 +21,8 @@ def is_state(formula: typed.Formula) -> bool:
             return all(is_state(item) for item in items)
         case typed.Temporal() | typed.Until() | typed.Shift() | typed.Edge() | typed.Freeze():
             return False
+        case typed.Recalled():
+            return False
         case _:
             assert_never(formula)
 

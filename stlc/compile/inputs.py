@@ -19,13 +19,15 @@ def inputs(program: Program, env: Mapping[str, Array], run: Run, ops: Ops) -> di
         run: within the trace.
         ops: the array library of `env`.
     """
-    names = program.columns or list(env)[:1]
-    return {
-        name: _beside(env[program.shifted[name].name], program.shifted[name], run, ops)
-        if name in program.shifted
-        else _cut(env[name], run.start, run.count)
-        for name in names
-    }
+
+    def read(name: str) -> Array:
+        if name == ir.ELAPSED:
+            return ops.counted(run.start, run.count, next(iter(env.values())))
+        if name in program.shifted:
+            return _beside(env[program.shifted[name].name], program.shifted[name], run, ops)
+        return _cut(env[name], run.start, run.count)
+
+    return {name: read(name) for name in program.columns or list(env)[:1]}
 
 
 def _cut(column: Array, start: int, count: int) -> Array:

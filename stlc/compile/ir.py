@@ -108,6 +108,17 @@ class Body:
 
 Num: TypeAlias = Lit | Col | At | Held | Op | Ind | Where | Extern
 
+ELAPSED = "#elapsed"
+"""The column that every evaluator knows by itself: how many samples came before the one at hand."""
+
+_LONG = 1 << 30
+
+
+def at_first(column: Col) -> At:
+    """What a column holds at the first sample, wherever it is read."""
+    return At(column.name, -_LONG, clamped=True)
+
+
 # --------------------------------------------------------------------- formulas
 
 

@@ -36,7 +36,8 @@ def show_formula(formula: ir.Formula) -> str:
         case ir.Atom():
             return _atom(formula)
         case ir.Join(op, items):
-            return f" {op} ".join(map(_operand, items))
+            shown_items = _without_lacks(items)
+            return f" {op} ".join(map(_operand, shown_items))
         case ir.Over(op, window, body) | ir.Past(op, window, body):
             end = "end" if isinstance(formula, ir.Over) else "start"
             return f"{op}{show_window(window, end)} {_operand(body)}"
@@ -59,7 +60,24 @@ def show_formula(formula: ir.Formula) -> str:
 def _operand(formula: ir.Formula) -> str:
     """In parentheses where it holds two formulas."""
     text = show_formula(formula)
-    return f"({text})" if isinstance(formula, (ir.Join, ir.Until, ir.Since)) else text
+    several = isinstance(formula, (ir.Until, ir.Since))
+    several |= isinstance(formula, ir.Join) and len(_without_lacks(formula.items)) > 1
+    return f"({text})" if several else text
+
+
+def _without_lacks(items: tuple[ir.Formula, ...]) -> list[ir.Formula]:
+    """Without what only says by how much a test of time beside it fails (`timers.recalled`)."""
+    tests = {item.num for item in items if isinstance(item, ir.Atom) and item.guard}
+    return [
+        item
+        for item in items
+        if not (
+            isinstance(item, ir.Atom)
+            and isinstance(item.num, ir.Op)
+            and item.num.name == "mul"
+            and item.num.args[0] in tests
+        )
+    ]
 
 
 def _atom(atom: ir.Atom) -> str:
@@ -94,6 +112,10 @@ def show_number(num: ir.Num, level: int = 0) -> str:
 
 def _leaf(leaf: ir.Col | ir.At | ir.Held) -> str:
     match leaf:
+        case ir.Col(ir.ELAPSED):
+            return "elapsed"
+        case ir.At(name) if leaf == ir.at_first(ir.Col(name)):
+            return f"first({shown(name)})"
         case ir.At(name, 1):
             return f"next({shown(name)})"
         case ir.At(name, -1):

@@ -55,11 +55,14 @@ class _Lowering:
             case typed.Temporal() | typed.Until():
                 return self._timed(node, sign)
             case typed.Shift(span, steps, body):
-                return ir.Shift(steps, self.formula(body, sign), None, span, weak=sign < 0)
+                outside = node.outside if sign > 0 or node.outside is None else not node.outside
+                return ir.Shift(steps, self.formula(body, sign), outside, span, weak=sign < 0)
             case typed.Edge():
                 return self._edge(node, sign)
             case typed.Freeze(span, bindings, body):
                 return ir.Freeze(bindings, self.formula(body, sign), span)
+            case typed.Recalled(_, _, along):
+                return self.formula(along, sign)
             case _:
                 assert_never(node)
 

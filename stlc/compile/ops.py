@@ -159,6 +159,9 @@ class Ops(Protocol):
     def full(self, shape: tuple[int, ...], value: float, like: Array) -> Array:
         """A constant array with dtype and device of `like`."""
 
+    def counted(self, first: int, count: int, like: Array) -> Array:
+        """`first`, `first + 1`, … along time: (count, batch) with batch, dtype and device of `like`."""
+
     def empty(self, shape: tuple[int, ...], like: Array) -> Array:
         """Memory with dtype and device of `like`, to be written to."""
 

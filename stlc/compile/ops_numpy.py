@@ -168,6 +168,11 @@ class NumpyOps:
         """A constant array."""
         return np.full(shape, value, dtype=like.dtype)
 
+    def counted(self, first: int, count: int, like: Array) -> Array:
+        """Whole numbers along time."""
+        numbers = np.arange(first, first + count, dtype=like.dtype)
+        return np.broadcast_to(numbers.reshape(-1, *(1,) * (like.ndim - 1)), (count, *like.shape[1:]))
+
     def empty(self, shape: tuple[int, ...], like: Array) -> Array:
         """Memory to be written to."""
         return np.empty(shape, dtype=like.dtype)

@@ -241,6 +241,11 @@ class OnnxOps:
         known = like.sheet.constant(value, like.kind)
         return known.spread(*(1 if length == BATCH else length for length in shape))
 
+    def counted(self, first: int, count: int, like: Value) -> Value:
+        """Whole numbers along time, of one trajectory where their number is not known."""
+        numbers = like.sheet.constant([[float(k)] for k in range(first, first + count)], like.kind)
+        return numbers.spread(count, *(1 if length == BATCH else length for length in like.shape[1:]))
+
     def cat(self, parts: Sequence[Value]) -> Value:
         """Joined along axis 0."""
         widest = max(parts, key=lambda part: part.shape[-1])

@@ -307,6 +307,11 @@ class TorchOps:
         """A new axis 0 in front."""
         return torch.stack(list(parts))
 
+    def counted(self, first: int, count: int, like: Tensor) -> Tensor:
+        """Whole numbers along time."""
+        numbers = torch.arange(first, first + count, dtype=like.dtype, device=like.device)
+        return numbers.view(-1, *(1,) * (like.ndim - 1)).expand(count, *like.shape[1:])
+
     def empty(self, shape: tuple[int, ...], like: Tensor) -> Tensor:
         """Memory to be written to, also outside of inference mode."""
         with torch.inference_mode(False):

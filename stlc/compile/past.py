@@ -2,24 +2,70 @@
 
 A timer holds the time up to the sample before: `historically[0, c] p` is `p and held >= c`, `once[0, c] p` is
 `p or since_p <= c`. At the start of a mission nothing was before: windows of the past are cut there.
+
+That decides at an instant, and has no slope. Along a plan the samples since its start are looked at as they
+were written about, and only what was before the start is left to the timer: after k steps it lacks the
+`c - held - k` steps that it lacked of c when the plan began.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import final
+from fractions import Fraction
+from typing import Literal, TypeAlias, final
 
 from stlc.compile import ir, typed
 from stlc.compile.bounds import report, to_window
 from stlc.compile.interface import Grid
 from stlc.compile.lower import lower
 from stlc.compile.simplify import simplify
-from stlc.compile.timers import Kind, Ledger, Timer, choose, denied, guard, tolerant
-from stlc.compile.walk import Sign, flip, is_state_formula, looks_back, normal
+from stlc.compile.timers import Kind, Ledger, Timer, choose, denied, guard, recalled, tolerant
+from stlc.compile.walk import Sign, at_hand, flip, is_state_formula, looks_back, normal
 from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
 _ZERO, _ONE = ir.Lit(0.0), ir.Lit(1.0)
+_Op: TypeAlias = Literal["and", "or"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Test:
+    """`left >= right`, where one is a timer and the other a number.
+
+    Attributes:
+        left: the greater one.
+        right: the other one.
+        span: of the operator.
+        later: how much a timer has gone on one step later, if nothing else happened.
+    """
+
+    left: ir.Num
+    right: ir.Num
+    span: Span
+    later: int = 0
+
+    def decides(self) -> typed.Recalled:
+        """As one of several ways: it decides, or has no say."""
+        return typed.Recalled(
+            self.span, guard(self.left, self.right, self.span), guard(*self._then, self.span)
+        )
+
+    def lacks(self) -> typed.Recalled:
+        """As one of several conditions: what is missing counts."""
+        return typed.Recalled(
+            self.span, guard(self.left, self.right, self.span), recalled(*self._then, self.span)
+        )
+
+    @property
+    def _then(self) -> tuple[ir.Num, ir.Num]:
+        """Both sides some samples after the timer was read at the first one."""
+        return self._since_first(self.left), self._since_first(self.right)
+
+    def _since_first(self, side: ir.Num) -> ir.Num:
+        if not isinstance(side, ir.Col):
+            return side
+        first = ir.at_first(side)
+        return ir.Op("add", (first, ir.Col(ir.ELAPSED))) if self.later else first
 
 
 @final
@@ -73,32 +119,38 @@ class Past:
             return typed.Truth(node.span, True)
         if window.hi == 0:
             return body
-        test = self._seen(node, body, window.hi) if once else self._held(node, body, window.hi)
-        return typed.Logic(node.span, "or" if once else "and", (body, test))
+        memory = self._seen(node, body, window.hi) if once else self._held(node, body, window.hi)
+        inside = replace(node, interval=_back(window, node.span), body=body)
+        op: _Op = "or" if once else "and"
+        return typed.Recalled(
+            node.span,
+            now=typed.Logic(node.span, op, (body, memory.now)),
+            along=typed.Logic(node.span, op, (inside, memory.along)),
+        )
 
-    def _seen(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Formula:
+    def _seen(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
         """Whether `body` held at one of the `most` samples before."""
         condition = self._condition(body)
         if most is None:
             draft = self._draft("latch", "seen", 0.0, 1.0, f"whether {_short(node.body)} ever held")
             seen = self.ledger.add(draft, lambda own: choose(condition, _ONE, own))
-            return guard(seen, _ONE, node.span)
+            return _Test(seen, _ONE, node.span).decides()
         about = f"steps since {_short(node.body)} last held, up to {most}"
         draft = self._draft("timer", "since", most + 1.0, most + 1.0, about)
         since = self.ledger.add(draft, lambda own: choose(condition, _ONE, _counted(own, most + 1)))
-        return guard(ir.Lit(float(most)), since, node.span)
+        return _Test(ir.Lit(float(most)), since, node.span, later=1).decides()
 
-    def _held(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Formula:
+    def _held(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
         """Whether `body` held at all of the `most` samples before."""
         condition = self._condition(body)
         if most is None:
             draft = self._draft("latch", "kept", 1.0, 1.0, f"whether {_short(node.body)} always held")
             kept = self.ledger.add(draft, lambda own: choose(condition, own, _ZERO))
-            return guard(kept, _ONE, node.span)
+            return _Test(kept, _ONE, node.span).lacks()
         about = f"steps for which {_short(node.body)} has held, up to {most}"
         draft = self._draft("timer", "held", float(most), float(most), about)
         held = self.ledger.add(draft, lambda own: choose(condition, _counted(own, most), _ZERO))
-        return guard(held, ir.Lit(float(most)), node.span)
+        return _Test(held, ir.Lit(float(most)), node.span, later=1).lacks()
 
     # ------------------------------------------------------------------------------ since
 
@@ -109,33 +161,43 @@ class Past:
         window = self._ending_now(node, outward=not positive)
         if left is None or right is None or window is None:
             return typed.Truth(node.span, True)
-        both = typed.Logic(node.span, "and" if positive else "or", (left, right))
+        ops: tuple[_Op, _Op] = ("and", "or") if positive else ("or", "and")
         if window.hi == 0:
-            return both
+            return typed.Logic(node.span, ops[0], (left, right))
         recent = self._recent(node, self._condition(left), self._condition(right), (window.hi, positive))
-        if positive:
-            begun = typed.Logic(node.span, "or", (right, recent))
-            return typed.Logic(node.span, "and", (left, begun))
-        begun = typed.Logic(node.span, "and", (right, typed.Not(node.span, recent)))
-        return typed.Logic(node.span, "or", (left, begun))
+        met = typed.Logic(node.span, ops[1], (right, recent.now))
+        whole = typed.Temporal(
+            node.span, "historically" if positive else "once", _back(ir.Window(0, None), node.span), left
+        )
+        before = typed.Logic(node.span, ops[0], (whole, recent.along))
+        return typed.Recalled(
+            node.span,
+            now=typed.Logic(node.span, ops[0], (left, met)),
+            along=typed.Logic(
+                node.span, ops[1], (_since_inside(node, left, right, window, positive=positive), before)
+            ),
+        )
 
     def _recent(
         self, node: typed.Until, left: ir.Formula, right: ir.Formula, how: tuple[int | None, bool]
-    ) -> typed.Formula:
-        """Whether q held at one of the samples before, and p from there on up to the sample before."""
+    ) -> typed.Recalled:
+        """Whether q held at one of the samples before, and p from there on up to now; or its contrary."""
         most, positive = how
         held, met = (left, right) if positive else (denied(left), denied(right))
         about = f"{_short(node.right)}, and {_short(node.left)} from there on"
         if most is None:
             draft = self._draft("latch", "since", 0.0, 1.0, f"whether there was {about}")
             begun = self.ledger.add(draft, lambda own: choose(held, choose(met, _ONE, own), _ZERO))
-            return guard(begun, _ONE, node.span)
+            test = _Test(begun, _ONE, node.span) if positive else _Test(_ZERO, begun, node.span)
+            return test.decides()
         far = ir.Lit(most + 1.0)
         draft = self._draft("timer", "since", far.value, far.value, f"steps since {about}, up to {most}")
         since = self.ledger.add(
             draft, lambda own: choose(held, choose(met, _ONE, _counted(own, most + 1)), far)
         )
-        return guard(ir.Lit(float(most)), since, node.span)
+        if positive:
+            return _Test(ir.Lit(float(most)), since, node.span, later=1).decides()
+        return _Test(since, far, node.span, later=1).decides()
 
     # ------------------------------------------------------------------------- rise, fall
 
@@ -149,8 +211,15 @@ class Past:
         about = f"whether {_short(node.body)} {'failed' if now > 0 else 'held'} at the sample before"
         draft = self._draft("latch", "before", 0.0 if positive else 1.0, 1.0, about)
         latch = self.ledger.add(draft, lambda _own: choose(condition, _ONE, _ZERO))
-        test = guard(latch, _ONE, node.span)
-        return typed.Logic(node.span, "and" if positive else "or", (body, test))
+        op: _Op = "and" if positive else "or"
+        begun = guard(ir.Col(ir.ELAPSED), _ONE, node.span)
+        first = typed.Logic(node.span, "or", (begun, _Test(latch, _ONE, node.span).lacks().along))
+        inside = typed.Shift(node.span, -1, before, outside=True)
+        return typed.Recalled(
+            node.span,
+            now=typed.Logic(node.span, op, (body, guard(latch, _ONE, node.span))),
+            along=typed.Logic(node.span, op, (body, typed.Logic(node.span, "and", (inside, first)))),
+        )
 
     # -------------------------------------------------------------------------- in common
 
@@ -158,7 +227,7 @@ class Past:
         return Timer(f"{self.name}_{what}", kind, initial, _ZERO, 0.0, high, about)
 
     def _condition(self, body: typed.Formula) -> ir.Formula:
-        return tolerant(simplify(lower(body, self.grid, self.sink)))
+        return tolerant(simplify(lower(at_hand(body), self.grid, self.sink)))
 
     def _body(self, body: typed.Formula) -> typed.Formula | None:
         """A body without operators of the past, if it is about one instant alone by then."""
@@ -199,3 +268,20 @@ def _short(formula: typed.Formula) -> str:
     """A formula as it was written, cut where it is long."""
     text = " ".join(formula.span.text.split())
     return f"`{text}`" if len(text) <= 40 else f"`{text[:37]}...`"
+
+
+def _back(window: ir.Window, span: Span) -> typed.Interval:
+    """A window of the past that ends now."""
+    hi = None if window.hi is None else typed.Time(steps=Fraction(window.hi), span=span)
+    return typed.Interval(typed.Time(), hi, span=span)
+
+
+def _since_inside(
+    node: typed.Until, left: typed.Formula, right: typed.Formula, window: ir.Window, *, positive: bool
+) -> typed.Formula:
+    """`since` or its dual over the samples since the first one; the operands of the dual are negated."""
+    interval = _back(window, node.span)
+    if positive:
+        return replace(node, interval=interval, left=left, right=right)
+    denied_ = tuple(typed.Not(part.span, part) for part in (left, right))
+    return typed.Not(node.span, replace(node, interval=interval, left=denied_[0], right=denied_[1]))

@@ -62,7 +62,8 @@ def key_of(leaf: ir.Col | ir.At | ir.Held) -> str:
 
 def columns_of(num: ir.Num) -> frozenset[str]:
     """Names of the columns that a number reads, at whatever sample."""
-    return frozenset(leaf.name for leaf in leaves(num) if isinstance(leaf, (ir.Col, ir.At)))
+    read = {leaf.name for leaf in leaves(num) if isinstance(leaf, (ir.Col, ir.At))}
+    return frozenset(read - {ir.ELAPSED})
 
 
 def held_by(num: ir.Num) -> frozenset[str]:
@@ -77,7 +78,7 @@ def of_now(num: ir.Num) -> bool:
 
 def looks_on(num: ir.Num) -> bool:
     """Whether the value of a number depends on where the trace ends."""
-    return any(isinstance(leaf, ir.At) and leaf.clamped for leaf in leaves(num))
+    return any(isinstance(leaf, ir.At) and leaf.clamped and leaf.steps > 0 for leaf in leaves(num))
 
 
 def reach_of(num: ir.Num) -> Reach:

@@ -23,6 +23,8 @@ def thaw(formula: typed.Formula, values: Mapping[str, ir.Num]) -> typed.Formula:
             return replace(formula, items=tuple(thaw(item, values) for item in formula.items))
         case typed.Until():
             return replace(formula, left=thaw(formula.left, values), right=thaw(formula.right, values))
+        case typed.Recalled():
+            return replace(formula, now=thaw(formula.now, values), along=thaw(formula.along, values))
         case typed.Freeze():
             bindings = tuple((name, thawed(num, values)) for name, num in formula.bindings)
             own = {name for name, _ in bindings}

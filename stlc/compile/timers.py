@@ -21,6 +21,9 @@ Kind: TypeAlias = Literal["clock", "status", "latch", "timer"]
 OPEN, TRUE, FALSE = 0.0, 1.0, -1.0
 """Values of a status."""
 
+MISSING = 1000.0
+"""Robustness that a step lacks which a timer asks for, and which lies before a plan."""
+
 
 @dataclass(frozen=True, slots=True)
 class Timer:
@@ -108,6 +111,16 @@ def at_least(left: ir.Num, right: ir.Num) -> ir.Atom:
 def guard(left: ir.Num, right: ir.Num, span: Span) -> typed.Pred:
     """`left >= right` as a test of time: it decides truth and never limits the margin."""
     return typed.Pred(span, ir.Op("sub", (left, right)), strict=False, guard=True)
+
+
+def recalled(left: ir.Num, right: ir.Num, span: Span) -> typed.Formula:
+    """`left >= right` as a test of what no plan changes any more: where it fails, what is missing counts.
+
+    Each missing step counts as much as no predicate reaches, so that of several instants those are preferred
+    at which a plan can do something; and it is finite, so that there is a best of plans that all fail.
+    """
+    gap = ir.Op("mul", (ir.Op("sub", (left, right)), ir.Lit(MISSING)))
+    return typed.Logic(span, "or", (guard(left, right, span), typed.Pred(span, gap, strict=False)))
 
 
 def choose(condition: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:

@@ -101,10 +101,11 @@ class Until(Node):
 
 @dataclass(frozen=True, slots=True)
 class Shift(Node):
-    """`next(p)` (+1), `prev(p)` (-1)."""
+    """`next(p)` (+1), `prev(p)` (-1); `outside` as in `ir.Shift`."""
 
     steps: int
     body: Formula
+    outside: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +124,20 @@ class Freeze(Node):
     body: Formula
 
 
-Formula: TypeAlias = Truth | Pred | Not | Logic | Temporal | Until | Shift | Edge | Freeze
+@dataclass(frozen=True, slots=True)
+class Recalled(Node):
+    """What was written about the past, made of timers; it is under no negation.
+
+    Attributes:
+        now: as a formula about one instant, whose timers decide truth alone.
+        along: with a robustness, along any stretch of a trace from whose first sample the timers are known.
+    """
+
+    now: Formula
+    along: Formula
+
+
+Formula: TypeAlias = Truth | Pred | Not | Logic | Temporal | Until | Shift | Edge | Freeze | Recalled
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,7 +51,7 @@ def truth(formula: typed.Formula, facts: Facts) -> bool | None:
             return _logic(formula, facts)
         case typed.Temporal(_, "always" | "eventually", _, body) | typed.Freeze(_, _, body):
             return truth(body, facts)
-        case typed.Temporal() | typed.Until() | typed.Shift() | typed.Edge():
+        case typed.Temporal() | typed.Until() | typed.Shift() | typed.Edge() | typed.Recalled():
             return None
         case _:
             assert_never(formula)
@@ -149,7 +149,7 @@ def _constrains(formula: typed.Formula, *, positive: bool) -> bool:
     match formula:
         case typed.Truth():
             return False
-        case typed.Pred() | typed.Edge() | typed.Shift():
+        case typed.Pred() | typed.Edge() | typed.Shift() | typed.Recalled():
             return True
         case typed.Not(_, body):
             return _constrains(body, positive=not positive)

@@ -23,8 +23,23 @@ def operands(formula: typed.Formula) -> tuple[typed.Formula, ...]:
             return (left, right)
         case typed.Not() | typed.Shift() | typed.Edge() | typed.Temporal() | typed.Freeze():
             return (formula.body,)
+        case typed.Recalled(_, now):
+            return (now,)
         case _:
             assert_never(formula)
+
+
+def at_hand(formula: typed.Formula) -> typed.Formula:
+    """A state formula with what it recalls told by timers alone."""
+    match formula:
+        case typed.Recalled(_, now):
+            return at_hand(now)
+        case typed.Logic(_, _, items):
+            return replace(formula, items=tuple(map(at_hand, items)))
+        case typed.Not(_, body):
+            return replace(formula, body=at_hand(body))
+        case _:
+            return formula
 
 
 def nodes(formula: typed.Formula) -> Iterator[typed.Formula]:
@@ -70,7 +85,7 @@ def _backwards(node: typed.Formula) -> bool:
 
 def is_state_formula(formula: typed.Formula) -> bool:
     """Whether `formula` is about one instant alone, frozen values and other samples apart."""
-    state = (typed.Truth, typed.Not, typed.Logic)
+    state = (typed.Truth, typed.Not, typed.Logic, typed.Recalled)
     return all(
         isinstance(node, state) or (isinstance(node, typed.Pred) and of_now(node.num))
         for node in nodes(formula)
@@ -105,7 +120,7 @@ def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
     match formula:
         case typed.Truth(span, value):
             return typed.Truth(span, value is (sign > 0))
-        case typed.Pred() | typed.Shift() | typed.Edge() | typed.Until(_, "since"):
+        case typed.Pred() | typed.Shift() | typed.Edge() | typed.Until(_, "since") | typed.Recalled():
             return formula if sign > 0 else typed.Not(formula.span, formula)
         case typed.Not(_, body):
             return normal(body, flip(sign))

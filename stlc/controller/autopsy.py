@@ -5,6 +5,7 @@ The chain: network -> plans -> states -> robustness of each requirement and perf
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -19,7 +20,7 @@ from stlc.diagnostics import Diagnostic, RunError, StlcError, SystemFileError
 from stlc.dynamics.system import System
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     from stlc.controller.policy import PlanNetwork
 
@@ -107,21 +108,25 @@ def _motion(step: Step) -> StlcError | None:
 
 
 def _robustness(step: Step) -> StlcError | None:
-    """A requirement whose value, or whose gradient, is no number on states that are."""
-    for index, rule in enumerate(step.task.rules):
-        value, slope = _differentiated(step, lambda u, i=index: _each(step, u)[0][:, i])  # type: ignore[misc]
-        for word, bad in (("robustness", value.isnan()), ("gradient", ~_finite(slope))):
-            row = _first(bad)
+    """A requirement whose value, or else whose gradient, is no finite number on states that are.
+
+    A value that is infinite spoils the gradients of all requirements, so values come first.
+    """
+    looks = [
+        _differentiated(step, lambda u, i=index: _each(step, u)[0][:, i])  # type: ignore[misc]
+        for index in range(len(step.task.rules))
+    ]
+    for what, bad_of, way in _WRONG:
+        for rule, look in zip(step.task.rules, looks, strict=True):
+            row = _first(bad_of(*look))
             if row is not None:
                 return RunError(
                     Diagnostic(
                         "R401",
-                        f"the {word} of `{rule.name}` is not a number on states that are",
+                        f"the {what.format(rule.name)} on states that are",
                         rule.span,
                         label="this requirement",
-                        help=(
-                            "a root, a power, a logarithm or a quotient has no slope at 0: keep away from it",
-                        ),
+                        help=(way,),
                         note=(f"from {_state(step, row)}", f"with {_plan(step, row)}", _at(step)),
                     )
                 )
@@ -177,6 +182,16 @@ def _differentiated(step: Step, value_of: Callable[[Tensor], Tensor]) -> tuple[T
 
 def _finite(slope: Tensor) -> Tensor:
     return torch.isfinite(slope).flatten(1).all(1)
+
+
+_ROOT = "a root, a power, a logarithm or a quotient has no slope at 0: keep away from it"
+_ENDLESS = "no plan is better than another there: keep its numbers finite, with `clip` for one"
+_WRONG: tuple[tuple[str, Callable[[Tensor, Tensor], Tensor], str], ...] = (
+    ("robustness of `{}` is not a number", lambda value, _: value.isnan(), _ROOT),
+    ("robustness of `{}` is minus infinity", lambda value, _: value == -torch.inf, _ENDLESS),
+    ("gradient of `{}` is not a number", lambda _, slope: ~_finite(slope), _ROOT),
+)
+"""What can be wrong with the value and the gradient of a requirement, and the way out."""
 
 
 def _first(marks: Tensor) -> int | None:

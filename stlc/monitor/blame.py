@@ -244,7 +244,7 @@ class Blamer:
     def blame(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> Blame:
         """Why `formula` is not `wanted` at `sample`."""
         match formula:
-            case typed.Truth():
+            case typed.Truth() | typed.Recalled():
                 return self._node(formula, wanted, sample)
             case typed.Pred():
                 return self._predicate(formula, sample, wanted)

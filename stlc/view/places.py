@@ -223,7 +223,7 @@ def _uses(rule: Rule, trace: Trace) -> Iterator[tuple[typed.Pred, Use]]:
                 stack += [(right, inner), (left, use)]
             case typed.Shift(body=body) | typed.Edge(body=body) | typed.Freeze(body=body):
                 stack.append((body, use))
-            case typed.Truth():
+            case typed.Truth() | typed.Recalled():
                 pass
             case _:
                 assert_never(node)

@@ -33,6 +33,7 @@ SPEC = "spec s\nstate signal x [m]\nstate signal v [m/s]\n"
 NEAR = "require near: eventually[0, T] abs(x) < 0.5\n"
 STUCK = {"push": "0.1 * u - 30", "clamp": "true"}  # at the clamp's lower end at once
 TERM = '[{name: soft, weight: 0.1, expr: "((v + 2) / 1 m/s)^0.25"}]'
+ENDLESS = "require hot: always[0, T] exp(v * v * 1000 / 1 m^2/s^2) < 2\n"
 LOW = "require low: eventually[0, T] ((v + 2 m/s) / 1 m/s)^0.25 <= -0.1\n"
 
 
@@ -92,6 +93,7 @@ def test_states_that_explode(push: str, what: str, method: str, capsys: pytest.C
     ("changed", "rules", "named"),
     [
         ({}, LOW + NEAR, "the gradient of `low` is not a number"),
+        ({}, NEAR + ENDLESS, "the robustness of `hot` is minus infinity"),
         ({"terms": TERM}, NEAR, "the performance term `soft`, or its gradient, is not a number"),
     ],
 )
@@ -102,6 +104,7 @@ def test_a_gradient_that_is_no_number(
     assert code == 3
     assert f"error[R401]: {named}" in said
     assert ("--> s.stl:4:1" in said) == ("low" in named)
+    assert ("--> s.stl:5:1" in said) == ("hot" in named)
     assert "the run keeps the weights before that step" in said
     run = Run.open(RunDir.newest().path)
     assert run.dir.status == "failed"

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mission_strategies import bodies, missions
-from proof.missions import check_mission, check_past, check_recorded
+from proof.missions import check_margins, check_mission, check_past, check_recorded
 
 from stlc.compile import typed
 
@@ -39,6 +39,12 @@ def test_timers_say_what_operators_of_the_past_say(formula: typed.Formula, seed:
 @given(bodies, seeds)
 def test_timers_ten_thousand_times(formula: typed.Formula, seed: int) -> None:
     check_past(formula, seed)
+
+
+@settings(max_examples=60)
+@given(bodies, seeds)
+def test_margins_of_the_past_are_those_of_the_definition(formula: typed.Formula, seed: int) -> None:
+    check_margins(formula, seed)
 
 
 @settings(max_examples=100)

@@ -166,10 +166,19 @@ REWRITTEN = {
         "(a >= -0.5 and always[0..25] (clock > 10 or x > 1))"
         " or (a_2 >= -0.5 and always[0..25] (clock > 25 or y <= 1))"
     ),
-    "always[0, T] (x > 1 m -> once[0, 1 s] y > 1 m)": ("always[0..25] (x <= 1 or y > 1 or a_since <= 10)"),
-    "always[0, T] historically[0, 1 s] y > 1 m": "always[0..25] (y > 1 and a_held >= 10)",
-    "always[0, T] rise(y > 1 m)": "always[0..25] (y > 1 and a_before >= 1)",
-    "always[0, T] (x > 1 m since y > 1 m)": "always[0..25] (x > 1 and (y > 1 or a_since >= 1))",
+    "always[0, T] (x > 1 m -> once[0, 1 s] y > 1 m)": (
+        "always[0..25] (x <= 1 or once[0..10] y > 1 or first(a_since) + elapsed <= 10)"
+    ),
+    "always[0, T] historically[0, 1 s] y > 1 m": (
+        "always[0..25] (historically[0..10] y > 1 and first(a_held) + elapsed >= 10)"
+    ),
+    "always[0, T] rise(y > 1 m)": (
+        "always[0..25] (y > 1 and prev(y <= 1) and (elapsed >= 1 or first(a_before) >= 1))"
+    ),
+    "always[0, T] (x > 1 m since y > 1 m)": (
+        "always[0..25] ((x > 1 since[0..start] y > 1)"
+        " or (historically[0..start] x > 1 and first(a_since) >= 1))"
+    ),
 }
 
 

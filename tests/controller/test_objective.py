@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
 import torch
 
+from stlc import native
 from stlc.compile.switch import Hard, Tanh
 from stlc.controller.objective import Objective, guided_objective, loss, paper_objective
 from stlc.controller.task import Task
+from stlc.dynamics.schema import parse_system
+from stlc.dynamics.system import System
+from stlc.grammar.parser import parse
+from stlc.source import Source
 
 
 def test_paper_loss_is_the_hinge_on_smooth_robustness_plus_gated_performance(car_task: Task) -> None:
@@ -49,3 +57,43 @@ def test_gradients_reach_every_control_that_matters(car_task: Task) -> None:
         assert u.grad is not None
         assert torch.isfinite(u.grad).all()
         assert (u.grad.abs().sum((1, 2)) > 0).double().mean() > 0.3
+
+
+CART = """
+stlc: 1
+name: cart
+time: {dt: 0.1 s, horizon: 20 steps}
+state: {x: {unit: m, range: [-2, 2]}, v: {unit: m/s, range: [-2, 2]}}
+control: {u: {unit: m/s^2, range: [-3, 3]}}
+flow: {x: v, v: u}
+init: {mixture: [{draw: {x: "uniform(-1.5, -0.5)", v: 0}}]}
+"""
+PAST = (
+    "eventually[0, T] historically[0 s, 0.5 s] x > 0.1 m",
+    "eventually[0, T] std.debounced(x > 0.1 m, 0.5 s)",
+    "eventually[0, T] historically (x > 0.1 m)",
+    "eventually[0, T] not (x < 0.1 m since[0, 0.5 s] v < 1 m/s)",
+    "eventually[0, T] rise(x > 0.1 m)",
+    "eventually[0, T] (x > 0.1 m and once[0, 1 s] v > 0.5 m/s)",
+)
+
+
+@pytest.mark.parametrize("formula", PAST)
+def test_plans_that_fail_a_formula_of_the_past_are_told_how_to_satisfy_it(
+    formula: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(native, "FLAGS", (*native.FLAGS, "-O0"))
+    path = Path("cart.yaml")
+    system = System(parse_system(Source(str(path), CART), path, {}))
+    text = f"import std\nstate signal x [m]\nstate signal v [m/s]\nrequire r: {formula}"
+    task = Task.of(parse(Source("cart.stl", text)), system)
+    x0 = task.sample(64, seed=1)
+    u = torch.full((64, 20, 1), 0.3, requires_grad=True)
+    for objective in (paper_objective(task), guided_objective(0.1, slope=5.0, performance_weight=0.0)):
+        outcome = loss(task, objective, x0, u)
+        assert torch.isfinite(outcome.total).all()
+        (slope,) = torch.autograd.grad(outcome.total.sum(), u)
+        failing = ~outcome.satisfied
+        assert failing.any()
+        if "historically (" not in formula:  # what failed before the first step is beyond all plans
+            assert (slope[failing].sum((1, 2)) < 0).all(), "to push harder helps"

@@ -12,7 +12,7 @@ from laws import OnTheClock
 from mission_strategies import GRID, SAMPLES, augmented, requirement, walks
 from reference import Interval, Trace
 
-from stlc.compile import typed
+from stlc.compile import ir, typed
 from stlc.compile.augment import augment
 from stlc.compile.graph import evaluate
 from stlc.compile.lift import recorded
@@ -76,6 +76,34 @@ def check_past(formula: typed.Formula, seed: int) -> None:
     planned = _planned(whole, columns)
     for k in (0, 1, 7, SAMPLES - HORIZON - 1):
         np.testing.assert_array_equal(planned[k], _defined(whole, columns, k))
+
+
+def _formula(formula: typed.Formula, ledger: Ledger) -> ir.Formula:
+    """What plans are asked for."""
+    sink: list[Diagnostic] = []
+    found = augment(requirement(formula), GRID, ledger, sink)
+    assert not [finding for finding in sink if finding.severity == "error"]
+    return simplify(lower(found.formula, GRID, sink))
+
+
+def check_margins(formula: typed.Formula, seed: int) -> None:
+    """By how much plans satisfy formulas of the past: as defined on a whole trace, finite from anywhere."""
+    columns = walks(seed, BATCH)
+    whole = typed.Temporal(SPAN, "always", typed.Interval(typed.Time(), typed.Time(horizons=1)), formula)
+    ledger = Ledger(frozenset(columns))
+    compiled = _formula(whole, ledger)
+    env = augmented(ledger.timers, columns)
+    starts = SAMPLES - HORIZON
+    (margins,) = evaluate([compiled], env, ops=NUMPY, count=starts)
+    margins = np.broadcast_to(margins, (starts, BATCH))
+    for k in (0, 1, 7, starts - 1):
+        defined = np.array([low for low, _ in _bounds(whole, columns, "truncate", k)])
+        known = np.isfinite(defined)
+        np.testing.assert_array_equal(margins[k][known], defined[known])
+        plan = {name: column[k : k + HORIZON + 1] for name, column in env.items()}
+        cut = np.broadcast_to(evaluate([compiled], plan, ops=NUMPY)[0][0], (BATCH,))
+        np.testing.assert_array_equal(cut >= -TOLERANCE, defined >= -TOLERANCE)
+        assert (cut > -np.inf).all(), "plans that fail can be compared"
 
 
 def check_recorded(formula: typed.Formula, seed: int) -> None:
