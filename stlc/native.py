@@ -22,7 +22,17 @@ import numpy as np
 from stlc import cache
 from stlc.cache import Cache
 from stlc.diagnostics import Diagnostic, notice
-from stlc.toolchain import CompilerError, compiled, compiler, failure, remember, trouble, version
+from stlc.toolchain import (
+    LONG_REMEMBERED,
+    CompilerError,
+    TooMuchError,
+    compiled,
+    compiler,
+    failure,
+    remember,
+    trouble,
+    version,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -303,16 +313,31 @@ def _built(text: str, using: str, key: str) -> bytes | None:
 
 
 def _compile(using: str, source: Path, target: Path, key: str) -> None:
-    """Build with vector forms of sine and the like where the C library has them, without elsewhere."""
+    """Build as fast code; as slow code where the compiler takes too much time or memory for that."""
+    try:
+        try:
+            why = _attempted(using, source, target, "-O3" if source.stat().st_size < LONG else "-O2")
+        except TooMuchError:
+            why = _attempted(using, source, target, "-O0")
+    except TooMuchError as much:
+        remember(key, much.why, seconds=LONG_REMEMBERED)
+        raise
+    if why:
+        remember(key, why)
+        raise CompilerError(why)
+
+
+def _attempted(using: str, source: Path, target: Path, level: str) -> str:
+    """Build with vector forms of sine and the like where the C library has them, without elsewhere.
+
+    Gives why that cannot be done, or "". Raises CompilerError where the compiler was given up.
+    """
     fast = [[*VECTOR_FLAGS, "-lmvec"]] if sys.platform == "linux" and platform.machine() == "x86_64" else []
-    level = "-O3" if source.stat().st_size < LONG else "-O2"
     for attempt in (*fast, []):
         done = compiled(using, [level, *FLAGS, str(source), "-o", str(target), *attempt, "-lm"])
         if done.code == 0 and target.is_file():
-            return
-    why = failure(done)
-    remember(key, why)
-    raise CompilerError(why)
+            return ""
+    return failure(done)
 
 
 def _processor() -> str:

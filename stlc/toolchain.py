@@ -1,7 +1,7 @@
 """The system's C compiler: found, asked for its version, and never waited for without end.
 
-A compiler that hangs is ended with all that it started, and not asked again: by this process, and for a while
-not by others of the same user either (`REMEMBERED`).
+A compiler that hangs, or takes too much time or memory, is ended with all that it started. One that hangs is
+not asked again: by this process, and for a while not by others of the same user either (`REMEMBERED`).
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ import shutil
 import signal
 import subprocess
 import tempfile
+import threading
 import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -26,9 +27,13 @@ IDLE = 10.0
 """Seconds in which a program that was started must use the processor, or it hangs."""
 BUSY = 40.0
 """Seconds of the processor after which a program is given up; of the clock where that is not known."""
+MEMORY = 2_000_000_000
+"""Bytes of memory beyond which a program is given up, where that is known."""
 REMEMBERED = 600.0
-"""Seconds for which other processes do not try again what failed."""
-_GRACE = 2.0
+"""Seconds for which other processes do not ask a compiler again that hangs."""
+LONG_REMEMBERED = 86_400.0
+"""Seconds for which other processes do not try again a text that was too much."""
+_GRACE = 1.0
 """Seconds from being asked to end until being ended."""
 _PROBE = "#include <math.h>\nint works(void) { return 1; }\n"
 
@@ -41,12 +46,22 @@ class CompilerError(Exception):
         self.why = why
 
 
-class HangsError(Exception):
-    """A program did not end within the limits, and was ended."""
+class TooMuchError(CompilerError):
+    """A compiler works, and takes more time or memory for a text than it gets."""
 
-    def __init__(self, why: str) -> None:
+
+class HangsError(Exception):
+    """A program did not end within the limits, and was ended.
+
+    Attributes:
+        why: said after its name.
+        worked: it was at work, and took too much time or memory.
+    """
+
+    def __init__(self, why: str, *, worked: bool = False) -> None:
         super().__init__(why)
         self.why = why
+        self.worked = worked
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +83,7 @@ def compiled(using: str, arguments: Sequence[str]) -> Done:
     """Run a compiler.
 
     Raises:
+        TooMuchError: it was given up while it worked.
         CompilerError: it hangs, did so a short while ago, or cannot be started.
     """
     key = _identity(using)
@@ -77,6 +93,8 @@ def compiled(using: str, arguments: Sequence[str]) -> Done:
     try:
         return run([using, *arguments])
     except HangsError as hangs:
+        if hangs.worked:
+            raise TooMuchError(hangs.why) from hangs
         remember(key, hangs.why)
         raise CompilerError(hangs.why) from hangs
     except OSError as error:
@@ -147,17 +165,18 @@ def trouble(key: str) -> str:
 def _recorded(kept: Cache, name: str) -> str:
     with suppress(ValueError, TypeError, KeyError):
         record = json.loads(kept.read(name) or b"")
-        if 0 <= time.time() - record["at"] <= REMEMBERED:
+        if 0 <= time.time() - record["at"] <= min(float(record["for"]), LONG_REMEMBERED):
             return str(record["why"])
     return ""
 
 
-def remember(key: str, why: str) -> None:
-    """Keep in mind that something failed."""
+def remember(key: str, why: str, *, seconds: float | None = None) -> None:
+    """Keep in mind that something failed, for so long; for `REMEMBERED` seconds where that is not said."""
     _known[key] = why
     kept = cache.lasting()
     if kept is not None:
-        kept.keep(_file(key), json.dumps({"at": time.time(), "why": why}).encode())
+        record = {"at": time.time(), "for": REMEMBERED if seconds is None else seconds, "why": why}
+        kept.keep(_file(key), json.dumps(record).encode())
 
 
 def remembered() -> list[str]:
@@ -195,24 +214,60 @@ def run(command: Sequence[str], *, given: str = "") -> Done:
         given: on its standard input.
 
     Raises:
-        HangsError: it used no processor time for `IDLE` seconds, or more than `BUSY`.
+        HangsError: it used no processor time for `IDLE` seconds, or more than `BUSY`, or more than `MEMORY`.
         OSError: it cannot be started.
     """
     # files, not pipes: whoever holds the other end of a pipe could keep us waiting
     with tempfile.TemporaryFile() as into, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as said:
         into.write(given.encode())
         into.seek(0)
-        process = subprocess.Popen(command, stdin=into, stdout=out, stderr=said, start_new_session=True)
+        process: subprocess.Popen[bytes] | None = None
         try:
+            with _whole():
+                process = subprocess.Popen(
+                    command, stdin=into, stdout=out, stderr=said, start_new_session=True
+                )
+            _bound(process)
             _await(process)
         except BaseException:
-            _end(process)
+            if process is not None:
+                _end(process)
             raise
         texts = []
         for file in (out, said):
             file.seek(0)
             texts.append(file.read().decode(errors="replace"))
     return Done(process.returncode, *texts)
+
+
+@contextmanager
+def _whole() -> Iterator[None]:
+    """Signals to stop come after what is done here: what is half begun could not be ended."""
+    if threading.current_thread() is not threading.main_thread():  # signals are the main thread's
+        yield
+        return
+    came: list[int] = []
+    before = {
+        number: signal.signal(number, lambda number, _: came.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+        if signal.getsignal(number) not in (None, signal.SIG_IGN)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for each in came:
+            signal.raise_signal(each)
+
+
+def _bound(process: subprocess.Popen[bytes]) -> None:
+    """Let a program and what it starts end by themselves, should nobody be left to end them."""
+    with suppress(ImportError, AttributeError, OSError, ValueError):
+        import resource
+
+        most = int(BUSY) + 5
+        resource.prlimit(process.pid, resource.RLIMIT_CPU, (most, most))
 
 
 def _await(process: subprocess.Popen[bytes]) -> None:
@@ -223,26 +278,38 @@ def _await(process: subprocess.Popen[bytes]) -> None:
         with suppress(subprocess.TimeoutExpired):
             process.wait(min(IDLE / 4, 0.5))
             return
-        now, found = time.monotonic(), _processor_time(process.pid)
+        now, found = time.monotonic(), _use(process.pid)
         if found is None:
             used, since = now - begun, now
-        elif found > used:
-            used, since = found, now
+        elif found.seconds > used:
+            used, since = found.seconds, now
         if now - since >= IDLE:
             raise HangsError(f"did nothing for {IDLE:g} s and was ended")
         if used >= BUSY:
-            raise HangsError(f"did not end within {BUSY:g} s and was ended")
+            raise HangsError(f"did not end within {BUSY:g} s of the processor and was ended", worked=True)
+        if found is not None and found.memory > MEMORY:
+            raise HangsError(f"took more than {MEMORY / 1e9:g} GB of memory and was ended", worked=True)
 
 
-def _processor_time(session: int) -> float | None:
-    """Seconds that the processes of a session, and those of them that ended, have used; None if unknown."""
-    ticks, known = 0, False
+@dataclass(frozen=True, slots=True)
+class _Use:
+    """What the processes of a session use: seconds of the processor, and bytes of memory."""
+
+    seconds: float
+    memory: int
+
+
+def _use(session: int) -> _Use | None:
+    """What the processes of a session use, with the time of those that ended; None if unknown."""
+    ticks, pages, known = 0, 0, False
     for path in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError, ValueError, IndexError):
             words = path.read_text(errors="replace").rpartition(")")[2].split()
             if int(words[3]) == session:
-                ticks, known = ticks + sum(map(int, words[11:15])), True
-    return ticks / os.sysconf("SC_CLK_TCK") if known else None
+                ticks, pages, known = ticks + sum(map(int, words[11:15])), pages + int(words[21]), True
+    if not known:
+        return None
+    return _Use(ticks / os.sysconf("SC_CLK_TCK"), pages * os.sysconf("SC_PAGE_SIZE"))
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -261,3 +262,51 @@ def test_a_compiler_that_hangs_in_one_text_is_not_asked_about_others(
         assert native.why_none(text) == "the C compiler did nothing for 0.2 s and was ended"
     assert (tmp_path / "cc.asked").read_text() == ".\n"
     assert not list(cache.glob("kernel-*"))
+
+
+BUSY_CC = """#!/bin/sh
+[ "$1" = --version ] && echo 1 && exit
+echo "$1" >> ${0}.asked
+for each; do case "$each" in *.c) grep -q 42 "$each" && case "$1" in
+  %s) while :; do :; done;; esac;; esac; done
+exec cc "$@"
+"""
+"""It takes for ever over `SMALL`, at some levels."""
+
+
+@pytest.fixture
+def busy(cache: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A compiler that is to be told at which levels it takes for ever."""
+    compiler = tmp_path / "busy-cc"
+    compiler.touch(0o755)
+    assert not cache.exists()
+    monkeypatch.setenv("CC", str(compiler))
+    monkeypatch.setattr(toolchain, "BUSY", 0.3)
+    monkeypatch.setattr(toolchain, "_versions", {})
+    return compiler
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs to know the processor time")
+def test_a_text_that_takes_too_long_is_built_as_slow_code(busy: Path) -> None:
+    busy.write_text(BUSY_CC % "-O[123]")
+    assert answer() == 42
+    assert (busy.parent / "busy-cc.asked").read_text() == "-O3\n-O0\n"
+    assert answer() == 42
+    assert (busy.parent / "busy-cc.asked").read_text() == "-O3\n-O0\n"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs to know the processor time")
+def test_a_text_that_is_too_much_is_named_and_left_alone_and_others_are_not(
+    busy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    busy.write_text(BUSY_CC % "*")
+    said = r"did not end within 0\.3 s of the processor and was ended"
+    for _ in "as this process", "as another", "an hour later":
+        with pytest.warns(Notice, match=f"W702: .*{said}; the same is done"):
+            assert native.load(SMALL) is None
+        assert native.why_none(SMALL).startswith("the C compiler did not end within 0.3 s")
+        toolchain._known.clear()
+        monkeypatch.setattr(toolchain, "REMEMBERED", 0.0)
+    assert (busy.parent / "busy-cc.asked").read_text() == "-O3\n-O0\n"
+    monkeypatch.setattr(toolchain, "BUSY", 30.0)
+    assert answer(EVIL) == 666

@@ -80,8 +80,53 @@ def test_one_that_will_not_be_asked_is_ended_too(tmp_path):
 def test_one_that_works_is_waited_for_and_not_for_ever(monkeypatch):
     assert run(["sh", "-c", "i=0; while [ $i -lt 300000 ]; do i=$((i+1)); done; echo $i"]).out == "300000\n"
     monkeypatch.setattr(toolchain, "BUSY", 0.2)
-    with pytest.raises(HangsError, match=r"did not end within 0\.2 s"):
+    monkeypatch.setattr(toolchain, "IDLE", 5.0)  # a machine that is busy does nothing for a while
+    with pytest.raises(HangsError, match=r"did not end within 0\.2 s of the processor") as ended:
         run(["sh", "-c", "while :; do :; done"])
+    assert ended.value.worked
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs to know the memory")
+def test_one_that_takes_much_memory_is_ended(monkeypatch):
+    monkeypatch.setattr(toolchain, "MEMORY", 60_000_000)
+    with pytest.raises(HangsError, match=r"took more than 0\.06 GB of memory") as ended:
+        run([sys.executable, "-c", "import time; held = b'.' * 200_000_000; time.sleep(99)"])
+    assert ended.value.worked
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of other processes")
+def test_one_that_is_left_alone_ends_by_itself():
+    assert run(["sh", "-c", "sleep 0.2; ulimit -t"]).out == f"{int(toolchain.BUSY) + 5}\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_in_the_middle_of_a_start_comes_after_it(monkeypatch, tmp_path, sleeper, number):
+    """What is half begun could not be ended: a compiler would stay."""
+
+    class StoppedError(Exception):
+        pass
+
+    def stop(*_):
+        raise StoppedError
+
+    class Interrupted(subprocess.Popen):
+        def __init__(self, *args, **named):
+            super().__init__(*args, **named)
+            until = time.monotonic() + 5.0
+            while not (tmp_path / "pids").exists() and time.monotonic() < until:
+                time.sleep(0.01)
+            os.kill(os.getpid(), number)
+            time.sleep(0.01)
+
+    monkeypatch.setattr(toolchain.subprocess, "Popen", Interrupted)
+    before = signal.signal(number, stop)
+    try:
+        with pytest.raises(StoppedError):
+            run([str(sleeper)])
+        assert signal.getsignal(number) is stop
+    finally:
+        signal.signal(number, before)
+    assert left(tmp_path) == []
 
 
 def test_who_holds_its_output_is_not_waited_for(tmp_path):
