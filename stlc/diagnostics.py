@@ -216,6 +216,7 @@ CODES: dict[str, str] = {
     "S202": "a name that is not a state",
     "S203": "a formula or a number in the wrong place",
     "S204": "a control without a range, or bounds in the wrong order",
+    "S205": "a feedback that cannot be computed",
     "S206": "a world or plugin that cannot be loaded",
     "S207": "a world that fails while it runs",
     "S208": "a function from outside that cannot be loaded, or that fails",
@@ -227,6 +228,7 @@ CODES: dict[str, str] = {
     "S303": "initial states in a file that cannot be used",
     "S304": "a mirror that is not a symmetry",
     "W601": "an acceptance rate of initial states below 1 %",
+    "W602": "plans of a plant that is unstable",
     # runs
     "R101": "no run, or a run folder that is damaged",
     "R102": "a checkpoint of another specification or system",

@@ -51,6 +51,17 @@ def test_a_grid_instead() -> None:
     assert len({tuple(row) for row in x0[:, [0, 1, 4]].tolist()}) == 84
 
 
+def test_a_feedback_beneath_the_plans() -> None:
+    whole = "\n".join(text for text in blocks("") if not text.startswith("policy:"))
+    whole = re.sub(r"^policy:.*$", "", whole, flags=re.MULTILINE)
+    regulator, given = (system(whole + text) for text in blocks("feedback"))
+    assert regulator.decl.feedback is not None
+    assert given.decl.feedback is not None
+    assert given.decl.feedback.gain[1][1] == 3.0
+    assert given.decl.feedback.authority == (2.0, 2.0)
+    assert bool(torch.isfinite(moved(regulator)).all())
+
+
 @pytest.mark.parametrize("name", ["heavy", "longer", "worn", "windy", "blurred", "late"])
 def test_every_scenario_can_be_laid_over(name: str) -> None:
     decl = parse_system(Source("arm.yaml", "\n".join(blocks(""))), Path("arm.yaml"))

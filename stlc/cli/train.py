@@ -191,6 +191,7 @@ def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str
     """Read, compile, and say which system file was taken."""
     from stlc.cli.output import say, show_diagnostics
     from stlc.controller.task import Task
+    from stlc.dynamics.feedback import unstable
     from stlc.dynamics.system import System
     from stlc.files import find_spec, find_system, read_source
     from stlc.grammar.parser import parse
@@ -208,7 +209,7 @@ def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str
     say(f"system {found}")
     loaded = System.load(found, overrides)
     task = Task.of(spec, loaded, overrides=overrides)
-    show_diagnostics(task.compiled.warnings)
+    show_diagnostics([*task.compiled.warnings, *unstable(loaded.decl)])
     return task
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from stlc.compile.modules import spec_sha256
 from stlc.controller.executed import as_foreseen
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from stlc.controller.drive import Recording, Setting
     from stlc.controller.rules import Rules
     from stlc.controller.run import Run
+    from stlc.dynamics.system import System
 
 TRACE = "trace.npz"
 SCENE = "scene.npz"
@@ -43,7 +45,7 @@ def trace_of(run: Run, recording: Recording, setting: Setting, rules: Rules | No
     """
     system = run.task.system
     states = np.moveaxis(recording.states, -1, 0)
-    actions = zip(system.control_names, np.moveaxis(recording.actions, -1, 0), strict=True)
+    actions = zip(system.control_names, np.moveaxis(_commanded(system, recording), -1, 0), strict=True)
     rows = np.arange(len(recording.states))
     return Trace(
         signature=system.signature,
@@ -61,6 +63,13 @@ def trace_of(run: Run, recording: Recording, setting: Setting, rules: Rules | No
         },
         meta=_meta(run, setting, rules),
     )
+
+
+def _commanded(system: System, recording: Recording) -> NDArray[np.float64]:
+    """What actuators got, (rows, steps, m)."""
+    states = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
+    planned = torch.from_numpy(recording.actions)
+    return system.commanded(states, planned.flatten(0, 1)).reshape(planned.shape).numpy()
 
 
 def save_trace_of(

@@ -125,7 +125,8 @@ class Worlds:
         """
         known = x[:, : self.size[1]]
         before, given = torch.split(known.clone(), self.parts), []
-        acts = torch.split(self.disturbance.acted(action.clone()), self.parts)
+        acted = self.disturbance.acted(self.system.commanded(x, action).clone())
+        acts = torch.split(self.system.planned(x, acted), self.parts)
         alone = [truth.step(state, act) for truth, state, act in zip(self.truths, before, acts, strict=True)]
         for world, state, act in zip(self.worlds, before, acts, strict=True):
             with blamed(world, "advance", f"take step {step}"):

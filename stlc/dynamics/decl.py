@@ -13,14 +13,14 @@ from stlc.diagnostics import Diagnostic
 from stlc.dynamics.decl_deployment import BackupDecl, JudgeRef, ScenarioDecl, TestDecl, WorldRef
 from stlc.dynamics.decl_init import InitDecl
 from stlc.dynamics.decl_learning import ObjectiveDecl, PolicyDecl, TrainDecl
-from stlc.dynamics.decl_model import Assign, ControlDecl, FunctionDecl, JumpDecl
+from stlc.dynamics.decl_model import Assign, ControlDecl, Feedback, FunctionDecl, JumpDecl
 from stlc.signature import Signature
 from stlc.source import Source, Span
 from stlc.units import Unit
 
 LEARNT = (
     *("dt", "horizon", "substeps", "integrator", "discrete", "constants", "signature", "controls"),
-    *("flow", "jumps", "clamps", "init", "objective", "policy"),
+    *("flow", "jumps", "clamps", "init", "objective", "policy", "feedback"),
 )
 """The fields of a system that decide what a policy learns."""
 
@@ -42,10 +42,11 @@ class SystemDecl:
         discrete: `flow` holds next-state maps instead of derivatives.
         constants: name -> (value in SI units, unit).
         signature: the state columns, in order.
-        controls: the inputs, in order.
+        controls: what is planned, in order: the inputs, or how far they are from what `feedback` gives.
         flow: derivative (or next value) a column, in its unit per second; unlisted ones are constant.
         jumps: in file order.
         clamps: columns that are kept within (low, high).
+        feedback: beneath the plans; None where actuators get what is planned.
         scenarios: named overlays.
         scenario: the one that is laid over, if any.
         functions: from outside, for specifications.
@@ -77,6 +78,7 @@ class SystemDecl:
     train: TrainDecl
     backup: BackupDecl
     test: TestDecl
+    feedback: Feedback | None = None
     scenarios: tuple[ScenarioDecl, ...] = ()
     scenario: ScenarioDecl | None = None
     functions: tuple[FunctionDecl, ...] = ()

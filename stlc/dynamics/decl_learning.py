@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from stlc.compile import ir
@@ -32,10 +33,28 @@ class ObjectiveDecl:
 
 
 @dataclass(frozen=True, slots=True)
+class FeedbackDecl:
+    """What `policy: {feedback: …}` asks for; `stlc.dynamics.feedback` makes it a gain.
+
+    Attributes:
+        around: name of a state or control -> its value at the point of operation, in its unit.
+        weights: name of a state or control -> weight of its cost for the regulator.
+        gain: control -> state -> entry of the gain, in the units of both; empty: that of the regulator.
+        authority: how much the feedback adds at most, as a share of half the range of each actuator.
+    """
+
+    around: Mapping[str, float] = field(default_factory=dict)
+    weights: Mapping[str, float] = field(default_factory=dict)
+    gain: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    authority: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
 class PolicyDecl:
     """Shape of the network and what it sees; no `observe` means every state.
 
     `mirror`: images of states and controls under a symmetry of system and specification; none where empty.
+    `feedback`: what lies beneath its plans, as asked for; None where plans are the controls themselves.
     """
 
     type: str = "mlp"
@@ -44,6 +63,8 @@ class PolicyDecl:
     observe_text: tuple[str, ...] = field(default=(), compare=False)
     mirror: tuple[Assign, ...] = ()
     mirror_span: Span | None = field(default=None, compare=False, repr=False)
+    feedback: FeedbackDecl | None = None
+    feedback_span: Span | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)

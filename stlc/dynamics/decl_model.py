@@ -36,6 +36,29 @@ class ControlDecl:
 
 
 @dataclass(frozen=True, slots=True)
+class Feedback:
+    """A linear feedback beneath the plans: actuators get clip(u0 + v + clip(K (x0 - x), -a, a), low, high).
+
+    `v` is what is planned; everything is in the units of the columns.
+
+    Attributes:
+        gain: K, a row a control with an entry a state.
+        state: x0, one a state.
+        control: u0, one a control.
+        low: lower ends of the actuators' ranges.
+        high: upper ends.
+        authority: a, how much the feedback adds at most, one a control.
+    """
+
+    gain: tuple[tuple[float, ...], ...]
+    state: tuple[float, ...]
+    control: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    authority: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Assign:
     """A column (or a local name) and its new value, in the unit of that column."""
 

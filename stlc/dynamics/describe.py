@@ -25,6 +25,7 @@ def describe(decl: SystemDecl) -> str:
     blocks = (
         ("states", [_state(column, flow.get(column.name), rate) for column in decl.signature.columns]),
         ("controls", [_control(decl, index) for index in range(len(decl.controls))]),
+        ("feedback beneath the plans", _feedback(decl)),
         ("jumps", [(jump.name, f"when {jump.text}", _resets(jump.resets)) for jump in decl.jumps]),
         ("initial situations", _situations(decl.init.mixture)),
         ("kept where", [(text,) for text in decl.init.where_text]),
@@ -59,6 +60,21 @@ def _control(decl: SystemDecl, index: int) -> Row:
     control = decl.controls[index]
     unit = f"[{control.unit}]" if control.unit.text else ""
     return control.name, unit, f"[{control.low:g}, {control.high:g}]", control.squash
+
+
+def _feedback(decl: SystemDecl) -> list[Row]:
+    """`u  [N]  u0 + plan + 3.1 (x0 - x) within 4, then within [-8, 8]`, a row a control."""
+    feedback = decl.feedback
+    rows: list[Row] = []
+    for i, control in enumerate(decl.controls if feedback is not None else ()):
+        assert feedback is not None
+        entries = zip(decl.signature.names, feedback.gain[i], feedback.state, strict=True)
+        parts = [f"{gain:+.4g} ({at:.4g} - {name})" for name, gain, at in entries if gain]
+        most, back = feedback.authority[i], " ".join(parts) or "0"
+        law = f"plan {feedback.control[i]:+.4g}, and {back} within {most:.4g}"
+        unit = f"[{control.unit}]" if control.unit.text else ""
+        rows.append((control.name, unit, f"actuator [{feedback.low[i]:g}, {feedback.high[i]:g}]", law))
+    return rows
 
 
 def _resets(resets: Sequence[Assign]) -> str:

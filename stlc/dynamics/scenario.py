@@ -76,7 +76,8 @@ def truth(decl: SystemDecl) -> SystemDecl:
     scenario = decl.scenario
     if scenario is None or not scenario.mismatch:
         return decl
-    return _laid_over(_with_constants(decl, scenario.mismatch), scenario.name)
+    real = replace(_with_constants(decl, scenario.mismatch), controls=decl.controls, feedback=decl.feedback)
+    return _laid_over(real, scenario.name)
 
 
 def _laid_over(decl: SystemDecl, name: str) -> SystemDecl:

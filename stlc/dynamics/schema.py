@@ -9,6 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TypeAlias
 
+from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.decl import SystemDecl
 from stlc.dynamics.decl_model import Assign, FunctionDecl
 from stlc.dynamics.schema_columns import name_columns, read_controls, read_states
@@ -98,7 +99,24 @@ def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | 
             later(reader, found[key], what)
     decl = _declaration(found, reader, source, path, overrides or {})
     reader.close()
-    return replace(decl, bases=bases)
+    return _with_feedback(replace(decl, bases=bases))
+
+
+def _with_feedback(decl: SystemDecl) -> SystemDecl:
+    """The declaration with the feedback beneath its plans that it asks for. Raises SystemFileError (S205)."""
+    asked = decl.policy.feedback
+    if asked is None:
+        return decl
+    from stlc.dynamics.feedback import NoFeedbackError, closed
+
+    try:
+        return closed(decl, asked)
+    except NoFeedbackError as error:
+        advice = "give a `gain`, another point of operation (`around`), or leave `feedback` out"
+        finding = Diagnostic(
+            "S205", f"no feedback can be had: {error}", decl.policy.feedback_span, help=(advice,)
+        )
+        raise SystemFileError(finding) from None
 
 
 def _version(node: Node | None, reader: Reader) -> None:

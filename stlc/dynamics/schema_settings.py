@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -10,7 +11,14 @@ from stlc.compile.scope import Entry, Known
 from stlc.compile.values import Number, Vector
 from stlc.dynamics.algebra import names_in, substitute
 from stlc.dynamics.decl_deployment import BackupDecl
-from stlc.dynamics.decl_learning import START, ObjectiveDecl, PolicyDecl, Term, TrainDecl
+from stlc.dynamics.decl_learning import (
+    START,
+    FeedbackDecl,
+    ObjectiveDecl,
+    PolicyDecl,
+    Term,
+    TrainDecl,
+)
 from stlc.dynamics.schema_columns import read_levels
 from stlc.dynamics.schema_expressions import SECOND, Expressions, written
 from stlc.dynamics.schema_flow import component_texts
@@ -20,10 +28,12 @@ from stlc.dynamics.schema_reader import Reader
 from stlc.dynamics.yaml_nodes import Node, Scalar, Sequence, as_int
 from stlc.grammar import ast
 from stlc.runtime.prefixes import SAMPLINGS
+from stlc.units import Unit
 
 OBJECTIVE_KEYS = ("gamma", "smoothing", "lambda", "terms")
 TERM_KEYS = ("name", "weight", "expr")
-POLICY_KEYS = ("type", "hidden", "observe", "mirror")
+POLICY_KEYS = ("type", "hidden", "observe", "mirror", "feedback")
+FEEDBACK_KEYS = ("around", "weights", "gain", "authority")
 POLICIES = ("mlp",)
 TRAIN_KEYS = ("budget", "steps", "seed", "lr", "batch", "samples", "method")
 METHODS = ("guided", "gradient")
@@ -103,7 +113,61 @@ def read_policy(node: Node | None, reader: Reader, names: Names) -> PolicyDecl:
         tuple(text for _, text in seen),
         read_mirror(found.get("mirror"), reader, names),
         found["mirror"].span if "mirror" in found else None,
+        read_feedback(found.get("feedback"), reader, names),
+        found["feedback"].span if "feedback" in found else None,
     )
+
+
+def read_feedback(node: Node | None, reader: Reader, names: Names) -> FeedbackDecl | None:
+    """The entry `feedback` of the policy: `lqr`, or what is asked of it."""
+    if node is None or (isinstance(node, Scalar) and node.is_null):
+        return None
+    if isinstance(node, Scalar):
+        if node.text == "lqr":
+            return FeedbackDecl()
+        reader.wrong(node, "`feedback`", "`lqr`, or a mapping", "feedback: {weights: {angle: 10}}")
+        return None
+    found = reader.fields(node, "`feedback`", FEEDBACK_KEYS)
+    units = {each.name: each.unit for each in names.columns} | {
+        each.name: each.unit for each in names.controls
+    }
+    here = names.expressions(reader)
+    around = _each(found.get("around"), "`around`", reader, units)
+    gain: dict[str, dict[str, float]] = {}
+    for entry in reader.entries(found.get("gain"), "`gain`"):
+        if entry.key.text not in {each.name for each in names.controls}:
+            reader.unknown(entry.key, "`gain`", tuple(each.name for each in names.controls))
+            continue
+        control = units[entry.key.text]
+        row = _each(
+            entry.value, f"`gain` of {entry.key.text}", reader, {c.name: c.unit for c in names.columns}
+        )
+        values = {
+            name: here.constant(each, f"the gain of `{name}`", control / units[name])
+            for name, each in row.items()
+        }
+        gain[entry.key.text] = {name: value for name, value in values.items() if value is not None}
+    points = {name: here.constant(each, f"`{name}`", units[name]) for name, each in around.items()}
+    weights = _each(found.get("weights"), "`weights`", reader, units)
+    costs = {name: reader.number(each, f"the weight of `{name}`") for name, each in weights.items()}
+    authority = reader.number(found.get("authority"), "`authority`")
+    return FeedbackDecl(
+        {name: value for name, value in points.items() if value is not None},
+        {name: value for name, value in costs.items() if value is not None},
+        gain,
+        1.0 if authority is None else authority,
+    )
+
+
+def _each(node: Node | None, where: str, reader: Reader, known: Mapping[str, Unit]) -> dict[str, Node]:
+    """Values by the names of columns."""
+    found = {}
+    for entry in reader.entries(node, where):
+        if entry.key.text in known:
+            found[entry.key.text] = entry.value
+        else:
+            reader.unknown(entry.key, where, tuple(known))
+    return found
 
 
 def _seen(node: Node, here: Expressions) -> tuple[tuple[ir.Num, str], ...]:

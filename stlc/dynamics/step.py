@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from stlc.compile import ir
-from stlc.dynamics.algebra import blend, substitute
+from stlc.dynamics.algebra import add, blend, map_formula, multiply, substitute
 from stlc.dynamics.decl import SystemDecl
 from stlc.dynamics.decl_model import JumpDecl
 from stlc.dynamics.integrators import INTEGRATORS, State
@@ -53,10 +53,11 @@ def build_step(decl: SystemDecl, *, soft: bool) -> Step:
     """
     writer = _Writer()
     start: State = {name: ir.Col(name) for name in decl.signature.names}
-    state = _flow(decl, writer, start)
+    given = {name: writer.name(name, num) for name, num in commands(decl).items()}
+    state = _flow(decl, writer, start, given)
     moved = {assign.name for assign in decl.flow}
     for jump in decl.jumps:
-        state = _jump(jump, state, soft=soft)
+        state = _jump(_given(jump, given), state, soft=soft)
         moved |= {assign.name for assign in jump.resets}
     reset = {assign.name for jump in decl.jumps for assign in jump.resets}
     state = {name: _clamped(decl, name, num) if name in reset else num for name, num in state.items()}
@@ -64,11 +65,40 @@ def build_step(decl: SystemDecl, *, soft: bool) -> Step:
     return Step(tuple(writer.lets), {name: state[name] for name in ordered})
 
 
-def _flow(decl: SystemDecl, writer: _Writer, state: State) -> State:
-    """All substeps of the continuous part."""
+def commands(decl: SystemDecl) -> dict[str, ir.Num]:
+    """Name of a control -> what its actuator gets, from the state and from what is planned.
+
+    {} where actuators get what is planned. It is computed once a step, as a sampled controller does.
+    """
+    feedback = decl.feedback
+    if feedback is None:
+        return {}
+    found: dict[str, ir.Num] = {}
+    for i, each in enumerate(decl.controls):
+        back: ir.Num = ir.Lit(0.0)
+        for gain, state, at in zip(feedback.gain[i], decl.signature.names, feedback.state, strict=True):
+            if gain:
+                back = add(back, multiply(ir.Lit(gain), ir.Op("sub", (ir.Lit(at), ir.Col(state)))))
+        most = feedback.authority[i]
+        bounded = ir.Op("clip", (back, ir.Lit(-most), ir.Lit(most)))
+        total = add(add(ir.Col(each.name), ir.Lit(feedback.control[i])), bounded)
+        found[each.name] = ir.Op("clip", (total, ir.Lit(feedback.low[i]), ir.Lit(feedback.high[i])))
+    return found
+
+
+def _given(jump: JumpDecl, given: State) -> JumpDecl:
+    """The jump, where it reads controls of what actuators get."""
+    if not given:
+        return jump
+    resets = tuple(replace(each, value=substitute(each.value, given)) for each in jump.resets)
+    return replace(jump, guard=map_formula(jump.guard, lambda num: substitute(num, given)), resets=resets)
+
+
+def _flow(decl: SystemDecl, writer: _Writer, state: State, given: State) -> State:
+    """All substeps of the continuous part; `given` is what actuators get."""
 
     def rate(at: State) -> State:
-        table = writer.named(at)
+        table = {**writer.named(at), **given}
         return {assign.name: substitute(assign.value, table) for assign in decl.flow}
 
     integrate = INTEGRATORS.get(decl.integrator)

@@ -18,19 +18,20 @@ from stlc.compile.switch import Hard, Switch
 from stlc.compile.timers import Timer
 from stlc.compile.typed import Parameter
 from stlc.diagnostics import Diagnostic, SystemFileError
-from stlc.dynamics.algebra import add, multiply, names_in
+from stlc.dynamics.algebra import add, multiply, names_in, substitute
 from stlc.dynamics.decl import SystemDecl
 from stlc.dynamics.decl_learning import START
 from stlc.dynamics.decl_model import Assign, ControlDecl
 from stlc.dynamics.describe import describe
 from stlc.dynamics.draws import Drawing, Rows
+from stlc.dynamics.feedback import unstable
 from stlc.dynamics.functions import load_functions
 from stlc.dynamics.mirror import Mirror
 from stlc.dynamics.rollout import Columns, Stepper
 from stlc.dynamics.samplers import InitialStates
 from stlc.dynamics.scenario import truth, under
 from stlc.dynamics.schema import load_system_decl
-from stlc.dynamics.step import Step, build_step
+from stlc.dynamics.step import Step, build_step, commands
 from stlc.files import find_system
 
 HARD = Hard()
@@ -141,6 +142,14 @@ class System:
         return torch.tensor([control.high for control in self.controls], dtype=torch.float32)
 
     @property
+    def actuator_widths(self) -> tuple[float, ...]:
+        """Widths of the ranges of the actuators; those of plans are wider where a feedback lies beneath."""
+        if self.decl.feedback is None:
+            return tuple(control.high - control.low for control in self.controls)
+        ends = zip(self.decl.feedback.low, self.decl.feedback.high, strict=True)
+        return tuple(high - low for low, high in ends)
+
+    @property
     def observed_count(self) -> int:
         """Numbers that the policy sees."""
         observe = self.decl.policy.observe
@@ -182,6 +191,29 @@ class System:
         before = self._named(x)
         later = before | self._later(before)
         return torch.stack([later[column.name] for column in self.added], 1) if self.added else x[:, :0]
+
+    def commanded(self, x: Tensor, u: Tensor) -> Tensor:
+        """What actuators get in states (B, n) where `u` (B, m) is planned; `u` itself without a feedback."""
+        if self._commands is None:
+            return u
+        found = self._commands({**self._named(x), **self._inputs(u)}, TORCH, HARD)
+        return torch.stack([found[name] for name in self.control_names], 1)
+
+    def planned(self, x: Tensor, command: Tensor) -> Tensor:
+        """What has to be planned in states (B, n) for actuators to get `command` (B, m), where they can."""
+        if self._commands is None:
+            return command
+        feedback = self.decl.feedback
+        assert feedback is not None
+        gain, at = x.new_tensor(feedback.gain), x.new_tensor(feedback.state)
+        most = x.new_tensor(feedback.authority)
+        back = ((at - x[:, : len(at)]) @ gain.T).clamp(-most, most)
+        return command - x.new_tensor(feedback.control) - back
+
+    @cached_property
+    def _commands(self) -> Program | None:
+        found = commands(self.decl)
+        return Program(found) if found else None
 
     def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
         """Many steps: (B, n), (B, T, m) -> (B, T+1, n), the initial state first."""
@@ -349,10 +381,11 @@ class System:
     def objective(self) -> tuple[ir.Num | None, ir.Num | None]:
         """The weighed sum of the performance terms over states, and of those that read a control."""
         sums: list[ir.Num | None] = [None, None]
+        given = commands(self.decl)
         for term in self.decl.objective.terms:
             if term.weight:
                 kind = bool(names_in(term.value) & set(self.control_names))
-                value = multiply(ir.Lit(term.weight), term.value)
+                value = multiply(ir.Lit(term.weight), substitute(term.value, given) if kind else term.value)
                 before = sums[kind]
                 sums[kind] = value if before is None else add(before, value)
         return sums[0], sums[1]
@@ -389,4 +422,4 @@ class System:
         low, high = self.control_low.double(), self.control_high.double()
         u = low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
         self.require_finite(self.rollout(x0, u))
-        return (*self.decl.warnings, *self.initial.warnings())
+        return (*self.decl.warnings, *self.initial.warnings(), *unstable(self.decl))

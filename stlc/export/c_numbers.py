@@ -10,6 +10,7 @@ from stlc.compile import ir
 from stlc.compile.c_numbers import Leaf, NumberWriter, Untranslatable, literal
 from stlc.controller.task import KEPT, PULL, SHORT, Task
 from stlc.dynamics.decl_learning import START
+from stlc.dynamics.step import commands
 
 if TYPE_CHECKING:
     from stlc.controller.promises import Promise
@@ -62,6 +63,14 @@ def squashed(task: Task) -> list[str]:
         lines.append(f"u[{i}] = (float){middle} + {unit} * (float){half};")
         at += width
     return lines
+
+
+def command(task: Task) -> list[str]:
+    """Statements that fill `command` from the state `x` and the first action `u` of a plan."""
+    names, given = task.system.control_names, commands(task.system.decl)
+    places = {name: f"x[{i}]" for i, name in enumerate(task.names)}
+    places |= {name: f"u[{i}]" for i, name in enumerate(names)}
+    return _assigned("command", [given.get(name, ir.Col(name)) for name in names], places)
 
 
 def _assigned(target: str, numbers: Sequence[ir.Num], places: Mapping[str, str]) -> list[str]:

@@ -103,6 +103,7 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
         "IMAGE_ACTION": "" if mirror is None else _block(c_numbers.image_of_action(task)),
         "SQUASH": _block(c_numbers.squashed(task)),
         "FORWARD": _block(c_weights.forward(network)),
+        "COMMAND": _block(c_numbers.command(task)),
         "COST": _block(c_numbers.cost(task)),
         "OVERALL": _block(_overall(task.rules, task.rules)),
         "SAFE": _block(_overall(task.compiled.safety, task.rules)),

@@ -72,6 +72,7 @@ def write_onnx(run: Run, folder: Path) -> None:
 def _facts(run: Run) -> dict[str, object]:
     """Names, units, ranges, hashes, and what the backup policy tries."""
     task, grid = run.task, backup.grid_of(run.task)
+    feedback = task.system.decl.feedback
     return {
         "format": FORMAT,
         "stlc": __version__,
@@ -82,6 +83,7 @@ def _facts(run: Run) -> dict[str, object]:
         "controls": [
             asdict(Quantity(each.name, str(each.unit), each.low, each.high)) for each in task.system.controls
         ],
+        "feedback": None if feedback is None else asdict(feedback),
         "requirements": [rule.name for rule in task.rules],
         "dt": task.dt,
         "horizon": task.horizon,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
@@ -149,6 +149,7 @@ _WRITERS: Mapping[Target, Callable[[Run, Path], Checked]] = {"torch": _torch, "c
 def _facts(run: Run) -> dict[str, object]:
     """Names and sizes of what goes in and comes out."""
     task = run.task
+    feedback = task.system.decl.feedback
     return {
         "spec": task.compiled.name,
         "system": task.system.name,
@@ -156,6 +157,7 @@ def _facts(run: Run) -> dict[str, object]:
         "controls": [
             {"name": each.name, "low": each.low, "high": each.high} for each in task.system.controls
         ],
+        "feedback": None if feedback is None else asdict(feedback),
         "requirements": [rule.name for rule in task.rules],
         "dt": task.dt,
         "horizon": task.horizon,

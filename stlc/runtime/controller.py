@@ -154,7 +154,10 @@ class Controller:
             raise RunError(Diagnostic("R402", "the policy's plan is not a number"))
         self._begun = followed
         self._added = said.get("added")
-        return self._decision(followed, policy_rho, single=single)
+        command = followed.judged.plan[:, 0].copy()
+        if self.facts.feedback is not None:
+            command = self.facts.feedback(x, command)
+        return self._decision(followed, command, policy_rho, single=single)
 
     # ---------------------------------------------------------------------- states
 
@@ -228,17 +231,18 @@ class Controller:
             getattr(followed.judged, name)[row] = getattr(found.judged, name)[0]
         followed.source[row], followed.t0[row], followed.kept[row] = found.source, found.t0, False
 
-    def _decision(self, followed: _Followed, policy_rho: Numbers, *, single: bool) -> Decision:
+    def _decision(
+        self, followed: _Followed, control: Numbers, policy_rho: Numbers, *, single: bool
+    ) -> Decision:
         judged = followed.judged
         source = np.array(RULES)[followed.source]
         rule = np.where(followed.kept, KEPT, source)
         each = dict(zip(self.facts.requirements, judged.each.T, strict=True))
         if not single:
-            control = judged.plan[:, 0].copy()
             plan, t0 = judged.plan.copy(), followed.t0.copy()
             return Decision(control, rule, plan, judged.rho, judged.safe, each, source, t0, policy_rho)
         return Decision(
-            judged.plan[0, 0].copy(),
+            control[0],
             str(rule[0]),
             judged.plan[0].copy(),
             float(judged.rho[0]),

@@ -7,11 +7,15 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, RunError, UsageError
 from stlc.runtime.prefixes import SAMPLINGS, Grid
 
+Numbers: TypeAlias = NDArray[np.float64]
 FACTS = "controller.json"
 FORMAT = "stlc-controller/1"
 DECIDE, FOLLOW, JUDGE, FALL = "decide.onnx", "follow.onnx", "judge.onnx", "fall.onnx"
@@ -39,6 +43,33 @@ class Quantity:
 
 
 @dataclass(frozen=True, slots=True)
+class Feedback:
+    """The law beneath the plans: actuators get clip(u0 + v + clip(K (x0 - x), -a, a), low, high).
+
+    Attributes:
+        gain: K, (m, n), without what the specification adds to states.
+        state: x0, (n,).
+        control: u0, (m,).
+        low: lower ends of the actuators' ranges, (m,).
+        high: upper ends, (m,).
+        authority: a, (m,).
+    """
+
+    gain: Numbers
+    state: Numbers
+    control: Numbers
+    low: Numbers
+    high: Numbers
+    authority: Numbers
+
+    def __call__(self, x: Numbers, planned: Numbers) -> Numbers:
+        """What actuators get: (rows, n), (rows, m) -> (rows, m)."""
+        back = (self.state - x[:, : len(self.state)]) @ self.gain.T
+        total = self.control + planned + np.clip(back, -self.authority, self.authority)
+        return np.clip(total, self.low, self.high)
+
+
+@dataclass(frozen=True, slots=True)
 class Facts:
     """What a controller is.
 
@@ -52,6 +83,7 @@ class Facts:
         horizon: steps of a plan.
         grid: of the backup policy.
         graphs: name of a file -> its bytes.
+        feedback: beneath the plans; None where actuators get what is planned.
     """
 
     spec: Mapping[str, str]
@@ -63,6 +95,7 @@ class Facts:
     horizon: int
     grid: Grid
     graphs: Mapping[str, bytes]
+    feedback: Feedback | None = None
 
     @property
     def added(self) -> tuple[Quantity, ...]:
@@ -109,7 +142,17 @@ def _facts(read: Mapping[str, Any], folder: Path) -> Facts:
         int(read["horizon"]),
         _grid(read["backup"]),
         {name: _whole(folder / name, digest) for name, digest in read["files"].items()},
+        _feedback(read.get("feedback"), len(read["controls"])),
     )
+
+
+def _feedback(read: Mapping[str, Any] | None, controls: int) -> Feedback | None:
+    if read is None:
+        return None
+    found = {name: np.array(read[name], dtype=np.float64) for name in Feedback.__annotations__}
+    if found["gain"].shape != (controls, len(found["state"])):
+        raise ValueError(f"a gain of shape {found['gain'].shape}")
+    return Feedback(**found)
 
 
 def _grid(read: Mapping[str, Any]) -> Grid:
