@@ -205,7 +205,7 @@ CODES: dict[str, str] = {
     "E601": "a trace that lacks a signal",
     "E602": "a trace whose time is not uniform",
     "E603": "a trace file that cannot be read, or is not safe to read",
-    "E604": "a trace that holds NaN or infinite values",
+    "E604": "a trace that holds infinite values",
     "E605": "a trace whose arrays do not fit together",
     # system files
     "S100": "not a YAML document",

@@ -22,10 +22,10 @@ from stlc.trace_extras import needed
 from stlc.trace_formats import read_recording
 from stlc.trace_meta import TraceMeta, meta_array
 from stlc.trace_npz import write_npz
-from stlc.trace_recording import CLOCK, EXTRA, Recording, absent, fit
-from stlc.trace_resample import resampled
+from stlc.trace_recording import CLOCK, EXTRA, Recording, Strand, absent, fit
+from stlc.trace_resample import Grid, resampled, usual_step
 from stlc.trace_table import GROUPS
-from stlc.trace_time import RESAMPLE, read_clock
+from stlc.trace_time import read_clock, require_same_step, resample_advice
 from stlc.trace_words import Words, in_numbers, wordless
 
 __all__ = [
@@ -107,6 +107,9 @@ class Reading:
     Attributes:
         names: signal -> its name in the file; `t` names the clock.
         resample: put the signals on a grid of so many seconds; None takes the file's own, which is uniform.
+        dt: seconds between samples, where the file does not say; it must not say otherwise.
+        max_gap: put the signals on a grid, on which they are unknown (NaN) within longer gaps in seconds;
+            without `resample` the grid has the usual step of the file.
         kinds: signal -> what its numbers mean, which says how it is resampled.
         words: signal -> what its words are worth, of all signals of interest; those of no interest, and with
             None all, are set aside among the extras.
@@ -114,6 +117,8 @@ class Reading:
 
     names: Mapping[str, str] = field(default_factory=dict)
     resample: float | None = None
+    dt: float | None = None
+    max_gap: float | None = None
     kinds: Mapping[str, Kind] = field(default_factory=dict)
     words: Mapping[str, Words] | None = None
 
@@ -154,25 +159,46 @@ def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
         recording = wordless(recording)
     else:
         recording = in_numbers(recording, {names.get(n, n): worth for n, worth in reading.words.items()})
-    if reading.resample is None:
-        trace = _uniform(recording)
+    if reading.resample is None and reading.max_gap is None:
+        trace = _uniform(recording, reading.dt)
     else:
         kinds = {names.get(name, name): kind for name, kind in reading.kinds.items()}
-        t0, data = resampled(recording, reading.resample, kinds)
-        trace = _trace(recording, t0, reading.resample, data)
+        grid = Grid(reading.resample or reading.dt, reading.max_gap)
+        laid = resampled(_clocked(recording, reading.dt), grid, kinds)
+        trace = _trace(recording, laid.t0, laid.dt, laid.data)
     return trace.renamed(names)
 
 
-def _uniform(recording: Recording) -> Trace:
+def _clocked(recording: Recording, dt: float | None) -> Recording:
+    """The recording where strands without a clock have one with this step."""
+    step = dt or recording.meta.dt
+    if step is None:
+        return recording
+    strands = tuple(
+        strand if strand.clock is not None else replace(strand, clock=step * np.arange(_longest(strand)))
+        for strand in recording.strands
+    )
+    return replace(recording, strands=strands)
+
+
+def _longest(strand: Strand) -> int:
+    return max((values.shape[-1] for values in strand.arrays.values() if values.ndim), default=0)
+
+
+def _uniform(recording: Recording, step: float | None) -> Trace:
     """The trace of a file with one uniform clock."""
     name = recording.name
     strands = [strand for strand in recording.strands if strand.arrays] or list(recording.strands)
     if len(strands) > 1:
         message = f"the signals of `{name}` follow {len(strands)} clocks"
-        raise TraceError(Diagnostic("E602", message, help=(RESAMPLE,)))
+        usual = [usual_step(s.clock.astype(np.float64).reshape(-1)) for s in strands if s.clock is not None]
+        help_ = (resample_advice(min((each for each in usual if each > 0), default=0.0)),)
+        raise TraceError(Diagnostic("E602", message, help=help_))
     (strand,) = strands
-    longest = max((values.shape[-1] for values in strand.arrays.values() if values.ndim), default=0)
-    t0, dt, samples = read_clock(name, strand.clock, recording.meta.dt, longest, others=strand.arrays)
+    said = recording.meta.dt if step is None else step
+    t0, dt, samples = read_clock(name, strand.clock, said, _longest(strand), others=strand.arrays)
+    if step is not None:
+        require_same_step(name, dt, step)
     data = fit(name, strand.arrays, samples)
     whole = {n: np.ascontiguousarray(values, dtype=np.float64) for n, values in data.items()}
     return _trace(recording, t0, dt, whole)

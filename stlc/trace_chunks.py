@@ -22,7 +22,7 @@ from stlc.trace_npz import Member, open_members, unreadable
 from stlc.trace_parquet import damage, open_parquet, signal_fields, table_of
 from stlc.trace_recording import CLOCK, EXTRA, Recording, Strand, of_arrays
 from stlc.trace_table import of_table
-from stlc.trace_time import RESAMPLE, TOLERANCE
+from stlc.trace_time import TOLERANCE, resample_advice
 from stlc.trace_words import instants_of
 
 Array = NDArray[Any]
@@ -142,7 +142,7 @@ class _Clock:
                 f"time in `{self.name}` is not uniform: t[{self.samples + i}] = {times[i]:.6g} s, "
                 f"where {wanted[i]:.6g} s was expected"
             )
-            raise TraceError(Diagnostic("E602", message, help=(RESAMPLE,)))
+            raise TraceError(Diagnostic("E602", message, help=(resample_advice(self.dt),)))
 
 
 # -------------------------------------------------------------------------- formats

@@ -78,12 +78,21 @@ def is_unit(text: str) -> bool:
 
 def _in_seconds(path: Path, name: str, clock: Array, unit: str) -> Array:
     """The times of a column in seconds. Raises TraceError (E605) for a unit that is no time."""
+    scale = clock_scale(f"`{path}`", name, unit)
+    return clock if scale == 1 or clock.dtype.kind == "U" else clock * scale
+
+
+def clock_scale(trace: str, name: str, unit: str) -> float:
+    """Seconds of one unit of a clock. Raises TraceError (E605) for a unit that is no time."""
     text = _SPELLINGS.get(unit.lower(), unit) or ("ns" if name == ROSTOPIC else "s")
-    time = unit_of(path, name, text)
+    try:
+        time = parse_unit(text)
+    except ValueError as error:
+        raise TraceError(Diagnostic("E605", f"column `{name}` of {trace}: {error}")) from None
     if time.dims != parse_unit("s").dims:
-        message = f"the clock `{name}` of `{path}` is in [{unit}], which is not a time"
+        message = f"the clock `{name}` of {trace} is in [{unit}], which is not a time"
         raise TraceError(Diagnostic("E605", message))
-    return clock if time.scale == 1 or clock.dtype.kind == "U" else clock * float(time.scale)
+    return float(time.scale)
 
 
 def _grouped(path: Path, columns: dict[str, Array], group: str, keys: Array) -> dict[str, Array]:

@@ -16,12 +16,33 @@ Floats = NDArray[np.float64]
 TOLERANCE = 0.05
 """Share of a step by which samples may stand beside the grid (rounded decimals, jitter)."""
 
-RESAMPLE = "--resample 0.1s  puts them on one grid (bool, int and enum held, real ones interpolated)"
+NO_CLOCK = "add an array `t` with the time of every sample in seconds, or name it: --map t=NAME"
+NO_STEP = "--dt 0.01s  says how far apart samples are that have no clock"
 
 SHORTEST, LONGEST = 1e-15, 1e12
 """Time steps in seconds: nothing is sampled faster than each femtosecond, or less than each 30,000 years."""
 
 _SNAP = 1e-6
+
+
+def resample_advice(step: float) -> str:
+    """A way out for samples that are not on one grid, by the usual time between them in seconds.
+
+    The grid is at least twice as fine: on one of their own step samples would be passed over.
+    """
+    if not (np.isfinite(step) and 2 * SHORTEST <= step <= LONGEST):
+        return "--resample TIME  puts them on one grid (bool, int and enum held, real ones interpolated)"
+    power = 10.0 ** np.floor(np.log10(step / 2))
+    finer = max(factor * power for factor in (1, 2, 5) if factor * power <= step / 2 * (1 + 1e-9))
+    return f"--resample {finer:.6g}s  puts them on one grid (bool, int and enum held, real ones interpolated)"
+
+
+def gap_advice(step: float) -> str:
+    """A way out for samples on a grid of which some are missing."""
+    return (
+        f"--max-gap {3 * step:.6g}s  keeps the grid and bridges gaps up to that; "
+        "in longer ones signals are unknown, and what needs them is inconclusive"
+    )
 
 
 def read_clock(
@@ -43,7 +64,7 @@ def read_clock(
         require_step(name, dt)
     if clock is None:
         if dt is None:
-            help_ = ("add an array `t` with the time of every sample in seconds, or name it: --map t=NAME",)
+            help_ = (NO_CLOCK, NO_STEP)
             known = ", ".join(others)
             note = (f"arrays in {name}: {known}",) if known else ()
             raise TraceError(Diagnostic("E601", f"trace `{name}` has no `t`", help=help_, note=note))
@@ -73,6 +94,14 @@ def require_step(name: str, dt: float) -> None:
         raise TraceError(Diagnostic("E602", f"the time step of `{name}` is {dt:g} s", help=help_))
 
 
+def require_same_step(name: str, found: float, said: float) -> None:
+    """Raise TraceError (E602) where the clock of a trace has another step than was said."""
+    if abs(found - said) > 1e-3 * said:
+        message = f"`{name}` has a sample every {found:.6g} s, not every {said:.6g} s"
+        help_ = ("leave out --dt: the file says what its step is",)
+        raise TraceError(Diagnostic("E602", message, help=help_))
+
+
 def _check_finite(name: str, times: Floats) -> None:
     bad = np.flatnonzero(~np.isfinite(times))
     if len(bad):
@@ -92,7 +121,7 @@ def _step(name: str, times: Floats, dt: float | None) -> float:
         message = (
             f"time in `{name}` is not uniform: t[{i}] = {times[i]:.6g} s is {drift[i]:.3g} s beside the grid"
         )
-        raise TraceError(Diagnostic("E602", message, help=(RESAMPLE,)))
+        raise TraceError(Diagnostic("E602", message, help=(resample_advice(mean),)))
     return _snap(mean, dt)
 
 
@@ -110,12 +139,26 @@ def _require_even(name: str, times: Floats) -> None:
     odd = gaps - usual
     np.abs(odd, out=odd)
     if odd.max() > TOLERANCE * usual:
-        i = int(np.argmax(odd > TOLERANCE * usual))
+        raise TraceError(_uneven(name, times, gaps, usual))
+
+
+def _uneven(name: str, times: Floats, gaps: Floats, usual: float) -> Diagnostic:
+    """E602: samples are missing, or they are not on a grid."""
+    i = int(np.argmax(np.abs(gaps - usual) > TOLERANCE * usual))
+    steps = np.rint(gaps / usual)
+    if (np.abs(gaps - steps * usual) <= TOLERANCE * usual).all() and (steps >= 1).all():
+        holes = int((steps > 1).sum())
+        more = f", the first of {holes} such gaps" if holes > 1 else ""
         message = (
-            f"time in `{name}` is not uniform: dt is {usual:.6g} s except at t[{i}] = {times[i]:.6g} s, "
-            f"where it is {gaps[i]:.6g} s"
+            f"samples are missing in `{name}`: dt is {usual:.6g} s, and after t[{i}] = {times[i]:.6g} s "
+            f"comes t[{i + 1}] = {times[i + 1]:.6g} s{more}"
         )
-        raise TraceError(Diagnostic("E602", message, help=(RESAMPLE,)))
+        return Diagnostic("E602", message, help=(gap_advice(usual),))
+    message = (
+        f"time in `{name}` is not uniform: dt is {usual:.6g} s except at t[{i}] = {times[i]:.6g} s, "
+        f"where it is {gaps[i]:.6g} s"
+    )
+    return Diagnostic("E602", message, help=(resample_advice(usual),))
 
 
 def snapped(step: float) -> float:

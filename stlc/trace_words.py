@@ -5,6 +5,7 @@ What is no number of any kind, words and complex numbers, is set aside, and refu
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -90,6 +91,22 @@ def instants_of(trace: str, strand: Strand) -> NDArray[np.datetime64]:
         raise TraceError(Diagnostic("E603", message, help=advice)) from None
 
 
+def instant_of_word(word: str) -> np.datetime64 | None:
+    """A date and time (ISO 8601); None for another word."""
+    try:
+        return np.datetime64(word.rstrip("Zz"), "ns")
+    except ValueError:
+        return None
+
+
+def number_of_word(trace: str, name: str, word: str, words: Words) -> float:
+    """What a word of a signal is worth. Raises TraceError (E603) for one that it does not have."""
+    worth = _worth(word, words)
+    if worth is None:
+        raise TraceError(_unknown(trace, name, word, words))
+    return worth
+
+
 def _seconds(trace: str, strand: Strand) -> NDArray[np.float64]:
     """Dates and times as seconds since the first."""
     instants = instants_of(trace, strand)
@@ -108,9 +125,11 @@ def _numbers(trace: str, name: str, values: NDArray[Any], words: Words) -> NDArr
 
 
 def _worth(word: str, words: Words) -> float | None:
-    """A member as it is written, or the only one that differs in the case of letters."""
+    """A member as it is written, or the only one that differs in the case of letters; NaN for no word."""
     if word in words:
         return words[word]
+    if not word and words:
+        return math.nan
     alike = {value for name, value in words.items() if name.lower() == word.lower()}
     return alike.pop() if len(alike) == 1 else None
 
@@ -124,8 +143,6 @@ def _unknown(trace: str, name: str, word: str, words: Words) -> Diagnostic:
         )
         return Diagnostic("E603", f"`{name}` in `{trace}` holds words (`{shown}`), not numbers", help=advice)
     note = (f"it is one of {', '.join(words)}, or a number",)
-    if not word:
-        return Diagnostic("E603", f"`{name}` in `{trace}` is empty in some samples", note=note)
     near = closest(word, words)
     advice = (f"did you mean `{near}`?",) if near else ()
     return Diagnostic("E603", f"`{name}` in `{trace}` cannot be `{shown}`", help=advice, note=note)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 from hypothesis import strategies as st
 
 from stlc.compile import ir, typed
+from stlc.compile.horizon import reach, uses_end
 from stlc.compile.interface import Grid
+from stlc.compile.pipeline import Rule
+from stlc.monitor.verdict import Monitor
 from stlc.source import Source, Span
 
 SPAN: Span = Source("random", "").span(0, 0)
@@ -169,3 +173,17 @@ def traces(low: int = 1, high: int = 14, batch: int = 2) -> st.SearchStrategy[di
         return {name: rng.integers(-24, 24, size=(samples, batch)) / 8 for name in NAMES}
 
     return st.builds(build, st.integers(low, high), st.integers(0, 2**32 - 1))
+
+
+def a_rule(formula: ir.Formula) -> Rule:
+    """A requirement that is judged once, or at every sample."""
+    like = Monitor("signal x\nrequire r: x > 0\n", dt=0.1).compiled.requirements[0]
+    return replace(
+        like,
+        formula=formula,
+        lowered=formula,
+        reach=reach(formula).future,
+        windowed=False,
+        uses_end=uses_end(formula),
+        absolute=False,
+    )

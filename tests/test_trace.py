@@ -358,7 +358,12 @@ def test_a_packed_array_that_is_damaged(tmp_path: Path) -> None:
         (
             {"t": [0.0, 0.1, 0.2, 0.9], "x": np.zeros(4)},
             "E602",
-            r"except at t\[2\] = 0.2 s, where it is 0.7 s",
+            r"missing in .*: dt is 0.1 s, and after t\[2\] = 0.2 s comes t\[3\] = 0.9 s",
+        ),
+        (
+            {"t": [0.0, 0.1, 0.2, 0.87, 0.97], "x": np.zeros(5)},
+            "E602",
+            r"except at t\[2\] = 0.2 s, where it is 0.67 s",
         ),
     ],
 )
@@ -534,8 +539,9 @@ def test_a_column_of_words_may_begin_with_an_empty_cell(tmp_path: Path) -> None:
     trace = load_trace(path)
     assert trace.extras["Sign"].tolist() == ["", "stop", ""]
     np.testing.assert_array_equal(trace.data["x"], [[1.0, np.nan, 3.0]])
-    with pytest.raises(TraceError, match=r"`Sign` in .* is empty in some samples"):
-        load_trace(path, Reading({"sign": "Sign"}, words=WORDS))
+    read = load_trace(path, Reading({"sign": "Sign"}, words=WORDS)).data["sign"][0]
+    assert read.tolist()[1] == WORDS["sign"]["stop"]
+    assert np.isnan(read[[0, 2]]).all()
 
 
 def test_without_a_clock_the_arrays_are_named(tmp_path: Path) -> None:

@@ -55,6 +55,8 @@ def check(
     tolerance: given.Tolerance = 1e-6,
     map_: given.Names = None,
     resample: given.Resample = None,
+    max_gap: given.MaxGap = None,
+    dt: given.Step = None,
     fail_under: given.FailUnder = None,
     out: given.Out = None,
     junit: given.Junit = None,
@@ -80,6 +82,8 @@ def check(
         time_step("--resample", resample),
         parse_overrides(set_),
         semantics,
+        time_step("--dt", dt),
+        time_step("--max-gap", max_gap),
     )
     talk = not (quiet or json)
     if _STREAM in traces:

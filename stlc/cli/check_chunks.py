@@ -51,6 +51,7 @@ def _require_pieces(path: Path, work: Work) -> None:
     question = work.question
     whole = {
         "--resample": question.resample is not None,
+        "--max-gap": question.max_gap is not None,
         "--out": work.out is not None,
         "--semantics": question.semantics != "exact",
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from stlc.cli.checked import Checked
 from stlc.cli.outcome import Outcome, overall
 from stlc.monitor.explain import Cause
 from stlc.monitor.judgement import Judgement
+from stlc.monitor.signals import Gap
 
 
 def document(outcomes: Sequence[Outcome]) -> dict[str, Any]:
@@ -34,6 +35,7 @@ def entry_of(result: Checked, end: str) -> dict[str, Any]:
         "end": end,
         "traces": verdict.traces,
         "samples": result.trace.samples,
+        "unknown": {name: gap_entry(gap, verdict.subject.time) for name, gap in verdict.subject.gaps.items()},
         "in_scope": verdict.in_scope,
         "verdict": verdict.overall if verdict.in_scope else "out of scope",
         "robustness": _least(verdict.requirements[0].counted(np.atleast_1d(verdict.robustness))),
@@ -41,6 +43,11 @@ def entry_of(result: Checked, end: str) -> dict[str, Any]:
         "satisfied_share": verdict.share,
         "requirements": [_requirement(judged, result) for judged in verdict],
     }
+
+
+def gap_entry(gap: Gap, time: Callable[[int], float]) -> dict[str, Any]:
+    """Where a signal is not known."""
+    return {"samples": gap.samples, "first": time(gap.first), "last": time(gap.last)}
 
 
 def _requirement(judged: Judgement, result: Checked) -> dict[str, Any]:

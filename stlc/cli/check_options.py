@@ -47,6 +47,16 @@ Resample = Annotated[
     str | None,
     typer.Option(metavar="TIME", help="Put the signals on a grid: bool, int, enum held, real linear."),
 ]
+Step = Annotated[
+    str | None, typer.Option(metavar="TIME", help="Time between samples that have no clock, as 10ms.")
+]
+MaxGap = Annotated[
+    str | None,
+    typer.Option(
+        metavar="TIME",
+        help="In longer gaps signals are unknown; three steps with --resample, else no gap may be.",
+    ),
+]
 FailUnder = Annotated[
     float | None, typer.Option(min=0, max=1, help="Exit 0 if this share of starts satisfies all.")
 ]

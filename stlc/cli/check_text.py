@@ -12,11 +12,12 @@ from stlc.cli.checked import Checked
 from stlc.cli.outcome import WORDS, Row
 from stlc.cli.output import table
 from stlc.cli.render import render_place
+from stlc.compile.horizon import columns
 from stlc.compile.semantics import TOLERANCE
 from stlc.escape import operand, shell, visible
 from stlc.monitor.explain import Cause
 from stlc.monitor.judgement import Judgement, Verdict
-from stlc.monitor.prepared import beside
+from stlc.monitor.prepared import beside, gap_text
 
 
 def describe_result(result: Checked, *, color: bool) -> str:
@@ -28,6 +29,7 @@ def _parts(result: Checked, color: bool) -> Iterator[str]:
     yield _title(result)
     yield ""
     yield _table(result)
+    yield from _gaps(result)
     for judged in result.verdict:
         cause = result.causes.get(judged.name)
         if cause is not None:
@@ -145,11 +147,32 @@ def _count(judged: Judgement, verdict: Verdict) -> str:
     return f"{headline}."
 
 
+def _gaps(result: Checked) -> list[str]:
+    """Where signals are not known that are needed."""
+    return [f"  {text}" for text in _gap_texts(result).values()]
+
+
+def _gap_texts(result: Checked) -> dict[str, str]:
+    subject = result.verdict.subject
+    samples = subject.signals.samples * subject.signals.batch
+    moment = subject.moment
+    return {
+        name: gap_text(name, gap, samples, (moment(gap.first), moment(gap.last)))
+        for name, gap in subject.gaps.items()
+    }
+
+
 def _inconclusive(judged: Judgement, result: Checked) -> str:
     name = visible(judged.name)
     needed, length = result.needs(judged)
+    gaps = [text for signal, text in _gap_texts(result).items() if signal in columns(judged.rule.formula)]
+    if gaps and needed <= length:
+        return f"{name} is inconclusive: {', '.join(gaps)}."
     if needed > length:
-        return f"{name} is inconclusive: it needs {needed:.6g} s of signal, the trace has {length:.6g} s."
+        more = "".join(f", and {text}" for text in gaps)
+        return (
+            f"{name} is inconclusive: it needs {needed:.6g} s of signal, the trace has {length:.6g} s{more}."
+        )
     return f"{name} is inconclusive: it has no value where it was judged."
 
 

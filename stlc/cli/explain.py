@@ -52,6 +52,8 @@ def explain(
     system: SystemOption = None,
     map_: given.Names = None,
     resample: given.Resample = None,
+    max_gap: given.MaxGap = None,
+    dt: given.Step = None,
     set_: SetOption = None,
     guarantee: Annotated[
         bool,
@@ -85,6 +87,8 @@ def explain(
             at,
             resample=time_step("--resample", resample),
             overrides=parse_overrides(set_),
+            dt=time_step("--dt", dt),
+            max_gap=time_step("--max-gap", max_gap),
         )
         explain_trace(what, question, runs, as_json=as_json)
 

@@ -45,6 +45,8 @@ class Question:
         resample: put the signals on a grid of so many seconds.
         overrides: constant -> its value, as text.
         semantics: of the robustness that is told.
+        dt: seconds between samples that have no clock.
+        max_gap: the longest gap between samples, in seconds, in which signals are known.
     """
 
     spec: Path | None = None
@@ -57,6 +59,8 @@ class Question:
     resample: float | None = None
     overrides: Mapping[str, str] = field(default_factory=dict)
     semantics: str = "exact"
+    dt: float | None = None
+    max_gap: float | None = None
 
 
 def usage(message: str, *advice: str) -> UsageError:
@@ -134,7 +138,12 @@ def spoken(question: Question) -> tuple[str, ...]:
     words += [] if question.system is None else ["--system", question.system]
     for option, pairs in (("--map", question.names), ("--set", question.overrides)):
         words += [word for name, value in pairs.items() for word in (option, f"{name}={value}")]
-    words += [] if question.resample is None else ["--resample", f"{question.resample:.10g}s"]
+    for option, seconds in (
+        ("--resample", question.resample),
+        ("--dt", question.dt),
+        ("--max-gap", question.max_gap),
+    ):
+        words += [] if seconds is None else [option, f"{seconds:.10g}s"]
     return tuple(words)
 
 
@@ -150,9 +159,8 @@ def laid_reading(monitor: Monitor | None, question: Question) -> Reading:
     from stlc.monitor.reading import reading_of
     from stlc.trace import Reading
 
-    if monitor is None:
-        return Reading(question.names, question.resample)
-    return reading_of(monitor.spec, question.names, question.resample)
+    asked = Reading(question.names, question.resample, question.dt, question.max_gap)
+    return asked if monitor is None else reading_of(monitor.spec, asked)
 
 
 def _below(path: Path) -> Path:

@@ -55,6 +55,8 @@ def plot(
     system: SystemOption = None,
     map_: given.Names = None,
     resample: given.Resample = None,
+    max_gap: given.MaxGap = None,
+    dt: given.Step = None,
     set_: SetOption = None,
     runs: Annotated[Path, typer.Option(help="Folder of all runs.")] = Path("runs"),
     as_json: JsonOption = False,
@@ -69,8 +71,15 @@ def plot(
     require_drawing()
     path = _find(what, runs)
     target = _target(output, path)
-    grid = time_step("--resample", resample)
-    question = Question(spec, system, names_of(map_), resample=grid, overrides=parse_overrides(set_))
+    question = Question(
+        spec,
+        system,
+        names_of(map_),
+        resample=time_step("--resample", resample),
+        overrides=parse_overrides(set_),
+        dt=time_step("--dt", dt),
+        max_gap=time_step("--max-gap", max_gap),
+    )
     recording = read_recording(path)
     planned = recording.meta.planned  # margins over time are those of windows
     source, note = specification(recording.name, question.spec, planned)

@@ -8,14 +8,15 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from stlc.cli.check_json import cause_entry
+from stlc.cli.check_json import cause_entry, gap_entry
 from stlc.cli.check_text import percent, signed
 from stlc.cli.outcome import WORDS, Outcome, Row
 from stlc.cli.output import table
 from stlc.cli.render import render_place
+from stlc.compile.horizon import columns
 from stlc.compile.semantics import TOLERANCE
 from stlc.escape import visible
-from stlc.monitor.prepared import beside
+from stlc.monitor.prepared import beside, gap_text
 from stlc.source import Source
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def outcome_of_tallies(online: Online, told: Told, said: tuple[str, ...], second
         name=told.name,
         status=status,
         rows=rows,
-        text="\n".join([*_text(told, rows, tallies, causes), "", WORDS[status].lower()]),
+        text="\n".join([*_text(told, online, rows, tallies, causes), "", WORDS[status].lower()]),
         entry=_entry(told, online, tallies, status)
         | {"requirements": _requirements(online, tallies, causes)},
         traces=0 if status == "out of scope" else 1,
@@ -98,12 +99,30 @@ def _row(name: str, tally: Tally, online: Online, cause: Cause | None) -> Row:
     if tally.status == "violated":
         why = f"violated at {tally.fails:,} of {tally.instants:,} starts"
     else:
-        why = "the trace is too short to say"
+        read = columns(online.rule(name).formula)
+        gaps = [text for signal, text in _gap_texts(online).items() if signal in read]
+        why = ", ".join(gaps) or "the trace is too short to say"
     return Row(name, tally.status, robustness_text(tally), where, why)
 
 
+def _gap_texts(online: Online) -> dict[str, str]:
+    """Where signals are not known."""
+    return {
+        name: gap_text(name, gap, online.samples, (_moment(online, gap.first), _moment(online, gap.last)))
+        for name, gap in online.gaps.items()
+    }
+
+
+def _moment(online: Online, sample: int) -> str:
+    return f"t = {online.time(sample):.10g} s"
+
+
 def _text(
-    told: Told, rows: tuple[Row, ...], tallies: Mapping[str, Tally], causes: Mapping[str, Cause]
+    told: Told,
+    online: Online,
+    rows: tuple[Row, ...],
+    tallies: Mapping[str, Tally],
+    causes: Mapping[str, Cause],
 ) -> Iterator[str]:
     head = f"{visible(told.source.name)} on {visible(told.name)}"
     yield f"{head}    1 trace x {told.samples} samples, dt {told.dt:g} s"
@@ -113,6 +132,12 @@ def _text(
         (row.name, WORDS[row.status], row.robustness, _share(tallies[row.name]), row.where) for row in rows
     ]
     yield table(lines, header=columns)
+    for gap in _gap_texts(online).values():
+        yield f"  {gap}"
+    for row in rows:
+        if row.status == "inconclusive":
+            yield ""
+            yield f"{visible(row.name)} is inconclusive: {row.why}."
     for name, cause in causes.items():
         yield ""
         yield _violation(name, tallies[name], cause, color=told.color)
@@ -140,6 +165,7 @@ def _entry(told: Told, online: Online, tallies: Mapping[str, Tally], status: Sta
         "end": online.how.end,
         "traces": 1,
         "samples": told.samples,
+        "unknown": {name: gap_entry(gap, online.time) for name, gap in online.gaps.items()},
         "in_scope": int(online.in_scope is not False),
         "verdict": status,
         "robustness": math.nan if any(map(math.isnan, known)) else min(known),
@@ -155,7 +181,7 @@ def _requirements(
 
 
 def _requirement(name: str, tally: Tally, online: Online, cause: Cause | None) -> dict[str, Any]:
-    rule = next(rule for rule in online.compiled.requirements if rule.name == name)
+    rule = online.rule(name)
     time = online.time(tally.worst)
     return {
         "name": name,

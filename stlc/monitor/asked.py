@@ -51,9 +51,14 @@ def worst(
 
 
 def sides_of(plans: Plans, beyond: int, asked: Asked) -> list[Side]:
-    """Both ends of what is possible, and the ending where it is another one."""
-    ends: list[End] = ["lower", "upper"] if asked.ending == "open" else ["lower", "upper", "truncate"]
-    return [Side(plans[end], end, 0 if end == "truncate" else beyond, asked.truth) for end in ends]
+    """Both ends of what is possible, and where windows are cut at the end both of what it is there."""
+    going_on: list[End] = ["lower", "upper"]
+    sides = [Side(plans[end], end, beyond, asked.truth, least=end == "lower") for end in going_on]
+    if asked.ending == "open":
+        return sides
+    return sides + [
+        Side(plans["truncate"], "truncate", 0, asked.truth, least=least) for least in (True, False)
+    ]
 
 
 def first_needed(planned: Plan, samples: int) -> int:

@@ -24,6 +24,7 @@ from stlc.compile.lower import lower
 from stlc.compile.samples import columns_of, leaves
 from stlc.compile.thaw import thaw
 from stlc.compile.walk import from_now, on_clock
+from stlc.monitor.holes import KNOWN, unsure
 from stlc.monitor.values import Record, bounds, granted, history
 from stlc.source import Span
 
@@ -304,7 +305,8 @@ class Blamer:
         key = (formula, wanted)
         if key not in self.cache:
             goal = formula if wanted else typed.Not(formula.span, formula)
-            self.cache[key] = granted(lower(goal, self.grid, []), self.record.env)
+            given = granted(lower(goal, self.grid, []), self.record.env)
+            self.cache[key] = unsure(given, self.record.holes, least=False) if self.record.holes else given
         return self.cache[key]
 
     def _margins(self, formula: typed.Formula, wanted: bool, instants: range) -> Floats:
@@ -345,7 +347,7 @@ class Blamer:
             (leaf.name, self._later(leaf, sample))
             for num in numbers(self._lowered(formula, wanted))
             for leaf in leaves(num)
-            if isinstance(leaf, (ir.Col, ir.At))
+            if isinstance(leaf, (ir.Col, ir.At)) and not leaf.name.startswith(KNOWN)
         }
         return replace(self._node(formula, wanted, sample), reads=tuple(sorted(found)))
 

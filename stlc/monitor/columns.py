@@ -21,6 +21,7 @@ from stlc.compile.schedule import Extent, Run, Schedule, schedule
 from stlc.compile.semantics import Exact
 from stlc.compile.windows import Windows
 from stlc.monitor.endings import reads_seen, with_seen
+from stlc.monitor.holes import holes_in, unsure, without_holes
 from stlc.monitor.streams import Latch, Latched, Leaf, Plan, column, read_by
 from stlc.monitor.values import by_truth
 
@@ -45,11 +46,16 @@ class Reader:
         formulas: over columns.
         end: what stands beyond the last row.
         going_on: the trace does not end with the last row.
+        back: rows before the first that is asked for which they read.
     """
 
-    def __init__(self, formulas: Sequence[ir.Formula], end: Beyond, *, going_on: bool = False) -> None:
+    def __init__(
+        self, formulas: Sequence[ir.Formula], end: Beyond, *, going_on: bool = False, back: int = 0
+    ) -> None:
         self.formulas = tuple(formulas)
         self.end = end
+        self.back = back
+        self._unsure: dict[tuple[frozenset[str], bool], Reader] = {}
         self._stop = FAR if going_on else None
         self.names = frozenset().union(*map(names_of_columns, self.formulas))
         self._known: dict[tuple[int, int, int], Schedule] = {}
@@ -70,6 +76,32 @@ class Reader:
         inner = {name: env[name] if len(env[name]) == length else env[name][:length] for name in names}
         return execute(self._known[key], inner, _EXACT)
 
+    def of_signals(
+        self, env: Mapping[str, Floats], start: int, count: int, *, least: bool | None = None
+    ) -> list[Floats]:
+        """The same of columns in which NaN is a value that is not known: the least or the most they may be.
+
+        Where `least` is None the columns (rows, 1) give both, (count, 2).
+        """
+        rows = {name: env[name] for name in self.names}
+        near = {name: values[max(start - self.back, 0) :] for name, values in rows.items()}
+        holes = holes_in(near)
+        if not holes:
+            return self(env, start, count)
+        known = {**env, **without_holes(rows, holes)}
+        if least is not None:
+            return self._sides(holes, least=least)(known, start, count)
+        both = (self._sides(holes, least=end)(known, start, count) for end in (True, False))
+        return [np.concatenate(pair, axis=1) for pair in zip(*both, strict=True)]
+
+    def _sides(self, holes: frozenset[str], *, least: bool) -> Reader:
+        """What reads the formulas at one end of what is possible."""
+        key = (holes, least)
+        if key not in self._unsure:
+            formulas = [unsure(formula, holes, least=least) for formula in self.formulas]
+            self._unsure[key] = Reader(formulas, self.end, going_on=self._stop is not None)
+        return self._unsure[key]
+
 
 @dataclass(slots=True)
 class Side:
@@ -80,6 +112,7 @@ class Side:
         end: which end: least, greatest, or with windows cut at the last sample.
         beyond: rows after the last sample that the formula over the columns reads.
         truth: predicates are true or false, +inf or -inf.
+        least: what is not known of a signal is at its least, else at its most.
         base: number of the first sample that is kept.
         rows: column -> values from `base` on, (kept + beyond, traces).
     """
@@ -88,6 +121,7 @@ class Side:
     end: End
     beyond: int
     truth: bool = False
+    least: bool = True
     base: int = 0
     rows: dict[str, Floats] = field(default_factory=dict)
     _over: bool = False
@@ -105,7 +139,7 @@ class Side:
             alike = [leaf for leaf in leaves if (leaf.back, leaf.ahead) == reads]
             formulas = [by_truth(leaf.formula) if self.truth else leaf.formula for leaf in alike]
             going_on = self.end != "truncate" and not self._over
-            self._leaves.append((alike, Reader(formulas, self.end, going_on=going_on)))
+            self._leaves.append((alike, Reader(formulas, self.end, going_on=going_on, back=reads[0])))
         latched = [stream for stream in self.plan.streams if isinstance(stream, Latched)]
         self._latched = [(stream, Reader(stream.parts, self.end)) for stream in latched]
         if self.end == "truncate":
@@ -162,7 +196,8 @@ class Side:
         env, first = signals
         start, ahead = self._settled.get(leaves[0].name, 0), leaves[0].ahead
         count = samples + max(self._pads[leaf.name] for leaf in leaves) - start
-        for leaf, values in zip(leaves, reader(env, start - first, count), strict=True):
+        found = reader.of_signals(env, start - first, count, least=self.least)
+        for leaf, values in zip(leaves, found, strict=True):
             self._put(leaf.name, start, values[: samples + self._pads[leaf.name] - start])
             self._settled[leaf.name] = max(samples - ahead, start)
 

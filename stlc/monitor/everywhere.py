@@ -57,8 +57,7 @@ class Everywhere:
 
     def certain(self, starts: range) -> Bounds:
         """At settled instants, where windows are cut to the trace."""
-        values = self._values(2, starts.start, starts.stop)
-        return Bounds(values, values)
+        return Bounds(*(self._values(which, starts.start, starts.stop) for which in (2, 3)))
 
     def either(self, start: int, stop: int) -> Bounds:
         """At any instants, where nothing is assumed of what lies outside of the trace."""

@@ -111,10 +111,8 @@ def _cause(
     at: tuple[int, int] | None = None,
 ) -> Cause:
     rule, (trace, start) = judgement.rule, judgement.worst if at is None else at
-    record = Record(
-        {name: column[:, trace : trace + 1] for name, column in subject.record.env.items()},
-        subject.record.ops,
-    )
+    one_trace = {name: column[:, trace : trace + 1] for name, column in subject.record.env.items()}
+    record = Record(one_trace, subject.record.ops, holes=subject.record.holes)
     window = window_of(rule, subject.horizon)
     stop = None if window is None else start + window + 1
     record = record if stop is None else record.cut(stop)

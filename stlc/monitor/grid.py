@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -12,7 +13,6 @@ from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.files import find_system
 from stlc.grammar import ast
 from stlc.trace import Trace, as_fraction
-from stlc.trace_time import RESAMPLE
 
 _SLACK = 1e-6
 
@@ -53,10 +53,18 @@ class Times:
             horizon, dt = float(self.horizon), float(self.dt)
             if self.trace:
                 message = f"`{self.trace}` has dt {dt:g} s, and T = {horizon:g} s is no whole number of steps"
-                raise TraceError(Diagnostic("E602", message, help=(RESAMPLE,)))
+                raise TraceError(Diagnostic("E602", message, help=(_dividing(horizon, dt),)))
             message = f"the horizon {horizon:g} s is not a whole number of steps of {dt:g} s"
             raise UsageError(Diagnostic("U101", message))
         return Grid(self.dt, whole)
+
+
+def _dividing(horizon: float, dt: float) -> str:
+    """A way out: the largest short number of seconds up to the step that divides the horizon."""
+    least = math.ceil(horizon / dt)
+    short = (n for n in range(least, least + 1000) if math.isclose(float(f"{horizon / n:.4g}") * n, horizon))
+    step = horizon / next(short, least)
+    return f"--resample {step:.6g}s  puts the signals on a grid of which T is a whole number of steps"
 
 
 def given_times(dt: float | Fraction | None, horizon: float | Fraction | None) -> Times:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -21,6 +22,7 @@ from stlc.compile.ops import Array
 from stlc.compile.pipeline import Rule
 from stlc.compile.schedule import End
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.monitor.holes import unsure
 from stlc.monitor.values import Ends, Record, bounds, window_bounds
 
 At: TypeAlias = int | Literal["all"] | None
@@ -74,8 +76,12 @@ def rule_known(rule: Rule, samples: int, starts: range, horizon: int | None) -> 
 def rule_signal(rule: Rule, record: Record, horizon: int | None, end: End) -> Array:
     """Values at every sample, `(samples, batch)`; NaN where `end` "strict" leaves them undefined.
 
+    So it is where they depend on what is not known, unless `end` is "lower" or "upper".
     A requirement on the mission clock has one value, whatever the sample.
     """
+    if record.holes:
+        least, most = (rule_signal(each, record.sure, horizon, end) for each in _sides(rule, record))
+        return _agreed(least, most, record, end)
     if rule.absolute:
         (value,) = rules_at([rule], record, 0, horizon, end)
         return record.ops.cat([value] * record.samples)
@@ -101,7 +107,12 @@ def _window_signal(rule: Rule, record: Record, window: int, end: End) -> Array:
 
 
 def rules_at(rules: Sequence[Rule], record: Record, at: int, horizon: int | None, end: End) -> list[Array]:
-    """Values at one sample, `(1, batch)` each; NaN where `end` "strict" leaves one undefined."""
+    """Values at one sample, `(1, batch)` each; NaN where `rule_signal` has it."""
+    if record.holes:
+        sides = [_sides(rule, record) for rule in rules]
+        least = rules_at([side[0] for side in sides], record.sure, at, horizon, end)
+        most = rules_at([side[1] for side in sides], record.sure, at, horizon, end)
+        return [_agreed(*pair, record, end) for pair in zip(least, most, strict=True)]
     starts_of_all = [starts_of(rule, record.samples, horizon, 0 if rule.absolute else at) for rule in rules]
     formulas = [rule.under(record.semantics) for rule in rules]
     together = [
@@ -115,6 +126,19 @@ def rules_at(rules: Sequence[Rule], record: Record, at: int, horizon: int | None
         values[formula] if formula in values else _alone(rule, record, starts.start, horizon, end)
         for rule, formula, starts in zip(rules, formulas, starts_of_all, strict=True)
     ]
+
+
+def _sides(rule: Rule, record: Record) -> tuple[Rule, Rule]:
+    """The requirement at its least and at its most, whatever the samples are that are not known."""
+    formula = rule.under(record.semantics)
+    least, most = (unsure(formula, record.holes, least=least) for least in (True, False))
+    return replace(rule, formula=least, lowered=least), replace(rule, formula=most, lowered=most)
+
+
+def _agreed(least: Array, most: Array, record: Record, end: End) -> Array:
+    if end in ("lower", "upper"):
+        return least if end == "lower" else most
+    return record.ops.where(least == most, least, math.nan)
 
 
 def _has_value(rule: Rule, record: Record, at: int, end: End) -> bool:

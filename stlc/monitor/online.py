@@ -21,7 +21,7 @@ from stlc.monitor.kept import Kept
 from stlc.monitor.needs import Need, needs_of
 from stlc.monitor.paced import Paced
 from stlc.monitor.recall import Recall, Worst
-from stlc.monitor.signals import arrange
+from stlc.monitor.signals import Gap, arrange, not_finite
 from stlc.monitor.tally import Flags, Judged, Tally
 from stlc.monitor.tracking import Tracker, Trackers
 from stlc.trace import Trace
@@ -141,6 +141,8 @@ class Online:
         self.how = how or How()
         self.compiled = compiled
         self._needs = needs_of(compiled, [*rules, *compiled.assumptions])
+        self.gaps: dict[str, Gap] = {}
+        """Where signals are not known."""
         self._kept = Kept()
         self._trackers = Trackers(compiled.grid.horizon)
         self._watched = [self._watch(rule) for rule in rules]
@@ -169,13 +171,15 @@ class Online:
     def push(self, sample: Sample) -> tuple[Decision, ...]:
         """Take one sample in; the verdicts that it decides, in the order of the requirements.
 
+        A value that is NaN is not known.
+
         Raises:
-            TraceError: E601, a signal is missing; E604, one is not finite; E605, one is not a single number.
+            TraceError: E601, a signal is missing; E604, one is infinite; E605, one is not a single number.
         """
         values = [_number(sample, need) for need in self._needs]
         for need, value in zip(self._needs, values, strict=True):
             if not math.isfinite(value):
-                raise self._not_finite(need, value, self.samples)
+                self._unknown(need, np.array([value]))
         rows = np.array(values).reshape(-1, 1, 1)
         self._take({need.column.name: row for need, row in zip(self._needs, rows, strict=True)}, 1)
         found: list[Decision] = []
@@ -199,9 +203,8 @@ class Online:
         columns = {name: np.asarray(values).reshape(laid.samples, 1) for name, values in laid.env.items()}
         for need in self._needs:
             values = columns[need.column.name][:, 0]
-            if not (finite := np.isfinite(values)).all():
-                first = int(np.argmin(finite))
-                raise self._not_finite(need, float(values[first]), self.samples + first)
+            if not np.isfinite(values).all():
+                self._unknown(need, values)
         self._take(columns, laid.samples)
         for watched in self._watched:
             if not watched.due(self.samples):
@@ -211,9 +214,15 @@ class Online:
         self._count_scope()
         self._trim()
 
-    def _not_finite(self, need: Need, value: float, sample: int) -> TraceError:
-        message = f"`{need.column.name}` is {value} at sample {sample}"
-        return TraceError(Diagnostic("E604", message, note=(f"needed by: {', '.join(need.by)}",)))
+    def _unknown(self, need: Need, values: Floats) -> None:
+        """Note which of the next samples (samples,) of a signal are NaN. Raises TraceError (E604) for inf."""
+        if np.isinf(values).any():
+            first = int(np.argmax(np.isinf(values)))
+            moment = f"sample {self.samples + first}"
+            finding = not_finite(f"`{need.column.name}`", values[first], moment, need)
+            raise TraceError(finding)
+        gap = self.gaps.get(need.column.name, Gap())
+        self.gaps[need.column.name] = gap.with_more(np.isnan(values), self.samples)
 
     def _take(self, columns: dict[str, Floats], count: int) -> None:
         """Append columns (time, 1) and bring every requirement up to date."""
@@ -289,6 +298,10 @@ class Online:
     def requirements(self) -> tuple[str, ...]:
         """Names of the requirements, in order."""
         return tuple(watched.rule.name for watched in self._watched)
+
+    def rule(self, name: str) -> Rule:
+        """A requirement. Raises UsageError (U101) for an unknown name."""
+        return self._find(name).rule
 
     def repeats(self, name: str) -> bool:
         """Whether a requirement is judged at every start, and not only at the first sample."""

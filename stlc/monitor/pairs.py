@@ -82,9 +82,8 @@ class Pairs:
         if self._leaves is not None:
             names, reader = self._leaves
             kept = len(next(iter(signals.values())))
-            for name, values in zip(
-                names, reader(signals, kept - (samples - first), samples - first), strict=True
-            ):
+            found = reader.of_signals(signals, kept - (samples - first), samples - first)
+            for name, values in zip(names, found, strict=True):
                 self._rows[name][begin:end] = values
         self._view()
         for stream, reader in self._latched:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from stlc.compile.pipeline import Compiled, Rule
-from stlc.monitor.signals import Signals
+from stlc.escape import visible
+from stlc.monitor.signals import Gap, Signals, gaps_of
 from stlc.monitor.values import Record
 
 
@@ -35,6 +36,11 @@ class Prepared:
         """Time step in seconds; None where nothing said so."""
         return None if self.compiled.grid.dt is None else float(self.compiled.grid.dt)
 
+    @property
+    def gaps(self) -> dict[str, Gap]:
+        """Where signals that are needed are not known."""
+        return gaps_of(self.signals)
+
     def time(self, sample: int) -> float:
         """Time of a sample in seconds; its number where the time step is unknown."""
         return float(sample) if self.dt is None else self.signals.t0 + sample * self.dt
@@ -42,6 +48,13 @@ class Prepared:
     def moment(self, sample: int) -> str:
         """The same in words: `t = 4.6 s`."""
         return f"sample {sample}" if self.dt is None else f"t = {self.time(sample):.10g} s"
+
+
+def gap_text(name: str, gap: Gap, samples: int, moments: tuple[str, str]) -> str:
+    """Where a signal is not known: ``rpm` is unknown at 120 of 6,000 samples (t = 8 s to 20 s)`."""
+    first, last = moments
+    where = first if gap.samples == 1 else f"{first} to {last.removeprefix('t = ')}"
+    return f"`{visible(name)}` is unknown at {gap.samples:,} of {samples:,} samples ({where})"
 
 
 def beside(moment: str, start: str) -> str:

@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
+from dataclasses import replace
 
 from stlc.grammar import ast
 from stlc.signature import Kind
-from stlc.trace import Reading
+from stlc.trace import AS_IT_IS, Reading
 from stlc.trace_words import TRUTH, Words
 
-_AS_DECLARED: Mapping[str, str] = MappingProxyType({})
 _KINDS: Mapping[str, Kind] = {"real": "real", "int": "int", "bool": "bool"}
 
 
-def reading_of(
-    spec: ast.Spec, names: Mapping[str, str] = _AS_DECLARED, resample: float | None = None
-) -> Reading:
+def reading_of(spec: ast.Spec, asked: Reading = AS_IT_IS) -> Reading:
     """How to read a file whose signals `spec` declares.
 
     Args:
         spec: the specification.
-        names: signal -> its name in the file, where they differ.
-        resample: seconds between the samples of a new grid; None takes the file's own.
+        asked: names in the file, of signals or of their columns (`from "…"`), and the grid.
     """
-    return Reading(names, resample, _kinds(spec), _words(spec))
+    columns = {item.name: item.column for item in spec.items if isinstance(item, ast.Signal) and item.column}
+    names = {_column(columns, name): there for name, there in asked.names.items()}
+    return replace(asked, names=names, kinds=_kinds(spec), words=_words(spec))
+
+
+def _column(columns: Mapping[str, str], name: str) -> str:
+    """What the column of a signal, or of a component of one, is called: `p[0]` of `p from "q"` is `q[0]`."""
+    base, bracket, index = name.partition("[")
+    return columns.get(name) or f"{columns.get(base, base)}{bracket}{index}"
 
 
 def _kinds(spec: ast.Spec) -> dict[str, Kind]:

@@ -82,7 +82,7 @@ class Recall:
         if excerpt is None:
             return None
         first, start, env = excerpt
-        record = Record(env, NUMPY)
+        record = Record.of(env, NUMPY)
         low, high = rule_bounds(rule, record, range(start, start + 1), self.compiled.grid.horizon, "open")
         if first and high[0, 0] != worst.high:
             return None

@@ -9,14 +9,17 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stlc.compile.ops import Array, Ops
 from stlc.compile.ops_numpy import NUMPY
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.monitor.needs import Need
 from stlc.registry import closest
+from stlc.signature import Column
+from stlc.source import Span
 from stlc.trace import Trace
-from stlc.units import same_dims
+from stlc.units import Unit, same_dims
 
 Given: TypeAlias = Mapping[str, Any]
 """Signal -> array (time,) or (…, time); a vector is (…, time, k)."""
@@ -69,11 +72,11 @@ class Signals:
 def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False) -> Signals:
     """Lay out the signals that are needed.
 
-    NumPy arrays and lists become float64; torch tensors keep dtype, device and gradients, or with `plain`
-    become NumPy arrays too.
+    NaN is a value that is not known. NumPy arrays and lists become float64; torch tensors keep dtype, device
+    and gradients, or with `plain` become NumPy arrays too.
 
     Raises:
-        TraceError: E601, a signal is missing; E604, one holds NaN or infinity (NumPy only);
+        TraceError: E601, a signal is missing; E604, one holds infinity (NumPy only);
             E605, arrays or units do not fit together.
     """
     name = given.name if isinstance(given, Trace) else UNNAMED
@@ -209,39 +212,88 @@ def _in_units(columns: Mapping[str, Array], needs: Sequence[Need], trace: Trace)
     converted = dict(columns)
     findings: list[Diagnostic] = []
     for need in needs:
-        name, wanted = need.column.name, need.column.unit
-        if name not in trace.signature or not wanted.text or not trace.signature[name].unit.text:
+        name = need.column.name
+        if name not in trace.signature:
             continue
-        recorded = trace.signature[name].unit
-        if not same_dims(recorded, wanted):
-            message = f"`{name}` is in [{recorded}] in `{trace.name}`, the specification declares [{wanted}]"
-            findings.append(Diagnostic("E605", message, need.span))
-        elif recorded.ratio != wanted.ratio:
-            converted[name] = converted[name] * float(recorded.ratio / wanted.ratio)
+        try:
+            factor = conversion(trace.name, need.column, trace.signature[name].unit, need.span)
+        except TraceError as error:
+            findings += error.diagnostics
+            continue
+        if factor != 1.0:
+            converted[name] = converted[name] * factor
     if findings:
         raise TraceError(*findings)
     return converted
 
 
+def conversion(trace: str, column: Column, recorded: Unit, span: Span | None = None) -> float:
+    """By what recorded numbers are multiplied; 1 where one side does not say what they mean.
+
+    Raises:
+        TraceError: E605, they measure something else than is declared.
+    """
+    wanted = column.unit
+    if not wanted.text or not recorded.text:
+        return 1.0
+    if not same_dims(recorded, wanted):
+        message = f"`{column.name}` is in [{recorded}] in `{trace}`, the specification declares [{wanted}]"
+        raise TraceError(Diagnostic("E605", message, span))
+    return float(recorded.ratio / wanted.ratio)
+
+
 def _check_finite(signals: Signals, needs: Sequence[Need]) -> None:
     findings = []
     for need in needs:
-        bad = ~np.isfinite(signals.env[need.column.name])
+        bad = np.isinf(signals.env[need.column.name])
         if bad.any():
             sample = int(np.argmax(bad.any(axis=1)))
             trace = int(np.argmax(bad[sample]))
             value = signals.env[need.column.name][sample, trace]
             place = f"t = {signals.t0 + sample * signals.dt:.6g} s" if signals.dt else f"sample {sample}"
             where = f"trace {trace}, {place}" if signals.shape else place
-            findings.append(
-                Diagnostic(
-                    "E604",
-                    f"`{need.column.name}` in {signals.name} is {value} at {where}",
-                    note=(
-                        f"{int(bad.sum())} of {bad.size} values are not finite",
-                        f"needed by: {', '.join(need.by)}",
-                    ),
-                )
-            )
+            finding = not_finite(f"`{need.column.name}` in {signals.name}", value, where, need)
+            findings.append(finding.with_note(f"{int(bad.sum())} of {bad.size} values are infinite"))
     if findings:
         raise TraceError(*findings)
+
+
+def not_finite(signal: str, value: float, where: str, need: Need) -> Diagnostic:
+    """E604 for an infinite value."""
+    return Diagnostic(
+        "E604",
+        f"{signal} is {value} at {where}",
+        help=("leave the cell empty where nothing was measured: then what needs it is inconclusive",),
+        note=(f"needed by: {', '.join(need.by)}",),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Samples at which a signal is not known.
+
+    Attributes:
+        samples: how many, over all traces.
+        first: the first of them.
+        last: the last one.
+    """
+
+    samples: int = 0
+    first: int = 0
+    last: int = 0
+
+    def with_more(self, unknown: NDArray[np.bool_], offset: int = 0) -> Gap:
+        """The same with those of (samples,) or (samples, traces) that follow from sample `offset` on."""
+        rows = np.flatnonzero(unknown.reshape(len(unknown), -1).any(axis=1))
+        if not len(rows):
+            return self
+        first = self.first if self.samples else offset + int(rows[0])
+        return Gap(self.samples + int(np.count_nonzero(unknown)), first, offset + int(rows[-1]))
+
+
+def gaps_of(signals: Signals) -> dict[str, Gap]:
+    """Where the columns are not known; of NumPy arrays alone."""
+    if signals.ops is not NUMPY:
+        return {}
+    found = {name: Gap().with_more(np.isnan(values)) for name, values in signals.env.items()}
+    return {name: gap for name, gap in found.items() if gap.samples}

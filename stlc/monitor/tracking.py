@@ -28,6 +28,7 @@ from stlc.monitor.columns import FAR, End
 from stlc.monitor.endings import lengthened, with_seen
 from stlc.monitor.everywhere import Everywhere
 from stlc.monitor.frontier import Frontier, skeleton
+from stlc.monitor.holes import unsure
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.paced import MOST, WIDE, Paced, Work, effort, span
 from stlc.monitor.pairs import Pairs, fits
@@ -209,7 +210,7 @@ class FromTheStart:
 
     def ended(self, starts: range) -> Bounds:
         """Where the trace is over."""
-        fronts = self._fronts[:2] if self.asked.ending == "open" else [self._fronts[2]] * 2
+        fronts = self._fronts[-2:]
         last = [replace(front, side=front.side.over()) for front in fronts]
         found = [front.ended(front.side.plan.formula, self.samples)[0] for front in last]
         return Bounds(found[0][: len(starts)], found[1][: len(starts)])
@@ -277,13 +278,19 @@ class Whole:
 
     def of_all(self, starts: range) -> tuple[Floats, Floats]:
         """Both ends of what is possible, wherever the traces end: (instants, traces) each."""
-        record, window = Record(with_seen(self._signals), NUMPY), self.window
+        record, window = Record.of(with_seen(self._signals), NUMPY), self.window
         lower, upper = self._ends["lower"], self._ends["upper"]
         if window is None:
             if self._long[0] != self.samples:
                 self._long = self.samples, lengthened(lower, self.samples), lengthened(upper, self.samples)
-            low = record.values([self._long[1]], starts, "lower", FAR)[0]
-            high = record.values([self._long[2]], starts, "upper", FAR)[0]
+            least, most = self._long[1:]
+            if record.holes:
+                least, most = (
+                    unsure(least, record.holes, least=True),
+                    unsure(most, record.holes, least=False),
+                )
+            low = record.values([least], starts, "lower", FAR)[0]
+            high = record.values([most], starts, "upper", FAR)[0]
             return np.asarray(low), np.asarray(high)
         low, high = window_bounds(lower, record, starts, window, "open")
         if upper != lower:
@@ -292,7 +299,7 @@ class Whole:
 
     def ended(self, starts: range) -> Bounds:
         """Where the trace is over."""
-        low, high = rule_bounds(self.rule, Record(self._signals, NUMPY), starts, self.horizon, self.ending)
+        low, high = rule_bounds(self.rule, Record.of(self._signals, NUMPY), starts, self.horizon, self.ending)
         return Bounds(low[:, 0], high[:, 0])
 
     def drop(self, start: int) -> int:  # noqa: ARG002

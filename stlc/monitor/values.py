@@ -13,9 +13,11 @@ from stlc.compile.defined import defined
 from stlc.compile.graph import evaluate
 from stlc.compile.horizon import parts
 from stlc.compile.ops import Array, Ops
+from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.samples import columns_of, everything, farthest
 from stlc.compile.schedule import End
 from stlc.compile.semantics import Exact, Semantics
+from stlc.monitor.holes import holes_in, unsure, without_holes
 
 Ends: TypeAlias = Literal["open", "truncate"]
 """`open`: the trace may go on, values are bounds over all continuations; `truncate`: windows are cut."""
@@ -26,11 +28,30 @@ _CHUNK = 1 << 22
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """Columns `(samples, batch)` and how to compute with them."""
+    """Columns `(samples, batch)` and how to compute with them.
+
+    Attributes:
+        env: name -> values, none of them NaN.
+        ops: the array library.
+        semantics: of min and max.
+        holes: signals that are not known everywhere (`stlc.monitor.holes`).
+    """
 
     env: Mapping[str, Array]
     ops: Ops
     semantics: Semantics = Exact()  # noqa: RUF009 - frozen
+    holes: frozenset[str] = frozenset()
+
+    @staticmethod
+    def of(env: Mapping[str, Array], ops: Ops) -> Record:
+        """A record of columns in which NaN stands for what is not known; in NumPy arrays alone."""
+        holes = holes_in(env) if ops is NUMPY else frozenset[str]()
+        return Record(without_holes(env, holes) if holes else env, ops, holes=holes)
+
+    @property
+    def sure(self) -> Record:
+        """The same for formulas that say themselves what is not known."""
+        return replace(self, holes=frozenset()) if self.holes else self
 
     @property
     def samples(self) -> int:
@@ -65,6 +86,10 @@ def bounds(
     Where nothing is unknown, both are one and the same array. `stop` says how many samples there will be,
     where that are more than are known.
     """
+    if record.holes:
+        least, most = (unsure(formula, record.holes, least=least) for least in (True, False))
+        low, high = bounds(least, record.sure, starts, ends, stop)
+        return low, (high if least == most else bounds(most, record.sure, starts, ends, stop)[1])
 
     def at(end: End, stop: int | None = None) -> Array:
         return record.values([formula], starts, end, stop)[0]

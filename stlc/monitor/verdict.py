@@ -246,7 +246,7 @@ class Monitor:
             raise UsageError(Diagnostic("U101", f"`{compiled.name}` has no requirement to judge"))
         read = [*rules, *compiled.assumptions] if plain else rules
         signals = arrange(given, needs_of(compiled, read), plain=plain)
-        return Prepared(compiled, rules, signals, Record(signals.env, signals.ops))
+        return Prepared(compiled, rules, signals, Record.of(signals.env, signals.ops))
 
     def _ready(self, recorded: Times) -> Compiled:
         """Compiled for what the arguments, the trace and the given system say; at last the named system."""

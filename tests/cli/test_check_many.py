@@ -151,7 +151,7 @@ def test_resampling_and_units_and_the_name_of_the_clock(capsys: pytest.CaptureFi
     np.savez("a.npz", time=t, height=np.full(N, 0.5), on=on)
     arguments = ("s.stl", "a.npz", "--map", "t=time", "--map", "a=height")
     assert check(*arguments) == 3
-    assert "--resample 0.1s" in capsys.readouterr().err
+    assert "--resample 0.05s" in capsys.readouterr().err  # not its own step
     assert check(*arguments, "-q", "--resample", "100ms") == 0
     for text in ("0.1", "0 s", "1 m", "x"):
         assert check(*arguments, "--resample", text) == 2
@@ -275,16 +275,25 @@ def test_a_stream_gives_what_the_trace_gives(
         ("t,a,on\n", 3, "holds no samples"),
         ("t,a,on\n0,1,1\n0.1,x,1\n", 3, "line 3 of the standard input has `x` where a number is expected"),
         ("t,a,on\n0,1,1\n0.1,1\n", 3, "line 3 of the standard input has 2 cells"),
-        ("t,a,on\n0,1,1\n0.1,1,1\n0.3,1,1\n", 3, "sample 2 has 0.3 s, not 0.2 s"),
+        ("t,a,on\n0,1,1\n0.1,1,1\n0.3,1,1\n", 3, "sample 2 has 0.3 s, not 0.2 s\n  = help: --max-gap 0.3s"),
         ("t,a,on\n0,1,1\n0,1,1\n", 3, "does not increase"),
         ("t,a,a\n0,1,1\n", 3, "names one twice"),
         ("0,1,2\n", 3, "numbers where the columns are named"),
-        ("t,a,on\n0,1,1\n0.1,nan,1\n", 3, "is nan at sample 1"),
+        ("t,a,on\n0,1,1\n0.1,inf,1\n", 3, "is inf at sample 1"),
+        ("t,a,on\n0,1,1\n0.1,1,1\n0.23,1,1\n", 3, "help: --resample 0.05s"),
+        ("t [m],a,on\n0,1,1\n", 3, "is in [m], which is not a time"),
+        ("t,a [s],on\n0,1,1\n0.1,1,1\n", 3, "is in [s] in `standard input`, the specification declares [m]"),
+        ("t,a [what],on\n0,1,1\n0.1,1,1\n", 3, "unknown unit `what`"),
+        ("t,a,on\nsoon,1,1\n", 3, "line 2 of the standard input has `soon` for a time"),
         ("t,b,on\n0,1,1\n0.1,1,1\n", 3, "no signal `a`"),
         ('{"t": 0, "a": 1, "on": 1}\n[1]\n', 3, "line 2 of the standard input is not a JSON object"),
-        ('{"t": 0, "a": "x", "on": 1}\n{"t": 1, "a": 1, "on": 1}\n', 3, "no signal `a`"),
+        (
+            '{"t": 0, "a": "x", "on": 1}\n{"t": 1, "a": 1, "on": 1}\n',
+            3,
+            "line 1 of the standard input has `x` where",
+        ),
         (b"\xff\xfe\x00", 3, "is not UTF-8"),
-        ('{"t": 0, "a": [1, 2], "on": 1}\n{"t": 1, "a": 1, "on": 1}\n', 3, "`a` is one number of a sample"),
+        ('{"t": 0, "a": [1, 2], "on": 1}\n{"t": 1, "a": 1, "on": 1}\n', 3, "no signal `a`"),
         ("t,a,on\n0,1," + "1" * 1_000_001, 3, "line 2 of the standard input is longer than"),
     ],
 )
@@ -327,11 +336,17 @@ def test_instants_that_a_stream_does_not_have(
 
 
 def test_options_that_need_the_whole_trace(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert stream(monkeypatch, "", "--resample", "1s") == 2
     assert stream(monkeypatch, "", "--out", "x.npz") == 2
     assert stream(monkeypatch, "", "--semantics", "agm") == 2
     assert check("-") == 2
     assert check("s.stl", "-", "other.npz") == 2
+
+
+def test_a_stream_in_other_units_with_a_date_for_a_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [f"2026-01-31T12:00:{k / 10:06.3f}Z,{100 * 0.5:g},1" for k in range(60)]
+    assert stream(monkeypatch, "\n".join(["timestamp,a [cm],on", *rows]), "-q") == 0
+    rows = [f"{100 * k},{100 * 2.5:g},1" for k in range(60)]
+    assert stream(monkeypatch, "\n".join(["time [ms];a [cm];on", *rows]).replace(",", ";"), "-q") == 1
 
 
 def test_columns_of_a_stream_may_be_renamed(monkeypatch: pytest.MonkeyPatch) -> None:

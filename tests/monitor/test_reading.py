@@ -10,6 +10,7 @@ import stlc
 from stlc.cli.app import main
 from stlc.diagnostics import TraceError
 from stlc.monitor.reading import reading_of
+from stlc.trace import Reading
 
 SPEC = """
 enum Light { red, green }
@@ -28,7 +29,7 @@ def written(folder: Path, rows: str) -> Path:
 
 
 def test_kinds_and_words_are_those_of_the_declarations() -> None:
-    reading = reading_of(stlc.parse(SPEC), {"x": "px"}, 0.5)
+    reading = reading_of(stlc.parse(SPEC), Reading({"x": "px"}, 0.5))
     assert reading.kinds == {"Lamp": "enum", "on": "bool", "n": "int"}
     assert reading.words is not None
     assert dict(reading.words["Lamp"]) == {"red": 0, "green": 1}
@@ -53,5 +54,12 @@ def test_a_word_that_is_no_member_and_a_cell_that_is_missing(tmp_path: Path) -> 
     monitor = stlc.Monitor(SPEC)
     with pytest.raises(TraceError, match=r"E603.*cannot be `blue`"):
         monitor.check(written(tmp_path, "0,green,no,1,2,\n1,blue,yes,1,0,\n"))
-    with pytest.raises(TraceError, match=r"E604.*`x` in .* is nan at trace 0, t = 1 s"):
-        monitor.check(written(tmp_path, "0,green,no,1,2,\n1,red,yes,1,,\n"))
+    assert monitor.check(written(tmp_path, "0,green,no,1,2,\n1,red,yes,1,,\n")).satisfied is None
+    assert monitor.check(written(tmp_path, "0,green,no,1,2,\n1,,yes,1,0,\n")).satisfied is None
+
+
+def test_a_signal_is_mapped_by_its_own_name_or_that_of_its_column() -> None:
+    spec = stlc.parse('signal rpm from "engine speed"\nsignal p : real[2] from "q"\nrequire r: rpm < p[0]')
+    for name in ("rpm", "engine speed"):
+        assert reading_of(spec, Reading({name: "log.engine"})).names == {"engine speed": "log.engine"}
+    assert reading_of(spec, Reading({"p[1]": "east"})).names == {"q[1]": "east"}

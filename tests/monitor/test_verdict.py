@@ -422,7 +422,7 @@ def test_missing_signals_are_named_with_those_who_need_them() -> None:
     assert monitor.check({"x": [1.0]}, require=["a"]).satisfied
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("bad", [np.inf, -np.inf])
 def test_values_that_are_not_finite(bad: float) -> None:
     values = np.zeros((3, 5))
     values[2, 3] = bad

@@ -1,0 +1,166 @@
+"""Samples that are not known: verdicts hold whatever is put into the holes, and streams say the same."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import formula_strategies as random_formulas
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stlc.compile.lower import lower
+from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.simplify import simplify
+from stlc.diagnostics import TraceError
+from stlc.monitor.asked import Asked
+from stlc.monitor.explain import explain
+from stlc.monitor.online import How
+from stlc.monitor.tracking import Trackers
+from stlc.monitor.values import Record, bounds, by_truth, window_bounds
+from stlc.monitor.verdict import Monitor
+
+NAN = float("nan")
+
+
+def holed(trace: dict[str, np.ndarray], seed: int, share: float) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return {name: np.where(rng.random(x.shape) < share, NAN, x) for name, x in trace.items()}
+
+
+def filled(trace: dict[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return {name: np.where(np.isnan(x), rng.integers(-40, 40, x.shape) / 8, x) for name, x in trace.items()}
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    written=random_formulas.formulas(held=()),
+    trace=random_formulas.traces(1, 14, 2),
+    ends=st.sampled_from(["open", "truncate"]),
+    window=st.none() | st.integers(0, 5),
+    seed=st.integers(0, 2**32 - 1),
+    share=st.sampled_from([0.05, 0.3, 1.0]),
+)
+def test_bounds_hold_for_every_filling(written, trace, ends, window, seed, share) -> None:
+    formula = simplify(lower(written, random_formulas.GRID, []))
+    unknown = holed(trace, seed, share)
+    record = Record.of(unknown, NUMPY)
+    starts = range(record.samples)
+
+    def judged(record: Record) -> Any:
+        if window is None:
+            return bounds(formula, record, starts, ends)
+        return window_bounds(formula, record, starts, window, ends)
+
+    low, high = judged(record)
+    assert not np.isnan(low).any()
+    assert not np.isnan(high).any()
+    for k in range(4):
+        least, most = judged(Record(filled(unknown, seed + k), NUMPY))
+        assert (low <= least).all()
+        assert (high >= most).all()
+    least, most = judged(Record(trace, NUMPY))
+    assert (low <= least).all()
+    assert (high >= most).all()
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    written=random_formulas.formulas(held=()),
+    trace=random_formulas.traces(1, 14, 1),
+    ending=st.sampled_from(["open", "truncate"]),
+    truth=st.booleans(),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_a_stream_with_holes_says_what_the_whole_trace_says(written, trace, ending, truth, seed) -> None:
+    formula = simplify(lower(written, random_formulas.GRID, []))
+    rule = random_formulas.a_rule(formula)
+    everywhere, samples = not rule.uses_end, len(trace["x"])
+    unknown = holed(trace, seed, 0.2)
+    tracker = Trackers(None).of(rule, Asked(ending, truth), everywhere=everywhere)
+    seen = [(-np.inf, np.inf)]
+    for now in range(1, samples + 1):
+        tracker.grow({name: x[:now] for name, x in unknown.items()}, 0, now)
+        low, high = tracker.live(0, 1)
+        seen.append((max(low[0], seen[-1][0]), min(high[0], seen[-1][1])))
+    starts = range(samples if everywhere else 1)
+    judged = by_truth(formula) if truth else formula
+    wanted = [end[:, 0] for end in bounds(judged, Record.of(unknown, NUMPY), starts, ending)]
+    found = tracker.ended(starts)
+    np.testing.assert_array_equal(found, wanted)
+    assert seen[-1][0] <= found.low[0] <= found.high[0] <= seen[-1][1]
+
+
+REQUIREMENTS = {
+    "bounded": "always[0 s, 0.4 s] (a > 0 or b > 0)",
+    "windowed": "a > 0 -> eventually[0, T] b > 0",
+    "beyond": "always[0, T] (a > -1 or eventually[0 s, 0.4 s] b > 0)",
+    "window_to_end": "always[0, T] (once[0 s, 0.2 s] a > 0 or eventually[0, end] b > 0)",
+    "always": "always (a > 1 -> eventually[0 s, 0.3 s] b > 0)",
+    "whole_past": "always (once a > 1 or historically b > -1)",
+    "under_a_window": "eventually[0 s, 0.4 s] always a > -1",
+    "chosen": "always[0, T] (if a > 0 then b else 1) > 0",
+    "frozen": "freeze a0 = a in always[0 s, 0.3 s] abs(b - a0) < 2",
+    "change": "always[0, T] abs(delta(a)) < 2",
+}
+
+
+@pytest.mark.parametrize("name", REQUIREMENTS)
+@settings(max_examples=10, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    samples=st.integers(1, 25),
+    end=st.sampled_from(["open", "truncate"]),
+    tolerance=st.sampled_from([1e-6, 0.0]),
+)
+def test_verdicts_with_holes(name: str, seed: int, samples: int, end: Any, tolerance: float) -> None:
+    monitor = Monitor(f"signal a\nsignal b\nrequire r: {REQUIREMENTS[name]}\n", dt=0.1, horizon=0.6)
+    rng = np.random.default_rng(seed)
+    whole = {signal: rng.integers(-16, 16, samples) / 8 for signal in ("a", "b")}
+    unknown = holed(whole, seed, 0.15)
+    judged = monitor.check(unknown, end=end, tolerance=tolerance)["r"]
+    for k in range(4):
+        full = monitor.check(filled(unknown, seed + k), end=end, tolerance=tolerance)["r"]
+        assert not (judged.holds & ~full.holds).any()
+        assert not (judged.fails & ~full.fails).any()
+    online = monitor.online(How(end=end, tolerance=tolerance, reasons=True))
+    for k in range(samples):
+        online.push({signal: float(values[k]) for signal, values in unknown.items()})
+    tally = online.finish()["r"]
+    assert tally.status == judged.overall
+    assert (tally.low, tally.high) == (judged.low.min(), judged.high.min())
+    cause = explain(monitor.check(unknown, end=end, tolerance=tolerance), "r")
+    assert (cause is not None) == (judged.overall == "violated")
+    if cause is not None:
+        assert all("nan" not in reading.text for reading in cause.readings)
+        assert all(not name.startswith("@") for name in cause.tree.leaf.signals)
+
+
+def test_what_is_known_decides() -> None:
+    monitor = Monitor(
+        "signal x\nrequire r: always[0 s, 0.4 s] x > 0\nrequire e: eventually[0 s, 0.4 s] x > 2", dt=0.1
+    )
+    assert monitor.check({"x": [1, NAN, 1, 1, 1]})["r"].status == "inconclusive"
+    assert monitor.check({"x": [1, NAN, -1, 1, 1]})["r"].status == "violated"
+    assert monitor.check({"x": [1, NAN, 3, 1, 1]})["e"].satisfied is True
+    low, high = monitor.bounds({"x": [1, NAN, 1, 1, 1]}, at=0)
+    assert (low, high) == (-np.inf, 1.0)
+    assert np.isnan(monitor.robustness({"x": [1, NAN, 1, 1, 1]}, at=0))
+    signal = monitor.requirement_robustness({"x": [1, NAN, 3, 1, 1, 1, 1]})["e"]
+    np.testing.assert_array_equal(signal, [NAN, NAN, 1, NAN, NAN, NAN, NAN])
+
+
+def test_infinite_values_are_refused_with_a_way_out() -> None:
+    monitor = Monitor("signal x\nrequire r: always x > 0", 0.1)
+    with pytest.raises(TraceError) as caught:
+        monitor.check({"x": [1.0, np.inf]})
+    (finding,) = caught.value.diagnostics
+    assert finding.code == "E604"
+    assert "leave the cell empty" in finding.help[0]
+    online = monitor.online()
+    online.push({"x": NAN})
+    with pytest.raises(TraceError, match=r"E604.*`x` is inf at sample 1"):
+        online.push({"x": np.inf})
+    assert online.gaps["x"].samples == 1
