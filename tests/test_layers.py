@@ -18,6 +18,7 @@ TRACE_FORMATS = (
         "trace_bag",
         "trace_cells",
         "trace_chunks",
+        "trace_live",
         "trace_csv",
         "trace_extras",
         "trace_formats",
