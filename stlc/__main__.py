@@ -2,15 +2,18 @@
 
 import sys
 
+from stlc import stopping
+
 
 def main() -> int:
     """Run the command line; Ctrl-C while it is being imported is an interruption like any other."""
     try:
+        stopping.arm()
         from stlc.cli.app import main as run
 
-        return run()
+        return stopping.finish(run())
     except KeyboardInterrupt:
-        return 130
+        return stopping.finish(130)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from functools import cache
 from pathlib import Path
 
 from stlc.diagnostics import Diagnostic, notice
+from stlc.stopping import undoing
 
 MOST_BYTES = 256_000_000
 """What the cache may hold; the files that were not used for the longest time go first."""
@@ -253,6 +254,7 @@ def _temporary(process: int) -> Cache | None:
             shutil.rmtree(folder, ignore_errors=True)
 
     atexit.register(clear)
+    undoing(lambda _code: clear())
     return made
 
 

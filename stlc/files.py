@@ -12,6 +12,7 @@ from pathlib import Path
 from stlc.diagnostics import Diagnostic, MissingError, SpecError, UsageError
 from stlc.registry import closest
 from stlc.source import Source
+from stlc.stopping import leaving
 
 MAX_BYTES = 10_000_000
 _INSTALLED = Path(__file__).parent / "library"
@@ -142,7 +143,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         return
     temporary = target.with_name(f".{target.stem}.{os.urandom(4).hex()}{target.suffix}")
     try:
-        with _reported(path):
+        with _reported(path), leaving(lambda _code: temporary.unlink(missing_ok=True)):
             target.parent.mkdir(parents=True, exist_ok=True)
             yield temporary
             _flush(temporary)

@@ -12,16 +12,21 @@ import hashlib
 import platform
 import sys
 import tempfile
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from shutil import rmtree
+from threading import Lock
+from time import perf_counter
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from stlc import cache
 from stlc.cache import Cache
 from stlc.diagnostics import Diagnostic, notice
+from stlc.stopping import leaving
 from stlc.toolchain import (
     LONG_REMEMBERED,
     CompilerError,
@@ -35,8 +40,6 @@ from stlc.toolchain import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
 
 FLAGS = ("-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC", "-std=c11")
@@ -44,8 +47,20 @@ VECTOR_FLAGS = ("-DVECTOR_MATH", *(f"-fno-builtin-{name}" for name in ("sin", "c
 """For the vector functions of the GNU C library: a sine is not merged with the cosine beside it."""
 LONG = 80_000
 """Characters of a C text from which on the third level of optimisation takes too long for what it gains."""
+GRAIN = 16
+"""Rows that a kernel judges side by side."""
 SMALL = 512
 """Rows below which a second thread costs more than it saves."""
+PART = 0.05
+"""Seconds that a kernel works without a look at whether it is to stop."""
+
+Stop: TypeAlias = Callable[[], bool]
+
+
+def never() -> bool:
+    """The stop of work that is done to its end."""
+    return False
+
 
 Doubles = "NDArray[np.float64]"
 
@@ -61,6 +76,7 @@ class Climb:
         generations: of `LANES` changed plans each.
         enough: a row is left alone once its robustness reaches this.
         seed: of the random changes.
+        stop: ends the climb before all rows are done.
     """
 
     bounds: NDArray[np.float64]
@@ -69,6 +85,7 @@ class Climb:
     generations: int
     enough: float
     seed: int
+    stop: Stop = never
 
 
 class Kernel:
@@ -125,13 +142,14 @@ class Kernel:
             threads: to share the rows among; the result does not depend on it.
 
         Returns:
-            Plans (B, T, m) and their robustness (B,); -inf where the dynamics give NaN.
+            Plans (B, T, m) and their robustness (B,); -inf where the dynamics give NaN. Where the climb was
+            stopped the last rows are as they were given, and their robustness is NaN.
 
         Raises:
             MemoryError: there is no room.
         """
         x0, plans = np.ascontiguousarray(x0, dtype=np.float64), np.array(plans, dtype=np.float64, order="C")
-        rho = np.empty(len(x0))
+        rho = np.full(len(x0), np.nan)
         arrays = [a.ctypes.data for a in (x0, plans, rho, how.bounds, how.factors, how.bank)]
         last_ones = (len(how.bank), how.generations, how.enough, how.seed)
 
@@ -139,7 +157,7 @@ class Kernel:
             done: int = self._climb(first, last, *arrays, *last_ones)
             return done
 
-        _share(rows, len(x0), threads)
+        _share(rows, len(x0), threads, grain=1, stop=how.stop)
         return plans, rho
 
 
@@ -201,16 +219,57 @@ class Adjoint:
         return out
 
 
-def _share(rows: Callable[[int, int], int], batch: int, threads: int) -> None:
-    """Call `rows(first, last)` on parts of a batch side by side. Raises MemoryError where one gives not 0."""
+def _share(
+    rows: Callable[[int, int], int], batch: int, threads: int, *, grain: int = GRAIN, stop: Stop = never
+) -> None:
+    """Call `rows(first, last)` on short parts of a batch, on so many threads side by side.
+
+    Between two parts Python goes on: an interruption ends the work there, and so does `stop`, which leaves
+    the other rows undone. Raises MemoryError where a part gives not 0.
+    """
+    queue = _Parts(batch, grain, stop)
     if threads < 2:
-        failed = rows(0, batch) != 0
+        queue.work(rows)
     else:
-        edges = [round(i * batch / threads) for i in range(threads + 1)]
         with ThreadPoolExecutor(threads) as pool:
-            failed = any(pool.map(rows, edges[:-1], edges[1:]))
-    if failed:
+            workers = [pool.submit(queue.work, rows) for _ in range(threads)]
+            try:
+                for worker in workers:
+                    worker.result()
+            except BaseException:
+                queue.end()
+                raise
+    if queue.failed:
         raise MemoryError
+
+
+class _Parts:
+    """The rows of a batch, handed out in parts that take about `PART` seconds each, whole grains."""
+
+    def __init__(self, batch: int, grain: int, stop: Stop) -> None:
+        self.failed = False
+        self._batch, self._grain, self._next, self._stop = batch, grain, 0, stop
+        self._lock = Lock()
+
+    def end(self) -> None:
+        """Hand out no more."""
+        self._next = self._batch
+
+    def work(self, rows: Callable[[int, int], int]) -> None:
+        """Do parts until there are none left; the size of the next follows from the time of the last."""
+        grains = 1
+        while not self.failed:
+            with self._lock:
+                if self._next < self._batch and self._stop():
+                    self._next = self._batch
+                first = self._next
+                last = self._next = min(first + grains * self._grain, self._batch)
+            if first >= last:
+                return
+            begun = perf_counter()
+            self.failed = rows(first, last) != 0 or self.failed
+            seconds = max(perf_counter() - begun, 1e-6)
+            grains = max(1, min(8 * grains, int(grains * PART / seconds)))
 
 
 def load(text: str) -> ctypes.CDLL | None:
@@ -303,7 +362,7 @@ def _opened(place: Cache, name: str) -> ctypes.CDLL | None:
 def _built(text: str, using: str, key: str) -> bytes | None:
     """The bytes of a library; None where there is no room to build. Raises CompilerError."""
     try:
-        with tempfile.TemporaryDirectory(prefix="stlc-") as folder:
+        with tempfile.TemporaryDirectory(prefix="stlc-") as folder, leaving(lambda _code: rmtree(folder)):
             source, target = Path(folder) / "kernel.c", Path(folder) / "kernel.so"
             source.write_text(text, encoding="utf-8")
             _compile(using, source, target, key)

@@ -22,6 +22,7 @@ from pathlib import Path
 
 from stlc import cache
 from stlc.cache import Cache
+from stlc.stopping import leaving
 
 IDLE = 10.0
 """Seconds in which a program that was started must use the processor, or it hangs."""
@@ -33,7 +34,7 @@ REMEMBERED = 600.0
 """Seconds for which other processes do not ask a compiler again that hangs."""
 LONG_REMEMBERED = 86_400.0
 """Seconds for which other processes do not try again a text that was too much."""
-_GRACE = 1.0
+_GRACE = 0.5
 """Seconds from being asked to end until being ended."""
 _PROBE = "#include <math.h>\nint works(void) { return 1; }\n"
 
@@ -227,8 +228,10 @@ def run(command: Sequence[str], *, given: str = "") -> Done:
                 process = subprocess.Popen(
                     command, stdin=into, stdout=out, stderr=said, start_new_session=True
                 )
-            _bound(process)
-            _await(process)
+            started = process
+            with leaving(lambda _code: _kill(started)):
+                _bound(process)
+                _await(process)
         except BaseException:
             if process is not None:
                 _end(process)
@@ -325,6 +328,11 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         pass
     finally:
-        with suppress(OSError):
-            os.killpg(process.pid, signal.SIGKILL)
+        _kill(process)
         process.wait()
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """End all processes of a session at once."""
+    with suppress(OSError):
+        os.killpg(process.pid, signal.SIGKILL)

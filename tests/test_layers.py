@@ -42,7 +42,7 @@ TRACE_FORMATS = (
 
 # From the bottom up; what stands in one line is one room.
 ROOMS = (
-    {"source", "version"},
+    {"source", "version", "stopping"},
     {"diagnostics"},
     {"escape"},
     {"registry", "units", "words", "jsontext"},

@@ -165,7 +165,7 @@ def _searched(trainer: Trainer) -> float:
         bad = (~satisfied(judged.rho)).nonzero()[:, 0][: trainer.engine.most]
     states, start, bank = x0[bad], plans[bad], trainer.buffer.bank
     before = time.process_time()
-    trainer.searcher.begin(states, start, bank, threads=1).result()
+    trainer.searcher.repair(states, start, bank)
     return (time.process_time() - before) * 1e3
 
 

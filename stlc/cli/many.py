@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import time
 from collections.abc import Iterator, Sequence
@@ -12,6 +13,7 @@ from stlc.cli.judge import Question, found, judged, taken
 from stlc.cli.outcome import WORDS, Outcome, Row, overall
 from stlc.cli.output import COLOR, ColorMode, table
 from stlc.diagnostics import Diagnostic, StlcError, UsageError
+from stlc.stopping import leaving
 
 SMALL = 1_000_000
 """Bytes: no file of less unpacks to more than fits into memory."""
@@ -52,8 +54,18 @@ def all_outcomes(works: Sequence[Work], jobs: int) -> Iterator[Outcome]:
     else:
         from concurrent.futures import ProcessPoolExecutor
 
-        with ProcessPoolExecutor(min(jobs or os.cpu_count() or 1, len(works))) as pool:
-            yield from pool.map(safe_outcome, works, chunksize=max(len(works) // 64, 1))
+        with ProcessPoolExecutor(min(jobs or os.cpu_count() or 1, len(works))) as pool, leaving(_end_all):
+            try:
+                yield from pool.map(safe_outcome, works, chunksize=max(len(works) // 64, 1))
+            except (KeyboardInterrupt, SystemExit):
+                _end_all()
+                raise
+
+
+def _end_all(_code: int = 0) -> None:
+    """End the processes of all jobs at once: an interrupted check asks for no more outcomes."""
+    for process in multiprocessing.active_children():
+        process.kill()
 
 
 def safe_outcome(work: Work) -> Outcome:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import signal
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, Self
@@ -16,6 +17,7 @@ from stlc.cli.progress import Progress, RunInfo, Summary
 from stlc.controller.train import Outcome, Watch
 from stlc.diagnostics import StlcError
 from stlc.rundir import LATEST, RUNS
+from stlc.stopping import age, leaving
 from stlc.view.learning import Commands, Learning, learning_of_run
 
 if TYPE_CHECKING:
@@ -24,13 +26,19 @@ if TYPE_CHECKING:
     from stlc.controller.logbook import Logbook, Opener
     from stlc.rundir import RunDir
 
+BESIDE = 10.0
+"""Seconds that a command has beside its budget."""
+AFTER = 1.2
+"""What pictures and the end of a process take, beside what came before the training."""
 FAILURES = "failures.png"
 """What the report draws of the starts that fail."""
 
 
 @dataclass(slots=True)
 class Sitting:
-    """Shows progress while it is open; the first Ctrl-C or SIGTERM asks to save and stop, a second one stops.
+    """Shows progress while it is open; Ctrl-C or SIGTERM saves and stops.
+
+    While steps are made it asks for that, and a second one stops at once, as the first does at other times.
 
     Attributes:
         folder: of the run.
@@ -47,12 +55,28 @@ class Sitting:
     keeps: bool = True
     _log: Logbook | None = None
     _asked: list[int] = field(default_factory=list)
+    _deferring: bool = False
+    _before_it: float = 0.0
+    _forced: ExitStack = field(default_factory=ExitStack)
     _before: dict[int, Any] = field(default_factory=dict)
 
     @property
     def watch(self) -> Watch:
         """What training reports to."""
-        return Watch(begun=self._begun, row=self._row, stop=lambda: bool(self._asked))
+        stop = lambda: bool(self._asked)  # noqa: E731
+        return Watch(self._begun, self._row, stop, self._steps, self._late)
+
+    def _late(self, budget: float) -> float:
+        """By how much a slow machine would let the command end too late: imports foretell the pictures."""
+        return (1.0 + AFTER) * self._before_it - BESIDE - 0.1 * budget
+
+    @contextmanager
+    def _steps(self) -> Iterator[None]:
+        self._deferring = True
+        try:
+            yield
+        finally:
+            self._deferring = False
 
     def _begun(self, chosen: dict[str, Any]) -> None:
         self.progress.chosen(chosen)
@@ -65,9 +89,11 @@ class Sitting:
             self._log.row(row)
 
     def __enter__(self) -> Self:
+        self._before_it = age()
         for number in (signal.SIGINT, signal.SIGTERM):
             self._before[number] = signal.signal(number, self._ask)
         if self.keeps:
+            self._forced.enter_context(leaving(self._ended))
             self._log = None if self.logbook is None else self.logbook(self.folder.path)
             self.progress.start(_info(self.folder))
         return self
@@ -79,15 +105,31 @@ class Sitting:
         if self._log is not None:
             self._log.close()
         if error is not None and self.keeps:
-            with suppress(StlcError):
-                self.folder.finish("interrupted" if kind is KeyboardInterrupt else "failed")
+            if isinstance(error, KeyboardInterrupt | SystemExit):
+                self._ended()
+            else:
+                with suppress(StlcError):
+                    self.folder.finish("failed")
         for number, handler in self._before.items():
             signal.signal(number, handler)
+        self._forced.close()
+
+    def _ended(self, _code: int = INTERRUPTED) -> None:
+        """What is left of a run that was ended on the spot: its last checkpoint."""
+        with suppress(StlcError):
+            self.folder.finish("interrupted")
+        self._say_interrupted()
+
+    def _say_interrupted(self) -> None:
+        ranks = 1 if self.outcome is None else self.outcome.ranks
+        say(f"interrupted, saved: {self.folder.shown}")
+        say(f"go on with: {_commands(self.folder, ranks).train_on}")
 
     def _ask(self, number: int, _frame: FrameType | None) -> None:
-        if self._asked:
-            raise KeyboardInterrupt
+        at_once = bool(self._asked) or not self._deferring
         self._asked.append(number)
+        if at_once:
+            raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(TERMINATED)
 
     @property
     def _signalled(self) -> int:
@@ -101,8 +143,7 @@ class Sitting:
         if not self.keeps:
             raise typer.Exit(self._signalled if outcome.interrupted else 0)
         if outcome.score is None:
-            say(f"interrupted, saved: {self.folder.shown}")
-            say(f"go on with: {_commands(self.folder, outcome.ranks).train_on}")
+            self._say_interrupted()
             code = self._signalled
             if json:
                 result = {"run": self.folder.shown, "seconds": outcome.seconds}

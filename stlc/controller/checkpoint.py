@@ -66,6 +66,11 @@ def save_checkpoint(
     return path
 
 
+def never_saved(run: RunDir) -> bool:
+    """Whether no checkpoint of a run was ever written."""
+    return not (run.path / FOLDER).exists()
+
+
 def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpoint:
     """Read the last checkpoint of a run.
 

@@ -17,22 +17,27 @@ from stlc.controller.savable import Hunt
 from stlc.controller.search import Searcher
 from stlc.controller.task import satisfied
 from stlc.files import write_atomic
+from stlc.native import never
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
     from torch import Tensor
 
     from stlc.controller.policy import Mlp
     from stlc.controller.task import Task
+    from stlc.native import Stop
 
 CEILING_TRIES = 8000
 """Plans that are tried for a held-out state before it counts as infeasible."""
 MOST_SEARCHED = 1024
 """Failing states that are searched: they speak for the others, to 1.6 % in one standard error."""
 CHUNK = 256
-"""Failing states that are searched together; between chunks the search can be ended."""
+"""Failing states that are searched together."""
+TORCH_CHUNK = 32
+"""The same where torch does the work."""
+JUDGED = 500
+"""States that are judged together; between these groups the judging can be ended."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,37 +84,42 @@ def score(
     *,
     n: int = HELD_OUT,
     seed: int = HELD_OUT_SEED,
-    enough: Callable[[], bool] = lambda: False,
+    enough: Stop = never,
 ) -> Score:
     """Judge a policy on `n` held-out states of seed `seed`; of missions, on states along held-out ones.
 
     The failing states are searched for any satisfying plan, in random order, until `enough` says so, at most
-    `MOST_SEARCHED` of them; one chunk is searched in any case. A search begins with the plan of the policy.
-    Where that leads nowhere it goes on as if there were no policy (in native code, which is fast enough for
-    it), so that what counts as feasible hardly depends on how well the policy is trained.
+    `MOST_SEARCHED` of them. A search begins with the plan of the policy. Where that leads nowhere it goes on
+    as if there were no policy (in native code, which is fast enough for it), so that what counts as feasible
+    hardly depends on how well the policy is trained. States that were searched while the time ran out do not
+    count as searched, unless they are the first. Where `enough` is said even before, fewer states are judged.
     """
     task = policy.task
     if task.compiled.timers:
-        states = visited(policy, n, seed)
+        states = visited(policy, n, seed, enough)
     else:
         states = task.sample(n, seed=seed, dtype=torch.float64)
-    plans, judged = policy.plan_judged(states)
-    good = satisfied(judged.rho)
-    shares = satisfied(judged.requirements).double().mean(0)
+    states, plans, rho, each = _judged(policy, states, enough)
+    n, good = len(states), satisfied(rho)
+    shares = satisfied(each).double().mean(0)
     generator = torch.Generator().manual_seed(HELD_OUT_SEED + 1)
     failing = (~good).nonzero()[:, 0]
     failing = failing[torch.randperm(len(failing), generator=generator)]
     known, searched = good.clone(), good.clone()
     searcher, hunt = Searcher(task, generator, enough=1e-4), Hunt(task)
-    for chunk in torch.split(failing[:MOST_SEARCHED], CHUNK):
-        if bool(searched[failing].any()) and enough():
+    size = TORCH_CHUNK if task.native is None else CHUNK
+    for number, chunk in enumerate(torch.split(failing[:MOST_SEARCHED], size)):
+        if number and enough():
             break
         start, bank = plans[chunk].float(), plans[good].float()
-        known[chunk] = searcher.repair(states[chunk].float(), start, bank, tries=CEILING_TRIES).solved
-        searched[chunk] = True
-        left = chunk[~known[chunk]]
-        if len(left) and task.native is not None:
-            known[left] = hunt.plans(states[left], enough)[1]
+        begun = states[chunk].float(), start, bank
+        found = searcher.repair(*begun, tries=CEILING_TRIES, stop=enough).solved
+        left = torch.nonzero(~found)[:, 0]
+        if len(left) and task.native is not None and not enough():
+            found[left] = hunt.plans(states[chunk[left]], enough)[1]
+        if number and enough():
+            break
+        known[chunk], searched[chunk] = found, True
     accuracy = float(good.double().mean())
     return Score(
         accuracy=accuracy,
@@ -117,11 +127,30 @@ def score(
         requirements={rule.name: float(share) for rule, share in zip(task.rules, shares, strict=True)},
         feasible=_feasible(known, searched, failing),
         states=states,
-        rho=judged.rho,
-        each=judged.requirements,
+        rho=rho,
+        each=each,
         known=known,
         searched=searched,
     )
+
+
+def _judged(policy: Mlp, states: Tensor, enough: Stop) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """States (k, dim), the plans that are followed from there, their robustness, and that of requirements.
+
+    All states, or as many as are judged before `enough` is said, the first ones in any case.
+    """
+    plans: list[Tensor] = []
+    rho: list[Tensor] = []
+    each: list[Tensor] = []
+    for part in torch.split(states, JUDGED):
+        if rho and enough():
+            break
+        followed, judged = policy.plan_judged(part)
+        plans.append(followed)
+        rho.append(judged.rho)
+        each.append(judged.requirements)
+    count = sum(map(len, rho))
+    return states[:count], torch.cat(plans), torch.cat(rho), torch.cat(each)
 
 
 def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:

@@ -14,7 +14,7 @@ import torch
 
 from stlc.compile.c_numbers import Untranslatable
 from stlc.compile.emit_c import Motion, emit
-from stlc.native import Climb, Kernel, load
+from stlc.native import Climb, Kernel, Stop, load, never
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -33,12 +33,14 @@ class Effort:
         enough: a row is left alone once its robustness reaches this.
         seed: of the changes.
         threads: to share the rows among; the result does not depend on it.
+        stop: ends the climb before all rows are done.
     """
 
     generations: int
     enough: float
     seed: int
     threads: int = 1
+    stop: Stop = never
 
 
 def motion_of(task: Task) -> Motion:
@@ -114,6 +116,14 @@ class NativeJudge:
             Plans (B, T, m) and their robustness (B,), in the dtype of `x0`.
         """
         arrays = [tensor.detach().double().contiguous().numpy() for tensor in (x0, plans, bank)]
-        how = Climb(self._bounds, self._factors, arrays[2], effort.generations, effort.enough, effort.seed)
+        how = Climb(
+            self._bounds,
+            self._factors,
+            arrays[2],
+            effort.generations,
+            effort.enough,
+            effort.seed,
+            effort.stop,
+        )
         best, rho = self.kernel.climb(arrays[0], arrays[1], how, threads=effort.threads)
         return torch.from_numpy(best).to(x0.dtype), torch.from_numpy(rho).to(x0.dtype)

@@ -16,10 +16,12 @@ import torch
 from torch import Tensor
 
 from stlc.controller.task import satisfied
+from stlc.native import never
 
 if TYPE_CHECKING:
     from stlc.controller.policy import Mlp
     from stlc.controller.task import Judged, Task
+    from stlc.native import Stop
 
 Planner: TypeAlias = Callable[[Tensor], "Judged"]
 """States (B, n) -> the plans that are followed from there, judged."""
@@ -128,8 +130,11 @@ def mission_steps(task: Task) -> int:
 
 
 @torch.no_grad()
-def visited(policy: Mlp, n: int, seed: int) -> Tensor:
-    """`n` states that missions pass through when the policy drives them, (n, dim) float64."""
+def visited(policy: Mlp, n: int, seed: int, enough: Stop = never) -> Tensor:
+    """`n` states that missions pass through when the policy drives them, (n, dim) float64.
+
+    Missions are driven no further once `enough` says so.
+    """
     task = policy.task
     generator = torch.Generator().manual_seed(seed)
     stride = max(task.horizon // 10, 1)
@@ -137,6 +142,8 @@ def visited(policy: Mlp, n: int, seed: int) -> Tensor:
     x = task.sample(max(64, 2 * n // legs), generator=generator, dtype=torch.float64)
     seen = [x]
     for _ in range(legs):
+        if enough():
+            break
         _, judged = policy.plan_judged(x)
         x = torch.stack([judged.columns[name][stride] for name in task.names], 1)
         x = x[task.alive(x)]

@@ -9,6 +9,7 @@ else: the seed and the `StepSchedule`, which every run records, decide the weigh
 from __future__ import annotations
 
 import math
+import os
 import re
 import time
 from collections import deque
@@ -45,9 +46,11 @@ def processor() -> float:
     """Seconds that this would have taken on an idle machine.
 
     The training thread and the search beside it take their turns with the cores: whichever of the two has
-    more to do is what is waited for.
+    more to do is what is waited for. So is a compiler.
     """
-    return max(time.thread_time(), time.process_time() / cores())
+    ended = os.times()
+    mine = max(time.thread_time(), time.process_time() / cores())
+    return mine + ended.children_user + ended.children_system
 
 
 def clock_of(name: Clock) -> Callable[[], float]:

@@ -11,11 +11,12 @@ import torch
 from stlc.compile.semantics import TOLERANCE
 from stlc.controller.search import THOROUGH, Searcher
 from stlc.controller.task import Task
+from stlc.native import never
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from torch import Tensor
+
+    from stlc.native import Stop
 
 PASSES = 4
 TRIES = 20_000
@@ -52,10 +53,10 @@ class Hunt:
         self.bank = extremes(task, torch.Generator().manual_seed(0))
 
     @torch.no_grad()
-    def plans(self, x0: Tensor, enough: Callable[[], bool] = lambda: False) -> tuple[Tensor, Tensor]:
+    def plans(self, x0: Tensor, enough: Stop = never) -> tuple[Tensor, Tensor]:
         """Plans (B, T, m) float64 from states (B, n), and which of them satisfy the specification, (B,).
 
-        No pass begins once `enough` says so.
+        It ends once `enough` says so.
         """
         generator = torch.Generator().manual_seed(0)
         searcher = Searcher(self.task, generator, enough=ENOUGH)
@@ -66,7 +67,8 @@ class Hunt:
             still = torch.nonzero(~found).squeeze(1)
             if not len(still) or enough():
                 break
-            plans = searcher.repair(x0[still].float(), start[still].clone(), self.bank, tries=tries).plans
+            begun = x0[still].float(), start[still].clone()
+            plans = searcher.repair(*begun, self.bank, tries=tries, stop=enough).plans
             best[still] = plans.double()
             found[still] = self.task.judge(x0[still].double(), best[still], states=False).rho >= -TOLERANCE
             start = self.bank[torch.randint(len(self.bank), (len(x0),), generator=generator)]

@@ -9,7 +9,9 @@ native kernel does it where there is one, torch elsewhere.
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
+from threading import Event
 from typing import TYPE_CHECKING
 
 import torch
@@ -19,16 +21,22 @@ from stlc.compile.emit_c import LANES
 from stlc.controller.config import cores
 from stlc.controller.kernel import Effort
 from stlc.controller.task import FLOAT32_SLACK
+from stlc.native import never
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from stlc.controller.task import Task
+    from stlc.native import Stop
 
 THOROUGH = 4000
 """Plans that are tried per state at most, unless told otherwise."""
 TRIES = 64
 """Plans of a generation where torch does the work."""
+MOST_TRIED = 4_000_000
+"""Numbers in the plans that torch tries at a time: what bounds its memory."""
+LOOK = 0.1
+"""Seconds between two looks at whether waiting is to end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +63,71 @@ class Repaired:
         return Repaired(self.states.to(device), self.plans.to(device), self.rho.to(device))
 
 
+class Search:
+    """A search for better plans that goes on beside whatever else is done.
+
+    What it gives depends on its states, plans, seed and bank alone, not on when it is asked or stopped and
+    begun again. The native kernel works on a thread of its own; torch in `advance`.
+
+    Attributes:
+        states: where plans start, (B, n).
+        plans: that it begins with, (B, T, m).
+        seed: of its random numbers.
+    """
+
+    def __init__(self, states: Tensor, plans: Tensor, seed: int) -> None:
+        self.states, self.plans, self.seed = states, plans, seed
+        self._cancelled = Event()
+        self._climb: _TorchClimb | None = None
+        self._share = 1
+        self._found: Future[Repaired] = Future()
+
+    @classmethod
+    def of(cls, found: Repaired) -> Search:
+        """A search that has come to its end."""
+        search = cls(found.states, found.plans, 0)
+        search._found.set_result(found)
+        return search
+
+    def on_thread(self, pool: ThreadPoolExecutor, climb: Callable[[Stop], Repaired]) -> Search:
+        """This search, begun on a thread."""
+        self._found = pool.submit(climb, self._cancelled.is_set)
+        return self
+
+    def by_steps(self, climb: _TorchClimb, steps: int) -> Search:
+        """This search, to be done in so many equal shares."""
+        self._climb, self._share = climb, -(-climb.left // max(1, steps))
+        return self
+
+    def done(self) -> bool:
+        """Whether it has come to its end."""
+        return self._found.done()
+
+    def advance(self) -> None:
+        """Do a share of the work, where that is not done on another thread."""
+        if self._climb is not None and not self.done():
+            for _ in range(self._share):
+                if not self._climb.generation():
+                    self._found.set_result(self._climb.found)
+                    break
+
+    def result(self, stop: Stop = never) -> Repaired | None:
+        """What was found once it has come to its end; None where `stop` says first not to wait any longer."""
+        while not self.done():
+            if stop():
+                return None
+            if self._climb is not None:
+                self.advance()
+            else:
+                with suppress(TimeoutError):
+                    self._found.result(LOOK)
+        return self._found.result()
+
+    def cancel(self) -> None:
+        """End it; it gives nothing then."""
+        self._cancelled.set()
+
+
 class Searcher:
     """A hill climber over open-loop plans of one task."""
 
@@ -73,11 +146,13 @@ class Searcher:
         self.task = task
         self.generator = generator
         self.enough = enough
-        self.low = task.system.control_low.to(device)
-        self.high = task.system.control_high.to(device)
+        self.device = device
         self._aside = ThreadPoolExecutor(1, thread_name_prefix="search")
 
-    def repair(self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH) -> Repaired:
+    @torch.no_grad()
+    def repair(
+        self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH, stop: Stop = never
+    ) -> Repaired:
         """Improve plans until they satisfy the specification or the effort is spent.
 
         Args:
@@ -85,61 +160,111 @@ class Searcher:
             plans: where to start, (B, T, m).
             bank: plans that solved other states, (k, T, m); may be empty.
             tries: plans per state at most.
+            stop: ends the search early, with what was found until then.
         """
-        return self.begin(x0, plans, bank, tries=tries, threads=cores()).result().to(x0.device)
+        if self.task.native is not None:
+            return self._climbing(x0, plans, bank, tries, cores(), self._seed())(stop).to(x0.device)
+        return self._climb(x0, plans, bank, tries, self._seed()).finish(stop)
 
     @torch.no_grad()
     def begin(
-        self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH, threads: int | None = None
-    ) -> Future[Repaired]:
-        """`repair` beside whatever else goes on; what it gives depends on arguments and generator alone.
+        self,
+        x0: Tensor,
+        plans: Tensor,
+        bank: Tensor,
+        *,
+        tries: int = THOROUGH,
+        steps: int = 1,
+        seed: int | None = None,
+    ) -> Search:
+        """`repair` beside whatever else goes on.
 
-        The native kernel leaves what it found on the processor.
+        The native kernel leaves what it found on the processor; torch works in `steps` shares.
         """
+        seed = self._seed() if seed is None else seed
+        search = Search(x0, plans, seed)
         if self.task.native is not None:
-            return self._aside.submit(self._climbing(x0, plans, bank, tries, threads or idle_cores()))
-        done: Future[Repaired] = Future()
-        done.set_result(self._climb(x0, plans, bank, tries))
-        return done
+            return search.on_thread(self._aside, self._climbing(x0, plans, bank, tries, idle_cores(), seed))
+        return search.by_steps(self._climb(x0, plans, bank, tries, seed), steps)
 
     @torch.no_grad()
     def at_once(self, x0: Tensor, plans: Tensor, *, tries: int) -> Repaired:
         """`repair` without a bank on the caller's own thread, as many threads of the kernel as torch has."""
         bank = plans.new_zeros(0, *plans.shape[1:])
         if self.task.native is None:
-            return self._climb(x0, plans, bank, tries)
-        return self._climbing(x0, plans, bank, tries, torch.get_num_threads())()
+            return self._climb(x0, plans, bank, tries, self._seed()).finish()
+        return self._climbing(x0, plans, bank, tries, torch.get_num_threads(), self._seed())(never)
+
+    def _seed(self) -> int:
+        return int(torch.randint(2**62, (), generator=self.generator))
 
     def _climbing(
-        self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int, threads: int
-    ) -> Callable[[], Repaired]:
+        self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int, threads: int, seed: int
+    ) -> Callable[[Stop], Repaired]:
         """A native climb that is ready to go; it has its own copies and its own random numbers."""
         native = self.task.native
         assert native is not None
-        seed = int(torch.randint(2**62, (), generator=self.generator))
         x0, plans, bank = (part.to("cpu", copy=True) for part in (x0, plans, bank))
-        effort = Effort(-(-tries // LANES), self.enough, seed, threads)
 
-        def climb() -> Repaired:
+        def climb(stop: Stop) -> Repaired:
+            effort = Effort(-(-tries // LANES), self.enough, seed, threads, stop)
             best, _ = native.climb(x0, plans, bank, effort)
             rho = self.task.judge(x0, best, states=False).rho
             return Repaired(x0, best, rho)
 
         return climb
 
-    def _climb(self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int) -> Repaired:
-        """The same in torch."""
-        found = Repaired(x0, plans.clone(), self.task.judge(x0, plans, states=False).rho.clone())
-        for _ in range(-(-tries // TRIES)):
-            still = (found.rho < self.enough).nonzero()[:, 0]
-            if still.numel() == 0:
-                break
-            self._keep_better(found, still, self._proposals(found.plans[still], TRIES, bank))
-        return found
+    def _climb(self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int, seed: int) -> _TorchClimb:
+        rho = self.task.judge(x0, plans, states=False).rho.clone()
+        found = Repaired(x0.clone(), plans.clone(), rho)
+        generator = torch.Generator().manual_seed(seed)
+        return _TorchClimb(self.task, found, bank.clone(), -(-tries // TRIES), self.enough, generator)
 
-    def _keep_better(self, found: Repaired, still: Tensor, tried: Tensor) -> None:
+
+class _TorchClimb:
+    """The same climb in torch, a generation at a time.
+
+    Attributes:
+        found: the best plans so far.
+        left: generations that are still to come, at most.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        found: Repaired,
+        bank: Tensor,
+        generations: int,
+        enough: float,
+        generator: torch.Generator,
+    ) -> None:
+        self.task, self.found, self.bank, self.left = task, found, bank, generations
+        self.enough, self.generator = enough, generator
+        device = found.states.device
+        self.low, self.high = task.system.control_low.to(device), task.system.control_high.to(device)
+
+    @torch.no_grad()
+    def generation(self, stop: Stop = never) -> bool:
+        """Try `TRIES` changed plans for every state that needs it; False once there is nothing left to do."""
+        still = (self.found.rho < self.enough).nonzero()[:, 0]
+        if self.left == 0 or not len(still):
+            return False
+        self.left -= 1
+        for part in torch.split(still, max(1, MOST_TRIED // (TRIES * self.found.plans[0].numel()))):
+            if stop():
+                break
+            self._keep_better(part, self._proposals(self.found.plans[part], TRIES, self.bank))
+        return self.left > 0
+
+    def finish(self, stop: Stop = never) -> Repaired:
+        """What was found at the end."""
+        while not stop() and self.generation(stop):
+            pass
+        return self.found
+
+    def _keep_better(self, still: Tensor, tried: Tensor) -> None:
         """Judge plans (k, tries, T, m) for the states `still`, (k,), and update `found` in place."""
-        tries = tried.shape[1]
+        found, tries = self.found, tried.shape[1]
         x0 = found.states[still].repeat_interleave(tries, 0)
         judged = self.task.judge(x0, tried.flatten(0, 1), states=False)
         value, which = judged.rho.view(-1, tries).max(1)

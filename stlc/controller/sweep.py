@@ -16,6 +16,8 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
+from stlc.stopping import CHILD, PATIENCE, leaving
+
 TAIL = 12
 """Lines of what a process said that are kept."""
 
@@ -82,7 +84,7 @@ def side_by_side(
         begun: called (in another thread) as each starts.
     """
     crew = _Crew(jobs)
-    with ThreadPoolExecutor(jobs) as pool:
+    with ThreadPoolExecutor(jobs) as pool, leaving(crew.kill):
         futures = [pool.submit(crew.send, errand, begun) for errand in errands]
         try:
             for future in as_completed(futures):
@@ -145,9 +147,14 @@ class _Crew:
             for process in going:
                 process.wait()
         except BaseException:
-            for process in going:
-                process.kill()
+            self.kill()
             raise
+
+    def kill(self, _code: int = 0) -> None:
+        """End every process at once, with what it has started."""
+        for process in tuple(self.live):
+            with suppress(OSError):
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 def start(
@@ -166,7 +173,7 @@ def start(
         stderr=subprocess.PIPE,
         text=True,
         encoding="utf-8",
-        env={**os.environ, "PYTHONIOENCODING": "utf-8"},
+        env={**os.environ, "PYTHONIOENCODING": "utf-8", CHILD: f"{0.7 * PATIENCE}"},
         cwd=folder,
         start_new_session=True,  # Ctrl-C reaches it through who started it alone, once
     )

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from stlc.compile.arith import Program
 from stlc.compile.graph import RobustnessGraph, evaluate
+from stlc.compile.horizon import nodes
 from stlc.compile.interface import Grid
 from stlc.compile.ops_torch import TORCH
 from stlc.compile.parameters import fixed
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from stlc.grammar import ast
 
 HARD = Hard()
+MOST_VALUES = 32_000_000
+"""Numbers that torch may hold at a time while it judges plans: 256 MB in float64."""
 FLOAT32_SLACK = 1e-5
 """Rounding that a float32 rollout may add to a margin that is 0 by construction."""
 TIE = 1e-4
@@ -208,8 +211,27 @@ class Task:
         """Robustness per requirement and states, by the native kernel where it can."""
         if x0.device.type == "cpu" and self.native is not None:
             return self.native.judge(x0, u, columns=states)
+        rows = max(1, MOST_VALUES // self._values_of_a_row)
+        if len(x0) <= rows:
+            return self._judged_by_torch(x0, u)
+        parts = [
+            self._judged_by_torch(*part)
+            for part in zip(torch.split(x0, rows), torch.split(u, rows), strict=True)
+        ]
+        each = torch.cat([each for each, _ in parts])
+        if not states:
+            return each, {}
+        return each, {name: torch.cat([part[name] for _, part in parts], 1) for name in self.names}
+
+    def _judged_by_torch(self, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
         columns = self.system.rollout_columns(x0, u, HARD)
         return self.graph.per_requirement_columns(columns, ops=TORCH), columns
+
+    @cached_property
+    def _values_of_a_row(self) -> int:
+        """About how many numbers torch holds for a plan that is judged: every part of the formulas."""
+        parts = sum(1 for rule in self.rules for _ in nodes(rule.formula))
+        return (self.horizon + 1) * (2 * len(self.names) + 2 * len(self.system.control_names) + 4 * parts)
 
     def cost(self, judged: Judged) -> Tensor:
         """What plans are chosen by where they satisfy the specification, without gradient: (batch,).

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import time
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from stlc.controller.autopsy import Step, autopsy
-from stlc.controller.checkpoint import load_checkpoint, restoring
+from stlc.controller.checkpoint import load_checkpoint, never_saved, restoring
 from stlc.controller.config import Engine, TrainConfig, decide
 from stlc.controller.conflict import conflict
 from stlc.controller.held_out import Score, score
@@ -23,9 +24,11 @@ from stlc.controller.symmetry import check_mirror
 from stlc.controller.trainer import Look, Trainer
 from stlc.diagnostics import Diagnostic, MissingError, RunError, StlcError, UsageError
 from stlc.dynamics.memory import keep_freed_memory
+from stlc.native import never
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
+    from contextlib import AbstractContextManager
 
     from stlc.controller.task import Task
     from stlc.rundir import RunDir
@@ -35,6 +38,8 @@ BARREN_LOOKS, BARREN_SHARE = 5, 0.1
 """After so many looks, and this share of the steps, a search that never found a plan is given up."""
 VERDICT_OVER = 0.04
 """Share of a budget by which the verdict may exceed it before the search for what is feasible is ended."""
+VERDICT_LEAST, VERDICT_SHARE = 20.0, 0.2
+"""Seconds, and share of the seconds that the steps took, which the verdict of a run without a budget has."""
 SAVE_EVERY = 500
 """Steps between checkpoints at most."""
 SAVE_SECONDS = 10.0
@@ -49,11 +54,16 @@ class Watch:
         begun: called once with what the engine chose, the margin and the number of steps among it.
         row: called with every row of `train.jsonl`.
         stop: asked after every step; True saves and ends.
+        deferring: holds while steps are made: who asks to stop then has the step finished and saved.
+            Otherwise an interruption may be raised anywhere.
+        late: seconds by which what is done before and after the training would exceed a budget of wall time.
     """
 
     begun: Callable[[dict[str, Any]], None] = lambda _chosen: None
     row: Callable[[dict[str, Any]], None] = lambda _row: None
-    stop: Callable[[], bool] = lambda: False
+    stop: Callable[[], bool] = never
+    deferring: Callable[[], AbstractContextManager[object]] = nullcontext
+    late: Callable[[float], float] = lambda _budget: 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,19 +116,20 @@ def train(
     """
     begun = clock_of(config.clock)()
     keep_freed_memory()
-    task.system.initial.require_many()
-    check_mirror(task)
-    device = find_device(ranks.device(config.device))
     engine = replace(decide(task, config), ranks=ranks.size)
-    torch.set_num_threads(engine.threads)
-    journal = Journal(folder, writes=ranks.first)
-    journal.engine(engine)
     declared = task.system.decl.train
     told = config.steps or (declared.steps if config.budget is None else None)
     budget = 0.0 if told is not None else config.budget or declared.budget or DEFAULT_BUDGET
     schedule = told if isinstance(told, StepSchedule) else StepSchedule.of(told or PROVISIONAL)
+    journal = Journal(folder, writes=ranks.first)
+    journal.engine(engine)
+    journal.note({"engine": asdict(engine), "schedule": str(schedule), "seconds_allowed": budget or None})
+    task.system.initial.require_many()
+    check_mirror(task)
+    device = find_device(ranks.device(config.device))
+    torch.set_num_threads(engine.threads)
     trainer = Trainer(task, engine, steps=schedule.at(0), device=device, ranks=ranks)
-    journal.note({"margin": trainer.margin, "engine": asdict(engine), "seconds_allowed": budget or None})
+    journal.note({"margin": trainer.margin})
     return _Session(journal, trainer, watch or Watch(), begun, schedule, budget).finish()
 
 
@@ -151,18 +162,24 @@ def resume(
     _require_as_many(engine.ranks, ranks.size)
     begun = clock_of(engine.clock)()
     task = load_task(folder)
-    saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
     if engine.threads:
         torch.set_num_threads(engine.threads)
     place = find_device(ranks.device(device))
+    facts: Mapping[str, Any] = folder.record()
+    saved = None
+    if not never_saved(folder) or "schedule" not in facts:
+        saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
+        facts = saved.facts
     seconds = (row.get("seconds") for row in folder.rows())
     before = max((spent for spent in seconds if isinstance(spent, int | float)), default=0.0)
     with restoring(folder):
-        trainer = Trainer(task, engine, steps=int(saved.facts["steps"]), device=place, ranks=ranks)
-        trainer.restore(saved.tensors, saved.facts)
-        schedule = StepSchedule.parse(str(saved.facts.get("schedule", trainer.steps)))
-        before = float(saved.facts.get("seconds", before))
+        schedule = StepSchedule.parse(str(facts.get("schedule", facts.get("steps"))))
+        before = float(facts.get("seconds", before))
         allowed = 0.0 if steps is not None else float(folder.record().get("seconds_allowed") or 0.0)
+        planned = schedule.at(0) if saved is None else int(facts["steps"])
+        trainer = Trainer(task, engine, steps=planned, device=place, ranks=ranks)
+        if saved is not None:
+            trainer.restore(saved.tensors, saved.facts)
     if steps is not None:
         schedule = schedule.with_steps(trainer.step, steps)
         trainer.steps = steps
@@ -241,24 +258,40 @@ class _Session:
         self.begun = begun
         self.schedule = schedule
         self.budget = budget
+        late = watch.late(budget) if budget and trainer.engine.clock == "wall" else 0.0
+        self._seconds = min(budget, max(budget - late, 0.5 * budget))
         self.now = clock_of(trainer.engine.clock)
+        self.trained = begun
         searching = trainer.engine.method == "guided"
-        self.pace = Pace(every=trainer.engine.every, searching=searching, now=self.now(), seconds=budget)
+        self.pace = Pace(
+            every=trainer.engine.every, searching=searching, now=self.now(), seconds=self._seconds
+        )
         self.barren = not trainer.ranks.any(trainer.buffer.count > 0)
 
     def finish(self) -> Outcome:
-        """Train to the end, judge, and close the record."""
+        """Train to the end, judge, and close the record.
+
+        Whatever interrupts it leaves the last checkpoint, from which `resume` goes on.
+        """
         trainer = self.trainer
         torch_does = by_torch(trainer.task, trainer.engine, trainer.device.type)
         self.journal.note({"by_torch": dict(torch_does)})
         self._note_schedule()
         chosen = {**asdict(trainer.engine), "margin": trainer.margin, "budget": self.budget or None}
         self.watch.begun({**chosen, "steps": self._known_steps, "by_torch": torch_does})
-        saved = time.perf_counter()
-        while self._goes_on():
-            if trainer.step >= trainer.next_look and self._hopeless(self._look()):
-                self._save()
-                break
+        try:
+            with self.watch.deferring():
+                whole = self._trained()
+                if not whole:
+                    return self._interrupted()
+            return self._judged() if trainer.ranks.first else self._ended()
+        finally:
+            trainer.close()
+
+    def _trained(self) -> bool:
+        """Make all steps; False where the run is to stop before."""
+        trainer, saved = self.trainer, time.perf_counter()
+        while (more := self._goes_on()) and not self._hopeless():
             if not math.isfinite(trainer.advance()):
                 raise self._broken()
             self.pace.stepped(trainer.step, self.now(), search_runs=_searching(trainer))
@@ -266,26 +299,34 @@ class _Session:
             if trainer.ranks.any(due):
                 self._save()
                 saved = time.perf_counter()
-            if trainer.ranks.any(self.watch.stop()) and trainer.step < self.schedule.steps:
-                return self._interrupted()
-        return self._judged() if trainer.ranks.first else self._ended()
-
-    def _goes_on(self) -> bool:
-        """Whether there is a step to make; where there is none, everything is saved.
-
-        To save is to wait for the search that goes on beside the steps. Where that took less than was
-        expected there is time for more steps.
-        """
-        if self._planned() > self.trainer.step:
-            return True
+            if trainer.ranks.any(self.watch.stop()):
+                return False
+        if more is None:
+            return False
         self._save()
-        return self._planned() > self.trainer.step
+        return not trainer.ranks.any(self.watch.stop())
+
+    def _goes_on(self) -> bool | None:
+        """Whether there is a step to make, after a search round where one is due; None: the run is to stop.
+
+        Both the end and a round wait for the search that goes on beside the steps. Where at the end that
+        takes less than was expected there is time for more steps.
+        """
+        trainer = self.trainer
+        ends = self._planned() <= trainer.step
+        if (ends or trainer.step >= trainer.next_look) and not self._wait_for_search():
+            return None
+        if ends and self._planned() <= trainer.step:
+            return False
+        if trainer.step >= trainer.next_look:
+            self._look()
+        return True
 
     def _planned(self) -> int:
         """The steps of the run as they are planned at this moment: by its budget, or by its schedule."""
         trainer = self.trainer
         if self.budget:
-            left = self.begun + self.budget - verdict_reserve(self.budget) - self.now()
+            left = self.begun + self._seconds - verdict_reserve(self._seconds) - self.now()
             steps = self.pace.plan(trainer.step, trainer.steps, trainer.next_look, left)
             steps = int(trainer.ranks.agree(steps))
             if steps != trainer.steps:
@@ -302,43 +343,56 @@ class _Session:
     def _note_schedule(self) -> None:
         self.journal.note({"steps": self._known_steps, "schedule": str(self.schedule)})
 
-    def _look(self) -> Look:
+    def _look(self) -> None:
         """A search round, and its row."""
         trainer = self.trainer
-        self._wait_for_search()
         began = self.now()
         look = trainer.look()
         self.pace.looked(trainer.step, self.now() - began)
         self._row(look)
-        return look
+        self.barren = self.barren and look.accuracy == 0.0 and look.repaired == 0
 
-    def _wait_for_search(self) -> None:
-        """Let the search beside the steps come to its end, as a search round and a checkpoint do."""
+    def _wait_for_search(self) -> bool:
+        """Let the search beside the steps come to its end; False where the run is to stop before."""
+        came = True
         if self.trainer.repairing is not None:
             began = self.now()
-            self.trainer.repairing.result()
+            came = self.trainer.repairing.result(self.watch.stop) is not None
             self.pace.searched(self.trainer.step, self.now() - began)
+        return not self.trainer.ranks.any(not came)
 
-    def _hopeless(self, look: Look) -> bool:
+    def _hopeless(self) -> bool:
         """Whether neither the policy nor the search has ever satisfied the specification for any state."""
         trainer = self.trainer
-        self.barren = self.barren and look.accuracy == 0.0 and look.repaired == 0
         enough = max(BARREN_LOOKS * trainer.engine.every, BARREN_SHARE * trainer.steps)
         return self.barren and trainer.engine.method == "guided" and trainer.step >= enough
 
     def _judged(self) -> Outcome:
+        self.trained = self.now()
         self.trainer.average.cpu()  # verdicts are float64, and the kernel's
         result = score(self.trainer.policy, n=self.trainer.engine.held_out, enough=self._out_of_time)
         self.journal.held_out(self.trainer.task, result)
         seconds = self.now() - self.begun
-        why = conflict(self.trainer.task) if result.feasible == 0.0 else None
+        why = conflict(self.trainer.task, self._late) if result.feasible == 0.0 else None
         found = {"seconds": seconds} if why is None else {"seconds": seconds, "why": why.message}
         self.journal.close("finished", {**result.summary(), **found})
         return replace(self._ended(), score=result, why=why)
 
     def _out_of_time(self) -> bool:
-        """Whether the verdict of a run with a budget has to come to its end."""
-        return self.budget > 0.0 and self.now() - self.begun > (1.0 + VERDICT_OVER) * self.budget
+        """Whether the verdict has to come to its end."""
+        return self.now() - self.trained > self._verdict_seconds
+
+    def _late(self) -> bool:
+        """Whether what follows the verdict has to come to its end, too."""
+        return self.now() - self.trained > 2.0 * self._verdict_seconds
+
+    @property
+    def _verdict_seconds(self) -> float:
+        """What is left of the budget for the verdict; without a budget a share of what the steps took."""
+        spent = self.trained - self.begun
+        if not self.budget:
+            return max(VERDICT_LEAST, VERDICT_SHARE * spent)
+        return max((1.0 + VERDICT_OVER) * self._seconds - spent, 0.5 * verdict_reserve(self._seconds))
 
     def _interrupted(self) -> Outcome:
         self._save()
@@ -352,8 +406,7 @@ class _Session:
         return Outcome(run, None, seconds, interrupted=interrupted, ranks=ranks, steps=steps)
 
     def _save(self) -> None:
-        """Write a checkpoint; it waits for the search that goes on beside the steps."""
-        self._wait_for_search()
+        """Write a checkpoint; of a search that goes on beside the steps it keeps what that begins with."""
         began = self.now()
         facts = {**self.trainer.facts(), "schedule": str(self.schedule), "seconds": began - self.begun}
         self.journal.checkpoint(self.trainer.tensors(), facts, step=self.trainer.step)

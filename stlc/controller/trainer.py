@@ -9,7 +9,6 @@ gradient step mixes fresh states with such hard ones. Of the network's plans the
 from __future__ import annotations
 
 import math
-from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -21,7 +20,7 @@ from stlc.controller.missions import Missions
 from stlc.controller.objective import Objective, guided_objective, loss, paper_objective
 from stlc.controller.policy import Mlp, PlanNetwork, network_of
 from stlc.controller.ranks import ALONE, Ranks
-from stlc.controller.search import Repaired, Searcher
+from stlc.controller.search import THOROUGH, Repaired, Search, Searcher
 from stlc.controller.supply import Draws, Fixed, Supply
 from stlc.controller.task import rank, satisfied
 
@@ -32,6 +31,8 @@ if TYPE_CHECKING:
 MARGIN_STATES = 128
 MARGIN_SHARE = 0.2
 MARGIN_RANGE = (0.01, 0.5)
+TORCH_MARGIN_STATES, TORCH_MOST, TORCH_TRIES = 32, 64, 2048
+"""States and plans of the searches of a training where torch does their work: some hundred times slower."""
 RISE = 30
 """Steps to the peak of the learning rate where it is held; independent of how many there will be."""
 
@@ -83,7 +84,7 @@ class Trainer:
             self.margin = ranks.agree(self._feasible_margin())
         self.objective = self._objective()
         self.searcher = self._searcher(MARGIN_SHARE * self.margin)
-        self.repairing: Future[Repaired] | None = None
+        self.repairing: Search | None = None
         self.accuracy = 0.0
         self.loss = math.nan
         self.learnt = torch.empty(0, len(task.names), device=device)
@@ -107,6 +108,8 @@ class Trainer:
             for averaged, current in pairs:
                 averaged.lerp_(current, 1.0 - decay)
         self.loss = float(value)
+        if self.repairing is not None:
+            self.repairing.advance()
         return self.loss
 
     @property
@@ -138,10 +141,26 @@ class Trainer:
             return self._of_all(Look(accuracy, shares, None, 0, 0))
         failing, repaired, before = self._take_repaired()
         feasible = None if before is None else max(before, accuracy)
-        bad = (~good).nonzero()[:, 0][: self.engine.most]
-        self.repairing = self.searcher.begin(x0[bad], plans[bad], self.buffer.bank)
+        bad = (~good).nonzero()[:, 0][: self._effort[0]]
+        self.repairing = self._begin(x0[bad], plans[bad])
         self.accuracy = accuracy
         return self._of_all(Look(accuracy, shares, feasible, failing, repaired))
+
+    def _begin(self, x0: Tensor, plans: Tensor, seed: int | None = None) -> Search:
+        """A search beside the steps until the next round."""
+        tries, steps = self._effort[1], self.engine.every
+        return self.searcher.begin(x0, plans, self.buffer.bank, tries=tries, steps=steps, seed=seed)
+
+    @property
+    def _effort(self) -> tuple[int, int]:
+        """Failing states of a search round at most, and plans that are tried for each."""
+        native = self.task.native is not None
+        return (self.engine.most, THOROUGH) if native else (min(self.engine.most, TORCH_MOST), TORCH_TRIES)
+
+    def close(self) -> None:
+        """End the search that goes on beside the steps."""
+        if self.repairing is not None:
+            self.repairing.cancel()
 
     def _of_all(self, look: Look) -> Look:
         """What the ranks saw together."""
@@ -165,7 +184,9 @@ class Trainer:
         """
         if self.repairing is None:
             return 0, 0, None
-        found = self.repairing.result().to(self.device)
+        repaired_by_then = self.repairing.result()
+        assert repaired_by_then is not None
+        found = repaired_by_then.to(self.device)
         solved = found.solved
         self.buffer.add(found.states[solved], found.plans[solved])
         self.supply.follow(found.states[solved], found.plans[solved])
@@ -219,11 +240,12 @@ class Trainer:
 
     def _feasible_margin(self) -> float:
         """A gamma of the size that plans can reach: a share of what search reaches on the median state."""
-        x0 = self.supply.take(MARGIN_STATES)
+        native = self.task.native is not None
+        count, tries = (MARGIN_STATES, THOROUGH) if native else (TORCH_MARGIN_STATES, TORCH_TRIES)
+        x0 = self.supply.take(min(count, MARGIN_STATES))
         middle = 0.5 * (self.task.system.control_low + self.task.system.control_high)
-        start = middle.to(self.device).expand(MARGIN_STATES, self.task.horizon, -1)
-        searcher = self._searcher(math.inf)
-        rho = searcher.repair(x0, start, self.buffer.bank).rho
+        start = middle.to(self.device).expand(len(x0), self.task.horizon, -1)
+        rho = self._searcher(math.inf).repair(x0, start, self.buffer.bank, tries=tries).rho
         reached = rho[satisfied(rho)]
         if reached.numel() == 0:
             return MARGIN_RANGE[0]
@@ -271,9 +293,13 @@ class Trainer:
         if isinstance(self.training, Fixed):
             found.update({f"training.{name}": value for name, value in self.training.tensors().items()})
         found.update({f"supply.{name}": value for name, value in self.supply.tensors().items()})
-        if self.repairing is not None:
-            known = self.repairing.result()
+        known = self.repairing.result(stop=lambda: True) if self.repairing is not None else None
+        if known is not None:
             found.update({f"repairing.{name}": getattr(known, name) for name in ("states", "plans", "rho")})
+        elif self.repairing is not None:
+            pending = {"states": self.repairing.states, "plans": self.repairing.plans}
+            found.update({f"searching.{name}": value for name, value in pending.items()})
+            found["searching.seed"] = torch.tensor(self.repairing.seed)
         found["buffer.states"], found["buffer.plans"] = self.buffer.states[:kept], self.buffer.plans[:kept]
         return found
 
@@ -297,9 +323,6 @@ class Trainer:
         self.accuracy, self.loss = float(facts["accuracy"]), float(facts.get("loss", math.nan))
         self.objective = self._objective()
         self.searcher = self._searcher(MARGIN_SHARE * self.margin)
-        if known := _below(tensors, "repairing"):
-            self.repairing = Future()
-            self.repairing.set_result(Repaired(**known))
         for prefix, module in (("network", self.network), ("average", self.average)):
             module.load_state_dict(_below(tensors, prefix))
         layout = self.optimizer.state_dict()
@@ -316,6 +339,11 @@ class Trainer:
         if isinstance(self.training, Fixed):
             self.training.restore(_below(tensors, "training"))
         self.generator.set_state(tensors["generator"].cpu())
+        if known := _below(tensors, "repairing"):
+            self.repairing = Search.of(Repaired(**known))
+        elif begun := _below(tensors, "searching"):
+            states, plans = begun["states"].to(self.device), begun["plans"].to(self.device)
+            self.repairing = self._begin(states, plans, int(begun["seed"]))
 
     def _restored(
         self, tensors: dict[str, Tensor], facts: dict[str, float | int]

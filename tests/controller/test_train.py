@@ -123,7 +123,8 @@ def test_a_slow_run_is_saved_by_the_clock(
     seen: list[bool] = []
     pointer = folder.path / "ckpt" / "last.json"
     train(car_task, config, folder, Watch(stop=lambda: bool(seen.append(pointer.exists()))))
-    assert seen == [True, True, True]
+    assert len(seen) >= 3
+    assert all(seen)
 
 
 def test_seeds_matter_and_repeat(car_task: Task, tmp_path: Path) -> None:
