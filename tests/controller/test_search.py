@@ -96,3 +96,40 @@ def test_the_buffer_forgets_the_oldest() -> None:
     assert kept.max() == CAPACITY + 9
     states, plans = buffer.draw(100, torch.Generator().manual_seed(1))
     assert torch.equal(states[:, 0], plans[:, 0, 0])
+
+
+def test_a_search_that_is_stopped_gives_what_it_has(task: Task) -> None:
+    x0 = task.sample(40, seed=7)
+    start = torch.zeros(40, task.horizon, 1)
+    searcher = Searcher(task, torch.Generator().manual_seed(0), enough=0.02)
+    found = searcher.repair(x0, start, start[:0], stop=lambda: True)
+    assert torch.equal(found.plans, start)
+    assert torch.allclose(found.rho, task.judge(x0, start).rho)
+
+
+def test_a_search_beside_the_steps_can_be_begun_again(task: Task) -> None:
+    """What it gives depends on what it begins with; a share of the work is done with every step."""
+    x0 = task.sample(20, seed=7)
+    start = torch.zeros(20, task.horizon, 1)
+    searcher = Searcher(task, torch.Generator().manual_seed(0), enough=0.02)
+    first = searcher.begin(x0, start, start[:0], tries=640, steps=5)
+    assert task.native is not None or first.result(stop=lambda: True) is None
+    again = searcher.begin(x0, start, start[:0], tries=640, steps=3, seed=first.seed)
+    for _ in range(5):
+        first.advance()
+    assert task.native is not None or first.done()
+    one, other = first.result(), again.result()
+    assert one is not None
+    assert other is not None
+    assert torch.equal(one.plans, other.plans)
+    assert bool((one.rho > task.judge(x0, start).rho).any())
+
+
+def test_a_search_that_is_cancelled_comes_to_its_end(car_task: Task) -> None:
+    x0 = car_task.sample(5000, seed=7)
+    start = torch.zeros(5000, car_task.horizon, 1)
+    searcher = Searcher(car_task, torch.Generator().manual_seed(0), enough=1e9)
+    search = searcher.begin(x0, start, start[:0], tries=10**6)
+    if car_task.native is not None:
+        search.cancel()
+        assert search.result() is not None

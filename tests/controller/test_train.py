@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -222,3 +223,56 @@ def test_wilson_interval_of_known_cases() -> None:
     assert abs(high - 0.5962) < 1e-3
     assert wilson(1.0, 10)[1] == 1.0
     assert wilson(0.0, 10)[0] == 0.0
+
+
+def test_a_run_that_was_interrupted_before_its_first_checkpoint_begins_again(
+    car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = TrainConfig(held_out=50, steps=4, seed=3, batch=16)
+    whole = train(car_task, config, _folder(car_task, tmp_path / "a", config))
+    folder = _folder(car_task, tmp_path / "b", config)
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "_feasible_margin", lambda _self: signal.raise_signal(signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            train(car_task, config, folder)
+    assert resume(folder).steps == 4
+    left, right = _saved(whole.run.dir), _saved(folder)
+    assert all(torch.equal(value, right[name]) for name, value in left.items())
+
+
+def test_a_checkpoint_keeps_a_search_that_goes_on(car_task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = decide(car_task, TrainConfig(batch=16, seed=1))
+    trainer, again = (Trainer(car_task, engine, steps=9, device=torch.device("cpu")) for _ in range(2))
+    trainer.advance()
+    trainer.look()
+    assert trainer.repairing is not None
+    search = trainer.repairing
+    with monkeypatch.context() as patch:
+        patch.setattr(search, "result", lambda stop: stop() and None)  # whatever the clock says, it goes on
+        again.restore({name: value.clone() for name, value in trainer.tensors().items()}, trainer.facts())
+    assert again.repairing is not None
+    assert again.repairing.seed == search.seed
+    one, other = search.result(), again.repairing.result()
+    assert one is not None
+    assert other is not None
+    assert torch.equal(one.plans, other.plans)
+
+
+def test_without_a_compiler_torch_judges_in_parts(car_task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stlc.native.compiler", lambda: None)
+    task = Task(car_task.compiled, System(car_task.system.decl))
+    x0 = task.sample(100, seed=7, dtype=torch.float64)
+    plans = torch.zeros(100, task.horizon, 1, dtype=torch.float64)
+    whole = task.judge(x0, plans)
+    monkeypatch.setattr("stlc.controller.task.MOST_VALUES", 7 * task._values_of_a_row)
+    parts = task.judge(x0, plans)
+    assert torch.equal(whole.rho, parts.rho)
+    assert all(torch.equal(column, parts.columns[name]) for name, column in whole.columns.items())
+
+
+def test_the_verdict_ends_when_its_time_is_over(car_task: Task) -> None:
+    engine = decide(car_task, TrainConfig(batch=16, seed=1))
+    trainer = Trainer(car_task, engine, steps=9, device=torch.device("cpu"))
+    found = score(trainer.policy, n=1200, enough=lambda: True)
+    assert len(found.states) == 500
+    assert found.accuracy <= found.feasible

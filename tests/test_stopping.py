@@ -1,0 +1,98 @@
+"""An interrupted command ends in time: work stops in parts, and what does not unwind is ended."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from stlc import native, stopping
+
+STUBBORN = """
+import signal, sys, time
+from stlc import stopping
+stopping.arm()
+signal.signal(signal.SIGINT, lambda *_: None)
+signal.signal(signal.SIGTERM, lambda *_: None)
+def undo(code):
+    open(sys.argv[1], "w").write(str(code))
+with stopping.leaving(undo), stopping.leaving(lambda _code: 1 / 0):
+    print("ready", flush=True)
+    while True:
+        time.sleep(0.01)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_does_not_unwind_is_ended_and_undone(tmp_path: Path, number: int) -> None:
+    words = [sys.executable, "-c", STUBBORN, str(tmp_path / "undone")]
+    with subprocess.Popen(words, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.send_signal(number)
+        code = process.wait(timeout=60)
+    assert code == 128 + number
+    assert (tmp_path / "undone").read_text() == str(code)
+
+
+def test_what_came_to_its_end_is_not_undone() -> None:
+    before = dict(stopping._undone)
+    with stopping.leaving(lambda _code: None):
+        assert len(stopping._undone) == len(before) + 1
+    assert stopping._undone == before
+
+
+def test_children_have_less_patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(stopping.CHILD, "0.1")
+    assert stopping._patience() == 0.1
+    for text in ("never", "-1", "1e9"):
+        monkeypatch.setenv(stopping.CHILD, text)
+        assert 0.0 <= stopping._patience() <= stopping.PATIENCE
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_rows_are_shared_in_parts_and_each_is_done_once(threads: int) -> None:
+    done: list[int] = []
+
+    def rows(first: int, last: int) -> int:
+        assert first % native.GRAIN == 0
+        done.extend(range(first, last))
+        return 0
+
+    native._share(rows, 1000, threads)
+    assert sorted(done) == list(range(1000))
+
+
+def test_work_is_stopped_between_two_parts() -> None:
+    done: list[int] = []
+
+    def rows(first: int, _last: int) -> int:
+        done.append(first)
+        return 0
+
+    native._share(rows, 10**6, 1, stop=lambda: len(done) == 3)
+    assert len(done) == 3
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_an_interruption_ends_the_work(threads: int) -> None:
+    def rows(_first: int, _last: int) -> int:
+        time.sleep(0.002)
+        return 0
+
+    timer = threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        native._share(rows, 1 << 40, threads, grain=1)
+    timer.join()
+
+
+def test_a_part_without_memory_is_told() -> None:
+    with pytest.raises(MemoryError):
+        native._share(lambda _first, _last: 1, 100, 2)
