@@ -6,6 +6,9 @@ specification. Needs the extra `stlc[gym]`.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -14,8 +17,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from stlc.compile import ir
 from stlc.compile.graph import evaluate
 from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.ranges import bounds
 from stlc.compile.semantics import TOLERANCE
 from stlc.controller.task import Task
 from stlc.controller.world import world_type
@@ -41,10 +46,12 @@ MOST = 10.0
 class SpecEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """One agent in the world of a system, rewarded by the robustness of a specification.
 
-    An observation is what the system's policy observes, (k,) float32; an action is one control in physical
-    units, (m,) float32, clipped to its range. `info` holds `state` (n,) float64, `robustness` by
-    requirement, `rho` of the whole, and `satisfied`. Robustness is that of the last horizon, of as much of
-    it as there is (`end = "truncate"`).
+    An observation is what the system's policy observes, (k,) float32, then the share of the episode that is
+    over where it is terminated at its end: what is left to earn depends on it. Its bounds are finite, what
+    is beyond them is clipped: those of the states' nominal ranges and of random plans, half as wide again.
+    An action is what actuators get, (m,) float32, in physical units, clipped to their range. `info` holds
+    `state` (n,) float64, `robustness` by requirement, `rho` of the whole, and `satisfied`. Robustness is that
+    of the last horizon, of as much of it as there is (`end = "truncate"`).
 
     Args:
         task: specification and system.
@@ -52,21 +59,33 @@ class SpecEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             A longer one goes on in the world of the system and is *truncated*.
         reward: "dense" gives what each step adds to the robustness, which sums to that of the episode less
             that of its start; "sparse" gives all of it with the last step.
+        normalised: observations and actions are from -1 to 1, which most learners expect.
+        time: whether the share of the episode that is over is observed; None: where it is terminated.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
 
-    def __init__(self, task: Task, *, steps: int | None = None, reward: Reward = "dense") -> None:
+    def __init__(
+        self,
+        task: Task,
+        *,
+        steps: int | None = None,
+        reward: Reward = "dense",
+        normalised: bool = False,
+        time: bool | None = None,
+    ) -> None:
         if reward not in ("dense", "sparse"):
             finding = Diagnostic("U101", f"there is no reward `{reward}`", help=("dense or sparse",))
             raise UsageError(finding)
         self.task = task
         self.steps = steps or task.horizon
         self.reward = reward
-        low, high = (bound.numpy() for bound in (task.system.control_low, task.system.control_high))
-        self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
-        shape = (task.system.observed_count,)
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, shape, dtype=np.float32)
+        self.normalised = normalised
+        self.time = self.steps <= task.horizon if time is None else time
+        self._actuators = _Box.of(task.system.actuators)
+        self._observed = _observed(task, time=self.time)
+        self.action_space = self._actuators.space(unit=normalised)
+        self.observation_space = self._observed.space(unit=normalised)
         self._formulas = [rule.formula for rule in task.rules]
         self._make = world_type(task.system.decl)
         self._worlds: Worlds | None = None
@@ -97,9 +116,9 @@ class SpecEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """One step of the world under `action`, (m,)."""
         if self._worlds is None or len(self._driven) > self.steps:
             raise UsageError(Diagnostic("U101", "the episode is over", help=("call `reset` first",)))
-        held = np.clip(action, self.action_space.low, self.action_space.high)  # type: ignore[attr-defined]
-        u = torch.as_tensor(held, dtype=torch.float64).reshape(1, -1)
-        self._driven.append(self._worlds.advance(self._driven[-1], u, len(self._driven)))
+        held = self._actuators.clipped(action, unit=self.normalised)
+        x, u = self._driven[-1], torch.as_tensor(held, dtype=torch.float64).reshape(1, -1)
+        self._driven.append(self._worlds.advance(x, self.task.system.planned(x, u), len(self._driven)))
         info, over = self._judged(), len(self._driven) > self.steps
         earned = info["rho"] - self._rho if self.reward == "dense" else info["rho"] * over
         self._rho = info["rho"]
@@ -108,9 +127,12 @@ class SpecEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def _seen(self) -> Observation:
         assert self._worlds is not None
-        x = self._worlds.disturbance.seen(self._driven[-1], len(self._driven) - 1)
-        observed: Observation = self.task.system.observe(x)[0].to(torch.float32).numpy(force=True)
-        return observed
+        step = len(self._driven) - 1
+        x = self._worlds.disturbance.seen(self._driven[-1], step)
+        seen = self.task.system.observe(x)[0].numpy(force=True)
+        if self.time:
+            seen = np.append(seen, step / self.steps)
+        return self._observed.told(seen, unit=self.normalised)
 
     def _judged(self) -> dict[str, Any]:
         """What the last horizon of the episode is worth, or as much of it as there is."""
@@ -129,10 +151,82 @@ class SpecEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         }
 
 
+@dataclass(frozen=True, slots=True)
+class _Box:
+    """Ends of a space, (k,) float32, as they are or as -1 and 1."""
+
+    low: Observation
+    high: Observation
+
+    @classmethod
+    def of(cls, ranges: Sequence[tuple[float, float]]) -> _Box:
+        ends = np.array(ranges, dtype=np.float32).reshape(-1, 2)
+        return cls(ends[:, 0], ends[:, 1])
+
+    def space(self, *, unit: bool) -> Any:
+        if unit:
+            return gymnasium.spaces.Box(-1.0, 1.0, self.low.shape, dtype=np.float32)
+        return gymnasium.spaces.Box(self.low, self.high, dtype=np.float32)
+
+    def clipped(self, given: NDArray[np.float32], *, unit: bool) -> NDArray[np.float64]:
+        """The number that a value of the space stands for, within the ends."""
+        low, high = self.low.astype(np.float64), self.high.astype(np.float64)
+        value = np.asarray(given, dtype=np.float64)
+        return np.clip(low + 0.5 * (value + 1.0) * (high - low) if unit else value, low, high)
+
+    def told(self, value: NDArray[np.float64], *, unit: bool) -> Observation:
+        """A number as a value of the space."""
+        if unit:
+            wide = (self.high - self.low).astype(np.float64)
+            value = 2.0 * (value - self.low) / wide - 1.0
+            return np.clip(value, -1.0, 1.0).astype(np.float32)
+        return np.clip(value, self.low, self.high).astype(np.float32)
+
+
+PROBED = 256
+"""Random plans whose observations widen the bounds of the space."""
+
+
+def _observed(task: Task, *, time: bool) -> _Box:
+    """Bounds of what the policy observes: of nominal ranges where they say, and of random plans; wider."""
+    system = task.system
+    generator = torch.Generator().manual_seed(0)
+    x0 = task.sample(PROBED, seed=0, dtype=torch.float64)
+    low, high = system.control_low.double(), system.control_high.double()
+    shape = (PROBED, task.horizon, len(low))
+    plans = low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
+    seen = system.observe(system.rollout(x0, plans)).flatten(0, 1)
+    facts = {
+        each.name: (each.low, each.high)
+        for each in system.signature.columns
+        if each.low is not None and each.high is not None
+    }
+    observe = system.decl.policy.observe
+    names = [column.name for column in system.added] if observe else list(system.names)
+    numbers = [*observe, *(ir.Col(name) for name in names)]
+    found = []
+    for number, column in zip(numbers, seen.unbind(1), strict=True):
+        ends = bounds(number, facts) or (math.inf, -math.inf)
+        least, most = min(ends[0], float(column.min())), max(ends[1], float(column.max()))
+        if not math.isfinite(most - least):
+            least, most = float(column.min()), float(column.max())
+        wider = 0.25 * max(most - least, 1e-3)
+        found.append((least - wider, most + wider))
+    return _Box.of([*found, *([(0.0, 1.0)] if time else [])])
+
+
 def make(
-    spec: Path | str, system: Path | str | None = None, *, steps: int | None = None, reward: Reward = "dense"
+    spec: Path | str,
+    system: Path | str | None = None,
+    *,
+    steps: int | None = None,
+    reward: Reward = "dense",
+    normalised: bool = False,
+    time: bool | None = None,
 ) -> SpecEnv:
     """The environment of a specification's file and of a system's, which the specification may name itself.
+
+    The other arguments are those of `SpecEnv`.
 
     Raises:
         UsageError: there is no such file, or no system is named.
@@ -144,4 +238,5 @@ def make(
     if named is None:
         raise UsageError(Diagnostic("U101", f"`{spec}` names no system", help=("give one",)))
     found = System.load(find_system(str(named), None if system else path))
-    return SpecEnv(Task.of(parsed, found), steps=steps, reward=reward)
+    task = Task.of(parsed, found)
+    return SpecEnv(task, steps=steps, reward=reward, normalised=normalised, time=time)

@@ -21,12 +21,56 @@ ROOT = Path(__file__).parent.parent
 SPECS = ("traffic", "reach_n_avoid", "ship_safe", "ship_track", "navigation", "manipulation")
 
 
+@pytest.mark.parametrize("normalised", [False, True])
 @pytest.mark.parametrize("name", SPECS)
-@pytest.mark.filterwarnings("ignore:.*(infinity|render|Box).*:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*(render|symmetric).*:UserWarning")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_it_passes_the_checker(name: str) -> None:
-    env = stlc.gym.make(ROOT / "specs" / f"{name}.stl")
+def test_it_passes_the_checker(name: str, normalised: bool) -> None:
+    env = stlc.gym.make(ROOT / "specs" / f"{name}.stl", normalised=normalised)
+    for space in (env.action_space, env.observation_space):
+        assert np.isfinite(space.low).all()
+        assert np.isfinite(space.high).all()
+        assert not normalised or (space.low == -1.0).all()
     check_env(env, skip_render_check=True)
+
+
+def test_normalised_actions_and_observations_are_the_others_scaled() -> None:
+    path = ROOT / "specs" / "ship_safe.stl"
+    plain, unit = stlc.gym.make(path), stlc.gym.make(path, normalised=True)
+    seen = [env.reset(seed=3)[0] for env in (plain, unit)]
+    low, high = plain.observation_space.low, plain.observation_space.high
+    for _ in range(5):
+        np.testing.assert_allclose(seen[1], 2.0 * (seen[0] - low) / (high - low) - 1.0, atol=1e-5)
+        plain_step = plain.step(np.array([0.25, -1.5], dtype=np.float32))
+        unit_step = unit.step(np.array([0.5, -0.5], dtype=np.float32))
+        assert plain_step[4]["state"].tolist() == unit_step[4]["state"].tolist()
+        seen = [plain_step[0], unit_step[0]]
+
+
+def test_what_is_left_of_an_episode_is_observed_where_it_ends() -> None:
+    path = ROOT / "specs" / "ship_safe.stl"
+    env, longer = stlc.gym.make(path), stlc.gym.make(path, steps=100)
+    width = env.task.system.observed_count
+    assert env.observation_space.shape == (width + 1,)
+    assert longer.observation_space.shape == (width,)
+    assert stlc.gym.make(path, time=False).observation_space.shape == (width,)
+    first, _ = env.reset(seed=0)
+    times = [first[-1], *(env.step(np.zeros(2, dtype=np.float32))[0][-1] for _ in range(20))]
+    np.testing.assert_allclose(times, np.arange(21) / 20, atol=1e-6)
+
+
+def test_actuators_get_the_action_where_a_feedback_lies_beneath_plans(tmp_path: Path) -> None:
+    (tmp_path / "u.yaml").write_text(
+        "stlc: 1\nname: u\ntime: {dt: 0.1 s, horizon: 10 steps}\nstate: {x: {unit: m, range: [-1, 1]}}\n"
+        "control: {u: {unit: m/s, range: [-6, 6]}}\nflow: {x: '4 / (1 s) * x + u'}\n"
+        "init: {mixture: [{draw: {x: 0.5}}]}\npolicy: {feedback: lqr}\n"
+    )
+    (tmp_path / "u.stl").write_text("state signal x [m]\nrequire r: always[0, T] x < 1 m\n")
+    env = stlc.gym.make(tmp_path / "u.stl", tmp_path / "u.yaml")
+    assert env.action_space.high.tolist() == [6.0]
+    env.reset(seed=0)
+    *_, info = env.step(np.array([-2.0], dtype=np.float32))
+    assert info["state"].tolist() == pytest.approx([0.5])
 
 
 def test_dense_rewards_sum_to_the_robustness_of_the_episode() -> None:

@@ -46,7 +46,7 @@ class Disturbance:
         self._streams = tuple(zip(*own, strict=True))
         self._angle = torch.tensor([control.squash == "angle" for control in system.controls])
         self._factor, self._offset = self._wrong_gains()
-        half = 0.5 * torch.tensor(system.actuator_widths, dtype=torch.float64)
+        half = 0.5 * torch.tensor([high - low for low, high in system.actuators]).double()
         self._reach = torch.where(self._angle, 1.0, half)
         self._spread = self._errors.sensor_noise * _ranges(system)
 

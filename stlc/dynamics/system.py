@@ -142,12 +142,11 @@ class System:
         return torch.tensor([control.high for control in self.controls], dtype=torch.float32)
 
     @property
-    def actuator_widths(self) -> tuple[float, ...]:
-        """Widths of the ranges of the actuators; those of plans are wider where a feedback lies beneath."""
+    def actuators(self) -> tuple[tuple[float, float], ...]:
+        """Ranges of what actuators get; those of plans are wider where a feedback lies beneath."""
         if self.decl.feedback is None:
-            return tuple(control.high - control.low for control in self.controls)
-        ends = zip(self.decl.feedback.low, self.decl.feedback.high, strict=True)
-        return tuple(high - low for low, high in ends)
+            return tuple((control.low, control.high) for control in self.controls)
+        return tuple(zip(self.decl.feedback.low, self.decl.feedback.high, strict=True))
 
     @property
     def observed_count(self) -> int:
