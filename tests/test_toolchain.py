@@ -78,9 +78,9 @@ def test_one_that_will_not_be_asked_is_ended_too(tmp_path):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs to know the processor time")
 def test_one_that_works_is_waited_for_and_not_for_ever(monkeypatch):
+    monkeypatch.setattr(toolchain, "IDLE", 5.0)  # a machine that is busy does nothing for a while
     assert run(["sh", "-c", "i=0; while [ $i -lt 300000 ]; do i=$((i+1)); done; echo $i"]).out == "300000\n"
     monkeypatch.setattr(toolchain, "BUSY", 0.2)
-    monkeypatch.setattr(toolchain, "IDLE", 5.0)  # a machine that is busy does nothing for a while
     with pytest.raises(HangsError, match=r"did not end within 0\.2 s of the processor") as ended:
         run(["sh", "-c", "while :; do :; done"])
     assert ended.value.worked

@@ -7,7 +7,7 @@ nothing here needs a library.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from typing import Any, Literal, TypeAlias
@@ -16,10 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 Kind: TypeAlias = Literal["float64", "float32", "int64", "bool"]
-Attribute: TypeAlias = int | tuple[int, ...]
+Attribute: TypeAlias = "int | tuple[int, ...] | Body"
 
 BATCH = 1 << 40
 """The length of an axis that is known only when the graph is run; only equal ones meet in an operation."""
+
+WRITTEN_OUT = 600
+"""Nodes up to which a loop is written out: a node with a body costs some microseconds a turn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +34,40 @@ class Node:
     outputs: tuple[str, ...]
     attributes: tuple[tuple[str, Attribute], ...]
 
+    @property
+    def reads(self) -> frozenset[str]:
+        """Everything that has to be there before it, what its body reads of the graph around too."""
+        bodies = (value for _, value in self.attributes if isinstance(value, Body))
+        return frozenset(self.inputs).union(*(body.around for body in bodies))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """A graph inside of a node, which runs it again and again.
+
+    Attributes:
+        sheet: that it stands on; `sheet.inputs` are what each turn is given.
+        outputs: what each turn gives.
+    """
+
+    sheet: Sheet
+    outputs: tuple[Value, ...]
+
+    @property
+    def nodes(self) -> list[Node]:
+        """What is computed in a turn, in order."""
+        return self.sheet.needed(self.outputs)
+
+    @property
+    def around(self) -> frozenset[str]:
+        """Names of the graph around that are read."""
+        nodes = self.nodes
+        read = {name for node in nodes for name in node.reads} | {value.name for value in self.outputs}
+        made = {name for node in nodes for name in node.outputs}
+        return frozenset(
+            read - made - self.sheet.constants.keys() - {value.name for value in self.sheet.inputs}
+        )
+
 
 @dataclass(slots=True)
 class Sheet:
@@ -40,11 +77,13 @@ class Sheet:
         nodes: in order.
         constants: name -> array.
         inputs: what is given when the graph is run.
+        prefix: how its names begin; a body has another one than the graph around.
     """
 
     nodes: list[Node] = field(default_factory=list)
     constants: dict[str, NDArray[Any]] = field(default_factory=dict)
     inputs: list[Value] = field(default_factory=list)
+    prefix: str = ""
     _known: dict[tuple[object, ...], tuple[Value, ...]] = field(default_factory=dict)
 
     def input(self, name: str, shape: tuple[int, ...], kind: Kind = "float64") -> Value:
@@ -57,7 +96,7 @@ class Sheet:
         array = np.asarray(value, dtype=kind)
         key = ("constant", kind, array.shape, array.tobytes())
         if key not in self._known:
-            name = f"c{len(self.constants)}"
+            name = f"{self.prefix}c{len(self.constants)}"
             self.constants[name] = array
             self._known[key] = (Value(self, name, array.shape, kind),)
         return self._known[key][0]
@@ -76,18 +115,50 @@ class Sheet:
         key = (op, names, facts, len(shapes))
         if key not in self._known:
             made = tuple(
-                Value(self, f"v{len(self.nodes)}.{place}", shape, kind) for place, shape in enumerate(shapes)
+                Value(self, f"{self.prefix}v{len(self.nodes)}.{place}", shape, kind)
+                for place, shape in enumerate(shapes)
             )
             self.nodes.append(Node(op, names, tuple(value.name for value in made), facts))
             self._known[key] = made
         return self._known[key]
+
+    def repeated(self, carried: Sequence[Value], rows: Sequence[Value], turn: Turn) -> tuple[Value, ...]:
+        """A loop over rows: as one node with a body, or written out where that is short.
+
+        Args:
+            carried: what goes from turn to turn, as it is at first.
+            rows: (count, …) each; every turn is given its own row (1, …) of each.
+            turn: the sheet that it is to be written on, carried values and rows -> carried values of the same
+                shapes, and what is kept, (1, …) each. `Value.on` brings there what stands around.
+
+        Returns:
+            What is kept, (count, …) each.
+        """
+        inner, count = Sheet(prefix=f"{self.prefix}s{len(self.nodes)}."), rows[0].shape[0]
+        now = [inner.input(f"{inner.prefix}i{i}", each.shape, each.kind) for i, each in enumerate(carried)]
+        row = [inner.input(f"{inner.prefix}r{i}", each.shape[1:], each.kind) for i, each in enumerate(rows)]
+        later, kept = turn(inner, now, [each.reshaped(1, *each.shape) for each in row])
+        body = Body(inner, (*later, *kept))
+        if count * len(body.nodes) <= WRITTEN_OUT:
+            return self._written_out(carried, rows, turn)
+        shapes = [each.shape for each in later] + [(count, *each.shape) for each in kept]
+        facts: dict[str, Attribute] = {"body": body, "num_scan_inputs": len(rows)}
+        outputs = self.emit("Scan", (*carried, *rows), shapes, carried[0].kind, facts)
+        return tuple(each.reshaped(count, *each.shape[2:]) for each in outputs[len(later) :])
+
+    def _written_out(self, carried: Sequence[Value], rows: Sequence[Value], turn: Turn) -> tuple[Value, ...]:
+        history = []
+        for row in zip(*(each.rows() for each in rows), strict=True):
+            carried, kept = turn(self, carried, row)
+            history.append(kept)
+        return tuple(joined(each) for each in zip(*history, strict=True))
 
     def needed(self, outputs: Sequence[Value]) -> list[Node]:
         """The nodes that outputs depend on, in order."""
         wanted, kept = {value.name for value in outputs}, []
         for node in reversed(self.nodes):
             if wanted & set(node.outputs):
-                wanted |= set(node.inputs)
+                wanted |= node.reads
                 kept.append(node)
         return kept[::-1]
 
@@ -107,6 +178,10 @@ class Value:
     name: str
     shape: tuple[int, ...]
     kind: Kind
+
+    def on(self, sheet: Sheet) -> Value:
+        """The same value as the sheet of a loop reads it."""
+        return Value(sheet, self.name, self.shape, self.kind)
 
     # ----------------------------------------------------------------- arithmetic
 
@@ -225,6 +300,9 @@ class Value:
         """The length of the last axis, (1,) int64."""
         (out,) = self.sheet.emit("Shape", (self,), [(1,)], "int64", {"start": self.ndim - 1})
         return out
+
+
+Turn: TypeAlias = Callable[[Sheet, Sequence[Value], Sequence[Value]], tuple[Sequence[Value], Sequence[Value]]]
 
 
 def joined(parts: Sequence[Value], axis: int = 0) -> Value:

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from stlc.compile.sheet import BATCH, Value
+from stlc.compile.sheet import BATCH, Body, Value
 from stlc.diagnostics import Diagnostic, MissingError
 from stlc.version import __version__
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-    from onnx import NodeProto, TensorProto, ValueInfoProto
+    from collections.abc import Iterable
 
-    from stlc.compile.sheet import Node
+    from numpy.typing import NDArray
+    from onnx import GraphProto, NodeProto, TensorProto, ValueInfoProto
+
+    from stlc.compile.sheet import Node, Sheet
 
 OPSET = 18
 """The functions of ONNX 1.13 (2022), which every runtime since knows."""
@@ -41,18 +43,8 @@ def model_of(name: str, outputs: Mapping[str, Value], facts: Mapping[str, str]) 
     from onnx import checker, helper
 
     sheet = next(iter(outputs.values())).sheet
-    nodes = sheet.needed(tuple(outputs.values()))
-    read = {each for node in nodes for each in node.inputs} | {each.name for each in outputs.values()}
-    renamed = [helper.make_node("Identity", [value.name], [shown]) for shown, value in outputs.items()]
-    graph = helper.make_graph(
-        [*map(_node, nodes), *renamed],
-        name,
-        [_declared(each, each.name) for each in sheet.inputs],
-        [_declared(value, shown) for shown, value in outputs.items()],
-        [_constant(key, sheet.constants[key]) for key in sheet.constants if key in read],
-    )
     model = helper.make_model(
-        graph,
+        _graph(sheet, name, list(outputs.items())),
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=FORMAT,
         producer_name="stlc",
@@ -64,11 +56,34 @@ def model_of(name: str, outputs: Mapping[str, Value], facts: Mapping[str, str]) 
     return data
 
 
+def _graph(sheet: Sheet, name: str, outputs: Iterable[tuple[str, Value]]) -> GraphProto:
+    """The part of a sheet that outputs depend on, under the names that they are shown by."""
+    from onnx import helper
+
+    shown = list(outputs)
+    nodes = sheet.needed([value for _, value in shown])
+    read = {each for node in nodes for each in node.reads} | {value.name for _, value in shown}
+    renamed = [helper.make_node("Identity", [value.name], [outside]) for outside, value in shown]
+    return helper.make_graph(
+        [*map(_node, nodes), *renamed],
+        name,
+        [_declared(each, each.name) for each in sheet.inputs],
+        [_declared(value, outside) for outside, value in shown],
+        [_constant(key, sheet.constants[key]) for key in sheet.constants if key in read],
+    )
+
+
 def _node(node: Node) -> NodeProto:
     from onnx import helper
 
     made = helper.make_node(node.op, list(node.inputs), list(node.outputs))
-    made.attribute.extend(helper.make_attribute(key, value) for key, value in node.attributes)
+    for key, value in node.attributes:
+        if isinstance(value, Body):
+            prefix = value.sheet.prefix
+            graph = _graph(value.sheet, key, [(f"{prefix}o{i}", out) for i, out in enumerate(value.outputs)])
+            made.attribute.append(helper.make_attribute(key, graph))
+        else:
+            made.attribute.append(helper.make_attribute(key, value))
     return made
 
 

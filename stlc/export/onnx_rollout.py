@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from stlc.compile import ir
 from stlc.compile.arith import Program
 from stlc.compile.ops_onnx import ONNX
-from stlc.compile.sheet import Value
+from stlc.compile.sheet import BATCH, Sheet, Value
 from stlc.compile.unrolled import Columns, require_numbers
+from stlc.dynamics.algebra import names_in
 from stlc.dynamics.schedule import Stage, schedule
 from stlc.dynamics.step import Step
 
@@ -72,20 +73,35 @@ class _Film:
 
     def _loop(self, stage: Stage) -> None:
         """Step what feeds back into itself."""
-        rows = {name: value.rows() for name, value in self.now.items()}
+        inside = stage.stepped.keys() | {name for block in stage.blocks for name in block}
+        read = {name for block in stage.blocks for num in block.values() for name in names_in(num)}
+        outside = sorted(read - inside)
+        timed = [name for name in outside if len(self.now[name]) == self.steps]
+        steady = [name for name in outside if name not in timed]
         blocks = [Program(block) for block in stage.blocks]
-        states = {name: self.start[name] for name in stage.stepped}
-        history: dict[str, list[Value]] = {name: [] for name in (*stage.stepped.values(), *stage.lets)}
-        for step in range(self.steps):
-            env = {name: row[min(step, len(row) - 1)] for name, row in rows.items()} | states
+        moving, sources = list(stage.stepped), list(stage.stepped.values())
+        kept = list(dict.fromkeys((*sources, *stage.lets)))
+
+        def turn(
+            sheet: Sheet, now: Sequence[Value], rows: Sequence[Value]
+        ) -> tuple[Sequence[Value], Sequence[Value]]:
+            env = {name: self.now[name].on(sheet) for name in steady}
+            env |= dict(zip(timed, rows, strict=False))
+            env |= dict(zip(moving, now, strict=True))
             for block in blocks:
                 env.update(block(env, ONNX))
-            for name, values in history.items():
-                values.append(env[name])
-            states = {name: env[source] for name, source in stage.stepped.items()}
+            later = [env[name].spread(1, BATCH, like=now[0]) for name in sources]
+            return later, [env[name] for name in kept]
+
+        carried = [self.start[name] for name in moving]
+        rows = [self.now[name] for name in timed] or [
+            carried[0].sheet.constant([[float(k)] for k in range(self.steps)])
+        ]
+        seen = carried[0].sheet.repeated(carried, rows, turn)
+        history = dict(zip(kept, seen, strict=True))
         for state, source in stage.stepped.items():
-            self._enter(state, ONNX.cat([self.start[state], *history[source]]))
-        self.now.update((name, ONNX.cat(history[name])) for name in stage.lets)
+            self._enter(state, ONNX.cat([self.start[state], history[source]]))
+        self.now.update((name, history[name]) for name in stage.lets)
 
 
 def assigned(numbers: Mapping[str, ir.Num], columns: Mapping[str, Value]) -> Columns:

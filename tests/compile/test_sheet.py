@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from sheets import computed
 
+from stlc.compile import sheet as sheets
 from stlc.compile.sheet import BATCH, Sheet, joined
 
 ARRAY = np.arange(15.0).reshape(5, 3) - 4.0
@@ -62,3 +63,28 @@ def test_shapes_that_do_not_fit_are_not_written() -> None:
     sheet = Sheet()
     with pytest.raises(AssertionError, match="5"):
         sheet.input("x", (5, BATCH)) + sheet.input("y", (4, BATCH))
+
+
+@pytest.mark.parametrize("written_out", [True, False])
+def test_a_loop_is_the_same_written_out_and_as_a_node(
+    written_out: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sheets, "WRITTEN_OUT", 10**9 if written_out else 0)
+    sheet = Sheet()
+    x, first = sheet.input("x", (5, BATCH)), sheet.input("first", (1, BATCH))
+    factor, unread = first * 0.5, first + 9.0
+
+    def turn(inner, now, rows):
+        total = now[0] + rows[0] * factor.on(inner)
+        return [total, now[0]], [total * 2.0, factor.on(inner), now[1]]
+
+    doubled, same, before = sheet.repeated([first, first], [x], turn)
+    scans = [node for node in sheet.needed([doubled]) if node.op == "Scan"]
+    assert bool(scans) != written_out
+    assert unread.name not in {name for node in sheet.needed([doubled]) for name in node.outputs}
+    begin = np.array([[1.0, 2.0, -4.0]])
+    found = computed({"doubled": doubled, "same": same, "before": before}, {"x": ARRAY, "first": begin})
+    totals = begin + np.cumsum(ARRAY * begin * 0.5, 0)
+    np.testing.assert_array_equal(found["doubled"], totals * 2.0)
+    np.testing.assert_array_equal(found["same"], np.repeat(begin * 0.5, 5, 0))
+    np.testing.assert_array_equal(found["before"], np.concatenate([begin, begin, totals[:3]]))

@@ -5,12 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from exported import CART, exported, mission, untrained
 from sheets import computed
 
 from stlc.compile import ir
+from stlc.compile import sheet as sheets
 from stlc.compile.sheet import BATCH, Sheet
+from stlc.compile.switch import Hard
+from stlc.dynamics.algebra import substitute
+from stlc.dynamics.integrators import rk4
+from stlc.dynamics.rollout import Stepper
 from stlc.dynamics.step import Step
 from stlc.export.onnx_graphs import deciding, judging
 from stlc.export.onnx_judge import columns_of, deepened, judged
@@ -72,7 +78,9 @@ def test_mirrors_and_angles_are_those_of_the_network(tmp_path: Path) -> None:
     assert "added" not in found
 
 
-def test_every_stage_of_a_step_is_rolled() -> None:
+@pytest.mark.parametrize("written_out", [True, False])
+def test_every_stage_of_a_step_is_rolled(written_out: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sheets, "WRITTEN_OUT", 10**9 if written_out else 0)
     x, y, z, u = (ir.Col(name) for name in ("x", "y", "z", "u"))
     feeds = ir.Op("add", (ir.Op("mul", (y, z)), u))
     step = Step(
@@ -92,6 +100,7 @@ def test_every_stage_of_a_step_is_rolled() -> None:
     rng = np.random.default_rng(4)
     given = {name: rng.normal(size=(1, 9)) for name in names} | {"u": rng.normal(size=(5, 9))}
     moved = rolled(step, start, controls)
+    assert ("Scan" in {node.op for node in sheet.nodes}) != written_out
     found = computed({f"{name}*": value for name, value in moved.items()}, given)
     now = {name: given[name][0] for name in names}
     for k in range(6):
@@ -111,3 +120,36 @@ def test_a_graph_takes_any_number_of_agents() -> None:
         plans = torch.ones(count, run.task.horizon, 1, dtype=torch.float64)
         found = computed(outputs, {"state": x.numpy(), "plan": plans.numpy()})
         np.testing.assert_allclose(found["rho"], run.task.judge(x, plans).rho, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("substeps", [1, 6])
+def test_a_step_of_many_parts_is_written_once(substeps: int) -> None:
+    """Written out, a plan of 40 steps of RK4 with 6 substeps would be some ten thousand nodes."""
+    angle, speed, push = (ir.Col(name) for name in ("angle", "speed", "push"))
+    pull = ir.Op("sub", (push, ir.Op("sin", (angle,))))
+    state: dict[str, ir.Num] = {"angle": angle, "speed": speed}
+    lets: list[tuple[str, ir.Num]] = []
+    for part in range(substeps):
+        moved = rk4(lambda at: {"angle": at["speed"], "speed": substitute(pull, at)}, state, 0.1 / substeps)
+        lets += [(f"{name}#{part}", number) for name, number in moved.items()]
+        state = {name: ir.Col(f"{name}#{part}") for name in moved}
+    step = Step(tuple(lets), {name: state[name] for name in ("angle", "speed")})
+    sheet = Sheet()
+    start = {name: sheet.input(name, (1, BATCH)) for name in ("angle", "speed")}
+    states = rolled(step, start, {"push": sheet.input("push", (40, BATCH))})
+    assert len(sheet.needed(list(states.values()))) < 30
+    rng = np.random.default_rng(5)
+    given = {
+        "angle": rng.normal(size=(1, 4)),
+        "speed": rng.normal(size=(1, 4)),
+        "push": rng.normal(size=(40, 4)),
+    }
+    found = computed({f"{name}*": value for name, value in states.items()}, given)
+    plain = Stepper(step).rollout(
+        {name: torch.from_numpy(given[name][0]) for name in ("angle", "speed")},
+        {"push": torch.from_numpy(given["push"])},
+        40,
+        Hard(),
+    )
+    for name in ("angle", "speed"):
+        np.testing.assert_allclose(found[f"{name}*"], plain[name], rtol=1e-12, atol=1e-12)
