@@ -26,6 +26,12 @@ def observed(task: Task) -> list[str]:
     return _assigned("seen", numbers, {name: f"x[{i}]" for i, name in enumerate(system.names)})
 
 
+def later(task: Task) -> list[str]:
+    """Statements that fill `later` with what clocks, statuses and timers are a step after the state `x`."""
+    numbers = [timer.update for timer in task.system.timers]
+    return _assigned("later", numbers, {name: f"x[{i}]" for i, name in enumerate(task.names)})
+
+
 def image_of_state(mirror: Mirror, task: Task) -> list[str]:
     """Statements that fill `image` from the state `x`."""
     names = task.names

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from importlib.resources import files
 from string import Template
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
 from stlc.compile.c_formulas import Forward
 from stlc.compile.c_numbers import literal
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from stlc.compile.c_steps import Plan
     from stlc.compile.emit_c import Motion
     from stlc.compile.pipeline import Rule
+    from stlc.compile.timers import Timer
     from stlc.controller.policy import PlanNetwork
     from stlc.controller.task import Task
 
@@ -74,6 +75,7 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
         "NAME": c_comment(task.system.name),
         "SPEC": c_comment(task.compiled.name),
         "STATES": len(task.names),
+        **_added(task),
         "NAMES": ", ".join(map(c_string, task.names)),
         "INPUTS": ", ".join(c_string(control.name) for control in controls),
         "CONTROLS": len(controls),
@@ -108,6 +110,40 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
         "OVERALL": _block(_overall(task.rules, task.rules)),
         "SAFE": _block(_overall(task.compiled.safety, task.rules)),
     }
+
+
+def _added(task: Task) -> dict[str, object]:
+    """What the specification adds to states: what it holds, how it begins and how it goes on."""
+    system, first = task.system, len(task.system.decl.signature.names)
+    tables = [("parameter, the caller's", each.column) for each in system.parameters]
+    tables += [(_holds(timer), timer.column) for timer in system.timers]
+    place = first + len(system.parameters)
+    listed = [f"     {c_comment(column.name)}: {c_comment(text)}" for text, column in tables]
+    return {
+        "MEASURED": first,
+        "PARAMETERS": len(system.parameters),
+        "TIMERS": len(system.timers),
+        "ADDED": "\n".join(listed) or "     nothing",
+        "ABOUT": ", ".join(map(c_string, ["measured"] * first + [text for text, _ in tables])),
+        "BEGIN": _block(
+            [f"x[{place + i}] = {literal(each.initial)};" for i, each in enumerate(system.timers)]
+        ),
+        "ADVANCE": _block(c_numbers.later(task)),
+    }
+
+
+def _holds(timer: Timer) -> str:
+    """What a state holds that the specification adds, in words."""
+    match timer.kind:
+        case "status":
+            about = timer.about.removeprefix("open | true | false").strip()
+            return f"status, 0 open, 1 true, -1 false: {about}"
+        case "latch":
+            return f"1 or 0: {timer.about}"
+        case "clock" | "timer":
+            return timer.about
+        case _:
+            assert_never(timer.kind)
 
 
 def _generators(dims: int) -> str:

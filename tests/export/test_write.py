@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from documents import misfits
-from exported import run_of
+from exported import CART, MISSION, run_of, untrained
 
 from stlc import native
 from stlc.cli.app import main
@@ -82,6 +82,43 @@ def test_the_header_may_be_included_from_cpp(spec: str, system: str, tmp_path: P
         for built in (build(folder), build_in_cpp(folder))
     )
     torch.testing.assert_close(theirs, mine, rtol=0.0, atol=1e-5)
+
+
+def mission_of(folder: Path) -> Run:
+    """A cart that makes promises on its mission clock, looks back, and has a parameter."""
+    (folder / "cart.yaml").write_text(CART)
+    held = "require calm: always[0, T] (v > 1 m/s -> once[0 s, 0.4 s] x < 0.4 m)\n"
+    (folder / "cart.stl").write_text(MISSION + held)
+    return untrained(folder / "cart.stl", folder / "cart.yaml", folder / "runs")
+
+
+@compiled
+@pytest.mark.parametrize("cpp", [False, True])
+def test_the_c_controller_advances_what_a_mission_adds(cpp: bool, tmp_path: Path) -> None:
+    if cpp and shutil.which("c++") is None:
+        pytest.skip("needs a C++ compiler")
+    run = mission_of(tmp_path)
+    system, far = run.task.system, 0.25
+    folder = export(run, "c", tmp_path / "out").folder
+    kinds = {timer.kind for timer in system.timers}
+    assert kinds >= {"clock", "status", "timer"}
+    drive = torch.randn(40, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64) / 2
+    whole = torch.tensor([[*drive[0], far, *(timer.initial for timer in system.timers)]], dtype=torch.float64)
+    lines = []
+    for sample in drive:
+        whole[:, :2] = sample
+        lines.append(whole[0].tolist())
+        whole = torch.cat((whole[:, :2], system.added_later(whole)), 1)
+    built = build_in_cpp(folder) if cpp else build(folder)
+    wanted = answers([str(built)], lines)
+    assert answers([str(built), "mission", str(far)], drive.tolist()) == wanted
+    assert (
+        len({line[len(system.decl.signature.names) + 1] for line in map(tuple, lines)}) > 10
+    )  # the clock runs
+    text = (folder / "stlc_controller.h").read_text()
+    assert "clock: counts the samples of the mission" in text
+    assert "status, 0 open, 1 true, -1 false: " in text
+    assert "STLC_MEASURED = 2," in text
 
 
 @compiled
