@@ -125,6 +125,45 @@ missions: st.SearchStrategy[typed.Formula] = st.recursive(
 """Requirements that may hold absolute operators under any Boolean structure."""
 
 
+@st.composite
+def _ahead(draw: st.DrawFn, depth: int) -> typed.Formula:
+    """Formulas that look ahead by windows with an end, and what stands beside them."""
+    if depth == 0:
+        return draw(_predicates | _predicates | bodies)
+    part = lambda: draw(_ahead(draw(st.integers(0, depth - 1))))  # noqa: E731
+    spans = _intervals(latest=3, now=True) | _intervals(latest=5)
+    match draw(st.sampled_from(["unary", "unary", "unary", "binary", "logic", "logic", "next"])):
+        case "unary":
+            return typed.Temporal(SPAN, draw(st.sampled_from(["always", "eventually"])), draw(spans), part())
+        case "binary":
+            op = draw(st.sampled_from(["until", "release", "unless"]))
+            return typed.Until(SPAN, op, draw(spans), part(), part())
+        case "next":
+            return typed.Shift(SPAN, 1, part())
+        case _:
+            return draw(_boolean(st.builds(part)))
+
+
+@st.composite
+def _over_the_future(draw: st.DrawFn) -> typed.Formula:
+    """An absolute operator over formulas that look ahead."""
+    inner = _ahead(draw(st.integers(1, 3)))
+    interval = draw(_intervals(latest=8, clock=draw(st.sampled_from(["start", "start", "now"]))))
+    if not draw(st.integers(0, 5)):
+        interval = draw(_intervals(latest=8, clock="start", endless=True))
+        return typed.Temporal(SPAN, "always", interval, draw(inner))
+    if draw(st.integers(0, 3)):
+        return typed.Temporal(SPAN, draw(st.sampled_from(["always", "eventually"])), interval, draw(inner))
+    op = draw(st.sampled_from(["until", "release", "unless"]))
+    return typed.Until(SPAN, op, interval, draw(inner), draw(inner))
+
+
+nested: st.SearchStrategy[typed.Formula] = st.recursive(
+    _over_the_future() | _over_the_future() | _goals(), _boolean, max_leaves=3
+)
+"""The same over formulas that look ahead."""
+
+
 def requirement(formula: typed.Formula) -> typed.Requirement:
     """A requirement `r`."""
     written = parse_expr(Source("random", "true"))

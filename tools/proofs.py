@@ -37,7 +37,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import laws
 from emitted import choosing, near_switches, slopes_agree
 from formula_strategies import formulas, traces
-from mission_strategies import bodies, missions
+from mission_strategies import bodies, missions, nested
 from proof import blamed, monitored, slopes, streamed
 from proof import missions as states
 from proof.cases import Case
@@ -177,6 +177,7 @@ PROOFS: dict[str, Callable[[Block], tuple[int, list[str]]]] = {
     "causes-streamed": partial(one_by_one, blamed.check_told_by_stream),
     "missions": partial(by_hypothesis, states.check_mission, {"formula": missions, "seed": _SEEDS}),
     "past": partial(by_hypothesis, states.check_past, {"formula": bodies, "seed": _SEEDS}),
+    "nested": partial(by_hypothesis, states.check_nested, {"formula": nested, "seed": _SEEDS}),
     "past-margins": partial(by_hypothesis, states.check_margins, {"formula": bodies, "seed": _SEEDS}),
     "recorded": partial(by_hypothesis, states.check_recorded, {"formula": missions, "seed": _SEEDS}),
     "laws": partial(by_hypothesis, _law, _LAW),

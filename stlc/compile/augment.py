@@ -11,6 +11,7 @@ from stlc.compile.interface import Grid
 from stlc.compile.lift import lifted
 from stlc.compile.lower import lower
 from stlc.compile.mission import Absolute, Branch, Goal, Leaf, Op, last_step, obligation, possible, update
+from stlc.compile.nested import TooFarError, unnested
 from stlc.compile.past import Past
 from stlc.compile.simplify import simplify
 from stlc.compile.timers import Ledger, Timer, tolerant
@@ -51,7 +52,12 @@ def augment(requirement: typed.Requirement, grid: Grid, ledger: Ledger, sink: li
     if grid.horizon is None:
         report(sink, _without_horizon(formula.span))
         return Augmented(always, always, None)
-    plain = past.rewrite(lifted(normal(formula), sink))
+    try:
+        flat = unnested(lifted(normal(formula), sink), grid, ledger, sink)
+    except TooFarError as problem:
+        report(sink, _looks_ahead(problem.span, str(problem)))
+        return Augmented(always, always, None)
+    plain = past.rewrite(flat)
     goal = _Goals(grid, ledger, sink, requirement.name).of(plain)
     return Augmented(obligation(goal, grid.horizon), possible(goal), goal)
 
@@ -122,14 +128,14 @@ def _about(formula: Absolute) -> str:
     return f"open | true | false  {latched}, samples {window.lo}..{end} of the mission"
 
 
-def _looks_ahead(span: Span) -> Diagnostic:
+def _looks_ahead(span: Span, why: str = "not about one instant of the mission") -> Diagnostic:
     return Diagnostic(
         "E310",
-        "the body of an absolute operator looks ahead",
+        "an absolute operator over more of the future than states can hold",
         span,
-        "not about one instant of the mission",
+        why,
         help=(
-            "use a formula of the present or the past here: `once[0, 3 s] p` is one",
+            "end the windows inside, and make those shorter that do not begin now",
             "`stlc check` judges this one as it is",
         ),
     )

@@ -141,7 +141,7 @@ def _remainder(leaf: Leaf, formula: Absolute, horizon: int) -> typed.Formula:
     span, left, right = formula.span, formula.left, formula.right
     known = guard(leaf.status, _KNOWN, span)
     alive = possible(leaf)
-    inside = _typed_inside(formula.window, leaf.clock, span)
+    inside = typed_inside(formula.window, leaf.clock, span)
     asked = typed.Logic(span, "->", (inside, right))
     met = typed.Logic(span, "and", (inside, right))
     far = _beyond(formula, leaf.clock, horizon)
@@ -176,7 +176,8 @@ def possible(goal: Goal) -> typed.Formula:
             assert_never(goal)
 
 
-def _typed_inside(window: ir.Window, clock: ir.Col, span: Span) -> typed.Formula:
+def typed_inside(window: ir.Window, clock: ir.Col, span: Span) -> typed.Formula:
+    """Whether the sample at hand is in a window of the mission."""
     begun = guard(clock, ir.Lit(float(window.lo)), span)
     if window.hi is None:
         return begun

@@ -19,10 +19,24 @@ from stlc.compile.bounds import report, to_window
 from stlc.compile.interface import Grid
 from stlc.compile.lower import lower
 from stlc.compile.simplify import simplify
-from stlc.compile.timers import Kind, Ledger, Timer, choose, denied, guard, recalled, tolerant
+from stlc.compile.timers import (
+    MISSING,
+    Kind,
+    Ledger,
+    Timer,
+    at_least,
+    choose,
+    denied,
+    guard,
+    recalled,
+    tolerant,
+)
 from stlc.compile.walk import Sign, at_hand, flip, is_state_formula, looks_back, normal
 from stlc.diagnostics import Diagnostic
 from stlc.source import Span
+
+REGISTER = 64
+"""Samples ago up to which states hold what a formula said then, one a sample."""
 
 _ZERO, _ONE = ir.Lit(0.0), ir.Lit(1.0)
 _Op: TypeAlias = Literal["and", "or"]
@@ -114,9 +128,13 @@ class Past:
     def _window(self, node: typed.Temporal) -> typed.Formula:
         once = node.op == "once"
         body = self._body(node.body)
-        window = self._ending_now(node, outward=not once)
-        if body is None or window is None:
+        if body is None:
             return typed.Truth(node.span, True)
+        window = to_window(node.interval, self.grid, self.sink, outward=not once)
+        if window.lo:
+            recent = ir.Window(0, None if window.hi is None else window.hi - window.lo)
+            inner = self._window(replace(node, interval=_back(recent, node.span)))
+            return self._delayed(node, inner, (window.lo, not once))
         if window.hi == 0:
             return body
         memory = self._seen(node, body, window.hi) if once else self._held(node, body, window.hi)
@@ -158,9 +176,13 @@ class Past:
         """`p since[0, c] q`: p now, and q now or so lately that p has held from there on; or its dual."""
         sign: Sign = 1 if positive else -1
         left, right = self._body(normal(node.left, sign)), self._body(normal(node.right, sign))
-        window = self._ending_now(node, outward=not positive)
-        if left is None or right is None or window is None:
+        if left is None or right is None:
             return typed.Truth(node.span, True)
+        window = to_window(node.interval, self.grid, self.sink, outward=not positive)
+        if window.lo and window.hi is None:
+            return self._lasting(node, left, right, (window.lo, positive))
+        if window.lo and window.hi is not None:
+            return self._since_before(node, window, positive=positive)
         ops: tuple[_Op, _Op] = ("and", "or") if positive else ("or", "and")
         if window.hi == 0:
             return typed.Logic(node.span, ops[0], (left, right))
@@ -207,18 +229,98 @@ class Past:
         body, before = self._body(normal(node.body, now)), self._body(normal(node.body, flip(now)))
         if body is None or before is None:
             return typed.Truth(node.span, True)
-        condition = self._condition(before)
-        about = f"whether {_short(node.body)} {'failed' if now > 0 else 'held'} at the sample before"
-        draft = self._draft("latch", "before", 0.0 if positive else 1.0, 1.0, about)
-        latch = self.ledger.add(draft, lambda _own: choose(condition, _ONE, _ZERO))
         op: _Op = "and" if positive else "or"
-        begun = guard(ir.Col(ir.ELAPSED), _ONE, node.span)
-        first = typed.Logic(node.span, "or", (begun, _Test(latch, _ONE, node.span).lacks().along))
-        inside = typed.Shift(node.span, -1, before, outside=True)
+        return typed.Logic(node.span, op, (body, self._delayed(node, before, (1, not positive))))
+
+    # --------------------------------------------------------------------- some time ago
+
+    def _delayed(
+        self, node: typed.Temporal | typed.Until | typed.Edge, body: typed.Formula, how: tuple[int, bool]
+    ) -> typed.Formula:
+        """What `body` said so many samples ago, in a register; second: what it said before the start."""
+        steps, before = how
+        if steps > REGISTER:
+            return self._refused(node.span, f"that asks what was more than {REGISTER} samples ago")
+        condition = self._condition(body)
+        initial = float(before)
+        known = _short(node.body if not isinstance(node, typed.Until) else node)
+        about = f"whether {known} held at the sample before"
+        draft = self._draft("latch", "before", initial, 1.0, about)
+        latch = self.ledger.add(draft, lambda _own: choose(condition, _ONE, _ZERO))
+        for ago in range(2, steps + 1):
+            about = f"whether {known} held {ago} samples before"
+            draft = self._draft("latch", "before", initial, 1.0, about)
+            latch = self.ledger.add(draft, lambda _own, last=latch: last)  # type: ignore[misc]
+        begun = guard(ir.Col(ir.ELAPSED), ir.Lit(float(steps)), node.span)
+        first = typed.Logic(node.span, "or", (begun, recalled(latch, _ONE, node.span)))
+        inside = typed.Shift(node.span, -steps, body, outside=True)
         return typed.Recalled(
             node.span,
-            now=typed.Logic(node.span, op, (body, guard(latch, _ONE, node.span))),
-            along=typed.Logic(node.span, op, (body, typed.Logic(node.span, "and", (inside, first)))),
+            now=guard(latch, _ONE, node.span),
+            along=typed.Logic(node.span, "and", (inside, first)),
+        )
+
+    def _since_before(self, node: typed.Until, window: ir.Window, *, positive: bool) -> typed.Formula:
+        """`p since[a, b] q`: p for the last a, and a ago `p since[0, b - a] q`; or its dual."""
+        lo, hi = window.lo, window.hi or 0
+        recent = replace(node, interval=_back(ir.Window(0, hi - lo), node.span))
+        ago = self._delayed(node, self._since(recent, positive=positive), (lo, not positive))
+        held = typed.Temporal(
+            node.span,
+            "historically" if positive else "once",
+            _back(ir.Window(0, lo), node.span),
+            normal(node.left, 1 if positive else -1),
+        )
+        return typed.Logic(node.span, "and" if positive else "or", (self._window(held), ago))
+
+    def _lasting(
+        self, node: typed.Until, left: typed.Formula, right: typed.Formula, how: tuple[int, bool]
+    ) -> typed.Formula:
+        """`p since[a, end] q`: how long ago the first q was from which on p has held; or its dual."""
+        least, positive = how
+        p, q = self._condition(left), self._condition(right)
+        held, met = (p, q) if positive else (denied(p), denied(q))
+        from_there = f"{_short(node.right)} with {_short(node.left)} from there on"
+        about = f"steps since the first {from_there}, up to {least}"
+        draft = self._draft("timer", "lasting", 0.0, float(least), about)
+
+        def update(own: ir.Col) -> ir.Num:
+            running = ir.Where(at_least(own, _ONE), _counted(own, least), choose(met, _ONE, _ZERO))
+            return choose(held, running, _ZERO)
+
+        age = self.ledger.add(draft, update)
+        span, bound = node.span, ir.Lit(float(least))
+        first, elapsed = ir.at_first(age), ir.Col(ir.ELAPSED)
+        after = ir.Op("add", (first, elapsed))
+        whole = _back(ir.Window(0, None), span)
+        inside = _since_inside(node, left, right, ir.Window(least, None), positive=positive)
+        if not positive:
+            none = typed.Logic(
+                span,
+                "or",
+                (
+                    typed.Temporal(span, "once", whole, left),
+                    guard(_ZERO, first, span),
+                    guard(ir.Lit(least - 1.0), after, span),
+                ),
+            )
+            now = typed.Logic(span, "or", (left, guard(ir.Lit(least - 1.0), age, span)))
+            return typed.Recalled(span, now=now, along=typed.Logic(span, "and", (inside, none)))
+        memory = typed.Logic(
+            span,
+            "and",
+            (
+                typed.Temporal(span, "historically", whole, left),
+                guard(first, _ONE, span),
+                guard(after, bound, span),
+            ),
+        )
+        missing = ir.Op("min", (ir.Op("sub", (elapsed, bound)), ir.Lit(-1.0)))
+        lacks = typed.Pred(span, ir.Op("mul", (missing, ir.Lit(MISSING))), strict=False)
+        return typed.Recalled(
+            span,
+            now=typed.Logic(span, "and", (left, guard(age, bound, span))),
+            along=typed.Logic(span, "or", (inside, memory, lacks)),
         )
 
     # -------------------------------------------------------------------------- in common
@@ -237,13 +339,6 @@ class Past:
         self._refused(body.span, "over a formula that looks ahead")
         return None
 
-    def _ending_now(self, node: typed.Temporal | typed.Until, *, outward: bool) -> ir.Window | None:
-        window = to_window(node.interval, self.grid, self.sink, outward=outward)
-        if window.lo == 0:
-            return window
-        self._refused(node.span, "with a window that does not end now")
-        return None
-
     def _refused(self, span: Span, why: str) -> typed.Formula:
         finding = Diagnostic(
             "E309",
@@ -251,7 +346,7 @@ class Past:
             span,
             f"a past operator {why}",
             help=(
-                "windows that end now train: `once[0, 3 s] p` becomes a timer",
+                f"windows that end now, or up to {REGISTER} samples ago, train: `once[0, 3 s] p` is a timer",
                 "`stlc check` can judge this one on recorded traces",
             ),
         )

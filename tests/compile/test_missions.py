@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mission_strategies import bodies, missions
-from proof.missions import check_margins, check_mission, check_past, check_recorded
+from mission_strategies import bodies, missions, nested
+from proof.missions import check_margins, check_mission, check_nested, check_past, check_recorded
 
 from stlc.compile import typed
 
@@ -26,6 +26,19 @@ def test_every_plan_satisfies_the_rewriting_iff_the_trace_satisfies_the_mission(
 @given(missions, seeds)
 def test_the_same_ten_thousand_times(formula: typed.Formula, seed: int) -> None:
     check_mission(formula, seed)
+
+
+@settings(max_examples=60)
+@given(nested, seeds)
+def test_what_looks_ahead_on_the_mission_clock_says_the_same(formula: typed.Formula, seed: int) -> None:
+    check_nested(formula, seed)
+
+
+@pytest.mark.slow
+@settings(max_examples=2_000)
+@given(nested, seeds)
+def test_the_same_of_two_thousand_that_look_ahead(formula: typed.Formula, seed: int) -> None:
+    check_nested(formula, seed)
 
 
 @settings(max_examples=100)

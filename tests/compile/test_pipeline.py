@@ -129,13 +129,15 @@ def test_a_clock_decides_truth_and_never_limits_the_margin() -> None:
 @pytest.mark.parametrize(
     ("text", "train"),
     [
-        ("always@[0, 1 s] eventually[0, 1 s] x > 1 m", ["E310"]),
+        ("always@[0, 1 s] eventually[0, end] x > 1 m", ["E310"]),
+        ("eventually@[0, 1 s] (y > 1 m and always[7 s, 8 s] x > 1 m)", ["E310"]),
+        ("eventually@[0, 1 s] freeze a = x in always[0, 1 s] x > a", ["E310"]),
         ("eventually@[0, end] x > 1 m", ["E312"]),
         ("not always@[1 s, end] x > 1 m", ["E312"]),
         ("once[1 s, 2 s] always@[0, 1 s] x > 1 m", ["E307"]),
         ("rise(always@[0, 1 s] x > 1 m)", ["E307"]),
         ("always[0, 1 s] (x > 1 m or (y > 1 m and always@[0, 1 s] x > 1 m))", ["E307"]),
-        ("always@[0, 1 s] once[1 s, 2 s] x > 1 m", ["E309"]),
+        ("always@[0, 1 s] once[7 s, 8 s] x > 1 m", ["E309"]),
         ("always[0, 1 s] once[0, 1 s] eventually[0, 1 s] x > 1 m", ["E309"]),
     ],
 )
@@ -169,11 +171,20 @@ REWRITTEN = {
     "always[0, T] (x > 1 m -> once[0, 1 s] y > 1 m)": (
         "always[0..25] (x <= 1 or once[0..10] y > 1 or first(a_since) + elapsed <= 10)"
     ),
+    "eventually@[0, 4 s] always[0, 1 s] x > 1 m": (
+        "a >= 0.5 or (a >= -0.5 and ((clock <= 24 and always[0..25] (clock <= 39 or x > 1)) or ((clock <= 39"
+        " or x > 1) until[0..25] (clock >= 10 and clock <= 50 and historically[0..10] x > 1"
+        " and first(a_held) + elapsed >= 10))))"
+    ),
+    "always@[0, 4 s] eventually[0, 1 s] x > 1 m": (
+        "a >= -0.5 and always[0..25] (clock < 10 or clock > 50 or once[0..10] x > 1"
+        " or first(a_since) + elapsed <= 10)"
+    ),
     "always[0, T] historically[0, 1 s] y > 1 m": (
         "always[0..25] (historically[0..10] y > 1 and first(a_held) + elapsed >= 10)"
     ),
     "always[0, T] rise(y > 1 m)": (
-        "always[0..25] (y > 1 and prev(y <= 1) and (elapsed >= 1 or first(a_before) >= 1))"
+        "always[0..25] (y > 1 and prev(y <= 1) and (elapsed >= 1 or a_before >= 1))"
     ),
     "always[0, T] (x > 1 m since y > 1 m)": (
         "always[0..25] ((x > 1 since[0..start] y > 1)"

@@ -21,7 +21,7 @@ from stlc.compile.ops_numpy import NUMPY
 from stlc.compile.semantics import TOLERANCE
 from stlc.compile.simplify import simplify
 from stlc.compile.timers import Ledger
-from stlc.compile.walk import absolute
+from stlc.compile.walk import absolute, nodes
 from stlc.diagnostics import Diagnostic
 
 BATCH = 4
@@ -67,6 +67,61 @@ def check_mission(formula: typed.Formula, seed: int) -> None:
     planned = _planned(formula, columns)
     np.testing.assert_array_equal(planned.all(0), _defined(formula, columns))
     assert (np.diff(planned.astype(int), axis=0) <= 0).all(), "what is falsified stays falsified"
+
+
+LONG = 110
+"""Samples that are longer than any nested formula looks."""
+LOOK = 45
+"""Samples after which what was falsified is known to be."""
+
+
+def _endless(formula: typed.Formula) -> bool:
+    return any(
+        isinstance(node, (typed.Temporal, typed.Until))
+        and node.op not in ("once", "historically", "since")
+        and node.interval.hi is None
+        for node in nodes(formula)
+    )
+
+
+def check_nested(formula: typed.Formula, seed: int) -> bool:
+    """The same of absolute operators over formulas that look ahead; False where no state holds them."""
+    columns = walks(seed, BATCH, LONG)
+    sink: list[Diagnostic] = []
+    ledger = Ledger(frozenset(columns))
+    beside = typed.Temporal(
+        SPAN, "always", typed.Interval(typed.Time(), typed.Time(), clock="start"), typed.Truth(SPAN, True)
+    )
+    whole = typed.Logic(SPAN, "and", (formula, beside))  # so that it is judged at the start
+    found = augment(requirement(whole), GRID, ledger, sink)
+    errors = {finding.code for finding in sink if finding.severity == "error"}
+    assert errors <= {"E307", "E309", "E310", "E312"}, errors
+    if errors:
+        return False
+    compiled = simplify(lower(found.formula, GRID, sink))
+    env = augmented(ledger.timers, columns)
+    starts = LONG - HORIZON
+    plans = {
+        name: np.stack([column[k : k + HORIZON + 1] for k in range(starts)], 1)
+        for name, column in env.items()
+    }
+    flat = {name: plan.reshape(HORIZON + 1, -1) for name, plan in plans.items()}
+    (margins,) = evaluate([compiled], flat, ops=NUMPY)
+    planned = np.broadcast_to(margins, (1, starts * BATCH)).reshape(starts, BATCH) >= -TOLERANCE
+    assert (np.diff(planned.astype(int), axis=0) <= 0).all(), "what is falsified stays falsified"
+    satisfied = planned.all(0)
+    if not _endless(formula):
+        np.testing.assert_array_equal(satisfied, _defined(formula, columns))
+        return True
+    # What never ends is falsified some time: not before it is for certain, and hardly later.
+    earlier = {name: column[: LONG - LOOK] for name, column in columns.items()}
+    long_lost, lost = (
+        np.array([high < -TOLERANCE for _, high in _bounds(formula, seen, "open")])
+        for seen in (earlier, columns)
+    )
+    assert (lost | satisfied).all()
+    assert (~satisfied | ~long_lost).all()
+    return True
 
 
 def check_past(formula: typed.Formula, seed: int) -> None:
