@@ -121,6 +121,8 @@ def _about(formula: Absolute) -> str:
     """`open | true | false`, and when it is latched."""
     left, right = (f"`{' '.join(body.span.text.split())}`" for body in (formula.left, formula.right))
     window = formula.window
+    if formula.right.span == formula.left.span:  # written otherwise
+        return f"open | true | false  what is known of {right}"
     if window == ir.Window(0, 0):
         return f"open | true | false  {right} at the start of the mission"
     end = "end" if window.hi is None else window.hi
