@@ -122,6 +122,9 @@ def _symbols() -> Mapping[str, Unit]:
         ("Wh", (2, 1, -2, 0, 0), 3600),
         ("kWh", (2, 1, -2, 0, 0), 3_600_000),
         ("l", (3, 0, 0, 0, 0), "1/1000"),
+        ("ft", (1, 0, 0, 0, 0), "381/1250"),
+        ("mph", (1, 0, -1, 0, 0), "1397/3125"),
+        ("lb", (0, 1, 0, 0, 0), "45359237/100000000"),
         ("deg", _NONE, pi / 180),
         ("°", _NONE, pi / 180),
         ("rpm", (0, 0, -1, 0, 0), pi / 30),
@@ -155,6 +158,11 @@ def parse_unit(text: str) -> Unit:
         dims = _dims(a + b * power for a, b in zip(dims, unit.dims, strict=True))
         ratio *= unit.ratio**power
     return Unit(dims, ratio, cleaned)
+
+
+def written_unit(text: str) -> Unit:
+    """The unit of a text that may be empty. Raises ValueError as `parse_unit`."""
+    return parse_unit(text) if text else DIMENSIONLESS
 
 
 def nearest(value: Fraction | float) -> float:

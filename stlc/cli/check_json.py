@@ -65,6 +65,7 @@ def _requirement(judged: Judgement, result: Checked) -> dict[str, Any]:
             "mean": _mean(least),
             "low": _least(low),
             "high": _least(high),
+            "unit": judged.unit or ("" if cause is None else cause.unit),
             "argmin": {"trace": trace, "start": time, "time": time if cause is None else cause.time},
         },
         "starts": judged.instants,
@@ -91,7 +92,9 @@ def cause_entry(cause: Cause) -> dict[str, Any]:
         "signal": None if first is None else first.signal,
         "value": None if first is None else first.value,
         "predicate": cause.predicate,
-        "readings": [{"signal": r.signal, "value": r.value, "text": r.text} for r in cause.readings],
+        "readings": [
+            {"signal": r.signal, "value": r.value, "unit": r.unit, "text": r.text} for r in cause.readings
+        ],
         "trace": cause.trace,
         "start": cause.start,
         "sample": cause.sample,

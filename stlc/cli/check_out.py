@@ -23,6 +23,7 @@ def write_robustness(path: Path, result: Checked, question: Question) -> None:
     from stlc.cli.judge import monitor_of
     from stlc.signature import Column, Signature
     from stlc.trace import Trace, save_trace
+    from stlc.units import written_unit
 
     trace = result.trace
     monitor = monitor_of(result.source, question, result.trace.meta.carried)
@@ -34,7 +35,8 @@ def write_robustness(path: Path, result: Checked, question: Question) -> None:
         for name, rows in values.items()
         if name in chosen
     }
-    signature = Signature(tuple(map(Column, data)))
+    units = {judged.name: written_unit(judged.unit) for judged in result.verdict}
+    signature = Signature(tuple(Column(name, units[name]) for name in data))
     path.parent.mkdir(parents=True, exist_ok=True)
     meta = replace(trace.meta, spec_text="", spec_path="", judge_text="", judge_path="")
     save_trace(path, Trace(signature, trace.dt, data, trace.t0, meta=meta, name=str(path)))

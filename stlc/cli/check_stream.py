@@ -11,6 +11,7 @@ import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from stlc.cli.check_text import in_unit, signed
 from stlc.cli.judge import Question, instant_of, laid_reading, monitor_of, usage
 from stlc.cli.outcome import WORDS, Outcome
 from stlc.cli.output import emit, wants_color
@@ -107,7 +108,8 @@ def _tell(decision: Decision, online: Online) -> None:
     if decision.status == "satisfied" and repeated:
         return
     low, high = decision.low, decision.high
-    value = f"{low:+.3f}" if low == high else f"[{low:+.3f}, {high:+.3f}]"
+    bounds = signed(low) if low == high else f"[{signed(low)}, {signed(high)}]"
+    value = in_unit(bounds, online.rule(decision.requirement).unit)
     judged = f", judged from t = {decision.time:.10g} s" if repeated else ""
     now = online.time(decision.sample)
     emit(f"t = {now:.10g} s  {visible(decision.requirement)}  {WORDS[decision.status]}  {value}{judged}")

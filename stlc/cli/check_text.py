@@ -69,17 +69,24 @@ def _table(result: Checked) -> str:
 
 def _row(judged: Judgement, result: Checked) -> tuple[str, ...]:
     share = "" if judged.holds.size == 1 else percent(judged.share)
-    return (judged.name, WORDS[judged.overall], _robustness(judged), share, _where(judged, result))
+    return (judged.name, WORDS[judged.overall], _robustness(judged, result), share, _where(judged, result))
 
 
-def _robustness(judged: Judgement) -> str:
+def _robustness(judged: Judgement, result: Checked) -> str:
+    cause = result.causes.get(judged.name)
+    unit = judged.unit or ("" if cause is None else cause.unit)
     low, high = (float(judged.counted(end).min(initial=np.inf)) for end in judged.margins)
     if not judged.counted(judged.holds).size:
         return ""
     if judged.overall == "inconclusive":
-        return f"[{signed(low)}, {signed(high)}]"
+        return in_unit(f"[{signed(low)}, {signed(high)}]", unit)
     value = float(judged.counted(judged.least).min())
-    return "boundary" if abs(value) <= TOLERANCE else signed(value)
+    return "boundary" if abs(value) <= TOLERANCE else in_unit(signed(value), unit)
+
+
+def in_unit(value: str, unit: str) -> str:
+    """A robustness with its unit, where it has one: `+1.500 m`."""
+    return f"{value} {visible(unit)}".rstrip()
 
 
 def signed(value: float) -> str:
@@ -113,7 +120,13 @@ def _where(judged: Judgement, result: Checked) -> str:
 def rows_of(result: Checked) -> tuple[Row, ...]:
     """The table as data, with a reason for what is not satisfied."""
     return tuple(
-        Row(judged.name, judged.overall, _robustness(judged), _where(judged, result), _why(judged, result))
+        Row(
+            judged.name,
+            judged.overall,
+            _robustness(judged, result),
+            _where(judged, result),
+            _why(judged, result),
+        )
         for judged in result.verdict
     )
 

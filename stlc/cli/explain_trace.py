@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from stlc.cli.check_text import in_unit
 from stlc.cli.output import emit, emit_json, wants_color
+from stlc.compile.walk import margin_unit
 from stlc.escape import visible
 
 if TYPE_CHECKING:
@@ -51,7 +53,8 @@ def _lines(cause: Cause, result: Checked) -> Iterator[str]:
     judged = cause.judgement
     of = f" in trace {cause.trace}" if result.verdict.traces > 1 else ""
     started = result.verdict.subject.moment(cause.start)
-    yield f"{visible(judged.name)} is violated{of}, judged from {started}: robustness {cause.tree.rho:+.6g}"
+    margin = in_unit(f"{cause.tree.rho:+.6g}", judged.unit or cause.unit)
+    yield f"{visible(judged.name)} is violated{of}, judged from {started}: robustness {margin}"
     advice = [("because", cause.because)]
     yield render_place(cause.place, cause.labels, advice, color=wants_color(sys.stdout)).rstrip("\n")
     yield ""
@@ -80,7 +83,8 @@ def _line(node: Blame, cause: Cause, result: Checked) -> str:
         when = f"from {when} to {subject.moment(node.until)}".replace("to t = ", "to ")
     values = _readings(node, cause, result)
     said = f", {', '.join(values)}" if values else ""
-    return f"{short}    is {str(node.holds).lower()} at {when}{said}, robustness {node.rho:+.6g}"
+    margin = in_unit(f"{node.rho:+.6g}", margin_unit(node.formula))
+    return f"{short}    is {str(node.holds).lower()} at {when}{said}, robustness {margin}"
 
 
 def _readings(node: Blame, cause: Cause, result: Checked) -> Sequence[str]:
@@ -109,6 +113,7 @@ def _values(cause: Cause, result: Checked) -> dict[str, Any]:
             "holds": node.holds,
             "time": subject.time(node.sample),
             "robustness": node.rho,
+            "unit": margin_unit(node.formula),
             "readings": _readings(node, cause, result),
         }
         for depth, node in _walk(cause.tree)

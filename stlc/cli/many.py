@@ -158,8 +158,8 @@ def _worst(rows: Sequence[Row]) -> Row:
 
 def _number(text: str) -> float:
     try:
-        return float(text.strip("[").split(",")[0])
-    except ValueError:
+        return float(text.strip("[").split(",")[0].split()[0])
+    except (ValueError, IndexError):
         return 0.0
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from stlc.cli.check_json import cause_entry, gap_entry
-from stlc.cli.check_text import percent, signed
+from stlc.cli.check_text import in_unit, percent, signed
 from stlc.cli.outcome import WORDS, Outcome, Row
 from stlc.cli.output import table
 from stlc.cli.render import render_place
@@ -81,28 +81,31 @@ def status_of(online: Online, tallies: Mapping[str, Tally]) -> Status:
     return "violated" if "violated" in found else "satisfied" if found == {"satisfied"} else "inconclusive"
 
 
-def robustness_text(tally: Tally) -> str:
+def robustness_text(tally: Tally, unit: str) -> str:
     """The least robustness, or its bounds."""
     if tally.status == "inconclusive":
-        return f"[{signed(tally.low)}, {signed(tally.high)}]"
-    return "boundary" if abs(tally.robustness) <= TOLERANCE else signed(tally.robustness)
+        return in_unit(f"[{signed(tally.low)}, {signed(tally.high)}]", unit)
+    near = abs(tally.robustness) <= TOLERANCE
+    return "boundary" if near else in_unit(signed(tally.robustness), unit)
 
 
 def _row(name: str, tally: Tally, online: Online, cause: Cause | None) -> Row:
     where = f"from t = {online.time(tally.worst):.10g} s" if tally.instants > 1 else ""
+    unit = online.rule(name).unit or ("" if cause is None else cause.unit)
+    value = robustness_text(tally, unit)
     if cause is not None:
         start = online.time(tally.worst) if tally.instants > 1 else cause.time
         where = beside(f"t = {cause.time:.10g} s", f"t = {start:.10g} s")
-        return Row(name, tally.status, robustness_text(tally), where, cause.because)
+        return Row(name, tally.status, value, where, cause.because)
     if tally.status == "satisfied":
-        return Row(name, tally.status, robustness_text(tally), where)
+        return Row(name, tally.status, value, where)
     if tally.status == "violated":
         why = f"violated at {tally.fails:,} of {tally.instants:,} starts"
     else:
         read = columns(online.rule(name).formula)
         gaps = [text for signal, text in _gap_texts(online).items() if signal in read]
         why = ", ".join(gaps) or "the trace is too short to say"
-    return Row(name, tally.status, robustness_text(tally), where, why)
+    return Row(name, tally.status, value, where, why)
 
 
 def _gap_texts(online: Online) -> dict[str, str]:
@@ -193,6 +196,7 @@ def _requirement(name: str, tally: Tally, online: Online, cause: Cause | None) -
             "mean": tally.robustness,
             "low": tally.low,
             "high": tally.high,
+            "unit": rule.unit or ("" if cause is None else cause.unit),
             "argmin": {"trace": 0, "start": time, "time": time if cause is None else cause.time},
         },
         "starts": tally.instants,

@@ -27,6 +27,7 @@ from stlc.compile.values import Label as Member
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.source import Span
+from stlc.units import Unit
 
 
 def comparison(expr: ast.Compare, values: Sequence[Value], scope: Scope) -> typed.Formula:
@@ -85,13 +86,21 @@ def _above(big: Number, small: Number, strict: bool, span: Span, scope: Scope) -
     Whole numbers differ by one step or not at all: halfway, no rounding and no tie decides, and the margin is
     that of `==`.
     """
+    written = _compared(big, small)
     if (big.kind, small.kind) == ("int", "int"):
         big = apply("sub" if strict else "add", (big, half(span)), span, scope)
-    return _pred(span, apply("sub", (big, small), span, scope), strict=strict)
+    return _pred(span, apply("sub", (big, small), span, scope), strict=strict, written=written)
 
 
-def _pred(span: Span, margin: Number, *, strict: bool = False) -> typed.Pred:
-    return typed.Pred(span, margin.num, strict, unit=margin.unit.si)
+def _pred(span: Span, margin: Number, *, strict: bool = False, written: Unit | None = None) -> typed.Pred:
+    unit = margin.unit if written is None else written
+    return typed.Pred(span, margin.num, strict, unit=unit.si, written=unit)
+
+
+def _compared(*sides: Number) -> Unit:
+    """The unit of what is compared: that of what varies, which constants are measured against."""
+    told = [side for side in sides if side.unit.text] or list(sides)
+    return next((side.unit for side in told if side.constant is None), told[0].unit)
 
 
 def _refuse_vectors(

@@ -24,6 +24,7 @@ from stlc.compile.horizon import columns, reach, uses_end
 from stlc.compile.interface import Grid, Interface
 from stlc.compile.lift import recorded
 from stlc.compile.lower import lower
+from stlc.compile.margins import as_written
 from stlc.compile.mission import Goal, mission_steps
 from stlc.compile.modulo import jumps
 from stlc.compile.pull import pull
@@ -34,7 +35,7 @@ from stlc.compile.scales import nominal
 from stlc.compile.semantics import Semantics
 from stlc.compile.simplify import simplify
 from stlc.compile.timers import Ledger, Timer
-from stlc.compile.walk import absolute, mentions_horizon
+from stlc.compile.walk import absolute, margin_unit, mentions_horizon
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar import ast
 from stlc.signature import Signature
@@ -84,6 +85,11 @@ class Rule:
     alive: ir.Formula
     span: Span = field(compare=False, repr=False)
     typed: typed.Requirement = field(compare=False, repr=False)
+
+    @property
+    def unit(self) -> str:
+        """Of its robustness; "" where its predicates are not all of one."""
+        return margin_unit(self.typed.formula)
 
     def under(self, semantics: Semantics) -> ir.Formula:
         """The formula with the robustness of `semantics`: shortened by the laws that hold there."""
@@ -158,6 +164,12 @@ def compile_spec(
         given = {item.name for item in spec.items if isinstance(item, ast.Param)} & (overrides or {}).keys()
         interface = _without(interface, given)
     resolved = resolve(spec, interface=interface, overrides=overrides or {}, grid=grid, sink=sink)
+    if purpose == "check":
+        resolved = replace(
+            resolved,
+            requirements=tuple(map(as_written, resolved.requirements)),
+            assumptions=tuple(map(as_written, resolved.assumptions)),
+        )
     ranges = nominal(resolved.signature.columns)
     stage = _Stage(grid, purpose, Ledger(_taken(resolved, interface)), sink, ranges)
     requirements = tuple(map(stage.rule, resolved.requirements))

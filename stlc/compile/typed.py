@@ -56,13 +56,15 @@ class Truth(Node):
 class Pred(Node):
     """`num > 0` (`strict`) or `num >= 0`; a `guard` decides truth and never limits the margin.
 
-    `unit` is that of the margin, in SI.
+    `num` and `unit`, that of the margin, are in SI; `written` is the unit of what is compared. Where recorded
+    traces are judged both are in that (`stlc.compile.margins`).
     """
 
     num: ir.Num
     strict: bool
     guard: bool = False
     unit: Unit = field(default=DIMENSIONLESS, compare=False, repr=False)
+    written: Unit = field(default=DIMENSIONLESS, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)

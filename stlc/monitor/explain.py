@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 
 from stlc.compile import typed
 from stlc.compile.lift import recorded
+from stlc.compile.walk import margin_unit
 from stlc.diagnostics import Label
 from stlc.grammar import ast
 from stlc.monitor.blame import Blame, Blamer
@@ -28,11 +29,13 @@ class Reading:
     Attributes:
         signal: its name.
         value: in its unit.
+        unit: as declared, "" without one.
         text: `x = 0.27 m`, `sign = stop`.
     """
 
     signal: str
     value: float
+    unit: str
     text: str
 
 
@@ -69,6 +72,11 @@ class Cause:
     because: str
     tree: Blame
     alone: bool
+
+    @property
+    def unit(self) -> str:
+        """Of the value that decides."""
+        return margin_unit(self.tree.leaf.formula)
 
 
 MOST = 500
@@ -161,7 +169,7 @@ class _Words:
                 value = float(self.record.env[name][sample, 0])
                 when = f" at {self.subject.moment(sample)}" if later else ""
                 text = f"{name} = {shown(value, read[name])}{when}"
-                seen.setdefault((name, sample), Reading(name, value, text))
+                seen.setdefault((name, sample), Reading(name, value, read[name].unit.text, text))
         return tuple(seen.values())
 
     def labels(self, tree: Blame) -> list[Label]:

@@ -57,6 +57,11 @@ class Judgement:
         return self.rule.name
 
     @property
+    def unit(self) -> str:
+        """Of the robustness: that of what is compared; "" where there are several."""
+        return self.rule.unit
+
+    @property
     def statuses(self) -> list[Status]:
         """One for each trace."""
         inside = np.ones(self.holds.shape[1], dtype=bool) if self.scope is None else self.scope
