@@ -201,6 +201,7 @@ CODES: dict[str, str] = {
     "W502": "a safety requirement that cannot constrain a prefix",
     "W503": "a requirement that is satisfied vacuously",
     "W504": "a specification that requires nothing",
+    "W505": "a conjunction that nothing satisfies",
     # traces
     "E601": "a trace that lacks a signal",
     "E602": "a trace whose time is not uniform",
@@ -246,6 +247,7 @@ CODES: dict[str, str] = {
     "R403": "a process of a training that is gone",
     "R404": "requirements that no plan satisfies",
     "R405": "starts from none of which a plan is known",
+    "W603": "a control without effect",
     "W701": "a cache folder, or a file in it, that others could have changed",
     "W702": "a C compiler that fails or hangs",
     "U101": "a command line that cannot be understood",

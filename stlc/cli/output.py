@@ -134,7 +134,7 @@ def console(*, stderr: bool = False, width: int | None = None) -> Console:
 
 
 def table(rows: Sequence[Sequence[str]], *, header: Sequence[str] = (), indent: str = "  ") -> str:
-    """Columns of text, aligned by width, two blanks apart; a cell that reads as a number stands right."""
+    """Columns of text, aligned by width, two blanks apart; numbers, and margins with a unit, stand right."""
     lines = [tuple(map(visible, row)) for row in ([header, *rows] if header else rows)]
     if not lines:
         return ""
@@ -149,7 +149,8 @@ def table(rows: Sequence[Sequence[str]], *, header: Sequence[str] = (), indent: 
 
 
 def _cell(text: str, width: int) -> str:
-    digits = text.lstrip("+-").replace(",", "").replace(".", "", 1)
+    number, _, unit = text.partition(" ") if text[:1] in ("+", "-") else (text, "", "")
+    digits = "" if " " in unit else number.lstrip("+-").replace(",", "").replace(".", "", 1)
     return text.rjust(width) if digits.isdigit() else text.ljust(width)
 
 

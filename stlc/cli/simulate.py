@@ -328,6 +328,7 @@ def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rule
         "redrawn": last.recording.redrawn,
         "errors": errors_of(run.task.plain.truth),
         "judge": None if rules is None else {"spec": rules.name, "path": rules.path, "rules": rules.docs},
+        "safety": [rule.name for rule in run.task.compiled.safety],
         "trace": f"{run.dir.shown}/trace.npz",
         "overrides": dict(order.overrides),
     }

@@ -42,6 +42,13 @@ ROWS = {
 }
 
 
+SAFETY = (
+    *("plan_safety", "executed_safe", "saved", "executed_safe_starts", "foreseen_safe_starts"),
+    "savable",
+)
+"""Of these, what says nothing where no requirement is tagged `@safety`."""
+
+
 def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
     """The measured figures, as a person reads them: the drives first; with `windows` plans and starts, too.
 
@@ -64,15 +71,16 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
     yield ""
     yield from _drives(document)
     header = ("", *(TITLES[name] for name in guards))
-    shares = _shares(guards) if windows else ()
+    shares = _shares(guards, safe=bool(document.get("safety", True))) if windows else ()
     yield table([*_rules(document), *shares, *_progress(guards), *_times(guards)], header=header)
     for name, guard in guards.items():
         if name != "none":
             yield f"  guard acted in {_acted(guard['decisions'])}"
     last = list(guards.values())[-1]
     yield from _broken(last["drives"])
-    if windows:
+    if windows and document.get("safety", True):
         yield f"  {_unsafe(last['unsafe'], seeds * agents)}"
+    if windows:
         yield from _foreseen(last["metrics"].get("foreseen"))
     if document.get("scenarios"):
         yield from compared(document)
@@ -182,8 +190,11 @@ def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: s
     yield f"  next       {shell(('stlc', 'check', judged, *needed))}"
 
 
-def _shares(guards: Record) -> Iterator[tuple[str, ...]]:
+def _shares(guards: Record, *, safe: bool) -> Iterator[tuple[str, ...]]:
+    """Shares of plans and starts; those of safety where any requirement is tagged `@safety`."""
     for label, name in ROWS.items():
+        if not safe and name in SAFETY:
+            continue
         found = [guard["metrics"].get(name) for guard in guards.values()]
         if any(found):
             yield (label, *("" if metric is None else _number(metric, "", 3) for metric in found))

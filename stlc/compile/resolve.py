@@ -15,6 +15,7 @@ from pathlib import PurePath
 from typing import TypeVar
 
 from stlc.compile import ir, typed
+from stlc.compile.contradiction import contradictions
 from stlc.compile.declare import Declared
 from stlc.compile.expressions import evaluate
 from stlc.compile.formulas import resolve_formula
@@ -252,8 +253,8 @@ def _scale(tags: Tags, formula: typed.Formula, ranges: Facts, scope: Scope) -> f
 def _warnings(
     requirement: typed.Requirement, item: ast.Require, signature: Signature, scope: Scope
 ) -> list[Diagnostic]:
-    """W502 and W503."""
+    """W502, W503 and W505."""
     tag = next((tag for tag in item.tags if tag.name == "safety"), None)
-    found = list(vacuous(requirement.formula, signature, scope.facts))
+    found = [*vacuous(requirement.formula, signature, scope.facts), *contradictions(requirement.formula)]
     weak = toothless(requirement, tag)
     return found if weak is None else [*found, weak]

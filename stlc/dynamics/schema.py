@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping as MappingType
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TypeAlias
 
+from stlc.compile.horizon import columns as columns_of_formula
+from stlc.compile.samples import columns_of
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.decl import SystemDecl
-from stlc.dynamics.decl_model import Assign, FunctionDecl
+from stlc.dynamics.decl_model import Assign, FunctionDecl, JumpDecl
 from stlc.dynamics.schema_columns import name_columns, read_controls, read_states
 from stlc.dynamics.schema_deploy import read_test
 from stlc.dynamics.schema_extends import extended
@@ -21,6 +24,7 @@ from stlc.dynamics.schema_init import read_init
 from stlc.dynamics.schema_names import (
     Clockwork,
     Names,
+    base_name,
     empty,
     later,
     read_constants,
@@ -137,6 +141,8 @@ def _declaration(
     names, clock, states, params, functions = _named(found, reader)
     timer_flow, timer_jumps = read_timers(states, reader, names, clock)
     flow = read_flow(found.get("flow"), reader, names, clock)
+    jumps = (*read_jumps(found.get("jump"), reader, names), *timer_jumps)
+    _report_idle(found.get("control"), reader, names, (*timer_flow, *flow), jumps)
     spec = reader.text(found.get("spec"), "`spec`")
     return SystemDecl(
         name=reader.name(found.get("name"), "`name`") or path.stem,
@@ -153,7 +159,7 @@ def _declaration(
         signature=names.signature,
         controls=tuple(names.controls),
         flow=(*timer_flow, *flow),
-        jumps=(*read_jumps(found.get("jump"), reader, names), *timer_jumps),
+        jumps=jumps,
         clamps=MappingProxyType(
             {
                 c.name: (c.low, c.high)
@@ -173,6 +179,22 @@ def _declaration(
         places=MappingProxyType(names.places),
         warnings=tuple(finding for finding in reader.findings if finding.severity == "warning"),
     )
+
+
+def _report_idle(
+    node: Node | None, reader: Reader, names: Names, flow: Sequence[Assign], jumps: Sequence[JumpDecl]
+) -> None:
+    """W603 for controls that move nothing."""
+    moved = [assign.value for assign in (*flow, *(reset for jump in jumps for reset in jump.resets))]
+    read = {name for num in moved for name in columns_of(num)}
+    read |= {name for jump in jumps for name in columns_of_formula(jump.guard)}
+    known = {entry.key.text: entry.key.span for entry in reader.entries(node, "`control`")}
+    for control in names.controls:
+        span = known.get(control.name) or known.get(base_name(control.name))
+        if control.name not in read and span is not None:
+            message = f"the control `{control.name}` has no effect: no flow and no jump reads it"
+            advice = f"`{base_name(control.name)}: ~` takes one away that an extended file has"
+            reader.report("W603", message, span, advice)
 
 
 def _named(found: dict[str, Node], reader: Reader) -> _Named:

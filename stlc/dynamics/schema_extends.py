@@ -6,7 +6,7 @@ from pathlib import Path
 
 from stlc.diagnostics import StlcError
 from stlc.dynamics.schema_reader import Reader
-from stlc.dynamics.yaml_nodes import Mapping, Node, load_yaml
+from stlc.dynamics.yaml_nodes import Entry, Mapping, Node, Scalar, load_yaml
 from stlc.files import beside, read_source
 from stlc.source import Source
 
@@ -18,7 +18,8 @@ def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]
     """The document with everything that the files it extends say, and the texts of these.
 
     A section that is a mapping in both keeps the entries of both, and where both have an entry that of the
-    extending file; anything else is replaced. Every value keeps the place where it is written. S209 is
+    extending file; an entry that is nothing (`~`) takes that of the extended file away, and anything else is
+    replaced. Every value keeps the place where it is written. S209 is
     reported where a file cannot be read, or leads back to itself.
     """
     sources: list[Source] = []
@@ -52,8 +53,16 @@ def _merged(base: Mapping, own: Mapping) -> Mapping:
     """Two documents: the sections of both, mappings entry by entry."""
     result = Mapping(own.span, base.entries, base.size)
     for entry in own.entries:
-        result = result.replaced(entry.key, _section(base.get(entry.key.text), entry.value))
+        if _removes(entry, base):
+            result = result.without(entry.key.text)
+        else:
+            result = result.replaced(entry.key, _section(base.get(entry.key.text), entry.value))
     return result
+
+
+def _removes(entry: Entry, base: Mapping) -> bool:
+    """Whether an entry takes one of the extended file away: `brake: ~`."""
+    return isinstance(entry.value, Scalar) and entry.value.is_null and base.get(entry.key.text) is not None
 
 
 def _section(base: Node | None, own: Node) -> Node:
@@ -61,5 +70,6 @@ def _section(base: Node | None, own: Node) -> Node:
         return own
     result = Mapping(own.span, base.entries, base.size)
     for entry in own.entries:
-        result = result.replaced(entry.key, entry.value)
+        removed = _removes(entry, base)
+        result = result.without(entry.key.text) if removed else result.replaced(entry.key, entry.value)
     return result

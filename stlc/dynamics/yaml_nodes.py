@@ -107,6 +107,10 @@ class Mapping:
         """The value of `key`, or None."""
         return next((entry.value for entry in self.entries if entry.key.text == key), None)
 
+    def without(self, key: str) -> Mapping:
+        """The same mapping without an entry."""
+        return Mapping(self.span, tuple(old for old in self.entries if old.key.text != key), self.size)
+
     def replaced(self, key: Scalar, value: Node) -> Mapping:
         """The same mapping with `key` set to `value` (appended when it is new)."""
         entry = Entry(key, value)

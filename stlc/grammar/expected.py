@@ -41,6 +41,7 @@ _SIGNS: Mapping[str, str] = MappingProxyType(
     }
 )
 _REPAIRS = ("COLON", "COMMA", "EQUAL", "RPAR", "RSQB", "RBRACE", "_DOTS", "_ARROW", "_IN", "_FN")
+_CLOSING = ("RPAR", "RSQB", "RBRACE")
 _POSTFIX = frozenset({"LPAR", "LSQB", "DOT"})
 _BEFORE_FORMULA = frozenset(
     {":", "and", "&", "&&", "or", "|", "||", "xor", "->", "=>", "implies", "not", "!"}
@@ -65,6 +66,30 @@ def point(stumble: Stumble, lexeme: Lexeme) -> Span:
 
 
 # ---------------------------------------------------------------------- recognisers
+
+
+def misspelt_operator(stumble: Stumble) -> Diagnostic | None:
+    """A word that is nearly an operator, and with that the piece parses: `alwyas[0, T] p`, `p adn q`."""
+    near_by = [x for x in (stumble.found, *reversed(stumble.before)) if x is not None and x.kind == "word"]
+    for lexeme in near_by[:_NEAR_BY]:
+        if lexeme.text in RESERVED or len(lexeme.text) < _LEAST_LETTERS:
+            continue
+        near = closest(lexeme.text, _OPERATORS)
+        if near is not None and stumble.piece.repaired_by(lexeme.start, lexeme.end, near):
+            return Diagnostic(
+                "E010",
+                f"unknown operator `{lexeme.text}`",
+                stumble.of(lexeme),
+                help=(f"did you mean `{near}`?",),
+            )
+    return None
+
+
+_OPERATORS = (
+    *("always", "eventually", "once", "historically", "until", "release", "unless", "since"),
+    *("and", "or", "xor", "not", "implies", "forall", "exists", "freeze", "then", "else"),
+)
+_NEAR_BY, _LEAST_LETTERS = 4, 3
 
 
 def unknown_unit(stumble: Stumble) -> Diagnostic | None:
@@ -157,15 +182,28 @@ def _repair(stumble: Stumble) -> Diagnostic | None:
     for terminal in _REPAIRS:
         if terminal not in stumble.accepts or (terminal == "_IN" and stumble.wants_operator):
             continue
-        sign = _SIGNS[terminal]
+        sign = _closing(stumble) or _SIGNS[terminal] if terminal in _CLOSING else _SIGNS[terminal]
         glued = sign in ":,)]}"
         inserted = sign if glued else f" {sign}"
+        sure = terminal not in _CLOSING or not _open_interval(stumble)
         if stumble.piece.repaired_by(previous.end, previous.end, inserted):
-            return _missing(stumble, sign, (previous.end, previous.end, inserted))
+            return _missing(stumble, sign, (previous.end, previous.end, inserted), sure=sure)
         if found is not None and stumble.piece.repaired_by(found.start, found.end, sign):
             start = previous.end if glued else found.start
-            return _missing(stumble, sign, (start, found.end, sign))
+            return _missing(stumble, sign, (start, found.end, sign), sure=sure)
     return None
+
+
+def _open_interval(stumble: Stumble) -> bool:
+    """Whether an interval is open, which `]` and `)` close with different meanings."""
+    return bool(stumble.open_brackets) and stumble.open_brackets[-1].interval
+
+
+def _closing(stumble: Stumble) -> str | None:
+    """What closes the bracket that was opened last."""
+    if not stumble.open_brackets:
+        return None
+    return {"(": ")", "[": "]", "{": "}"}.get(stumble.open_brackets[-1].opening.text)
 
 
 def _definition_colon(stumble: Stumble) -> Diagnostic | None:
@@ -179,7 +217,8 @@ def _definition_colon(stumble: Stumble) -> Diagnostic | None:
     return _missing(Stumble(stumble.piece, sign.start), "=", (sign.start, sign.end, " ="))
 
 
-def _missing(stumble: Stumble, sign: str, edit: tuple[int, int, str]) -> Diagnostic:
+def _missing(stumble: Stumble, sign: str, edit: tuple[int, int, str], *, sure: bool = True) -> Diagnostic:
+    """That a sign is missing; where it is not `sure` that no other one was meant, nothing is repaired."""
     low, high, text = edit
     label = f"expected `{sign}` before this" if low == high and stumble.found is not None else ""
     return Diagnostic(
@@ -189,7 +228,7 @@ def _missing(stumble: Stumble, sign: str, edit: tuple[int, int, str]) -> Diagnos
         label,
         _labels(stumble),
         help=(stumble.line_with(edit),),
-        fix=Fix(((stumble.piece.source.span(low, high), text),)),
+        fix=Fix(((stumble.piece.source.span(low, high), text),)) if sure else None,
     )
 
 

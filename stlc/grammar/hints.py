@@ -11,6 +11,7 @@ from collections.abc import Callable
 from stlc.diagnostics import Diagnostic, Fix, Label
 from stlc.grammar.expected import (
     expected,
+    misspelt_operator,
     point,
     stray_bracket,
     unknown_declaration,
@@ -285,6 +286,7 @@ RECOGNISERS: tuple[Recogniser, ...] = (
     _bars,
     _equals,
     _chain,
+    misspelt_operator,
     _vector,
     unknown_unit,
     unknown_declaration,

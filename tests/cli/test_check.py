@@ -332,7 +332,7 @@ def without(name: str) -> Trace:
 
 def not_finite() -> Trace:
     trace = drive()
-    trace.data["dx"][2, 7] = np.nan
+    trace.data["dx"][2, 7] = np.inf
     return trace
 
 
@@ -352,7 +352,7 @@ def a_bare_pickle() -> None:
 
 HOSTILE: dict[str, tuple[Callable[[], object], str, str]] = {
     "missing": (lambda: saved(without("dx")), "E601", "needed by: no_collision"),
-    "nan": (lambda: saved(not_finite()), "E604", "`dx` in trace.npz is nan at trace 2, t = 0.7 s"),
+    "inf": (lambda: saved(not_finite()), "E604", "`dx` in trace.npz is inf at trace 2, t = 0.7 s"),
     "truncated": (truncated, "E603", "damaged or cut short"),
     "objects": (with_a_pickle, "E603", "Python objects"),
     "pickle": (a_bare_pickle, "E603", "it is a pickle"),

@@ -244,8 +244,8 @@ def as_json(trace: Trace) -> str:
 def test_a_stream(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, form) -> None:
     assert stream(monkeypatch, form(a_trace(peak=3))) == 1
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "t = 0.3 s  window  satisfied  +5.500"
-    assert "t = 3 s  low  VIOLATED  [-inf, -1.000]" in lines
+    assert lines[0] == "t = 0.3 s  window  satisfied  +5.500 m"
+    assert "t = 3 s  low  VIOLATED  [-inf, -1.000] m" in lines
     assert "  = because: `a < top * 1 m` is false where a = 3 m, at t = 3 s" in lines
     assert lines[-1] == "violated"
     assert stream(monkeypatch, form(a_trace()), "-q") == 0

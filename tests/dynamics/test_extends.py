@@ -79,3 +79,16 @@ def test_a_chain_that_leads_nowhere_is_said(folder: Path, target: str) -> None:
     with pytest.raises(StlcError) as caught:
         load_system_decl(folder / "fast.yaml")
     assert [finding.code for finding in caught.value.diagnostics] == ["S209"]
+
+
+def test_an_entry_that_is_nothing_takes_one_away(folder: Path) -> None:
+    (folder / "cart.yaml").write_text(BASE.replace("control: {", "control: {brake: {range: [0, 1]}, "))
+    whole = load_system_decl(folder / "cart.yaml")
+    assert [control.name for control in whole.controls] == ["brake", "u"]
+    assert [(w.code, w.message) for w in whole.warnings] == [
+        ("W603", "the control `brake` has no effect: no flow and no jump reads it")
+    ]
+    (folder / "plain.yaml").write_text("extends: cart.yaml\nname: plain\ncontrol: {brake: ~}\njump: ~\n")
+    plain = load_system_decl(folder / "plain.yaml")
+    assert [control.name for control in plain.controls] == ["u"]
+    assert (plain.jumps, plain.warnings) == ((), ())

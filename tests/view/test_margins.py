@@ -63,7 +63,7 @@ def test_a_margin_has_the_unit_of_its_predicates():
     data = {name: np.ones((1, 4)) for name in ("x", "v", "on")}
     trace = Trace(Signature(columns), 0.1, data, meta=TraceMeta(spec_text=text, horizon=2, dt=0.1))
     verdict = monitor_of(trace).check(trace)
-    assert units_of(verdict) == {"place": "m", "speed": "m/s", "apart": "m"}
+    assert units_of(verdict) == {"place": "m", "speed": "km/h", "apart": "m"}
 
 
 @pytest.mark.parametrize("right", [0, 1])
