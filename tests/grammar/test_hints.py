@@ -121,3 +121,28 @@ def test_messages_name_at_most_four_things():
         for finding in findings(path.read_text(encoding="utf-8")):
             if finding.message.startswith("expected"):
                 assert finding.message.count("`,") + finding.message.count(" or ") <= 4
+
+
+@pytest.mark.parametrize("bracket", ["]", ")"])
+def test_an_interval_is_closed_by_nobody_but_its_author(bracket):
+    """`]` and `)` mean different samples; what is meant is not known, so nothing is repaired."""
+    (finding,) = findings("signal v\nrequire a: always[0, T abs(v) <= 1.5")
+    assert finding.fix is None
+    assert finding.help == ("require a: always[0, T] abs(v) <= 1.5",)
+    parse(Source("s.stl", f"signal v\nrequire a: always[0, T{bracket} abs(v) <= 1.5"))
+
+
+@pytest.mark.parametrize(
+    ("formula", "near"),
+    [
+        ("alwyas[0, T] v > 1", "always"),
+        ("eventualy v > 1", "eventually"),
+        ("v > 1 adn v < 2", "and"),
+        ("v > 0 untill[0, 1 s] v > 1", "until"),
+        ("(v > 1 or alwys[0, T] v > 2)", "always"),
+    ],
+)
+def test_operators_that_are_misspelt(formula, near):
+    (finding,) = findings(f"signal v\nrequire a: {formula}\n")
+    assert finding.help == (f"did you mean `{near}`?",)
+    assert finding.fix is None
