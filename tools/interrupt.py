@@ -38,7 +38,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 ANSWER = 2.0
 """Seconds from the signal to the end of the process."""
-_FOREIGN = re.compile("matplotlib|torchinductor")
+_FOREIGN = re.compile(r"matplotlib|torchinductor|\.ses$")
 """Folders that libraries make for themselves."""
 MARK = "STLC_INTERRUPTED_COMMAND"
 STLC = (sys.executable, "-m", "stlc")
@@ -283,7 +283,7 @@ def _look(kind: Kind, folder: Path, values: dict[str, str], result: Result, *, s
     """What a command has said and left, and whether its runs go on."""
     said = (folder / "said").read_text(errors="replace")
     good = {128 + signal.SIGINT, 128 + signal.SIGTERM} if signalled else set()
-    before = result.code == -signal.SIGINT and not said  # Python itself had not begun
+    before = result.code in (-signal.SIGINT, -signal.SIGTERM) and not said  # Python itself had not begun
     if result.code not in good | {0, 1, 4} and not before:
         result.wrong.append(f"exit code {result.code}")
     if "Traceback" in said or "B001" in said:
@@ -363,6 +363,9 @@ def main() -> int:
     parser.add_argument("--slow", type=float, default=1.0, help="by how much signals are sent later")
     parser.add_argument("--only", default="", help="kinds whose name holds this")
     options = parser.parse_args()
+    signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a shell's `&` lets it be ignored, by children too
     kinds = tuple(kind for kind in KINDS if options.only in kind.name)
     with tempfile.TemporaryDirectory(prefix="interrupt-") as home, ThreadPoolExecutor(options.jobs) as pool:
         stage = prepare(Path(home))

@@ -110,6 +110,7 @@ class Cell:
             seed=self.seed,
             held_out=self.held_out,
             clock=self.length.clock,
+            drives=0,
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -61,6 +61,7 @@ class Summary:
         seconds: of training.
         folder: of the run.
         learning: the verdict on the training, with what to do next.
+        driven: what the policy does in closed loop, a line each.
         steps: of the optimiser.
         searched: held-out starts that the policy solves or that were searched; 0 where that is unknown.
         where: where the worst requirement fails, in words, or "".
@@ -77,6 +78,7 @@ class Summary:
     seconds: float = 0.0
     folder: str = ""
     learning: Learning | None = None
+    driven: Sequence[str] = ()
     steps: int = 0
     searched: int = 0
     where: str = ""
@@ -314,7 +316,8 @@ def native_text(by_torch: Mapping[str, str]) -> str:
 def final_screen(summary: Summary, spark: str = "") -> list[str]:
     """The lines that close a training run; the last one is the next command, where there is a verdict."""
     low, high = summary.interval
-    lines = [
+    lines = [f"{'' if i else 'closed loop':<15} {line}" for i, line in enumerate(summary.driven)]
+    lines += [
         f"plan accuracy   {summary.accuracy:.3f}   95 % interval [{low:.3f}, {high:.3f}]"
         f" on {summary.held_out:,} held-out starts" + (f"   {spark}" if spark else "")
     ]
@@ -349,6 +352,8 @@ def final_screen(summary: Summary, spark: str = "") -> list[str]:
 
 def _emphasised(line: str) -> Text:
     text = Text(line)
-    if line.startswith(("plan accuracy", "Next:")):
-        text.stylize("bold", 0, 25 if line.startswith("plan") else len(line))
+    if line.startswith(("closed loop", "Next:")):
+        text.stylize("bold", 0, len(line))
+    elif line.startswith("plan accuracy"):
+        text.stylize("bold", 0, 25)
     return text

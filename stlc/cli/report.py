@@ -31,18 +31,21 @@ def report(
 ) -> None:
     """Write the report of `run` and print where it is."""
     from stlc.rundir import RunDir
-    from stlc.view.learning import Commands, learning_of_run
+    from stlc.view.learning import Commands, driven_lines, learning_of_run, recommended
     from stlc.view.report import write_report
 
     folder = RunDir.open(run, runs)
     write_report(folder)
     path = f"{folder.shown}/report.html"
-    learning = learning_of_run(folder, Commands.of(folder.shown))
+    record = folder.record()
+    learning = learning_of_run(folder, Commands.of(folder.shown, guard=recommended(record)))
     if as_json:
         result: dict[str, object] = {"run": folder.shown, "report": path}
         result |= {} if learning is None else {"verdict": learning.summary()}
         emit_json("report/1", ok=True, exit_code=0, result=result)
     else:
+        for line in driven_lines(record.get("result") or {}):
+            say(line)
         if learning is not None:
             say(f"{learning.level}: {learning.sentence}")
             if learning.worst:

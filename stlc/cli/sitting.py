@@ -18,7 +18,7 @@ from stlc.controller.train import Outcome, Watch
 from stlc.diagnostics import StlcError
 from stlc.rundir import LATEST, RUNS
 from stlc.stopping import age, leaving
-from stlc.view.learning import Commands, Learning, learning_of_run
+from stlc.view.learning import Commands, Learning, driven_lines, learning_of_run, recommended
 
 if TYPE_CHECKING:
     from types import FrameType, TracebackType
@@ -157,6 +157,7 @@ class Sitting:
         if json:
             learning = _learning(outcome)
             result = {"run": self.folder.shown, "seconds": outcome.seconds, **outcome.score.summary()}
+            result |= {} if outcome.driven is None else {"closed_loop": outcome.driven.summary()}
             result |= {} if learning is None else {"verdict": learning.summary()}
             result |= {key: self.folder.record().get(key) for key in ("steps", "schedule")}
             emit_json("train/1", ok=found, exit_code=code, diagnostics=why, result=result)
@@ -180,7 +181,8 @@ def spoken(folder: RunDir) -> str:
 def _commands(folder: RunDir, ranks: int = 1) -> Commands:
     """The commands that a closing screen names; the run need not be named while it is the newest."""
     newest = (RUNS / LATEST).resolve() == folder.path.resolve()
-    return Commands.of(spoken(folder), newest=newest, start=started(ranks))
+    guard = recommended(folder.record())
+    return Commands.of(spoken(folder), newest=newest, start=started(ranks), guard=guard)
 
 
 def _learning(outcome: Outcome) -> Learning | None:
@@ -227,6 +229,7 @@ def _summary(outcome: Outcome, *, pictures: bool) -> Summary:
         steps=outcome.steps,
         searched=int(score.searched.sum()),
         learning=learning,
+        driven=driven_lines({} if outcome.driven is None else {"closed_loop": outcome.driven.summary()}),
         where=where,
         unsolved=unsolved,
         picture=f"{folder.shown}/{FAILURES}" if pictures and weakness and drawn.is_file() else "",

@@ -78,6 +78,7 @@ def train(
     lr: o.RateOption = None,
     batch: o.BatchOption = None,
     held_out: o.HeldOutOption = None,
+    drives: o.DrivesOption = None,
     log: o.LogOption = None,
     runs: o.RunsOption = Path("runs"),
     pictures: o.PicturesOption = True,
@@ -94,13 +95,19 @@ def train(
         _refuse_on_resume(
             {"SPEC": spec or None, "--system": system, "--seed": seed, "--method": method}
             | {"--name": name, "--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch}
-            | {"--set": set_, "--seeds": seeds, "--held-out": held_out, "--cluster": cluster}
+            | {
+                "--set": set_,
+                "--seeds": seeds,
+                "--held-out": held_out,
+                "--drives": drives,
+                "--cluster": cluster,
+            }
         )
         total = parse_count(steps, "--steps") if steps is not None else None
         more = parse_seconds(budget) if budget is not None else None
         length = Length(total, more)
         _go_on(resume, runs=runs, length=length, device=device, logbook=logbook, pictures=pictures, json=json)
-    from stlc.controller.config import HELD_OUT, TrainConfig
+    from stlc.controller.config import DRIVES, HELD_OUT, TrainConfig
 
     config = TrainConfig(
         method=_method(method) if method is not None else None,
@@ -114,6 +121,7 @@ def train(
         batch=batch,
         held_out=held_out or HELD_OUT,
         clock=parse_clock(clock),
+        drives=DRIVES if drives is None else drives,
     )
     launch = _launch(runs, name, set_)
     if len(specs) > 1 or seeds is not None or cluster is not None:

@@ -94,6 +94,7 @@ class Many:
             "--lr": config.lr,
             "--batch": config.batch,
             "--held-out": config.held_out,
+            "--drives": config.drives,
             "--log": self.log,
             "--runs": launch.root,
         }

@@ -63,6 +63,9 @@ PlansOption = Annotated[int | None, typer.Option(min=1, help="Plans that the net
 RateOption = Annotated[float | None, typer.Option(help="Peak learning rate.")]
 BatchOption = Annotated[int | None, typer.Option(min=1, help="Fresh states a step.")]
 HeldOutOption = Annotated[int | None, typer.Option(min=1, help="Held-out starts of the verdict; 5000.")]
+DrivesOption = Annotated[
+    int | None, typer.Option(min=0, help="Drives after the training, under one guard at most; 400, 0: none.")
+]
 LogOption = Annotated[
     str | None, typer.Option(metavar="tensorboard", help="Keep the curves for TensorBoard too.")
 ]

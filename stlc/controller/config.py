@@ -19,6 +19,8 @@ Clock = Literal["wall", "processor"]
 ENGINE_VERSION = 2
 """Raised with every change of what the engine reaches; figures that another one made are taken anew."""
 
+DRIVES = 400
+"""Drives under one guard after a training, at most."""
 HELD_OUT = 5000
 HELD_OUT_SEED = 981_273
 """Seed of the held-out states: used for reports only, never while training or tuning."""
@@ -45,6 +47,7 @@ class TrainConfig:
         lr: peak learning rate.
         batch: fresh states a step.
         held_out: states of the last verdict.
+        drives: after the training, under one guard at most; 0: none.
     """
 
     method: Method | None = None
@@ -58,6 +61,7 @@ class TrainConfig:
     batch: int | None = None
     held_out: int = HELD_OUT
     clock: Clock = "wall"
+    drives: int = DRIVES
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +92,7 @@ class Engine:
         samples: size of a fixed training set; 0: fresh states in every step.
         clock: of budgets and of the times on record.
         ranks: processes that train together, each with so many states a step.
+        drives: after the training, under one guard at most; 0: none.
     """
 
     method: Method
@@ -113,11 +118,12 @@ class Engine:
     samples: int = 0
     clock: Clock = "wall"
     ranks: int = 1
+    drives: int = DRIVES
 
 
 _MOST = {
     **dict.fromkeys(("hidden", "plans", "threads", "ranks"), 65_536),
-    **dict.fromkeys(("batch", "hard", "pool", "most", "held_out", "samples"), 10**8),
+    **dict.fromkeys(("batch", "hard", "pool", "most", "held_out", "samples", "drives"), 10**8),
     **dict.fromkeys(("warmup", "average"), 1.0),
     "hold": 0.999,
 }
@@ -171,6 +177,7 @@ def decide(task: Task, config: TrainConfig) -> Engine:
         threads=config.threads or _threads(searching=guided and config.device == "cpu"),
         samples=0 if guided else declared.samples or 0,
         clock=config.clock,
+        drives=config.drives,
     )
 
 

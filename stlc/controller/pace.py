@@ -71,7 +71,7 @@ class Planned:
     steps: int
 
 
-_TEXT = re.compile(r"[1-9]\d{0,17}(,[1-9]\d{0,17}@[1-9]\d{0,17})*")
+_TEXT = re.compile(r"[1-9]\d{0,17}(,[1-9]\d{0,17}@(0|[1-9]\d{0,17}))*")
 
 
 @dataclass(frozen=True, slots=True)

@@ -267,17 +267,7 @@ def judge_drives(rules: Rules, task: Task, recording: Recording, savable: NDArra
     Raises:
         SpecError: the rules do not fit what was recorded.
     """
-    outside = any(isinstance(item, ast.Extern) for item in rules.spec.items)
-    decl = task.system.decl
-    monitor = Monitor(
-        rules.spec,
-        dt=decl.dt,
-        horizon=decl.dt * decl.horizon,
-        system=decl.path if outside else None,
-        overrides=rules.overrides,
-    )
-    columns = np.moveaxis(recording.states, -1, 0)
-    verdict = monitor.check(dict(zip(task.names, columns, strict=True)))
+    verdict = verdict_on_drives(rules, task, recording)
     found = {judgement.name: np.array(judgement.statuses) for judgement in verdict}
     safety = frozenset(rule.name for rule in verdict.subject.compiled.safety)
     broken = tuple(
@@ -288,6 +278,21 @@ def judge_drives(rules: Rules, task: Task, recording: Recording, savable: NDArra
     for each in broken:
         viable[each.row] = not each.excused
     return Drives(found, broken, viable | obeying(found, len(savable)))
+
+
+def verdict_on_drives(rules: Rules, task: Task, recording: Recording) -> Verdict:
+    """The verdict on every drive from its first sample to its last; raises SpecError as `judge_drives`."""
+    outside = any(isinstance(item, ast.Extern) for item in rules.spec.items)
+    decl = task.system.decl
+    monitor = Monitor(
+        rules.spec,
+        dt=decl.dt,
+        horizon=decl.dt * decl.horizon,
+        system=decl.path if outside else None,
+        overrides=rules.overrides,
+    )
+    columns = np.moveaxis(recording.states, -1, 0)
+    return monitor.check(dict(zip(task.names, columns, strict=True)))
 
 
 def _lost(

@@ -12,6 +12,8 @@ import torch
 
 from stlc.controller.autopsy import Step, autopsy
 from stlc.controller.checkpoint import load_checkpoint, never_saved, restoring
+from stlc.controller.closed_loop import ClosedLoop, closed_loop
+from stlc.controller.closed_loop import reserve as drive_reserve
 from stlc.controller.config import Engine, TrainConfig, decide
 from stlc.controller.conflict import conflict
 from stlc.controller.held_out import Score, score
@@ -38,6 +40,8 @@ BARREN_LOOKS, BARREN_SHARE = 5, 0.1
 """After so many looks, and this share of the steps, a search that never found a plan is given up."""
 VERDICT_OVER = 0.04
 """Share of a budget by which the verdict may exceed it before the search for what is feasible is ended."""
+DRIVE_SHARE = 0.15
+"""Share of the seconds that a training without a budget took, in which the policy is driven."""
 VERDICT_LEAST, VERDICT_SHARE = 20.0, 0.2
 """Seconds, and share of the seconds that the steps took, which the verdict of a run without a budget has."""
 SAVE_EVERY = 500
@@ -78,6 +82,7 @@ class Outcome:
         interrupted: ended by `Watch.stop`.
         ranks: that trained together.
         why: why no plan satisfies the specification, where none was found for any start.
+        driven: the policy in closed loop; None where it was not driven.
     """
 
     run: Run
@@ -87,6 +92,7 @@ class Outcome:
     ranks: int = 1
     why: Diagnostic | None = None
     steps: int = 0
+    driven: ClosedLoop | None = None
 
 
 def train(
@@ -326,7 +332,7 @@ class _Session:
         """The steps of the run as they are planned at this moment: by its budget, or by its schedule."""
         trainer = self.trainer
         if self.budget:
-            left = self.begun + self._seconds - verdict_reserve(self._seconds) - self.now()
+            left = self.begun + self._seconds - self._reserve - self.now()
             steps = self.pace.plan(trainer.step, trainer.steps, trainer.next_look, left)
             steps = int(trainer.ranks.agree(steps))
             if steps != trainer.steps:
@@ -372,11 +378,33 @@ class _Session:
         self.trainer.average.cpu()  # verdicts are float64, and the kernel's
         result = score(self.trainer.policy, n=self.trainer.engine.held_out, enough=self._out_of_time)
         self.journal.held_out(self.trainer.task, result)
-        seconds = self.now() - self.begun
         why = conflict(self.trainer.task, self._late) if result.feasible == 0.0 else None
-        found = {"seconds": seconds} if why is None else {"seconds": seconds, "why": why.message}
+        driven = self._driven() if why is None else None
+        found: dict[str, object] = {"seconds": self.now() - self.begun}
+        found |= {} if why is None else {"why": why.message}
+        found |= {} if driven is None else {"closed_loop": driven.summary()}
         self.journal.close("finished", {**result.summary(), **found})
-        return replace(self._ended(), score=result, why=why)
+        return replace(self._ended(), score=result, why=why, driven=driven)
+
+    def _driven(self) -> ClosedLoop | None:
+        """The policy in closed loop, for as long as there is time."""
+        drives = self.trainer.engine.drives
+        if not drives:
+            return None
+        run = Run(self.journal.folder, self.trainer.task, self.trainer.policy)
+        begun = self.now()
+        if self.budget:
+            end = self.begun + (1.0 + VERDICT_OVER) * self._seconds
+            end = max(end, begun + 0.5 * drive_reserve(self._seconds))
+        else:
+            end = begun + DRIVE_SHARE * (begun - self.begun)
+        return closed_loop(run, lambda: end - self.now(), drives)
+
+    @property
+    def _reserve(self) -> float:
+        """Seconds of the budget for what follows the steps."""
+        drives = drive_reserve(self._seconds) if self.trainer.engine.drives else 0.0
+        return verdict_reserve(self._seconds) + drives
 
     def _out_of_time(self) -> bool:
         """Whether the verdict has to come to its end."""
@@ -392,7 +420,9 @@ class _Session:
         spent = self.trained - self.begun
         if not self.budget:
             return max(VERDICT_LEAST, VERDICT_SHARE * spent)
-        return max((1.0 + VERDICT_OVER) * self._seconds - spent, 0.5 * verdict_reserve(self._seconds))
+        drives = self._reserve - verdict_reserve(self._seconds)
+        left = (1.0 + VERDICT_OVER) * self._seconds - drives - spent
+        return max(left, 0.5 * verdict_reserve(self._seconds))
 
     def _interrupted(self) -> Outcome:
         self._save()

@@ -91,7 +91,7 @@ class Commands:
 
     Attributes:
         train_on: that goes on with the training, without a budget.
-        simulate: that drives the policy under the guard.
+        simulate: that drives the policy under the guard that is recommended.
         report: that writes the report.
     """
 
@@ -100,11 +100,73 @@ class Commands:
     report: str
 
     @classmethod
-    def of(cls, run: str, *, newest: bool = False, start: str = "stlc") -> Commands:
-        """Those of the run that is found by the name `run`; `newest` need not be named to be driven."""
+    def of(cls, run: str, *, newest: bool = False, start: str = "stlc", guard: str = "paper") -> Commands:
+        """Those of the run that is found by the name `run`; `newest` need not be named to be driven.
+
+        `guard` is the one that is recommended: `none`, `paper` or `full`.
+        """
         run = shell((operand(run),))
-        simulate = "stlc simulate --backup" if newest else f"stlc simulate {run} --backup"
+        words = {"none": "", "paper": " --backup", "full": " --guard full"}[guard]
+        simulate = f"stlc simulate{words}" if newest else f"stlc simulate {run}{words}"
         return cls(f"{start} train --resume {run}", simulate, f"stlc report {run}")
+
+
+def recommended(record: Mapping[str, Any]) -> str:
+    """The guard that a run's record recommends, `paper` where none was driven."""
+    result = record.get("result")
+    driven = result.get("closed_loop") if isinstance(result, Mapping) else None
+    guard = driven.get("recommended") if isinstance(driven, Mapping) else None
+    return guard if guard in ("none", "paper", "full") else "paper"
+
+
+def driven_lines(result: Mapping[str, Any]) -> list[str]:
+    """What a run's result says of its drives, best first: a line for each guard, and what is recommended.
+
+    Empty where nothing is on record; a reason where nothing could be driven.
+    """
+    found = result.get("closed_loop")
+    if not isinstance(found, Mapping):
+        return []
+    try:
+        guards = [each for each in found.get("guards") or () if isinstance(each, Mapping)]
+        if not guards:
+            why = found.get("why") or "no drive came to its end in the time that there was"
+            return [f"not driven: {why}"]
+        best = found.get("recommended")
+        first = sorted(guards, key=lambda each: each.get("guard") != best)
+        lines = [_driven_line(each) for each in first]
+        lines += [line for each in first if (line := _changed_line(each))]
+        return [*lines, f"recommended: {ADVISED[best]}"] if best in ADVISED else lines
+    except (KeyError, TypeError, ValueError):  # what somebody else has written
+        return []
+
+
+GUARDED = {"none": "without a guard", "paper": "with the paper's guard", "full": "with the full guard"}
+ADVISED = {
+    "none": "no guard (`stlc simulate`), by what was driven",
+    "paper": "the paper's guard (`--backup`), by what was driven",
+    "full": "the full guard (`--guard full`), by what was driven",
+}
+
+
+def _driven_line(each: Mapping[str, Any]) -> str:
+    """`51 of 60 drives satisfied (85.0 %, 95 % interval 73.9 to 91.9 %) without a guard, 98.3 % safe`."""
+    low, high = each["interval"]
+    safe = "" if each.get("safe") is None else f", {share(each['safe'])} safe"
+    part = f"{share(each['share'])}, 95 % interval {100 * low:.1f} to {share(high)}"
+    guard = GUARDED.get(str(each["guard"]), "")
+    return f"{each['satisfied']:,} of {each['drives']:,} drives satisfied ({part}) {guard}{safe}"
+
+
+def _changed_line(each: Mapping[str, Any]) -> str:
+    """What a guard changes on the starts that were driven without it, too."""
+    if not each.get("compared"):
+        return ""
+    name = {"paper": "the paper's guard", "full": "the full guard"}.get(str(each["guard"]), "")
+    return (
+        f"{name} changes {each['gained'] + each['lost']:,} of {each['compared']:,} drives: "
+        f"{each['gained']:,} are satisfied only with it, {each['lost']:,} only without"
+    )
 
 
 def learning_of_run(run: RunDir, commands: Commands) -> Learning | None:

@@ -9,7 +9,7 @@ from typing import Any
 from stlc.view.curves import draw_curves
 from stlc.view.highlight import spec_html
 from stlc.view.html import Child, Html, classed, el, facts, figure, join, table
-from stlc.view.learning import Commands, clause, learning_on_record
+from stlc.view.learning import Commands, clause, driven_lines, learning_on_record, recommended
 from stlc.view.material import Material, untagged
 from stlc.view.page import Section
 from stlc.view.words import count, interval, number, obeyed_sentence, seconds, share, viable_sentence
@@ -22,10 +22,13 @@ def headline(material: Material) -> Html:
     """
     record, result, simulation = material.record, material.result, material.simulation or {}
     driven, lost = obeyed_sentence(simulation), viable_sentence(simulation)
+    trial = [] if driven else driven_lines(result or {})
+    head = f"{trial[0][:1].upper()}{trial[0][1:]}" if trial else _verdict(material)
     names = dict.fromkeys((material.spec, str(record.get("system", "")), f"run {material.run.name}"))
     return join(
         classed("p", "eyebrow", " · ".join(name for name in names if name)),
-        el("h1", driven or _verdict(material)),
+        el("h1", driven or head),
+        el("p", *_spoken(". ".join((*trial[1:], _verdict(material))))) if trial else None,
         el("p", f"{lost}.") if lost else None,
         el("p", f"{_verdict(material)}. {_beside(result)}" if driven else _beside(result))
         if result
@@ -70,7 +73,7 @@ def _sampled(result: Mapping[str, Any]) -> str:
 def _advice(material: Material) -> Html | None:
     """How far the training came, and what would help, where the policy falls short."""
     where = clause(material.held_out, material.signature)
-    commands = Commands.of(shlex.quote(material.run.shown))
+    commands = Commands.of(shlex.quote(material.run.shown), guard=recommended(material.record))
     learning = learning_on_record(material.record, material.rows, commands, where)
     if learning is None or not learning.advice:
         return None
@@ -88,7 +91,10 @@ def _spoken(advice: str) -> list[Child]:
 
 def _training_tiles(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     accuracy, feasible = result.get("accuracy"), result.get("feasible")
-    tiles = [(share(accuracy), "plan accuracy")]
+    driven = result.get("closed_loop")
+    closed = driven.get("share") if isinstance(driven, Mapping) else None
+    tiles = [(share(closed), "of drives satisfied")] if closed is not None else []
+    tiles.append((share(accuracy), "plan accuracy"))
     if accuracy is not None and feasible:
         tiles.append((share(accuracy / feasible), "of what is known feasible"))
     tiles.append((seconds(result.get("seconds")), "of training and verdict"))

@@ -150,10 +150,10 @@ def test_a_schedule_is_read_as_it_is_written(steps: list[tuple[int, int]], first
     schedule = StepSchedule.of(first)
     for more, rest in steps:
         last = schedule.plannings[-1]
-        step = min(max(last.step, 1) + more, last.steps)
-        schedule = schedule.with_steps(step, step + rest)
+        step = min(last.step + more, last.steps)
+        schedule = schedule.with_steps(step, max(step + rest, 1))
     assert StepSchedule.parse(str(schedule)) == schedule
-    assert schedule.at(0) == first
+    assert schedule.at(0) == [each.steps for each in schedule.plannings if each.step == 0][-1]
     assert schedule.at(10**9) == schedule.steps
 
 
