@@ -165,6 +165,15 @@ def written_unit(text: str) -> Unit:
     return parse_unit(text) if text else DIMENSIONLESS
 
 
+KELVIN = "temperatures are in kelvin, [K]; one in degrees Celsius is declared without a unit"
+_CELSIUS = re.compile("deg_?C|°C|celsius|centigrade", re.IGNORECASE)
+
+
+def means_celsius(text: str) -> bool:
+    """Whether somebody means degrees Celsius, which have an offset and are no unit here."""
+    return _CELSIUS.fullmatch(text.strip()) is not None
+
+
 def nearest(value: Fraction | float) -> float:
     """The double nearest to a number; +-inf beyond the largest."""
     try:

@@ -107,3 +107,8 @@ def test_si_keeps_the_dimensions(a: Unit) -> None:
     assert a.si.ratio == 1
     assert same_dims(a, a.si)
     assert parse_unit(str(a.si)) == a.si
+
+
+@pytest.mark.parametrize(("text", "si"), [("1 mph", 0.44704), ("1 ft", 0.3048), ("1 lb", 0.45359237)])
+def test_units_of_elsewhere(text: str, si: float) -> None:
+    assert parse_unit(text.split()[1]).scale == si

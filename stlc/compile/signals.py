@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
@@ -15,7 +16,7 @@ from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
 from stlc.registry import closest
 from stlc.signature import Column, Kind, Role
-from stlc.units import DIMENSIONLESS, Unit, nearest, parse_unit, same_dims
+from stlc.units import DIMENSIONLESS, KELVIN, Unit, nearest, parse_unit, same_dims
 
 Labels = tuple[tuple[str, float], ...]
 
@@ -23,16 +24,23 @@ MAX_COMPONENTS = 1000
 _KINDS: Mapping[str, Kind] = {"real": "real", "int": "int", "bool": "bool"}
 
 
+_TEMPERATURE = re.compile("temp|therm|celsius|heat|cool|oven|ambient", re.IGNORECASE)
+
+
 def declared_unit(text: str, decl: ast.Declaration, scope: Scope) -> Unit:
     """The unit in the brackets of a declaration. Raises Failed (E203)."""
     if not text:
         return DIMENSIONLESS
     try:
-        return parse_unit(text)
+        unit = parse_unit(text)
     except ValueError as error:
         return scope.fail(
             Diagnostic("E203", str(error), decl.name_span, help=("units: m, s, m/s^2, deg, 1, …",))
         )
+    if text.strip() == "C" and _TEMPERATURE.search(decl.name_span.text):
+        message = f"`{decl.name_span.text}` is declared in coulombs [C]"
+        scope.report(Diagnostic("W107", message, decl.name_span, help=(KELVIN,)))
+    return unit
 
 
 def check_type(type_: ast.TypeRef | None, enums: Mapping[str, Labels], scope: Scope) -> None:

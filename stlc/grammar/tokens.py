@@ -10,7 +10,7 @@ from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar.words import BUILT_IN, UNIT_NAMES
 from stlc.registry import closest
 from stlc.source import Source, Span
-from stlc.units import SYMBOLS, parse_unit
+from stlc.units import KELVIN, SYMBOLS, means_celsius, parse_unit
 
 MAX_DIGITS = 400
 _UNIT_LENGTH = 60
@@ -82,6 +82,8 @@ def unit_of(context: Context, leaf: Leaf | None) -> str:
 def _bad_unit(leaf: Leaf, text: str, reason: str) -> Diagnostic:
     if "," in text:
         advice: tuple[str, ...] = (f"a range is written `in {leaf.text}`",)
+    elif means_celsius(text.strip("[] ")):
+        advice = (KELVIN,)
     else:
         near = next((found for word in _WORD.findall(text) if (found := near_unit(word))), None)
         advice = (f"did you mean `{near}`?",) if near else ()
@@ -92,7 +94,11 @@ def _bad_unit(leaf: Leaf, text: str, reason: str) -> Diagnostic:
 
 def near_unit(word: str) -> str | None:
     """The unit that somebody means who writes `word`, if it is none."""
-    return None if word in SYMBOLS else UNIT_NAMES.get(word.lower()) or closest(word, SYMBOLS)
+    return (
+        None
+        if word in SYMBOLS or means_celsius(word)
+        else UNIT_NAMES.get(word.lower()) or closest(word, SYMBOLS)
+    )
 
 
 def number_of(context: Context, leaf: Leaf) -> Fraction:

@@ -109,3 +109,12 @@ def test_a_number_in_a_unit_is_the_number_over_its_scale(num: ir.Num, x: float) 
         float(evaluate([ir.Atom(each)], env, ops=NUMPY)[0][0, 0]) for each in (num, in_unit(num, unit))
     )
     assert math.isclose(scaled * unit.scale, plain, rel_tol=1e-9, abs_tol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("declared", "codes"), [("temp [C]", ["W107"]), ("charge [C]", []), ("temp [K]", [])]
+)
+def test_a_temperature_in_coulombs(declared: str, codes: list[str]) -> None:
+    name = declared.split()[0]
+    compiled = Monitor(f"signal {declared}\nrequire r: always[0 s, 1 s] {name} > 1", dt=0.1).compiled
+    assert [finding.code for finding in compiled.warnings] == codes

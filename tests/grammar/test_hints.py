@@ -146,3 +146,10 @@ def test_operators_that_are_misspelt(formula, near):
     (finding,) = findings(f"signal v\nrequire a: {formula}\n")
     assert finding.help == (f"did you mean `{near}`?",)
     assert finding.fix is None
+
+
+@pytest.mark.parametrize("text", ["signal t [degC]\nrequire a: t > 1", "signal t\nrequire a: t > 20 degC"])
+def test_degrees_celsius_are_not_taken_for_angles(text):
+    (finding,) = findings(text)
+    assert (finding.code, "kelvin" in finding.help[0]) == ("E101", True)
+    assert not any("`deg`" in line for line in finding.help)
