@@ -246,7 +246,7 @@ CODES: dict[str, str] = {
     "R401": "training diverged",
     "R402": "a policy whose plan is not a number",
     "R403": "a process of a training that is gone",
-    "R404": "requirements that no plan satisfies",
+    "R404": "requirements that no plan was found for",
     "R405": "starts from none of which a plan is known",
     "W603": "a control without effect",
     "W701": "a cache folder, or a file in it, that others could have changed",

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from stlc.controller.config import HELD_OUT, HELD_OUT_SEED
+from stlc.controller.explore import EFFORTS, Exploration
 from stlc.controller.missions import visited
 from stlc.controller.savable import Hunt
 from stlc.controller.search import Searcher
@@ -32,6 +33,9 @@ CEILING_TRIES = 8000
 """Plans that are tried for a held-out state before it counts as infeasible."""
 MOST_SEARCHED = 1024
 """Failing states that are searched: they speak for the others, to 1.6 % in one standard error."""
+EXPLORED = 4
+"""Failing states that are explored where no plan is known for any."""
+ENOUGH = 1e-4
 CHUNK = 256
 """Failing states that are searched together."""
 TORCH_CHUNK = 32
@@ -106,7 +110,7 @@ def score(
     failing = (~good).nonzero()[:, 0]
     failing = failing[torch.randperm(len(failing), generator=generator)]
     known, searched = good.clone(), good.clone()
-    searcher, hunt = Searcher(task, generator, enough=1e-4), Hunt(task)
+    searcher, hunt = Searcher(task, generator, enough=ENOUGH), Hunt(task)
     size = TORCH_CHUNK if task.native is None else CHUNK
     for number, chunk in enumerate(torch.split(failing[:MOST_SEARCHED], size)):
         if number and enough():
@@ -120,6 +124,9 @@ def score(
         if number and enough():
             break
         known[chunk], searched[chunk] = found, True
+    if len(failing) and not bool(known.any()) and not enough():
+        _explore(task, states, failing, known, enough)
+        searched |= known
     accuracy = float(good.double().mean())
     return Score(
         accuracy=accuracy,
@@ -151,6 +158,16 @@ def _judged(policy: Mlp, states: Tensor, enough: Stop) -> tuple[Tensor, Tensor, 
         each.append(judged.requirements)
     count = sum(map(len, rho))
     return states[:count], torch.cat(plans), torch.cat(rho), torch.cat(each)
+
+
+def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough: Stop) -> None:
+    """Mark failing states for which exploration finds a plan; starts of missions are tried first."""
+    clocks = [task.names.index(timer.name) for timer in task.system.timers if timer.kind == "clock"]
+    age = states[failing][:, clocks].sum(1)
+    first = failing[age.argsort(stable=True)[:EXPLORED]]
+    generator = torch.Generator().manual_seed(HELD_OUT_SEED + 2)
+    found = Exploration(task).solved(states[first], EFFORTS[1], generator, ENOUGH, enough)
+    known[first] = (states[first][:, None] == found.states[None]).all(2).any(1)
 
 
 def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:

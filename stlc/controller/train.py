@@ -15,7 +15,7 @@ from stlc.controller.checkpoint import load_checkpoint, never_saved, restoring
 from stlc.controller.closed_loop import ClosedLoop, closed_loop
 from stlc.controller.closed_loop import reserve as drive_reserve
 from stlc.controller.config import Engine, TrainConfig, decide
-from stlc.controller.conflict import conflict
+from stlc.controller.conflict import conflict, refuted
 from stlc.controller.held_out import Score, score
 from stlc.controller.journal import Journal
 from stlc.controller.natives import by_torch
@@ -37,7 +37,11 @@ if TYPE_CHECKING:
 
 DEFAULT_BUDGET = 60.0
 BARREN_LOOKS, BARREN_SHARE = 5, 0.1
-"""After so many looks, and this share of the steps, a search that never found a plan is given up."""
+"""After so many looks, and this share of the steps, a search that never found a plan is given up.
+
+It has explored with all the effort there is by then; where it is proved that there is no plan, the first look
+is the last.
+"""
 VERDICT_OVER = 0.04
 """Share of a budget by which the verdict may exceed it before the search for what is feasible is ended."""
 DRIVE_SHARE = 0.15
@@ -81,7 +85,7 @@ class Outcome:
         steps: that were made in all.
         interrupted: ended by `Watch.stop`.
         ranks: that trained together.
-        why: why no plan satisfies the specification, where none was found for any start.
+        why: which requirements no plan was found for, where none was found for any start.
         driven: the policy in closed loop; None where it was not driven.
     """
 
@@ -273,6 +277,8 @@ class _Session:
             every=trainer.engine.every, searching=searching, now=self.now(), seconds=self._seconds
         )
         self.barren = not trainer.ranks.any(trainer.buffer.count > 0)
+        self.refuted: bool | None = None
+        self.exhausted = False
 
     def finish(self) -> Outcome:
         """Train to the end, judge, and close the record.
@@ -325,7 +331,10 @@ class _Session:
         if ends and self._planned() <= trainer.step:
             return False
         if trainer.step >= trainer.next_look:
-            self._look()
+            began = self.now()
+            if trainer.ranks.any(not trainer.explore(self.watch.stop)):
+                return None
+            self._look(began)
         return True
 
     def _planned(self) -> int:
@@ -349,14 +358,16 @@ class _Session:
     def _note_schedule(self) -> None:
         self.journal.note({"steps": self._known_steps, "schedule": str(self.schedule)})
 
-    def _look(self) -> None:
-        """A search round, and its row."""
+    def _look(self, began: float) -> None:
+        """A search round that began at a time, and its row."""
         trainer = self.trainer
-        began = self.now()
         look = trainer.look()
         self.pace.looked(trainer.step, self.now() - began)
         self._row(look)
-        self.barren = self.barren and look.accuracy == 0.0 and look.repaired == 0
+        self.barren = self.barren and look.accuracy == 0.0 and look.repaired + look.explored == 0
+        self.exhausted = not trainer.ranks.any(not trainer.exhausted)
+        if self.barren and self.refuted is None and trainer.engine.method == "guided":
+            self.refuted = trainer.ranks.any(refuted(trainer.task))
 
     def _wait_for_search(self) -> bool:
         """Let the search beside the steps come to its end; False where the run is to stop before."""
@@ -371,7 +382,9 @@ class _Session:
         """Whether neither the policy nor the search has ever satisfied the specification for any state."""
         trainer = self.trainer
         enough = max(BARREN_LOOKS * trainer.engine.every, BARREN_SHARE * trainer.steps)
-        return self.barren and trainer.engine.method == "guided" and trainer.step >= enough
+        if not self.barren or trainer.engine.method != "guided":
+            return False
+        return bool(self.refuted) or (self.exhausted and trainer.step >= enough)
 
     def _judged(self) -> Outcome:
         self.trained = self.now()
@@ -381,7 +394,8 @@ class _Session:
         why = conflict(self.trainer.task, self._late) if result.feasible == 0.0 else None
         driven = self._driven() if why is None else None
         found: dict[str, object] = {"seconds": self.now() - self.begun}
-        found |= {} if why is None else {"why": why.message}
+        if why is not None:
+            found |= {"why": why.message, "proved": refuted(self.trainer.task)}
         found |= {} if driven is None else {"closed_loop": driven.summary()}
         self.journal.close("finished", {**result.summary(), **found})
         return replace(self._ended(), score=result, why=why, driven=driven)
@@ -457,6 +471,7 @@ class _Session:
             "lr": trainer.rate,
             "repaired": look.repaired,
             "failing": look.failing,
+            "explored": look.explored,
             "s_per_step": self.pace.remaining(trainer.step, trainer.steps, trainer.next_look) / rest,
         }
         self.journal.row(row)

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from stlc.controller.buffer import Buffer
+from stlc.controller.explore import EFFORTS, Exploration
 from stlc.controller.missions import Missions
 from stlc.controller.objective import Objective, guided_objective, loss, paper_objective
 from stlc.controller.policy import Mlp, PlanNetwork, network_of
@@ -23,16 +24,24 @@ from stlc.controller.ranks import ALONE, Ranks
 from stlc.controller.search import THOROUGH, Repaired, Search, Searcher
 from stlc.controller.supply import Draws, Fixed, Supply
 from stlc.controller.task import rank, satisfied
+from stlc.native import never
 
 if TYPE_CHECKING:
     from stlc.controller.config import Engine
     from stlc.controller.task import Task
+    from stlc.native import Stop
 
 MARGIN_STATES = 128
 MARGIN_SHARE = 0.2
 MARGIN_RANGE = (0.01, 0.5)
 TORCH_MARGIN_STATES, TORCH_MOST, TORCH_TRIES = 32, 64, 2048
 """States and plans of the searches of a training where torch does their work: some hundred times slower."""
+BARREN = 0.05
+"""Share of the failing states that a climb solves, below which plans are looked for by exploration too."""
+LEARNT = 0.5
+"""Share of fresh states that a policy satisfies, from which on nothing is explored any more."""
+EXPLORED = 4
+"""Starts that are explored before a round, at most."""
 RISE = 30
 """Steps to the peak of the learning rate where it is held; independent of how many there will be."""
 
@@ -47,6 +56,7 @@ class Look:
         feasible: share for which a satisfying plan is known after the search (None: no search was made).
         failing: states that the search worked on.
         repaired: how many of them it solved.
+        explored: plans that exploration found, those from states on their way among them.
     """
 
     accuracy: float
@@ -54,6 +64,7 @@ class Look:
     feasible: float | None
     failing: int
     repaired: int
+    explored: int = 0
 
 
 class Trainer:
@@ -85,6 +96,7 @@ class Trainer:
         self.objective = self._objective()
         self.searcher = self._searcher(MARGIN_SHARE * self.margin)
         self.repairing: Search | None = None
+        self.barren, self.effort, self.explored = False, 0, 0
         self.accuracy = 0.0
         self.loss = math.nan
         self.learnt = torch.empty(0, len(task.names), device=device)
@@ -126,6 +138,35 @@ class Trainer:
         return Mlp(self.task, self.average)
 
     @torch.no_grad()
+    def explore(self, stop: Stop = never) -> bool:
+        """Look for plans by exploration, where the round before has shown that climbing leads nowhere.
+
+        The effort grows with every time that nothing is found. False where `stop` came first; then nothing
+        has changed.
+        """
+        if not self.barren:
+            return True
+        before = self.generator.get_state()
+        starts = self.task.sample(EXPLORED, generator=self.generator)
+        seed = int(torch.randint(2**62, (), generator=self.generator))
+        generator = torch.Generator().manual_seed(seed)
+        effort, spare = EFFORTS[self.effort], self.searcher.enough
+        found = Exploration(self.task).solved(starts, effort, generator, spare, stop).to(self.device)
+        if stop():
+            self.generator.set_state(before)
+            return False
+        self.buffer.add(found.states, found.plans)
+        self.supply.follow(found.states, found.plans)
+        self.barren, self.explored = False, len(found.rho)
+        self.effort += self.explored == 0
+        return True
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether exploration has been tried with all the effort there is, and found nothing."""
+        return self.effort >= len(EFFORTS)
+
+    @torch.no_grad()
     def look(self) -> Look:
         """Judge fresh states; with the guided method also repair what fails.
 
@@ -144,7 +185,9 @@ class Trainer:
         bad = (~good).nonzero()[:, 0][: self._effort[0]]
         self.repairing = self._begin(x0[bad], plans[bad])
         self.accuracy = accuracy
-        return self._of_all(Look(accuracy, shares, feasible, failing, repaired))
+        self.barren = repaired < BARREN * failing and accuracy < LEARNT and not self.exhausted
+        explored, self.explored = self.explored, 0
+        return self._of_all(Look(accuracy, shares, feasible, failing, repaired, explored))
 
     def _begin(self, x0: Tensor, plans: Tensor, seed: int | None = None) -> Search:
         """A search beside the steps until the next round."""
@@ -164,8 +207,9 @@ class Trainer:
 
     def _of_all(self, look: Look) -> Look:
         """What the ranks saw together."""
-        own = (look.feasible or 0.0, look.failing, look.repaired, look.accuracy, *look.requirements)
-        feasible, failing, repaired, accuracy, *shares = self.ranks.mean(own)
+        counts = (look.failing, look.repaired, look.explored)
+        own = (look.feasible or 0.0, *counts, look.accuracy, *look.requirements)
+        feasible, failing, repaired, explored, accuracy, *shares = self.ranks.mean(own)
         size = self.ranks.size
         return Look(
             accuracy,
@@ -173,6 +217,7 @@ class Trainer:
             None if look.feasible is None else feasible,
             round(failing * size),
             round(repaired * size),
+            round(explored * size),
         )
 
     def _take_repaired(self) -> tuple[int, int, float | None]:
@@ -288,7 +333,8 @@ class Trainer:
         """What every rank has for itself."""
         found: dict[str, Tensor] = {"generator": self.generator.get_state()}
         if not self.ranks.first:
-            found["counts"] = torch.tensor([self.accuracy, self.buffer.count], dtype=torch.float64)
+            counts = [self.accuracy, self.buffer.count, self.barren, self.effort]
+            found["counts"] = torch.tensor(counts, dtype=torch.float64)
         kept = len(self.buffer)
         if isinstance(self.training, Fixed):
             found.update({f"training.{name}": value for name, value in self.training.tensors().items()})
@@ -313,6 +359,8 @@ class Trainer:
             "solved": self.buffer.count,
             "next_look": self.next_look,
             "accuracy": self.accuracy,
+            "barren": int(self.barren),
+            "effort": self.effort,
         }
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
@@ -321,6 +369,8 @@ class Trainer:
         self.step, self.steps = int(facts["step"]), int(facts["steps"])
         self.margin, self.next_look = float(facts["margin"]), int(facts["next_look"])
         self.accuracy, self.loss = float(facts["accuracy"]), float(facts.get("loss", math.nan))
+        self.effort = max(int(facts.get("effort", 0)), 0)
+        self.barren = bool(facts.get("barren", 0)) and not self.exhausted
         self.objective = self._objective()
         self.searcher = self._searcher(MARGIN_SHARE * self.margin)
         for prefix, module in (("network", self.network), ("average", self.average)):
@@ -354,8 +404,9 @@ class Trainer:
         shared = ("network.", "average.", "adam.")
         common = {name: value for name, value in tensors.items() if name.startswith(shared)}
         own = _below(tensors, f"rank{self.ranks.rank}")
-        accuracy, solved = own.pop("counts").tolist()
-        return common | own, {**facts, "accuracy": accuracy, "solved": int(solved)}
+        accuracy, solved, barren, effort = own.pop("counts").tolist()
+        counts = {"solved": int(solved), "barren": int(barren), "effort": int(effort)}
+        return common | own, {**facts, "accuracy": accuracy, **counts}
 
 
 def _network(task: Task, engine: Engine, device: torch.device) -> PlanNetwork:

@@ -22,7 +22,7 @@ from stlc.view.held_out import HeldOut, find_weakness, load_held_out, weakness_t
 from stlc.view.words import seconds as duration
 from stlc.view.words import share
 
-Level: TypeAlias = Literal["infeasible", "undertrained", "partly trained", "trained"]
+Level: TypeAlias = Literal["infeasible", "no plan known", "undertrained", "partly trained", "trained"]
 
 UNDERTRAINED, TRAINED = 0.5, 0.95
 """Shares of what is known to be feasible: below is undertrained; from there on is trained."""
@@ -215,14 +215,17 @@ def learning_of(
         sentence = (
             "no plan that satisfies the specification was found for any start, by the policy or by search"
         )
+        proved = bool(result.get("proved"))
+        if proved:
+            sentence = "no plan satisfies the specification: bounds of what the controls can do prove it"
+        more = "more training cannot help" if proved else "more training hardly helps where there is no plan"
         advice: tuple[str, ...] = (
-            "a looser specification, a longer horizon, or another initial set: more training cannot help",
+            f"a looser specification, a longer horizon, or another initial set: {more}",
         )
-        return Learning("infeasible", None, sentence, advice, commands.report)
+        level: Level = "infeasible" if proved else "no plan known"
+        return Learning(level, None, sentence, advice, commands.report)
     part = min(accuracy / feasible, 1.0)
-    level: Level = (
-        "trained" if part >= TRAINED else "partly trained" if part >= UNDERTRAINED else "undertrained"
-    )
+    level = "trained" if part >= TRAINED else "partly trained" if part >= UNDERTRAINED else "undertrained"
     searched, held_out = int(result.get("searched") or 0), int(result.get("held_out") or 0)
     sampled = 0 < searched < held_out
     estimate = f", by an estimate from {searched:,} of the {held_out:,} starts" if sampled else ""

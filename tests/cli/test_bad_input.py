@@ -128,7 +128,7 @@ def test_weights_that_are_no_numbers_are_not_kept(capsys: pytest.CaptureFixture[
         ("require far: eventually[0, T] x > 100\n", "no plan satisfies `far`", ["--> s.stl:5:1"]),
         (
             "require left: always[0, T] x < 0.5\nrequire right: always[0, T] x > 0.5\n",
-            "no plan satisfies `left` and `right` together",
+            "no plan was found that satisfies `left` and `right` together",
             ["--> s.stl:5:1", "6 | require right"],
         ),
     ],
@@ -142,6 +142,7 @@ def test_requirements_that_nothing_satisfies(
     assert all(place in said for place in places)
     record = RunDir.newest().record()
     assert (record["status"], record["result"]["why"]) == ("finished", message)
+    assert record["result"]["proved"] is message.startswith("no plan satisfies")
     assert (RunDir.newest().path / "ckpt" / "last.json").is_file()
 
 
@@ -150,7 +151,7 @@ def test_a_search_that_never_finds_a_plan_ends_early(capsys: pytest.CaptureFixtu
     code, _ = _trained(capsys, {}, rules, "--steps", "400", "--json")
     assert code == 1
     rows = RunDir.newest().rows()
-    assert [row["step"] for row in rows] == [50, 100, 150, 200, 250]
+    assert [row["step"] for row in rows] == [50]  # where it is proved that there is none, no other is tried
 
 
 def test_the_document_has_the_diagnosis(capsys: pytest.CaptureFixture[str]) -> None:

@@ -85,9 +85,13 @@ def test_an_estimate_is_called_one() -> None:
 
 def test_where_nothing_is_possible_training_is_not_the_advice() -> None:
     learning = learning_of(result(0.0, 0.0), [], COMMANDS)
-    assert (learning.level, learning.share) == ("infeasible", None)
-    assert "more training cannot help" in learning.advice[0]
+    assert (learning.level, learning.share) == ("no plan known", None)
+    assert "more training hardly helps" in learning.advice[0]
     assert "train" not in learning.command
+    proved = learning_of({**result(0.0, 0.0), "proved": True}, [], COMMANDS)
+    assert proved.level == "infeasible"
+    assert "prove it" in proved.sentence
+    assert "more training cannot help" in proved.advice[0]
 
 
 def test_a_flat_curve_is_not_answered_with_more_time() -> None:

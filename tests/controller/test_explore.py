@@ -1,0 +1,121 @@
+"""Plans that are put together from their beginnings, where climbing whole plans leads nowhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stlc.compile import ir
+from stlc.compile.semantics import TOLERANCE
+from stlc.controller.config import TrainConfig, decide
+from stlc.controller.explore import Exploration, pieces
+from stlc.controller.search import Searcher
+from stlc.controller.task import Task
+from stlc.controller.trainer import Look, Trainer
+from stlc.dynamics.system import System
+from stlc.grammar.parser import parse
+from stlc.source import Source
+
+SYSTEM = """
+stlc: 1
+name: point
+time: {dt: 1 s, horizon: 16 steps, integrator: euler}
+state:
+  x: {unit: m, range: [0, 10]}
+  y: {unit: m, range: [0, 10]}
+control:
+  vx: {unit: m/s, range: [-1, 1]}
+  vy: {unit: m/s, range: [-1, 1]}
+flow: {x: vx, y: vy}
+init:
+  mixture:
+    - draw: {x: "uniform(4, 4.4)", y: "uniform(4, 4.4)"}
+"""
+SPEC = """
+spec puzzle
+state signal x, y [m]
+def p = [x, y]
+region wall = box([5, 0], [5.6, 3])
+require key:  (p not in box([7, 0], [8, 10])) until[0, T] p in box([1, 0], [2, 1])
+require goal: eventually[0, T] p in box([9, 0], [10, 2])
+require dry:  always[0, T] p not in wall
+"""
+"""The key is on the other side than the goal, behind a door: no plan that falls short hints at it."""
+
+
+@pytest.fixture(scope="module")
+def puzzle(tmp_path_factory: pytest.TempPathFactory) -> Task:
+    path = tmp_path_factory.mktemp("puzzle") / "point.yaml"
+    path.write_text(SYSTEM)
+    return Task.of(parse(Source("puzzle.stl", SPEC)), System.load(path))
+
+
+def test_a_puzzle_is_solved_that_a_climb_does_not_solve(puzzle: Task) -> None:
+    x0 = puzzle.sample(4, seed=0, dtype=torch.float64)
+    middle = torch.zeros(len(x0), puzzle.horizon, 2)
+    climbed = Searcher(puzzle, torch.Generator().manual_seed(0), enough=1e-4).repair(
+        x0.float(), middle, middle[:0], tries=1000
+    )
+    assert not bool(climbed.solved.all())
+    found = Exploration(puzzle).plan(x0[0], 40, torch.Generator().manual_seed(0))
+    assert found.plan is not None
+    judged = puzzle.judge(x0[:1], found.plan[None])
+    assert float(judged.rho) >= -TOLERANCE
+    assert bool((found.plan.abs() <= 1.0).all())
+
+
+def test_the_same_seed_finds_the_same(puzzle: Task) -> None:
+    starts = puzzle.sample(3, seed=0)
+    one, other = (
+        Exploration(puzzle).solved(starts, 24, torch.Generator().manual_seed(3), 0.05) for _ in range(2)
+    )
+    assert len(one.rho) > 0
+    assert torch.equal(one.plans, other.plans)
+    assert bool((puzzle.judge(one.states, one.plans).rho >= -1e-5).all())
+
+
+def test_what_is_found_is_raised_to_what_is_asked(puzzle: Task) -> None:
+    starts = puzzle.sample(2, seed=1)
+    if puzzle.native is None:
+        pytest.skip("there is no C compiler")
+    found = Exploration(puzzle).solved(starts, 48, torch.Generator().manual_seed(0), 0.1)
+    assert float(found.rho.max()) >= 0.1
+
+
+def test_one_sweep_is_made_where_there_is_no_time(puzzle: Task) -> None:
+    asked: list[int] = []
+
+    def enough() -> bool:
+        asked.append(1)
+        return True
+
+    found = Exploration(puzzle).plan(puzzle.sample(1, seed=0)[0], 9, torch.Generator().manual_seed(0), enough)
+    assert found.sweeps == 1
+    assert len(asked) <= 1
+
+
+def test_a_training_explores_where_climbing_leads_nowhere(
+    puzzle: Task, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stlc.controller.trainer.MARGIN_STATES", 8)
+    monkeypatch.setattr("stlc.controller.search.THOROUGH", 16)
+    engine = replace(decide(puzzle, TrainConfig(seed=0, batch=8, threads=1)), pool=16, most=8, every=1)
+    trainer = Trainer(puzzle, engine, steps=8, device=torch.device("cpu"))
+    looks: list[Look] = []
+    while sum(look.explored for look in looks) == 0 and trainer.step < 6:
+        trainer.advance()
+        looks.append(trainer.look())
+    assert [look.explored for look in looks[:2]] == [0, 0]  # climbing is what is tried first
+    assert looks[-1].explored > 0
+    assert trainer.buffer.count >= looks[-1].explored
+
+
+def test_pieces_are_what_a_formula_is_the_conjunction_of() -> None:
+    a, b, c = (ir.Atom(ir.Col(name)) for name in "abc")
+    window = ir.Window(0, 3)
+    whole = ir.Join("and", (c, ir.Over("always", window, ir.Join("and", (a, b)))))
+    assert pieces(whole) == [c, ir.Over("always", window, a), ir.Over("always", window, b)]
+    either = ir.Over("eventually", window, ir.Join("and", (a, b)))
+    assert pieces(either) == [either]
