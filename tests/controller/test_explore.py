@@ -100,14 +100,15 @@ def test_a_training_explores_where_climbing_leads_nowhere(
     puzzle: Task, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("stlc.controller.trainer.MARGIN_STATES", 8)
-    monkeypatch.setattr("stlc.controller.search.THOROUGH", 16)
+    monkeypatch.setattr("stlc.controller.trainer.BARREN", 2.0)  # whatever a climb solves
     engine = replace(decide(puzzle, TrainConfig(seed=0, batch=8, threads=1)), pool=16, most=8, every=1)
     trainer = Trainer(puzzle, engine, steps=8, device=torch.device("cpu"))
     looks: list[Look] = []
     while sum(look.explored for look in looks) == 0 and trainer.step < 6:
         trainer.advance()
+        assert trainer.explore()
         looks.append(trainer.look())
-    assert [look.explored for look in looks[:2]] == [0, 0]  # climbing is what is tried first
+    assert [look.explored for look in looks[:2]] == [0, 0]  # climbing is tried first
     assert looks[-1].explored > 0
     assert trainer.buffer.count >= looks[-1].explored
 
