@@ -39,6 +39,8 @@ NARROW = 0.03
 """Half the width of an interval at which a share is known well enough."""
 NEAR = 0.02
 """Share by which a cheaper guard may be worse than the best one and still be recommended."""
+LEAST = 20
+"""Drives from which on a guard may be recommended that is hardly known to be better."""
 FEWER = 4
 """A seed whose drives take too long is driven with so many times fewer agents."""
 
@@ -75,6 +77,11 @@ class Share:
         """The 95 % Wilson interval of the share."""
         return wilson(self.share, self.drives)
 
+    def better_than(self, other: Share) -> bool:
+        """Whether it is worth its cost: by more than `NEAR`, and over `LEAST` drives or beyond doubt."""
+        proved = self.drives >= LEAST or self.interval[0] > other.interval[1]
+        return proved and self.share > other.share + NEAR
+
     def summary(self) -> dict[str, object]:
         """For JSON documents."""
         safe = None if self.safe is None else self.safe / self.drives
@@ -109,11 +116,12 @@ class ClosedLoop:
 
     @property
     def recommended(self) -> Share | None:
-        """The cheapest guard that does about as well as the best."""
-        if not self.shares:
-            return None
-        best = max(share.share for share in self.shares)
-        return next(share for share in self.shares if share.share >= best - NEAR)
+        """The cheapest guard that does about as well as the best, few drives of which prove little."""
+        best: Share | None = None
+        for share in self.shares:
+            if best is None or share.better_than(best):
+                best = share
+        return best
 
     def summary(self) -> dict[str, object]:
         """For JSON documents."""

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.controller.closed_loop import NEAR, SEED, ClosedLoop, Share, closed_loop, reserve
+from stlc.controller.closed_loop import LEAST, NEAR, SEED, ClosedLoop, Share, closed_loop, reserve
 from stlc.controller.config import DRIVES, HELD_OUT_SEED, TrainConfig, decide
 from stlc.controller.launch import Launch, open_folder
 from stlc.controller.policy import Mlp, network_of
@@ -108,11 +108,21 @@ def test_the_cheapest_guard_that_does_as_well_is_recommended(drawn: tuple[tuple[
     )
     best = ClosedLoop(shares, 10).recommended
     assert best is not None
-    assert best.share >= max(share.share for share in shares) - NEAR
-    cheaper = shares[: guards.index(best.guard)]
-    assert all(share.share < max(each.share for each in shares) - NEAR for share in cheaper)
+    assert all(share.share <= best.share + NEAR for share in shares if share.drives >= LEAST)
+    assert not any(share.share >= best.share for share in shares[: guards.index(best.guard)])
     low, high = best.interval
     assert low - 1e-9 <= best.share <= high + 1e-9
+
+
+def test_few_drives_prove_little() -> None:
+    shares = (Share("none", 40, 29, 29), Share("paper", 20, 5, 20), Share("full", 5, 5, 5))
+    best = ClosedLoop(shares, 10).recommended
+    assert best is not None
+    assert best.guard == "none"
+    shares = (Share("none", 20, 0, 0), Share("full", 5, 5, 5))
+    best = ClosedLoop(shares, 10).recommended
+    assert best is not None
+    assert best.guard == "full"
 
 
 def test_what_is_said_of_drives() -> None:
