@@ -1,0 +1,86 @@
+"""The tasks of `examples/tasks`: they compile, known plans satisfy them, and training comes to drive them."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from stlc.cli.app import main
+from stlc.compile.semantics import TOLERANCE
+from stlc.controller.task import Task
+from stlc.dynamics.system import System
+from stlc.files import read_source
+from stlc.grammar.parser import parse
+from stlc.lint.lint import lint
+from stlc.monitor.verdict import Monitor
+
+ROOT = Path(__file__).resolve().parents[2]
+TASKS = ROOT / "examples" / "tasks"
+NAMES = sorted(json.loads((ROOT / "tests" / "data" / "task_plans.json").read_text()))
+PLANS: dict[str, Any] = json.loads((ROOT / "tests" / "data" / "task_plans.json").read_text())
+"""For each task a start and the controls of a whole mission, found by exploration."""
+ENOUGH = 38
+"""Of 40 drives, how many satisfy the specification at least, with the guard that does best."""
+
+
+def task(name: str) -> Task:
+    return Task.of(parse(read_source(TASKS / f"{name}.stl")), System.load(TASKS / f"{name}.yaml"))
+
+
+def test_every_task_has_a_system_a_plan_and_a_row() -> None:
+    assert {path.stem for path in TASKS.glob("*.yaml")} == set(PLANS)
+    table = (TASKS / "README.md").read_text()
+    assert all(f"`{name}`" in table for name in NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_task_compiles_and_nothing_is_to_be_said(name: str) -> None:
+    found = task(name)
+    assert found.compiled.timers
+    assert not lint(read_source(TASKS / f"{name}.stl"))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_known_plan_satisfies_the_task(name: str) -> None:
+    found = task(name)
+    start = torch.tensor([PLANS[name]["start"][column] for column in found.plain.names], dtype=torch.float64)
+    x0 = found.sample(1, seed=0, dtype=torch.float64)[0]
+    x0[: len(start)] = start
+    controls = torch.tensor(PLANS[name]["controls"], dtype=torch.float64)
+    low, high = found.system.control_low - 1e-6, found.system.control_high + 1e-6
+    assert bool(((controls >= low) & (controls <= high)).all())
+    path = found.rollout(x0[None], controls[None])[0].numpy()
+    spec = parse(read_source(TASKS / f"{name}.stl"))
+    horizon = Fraction(found.system.decl.horizon) * found.system.decl.dt
+    monitor = Monitor(spec, dt=found.system.decl.dt, horizon=horizon)
+    driven = {column: values[None] for column, values in zip(found.names, path.T, strict=True)}
+    assert np.all(monitor.check(driven).robustness >= -TOLERANCE)
+    still = found.rollout(x0[None], torch.zeros_like(controls)[None])[0].numpy()
+    driven = {column: values[None] for column, values in zip(found.names, still.T, strict=True)}
+    assert np.all(monitor.check(driven).robustness < 0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_a_minute_of_training_satisfies_the_task(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    budget = ["--budget", "60s", "--clock", "processor", "--threads", "1", "--seed", "1"]
+    where = ["--no-pictures", "--runs", str(tmp_path)]
+    assert main(["train", str(TASKS / f"{name}.stl"), *budget, *where]) == 0
+    capsys.readouterr()
+    obeyed = {}
+    for guard in ("none", "paper", "full"):
+        how = ["--guard", guard, "--time-limit", "none", "--seeds", "4", "--agents", "10"]
+        assert main(["simulate", "latest", *how, "--json", *where]) == 0
+        result = json.loads(capsys.readouterr().out)["result"]
+        obeyed |= {each["guard"]: each["drives"]["obeyed"] for each in result["guards"]}
+        if max(obeyed.values()) >= ENOUGH:
+            break
+    assert max(obeyed.values()) >= ENOUGH
