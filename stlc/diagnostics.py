@@ -231,6 +231,7 @@ CODES: dict[str, str] = {
     "S304": "a mirror that is not a symmetry",
     "W601": "an acceptance rate of initial states below 1 %",
     "W602": "plans of a plant that is unstable",
+    "W604": "a mission without end that is driven for longer than it was judged",
     # runs
     "R101": "no run, or a run folder that is damaged",
     "R102": "a checkpoint of another specification or system",

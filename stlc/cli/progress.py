@@ -67,6 +67,7 @@ class Summary:
         where: where the worst requirement fails, in words, or "".
         unsolved: what remains, in words, or "".
         picture: that shows it, or "".
+        judged: seconds of missions without end on which the policy was judged; None where missions end.
         status: how the run ended: `finished`, `interrupted`, …
     """
 
@@ -84,6 +85,7 @@ class Summary:
     where: str = ""
     unsolved: str = ""
     picture: str = ""
+    judged: float | None = None
     status: str = "finished"
 
 
@@ -313,6 +315,13 @@ def native_text(by_torch: Mapping[str, str]) -> str:
     return " · ".join(lines)
 
 
+def _judged(summary: Summary) -> list[str]:
+    """For how long a mission without end was driven."""
+    if summary.judged is None:
+        return []
+    return [f"judged          on missions of {summary.judged:g} s; what is required has no end"]
+
+
 def final_screen(summary: Summary, spark: str = "") -> list[str]:
     """The lines that close a training run; the last one is the next command, where there is a verdict."""
     low, high = summary.interval
@@ -327,6 +336,7 @@ def final_screen(summary: Summary, spark: str = "") -> list[str]:
         if 0 < summary.searched < summary.held_out:
             estimate = f" (an estimate: {summary.searched:,} starts were searched or solved)"
         lines.append(f"known feasible  {summary.feasible:.3f}   of which {share} are satisfied{estimate}")
+    lines += _judged(summary)
     learning = summary.learning
     if learning is not None:
         lines.append(f"verdict         {learning.level}: {learning.sentence}")

@@ -123,7 +123,7 @@ def simulate(
     """Deploy the policy of a run, record it, and say how it did."""
     chosen = _guard(backup, guard)
     printed = _printed(json=json, margins=margins)
-    from stlc.cli.output import emit_json
+    from stlc.cli.output import emit_json, show_diagnostics
     from stlc.cli.simulate_pictures import draw, require_robots
     from stlc.cli.simulate_text import closing, screen
     from stlc.cli.simulate_watch import require_writable
@@ -135,6 +135,7 @@ def simulate(
         check_writable(record)
     require_writable(margins)
     opened = Run.open(run, root=runs, overrides=parse_overrides(set_))
+    show_diagnostics(_longer(opened, steps or opened.task.system.decl.test.steps))
     if window:
         require_robots(opened)
     test, which = opened.task.system.decl.test, tuple(range(seed, seed + seeds))
@@ -152,6 +153,18 @@ def simulate(
     else:
         _print(closing(document["trace"], drawn, record, _needed_system(opened)), printed)
     _end(opened, window=window, code=code)
+
+
+def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
+    """W604 where what is required for ever is driven for longer than the policy was judged."""
+    result = run.dir.record().get("result")
+    judged = result.get("judged_seconds") if isinstance(result, dict) else None
+    seconds = steps * run.task.dt
+    if not isinstance(judged, int | float) or seconds <= judged:
+        return ()
+    message = f"{seconds:g} s are driven, and training judged the policy on missions of {judged:g} s"
+    note = "what is required has no end: nothing is known of it beyond that but what is driven now"
+    return (Diagnostic("W604", message, note=(note,)),)
 
 
 def _end(run: Run, *, window: bool, code: int) -> None:

@@ -230,6 +230,7 @@ def _summary(outcome: Outcome, *, pictures: bool) -> Summary:
         searched=int(score.searched.sum()),
         learning=learning,
         driven=driven_lines({} if outcome.driven is None else {"closed_loop": outcome.driven.summary()}),
+        judged=score.endless,
         where=where,
         unsolved=unsolved,
         picture=f"{folder.shown}/{FAILURES}" if pictures and weakness and drawn.is_file() else "",

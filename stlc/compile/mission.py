@@ -82,6 +82,13 @@ def mission_steps(goal: Goal) -> int:
     return max(map(mission_steps, goal.items))
 
 
+def endless(goal: Goal) -> bool:
+    """Whether a mission is never over: one of its formulas has no end."""
+    if isinstance(goal, Leaf):
+        return goal.formula.window.hi is None
+    return any(map(endless, goal.items))
+
+
 # ----------------------------------------------------------------------------- the latch
 
 

@@ -25,7 +25,7 @@ from stlc.compile.interface import Grid, Interface
 from stlc.compile.lift import recorded
 from stlc.compile.lower import lower
 from stlc.compile.margins import as_written
-from stlc.compile.mission import Goal, mission_steps
+from stlc.compile.mission import Goal, endless, mission_steps
 from stlc.compile.modulo import jumps
 from stlc.compile.pull import pull
 from stlc.compile.ranges import Facts
@@ -110,6 +110,8 @@ class Compiled:
         parameters: what is drawn for every trajectory and the system does not carry, for training.
         pull: for training, how far the next goal of the mission is at one sample; None without such goals.
         mission: the last step of the mission that a requirement names; None where none does.
+        recurring: of a mission that is never over, the steps that its timers remember: it comes round after
+            about so many. None where all missions end.
         grid: of time.
         warnings: what is worth saying although it compiles.
         typed: the resolved specification.
@@ -124,6 +126,7 @@ class Compiled:
     parameters: tuple[typed.Parameter, ...]
     pull: ir.Num | None = field(repr=False)
     mission: int | None
+    recurring: int | None
     grid: Grid
     warnings: tuple[Diagnostic, ...]
     typed: typed.Spec = field(repr=False)
@@ -190,6 +193,7 @@ def compile_spec(
         parameters=tuple(each for each in resolved.parameters if not each.carried),
         pull=pull(goals),
         mission=max(map(mission_steps, goals), default=None),
+        recurring=_remembered(stage.ledger.timers) if any(map(endless, goals)) else None,
         grid=grid,
         warnings=tuple(sink),
         typed=resolved,
@@ -244,6 +248,11 @@ class _Stage:
 
     def _lowered(self, formula: typed.Formula) -> ir.Formula:
         return simplify(lower(formula, self.grid, self.sink))
+
+
+def _remembered(timers: Iterable[Timer]) -> int:
+    """The most steps that a timer counts; 0 where there is none."""
+    return max((int(timer.high) for timer in timers if timer.kind == "timer"), default=0)
 
 
 def _without(interface: Interface, names: Iterable[str]) -> Interface:

@@ -57,6 +57,8 @@ def _draw(goal: Goal) -> _Draw | None:
 def _leaf(leaf: Leaf) -> _Draw | None:
     """Promises draw until they are met, `always` until its window begins."""
     formula, window = leaf.formula, leaf.formula.window
+    if formula.op == "always" and window.hi is None and (rounds := _rounds(leaf)):
+        return rounds
     promise = formula.op in ("eventually", "until")
     due = window.hi if promise else window.lo
     if due is None or due == 0 or isinstance(formula.margin, ir.Truth):
@@ -71,6 +73,29 @@ def _leaf(leaf: Leaf) -> _Draw | None:
     gap = ir.Op("relu", (ir.Op("neg", (margin,)),))
     over = _where(lost, ir.Lit(_LOST), ir.Lit(_DONE))
     return _Draw(_where(waiting, gap, _ZERO), _where(waiting, left, over))
+
+
+def _rounds(leaf: Leaf) -> _Draw | None:
+    """What recurs for ever, `always@[a, end] once[0, c] p`: p draws, and is due c after it was last there."""
+    margin = leaf.formula.margin
+    parts = margin.items if isinstance(margin, ir.Join) and margin.op == "and" else (margin,)
+    draws = [draw for part in parts if (draw := _round(part, leaf)) is not None]
+    return _first_due(draws) if draws else None
+
+
+def _round(part: ir.Formula, leaf: Leaf) -> _Draw | None:
+    """Of `p or c - since >= 0`."""
+    if not isinstance(part, ir.Join) or part.op != "or":
+        return None
+    tests = [item.num for item in part.items if isinstance(item, ir.Atom) and item.guard and item.sign > 0]
+    margin = _margin(part)
+    if margin is None or len(tests) != 1:
+        return None
+    begins = ir.Op("sub", (ir.Lit(float(leaf.formula.window.lo)), leaf.clock))
+    left = ir.Op("max", (begins, tests[0]))
+    lost = at_least(ir.Lit(-0.5), leaf.status)
+    gap = ir.Op("relu", (ir.Op("neg", (margin,)),))
+    return _Draw(_where(lost, _ZERO, gap), _where(lost, ir.Lit(_LOST), left))
 
 
 def _first_due(draws: Sequence[_Draw]) -> _Draw:

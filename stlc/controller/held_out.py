@@ -13,7 +13,7 @@ import torch
 
 from stlc.controller.config import HELD_OUT, HELD_OUT_SEED
 from stlc.controller.explore import EFFORTS, Exploration
-from stlc.controller.missions import visited
+from stlc.controller.missions import mission_steps, visited
 from stlc.controller.savable import Hunt
 from stlc.controller.search import Searcher
 from stlc.controller.task import satisfied
@@ -59,6 +59,7 @@ class Score:
         each: (n, requirements).
         known: states for which some satisfying plan is known, (n,) bool.
         searched: states that the policy solves or that were searched, (n,) bool.
+        endless: of missions without end, the seconds of them that were driven for the states; else None.
     """
 
     accuracy: float
@@ -70,6 +71,7 @@ class Score:
     each: Tensor
     known: Tensor
     searched: Tensor
+    endless: float | None = None
 
     def summary(self) -> dict[str, object]:
         """The plain numbers, for `run.json`."""
@@ -80,6 +82,7 @@ class Score:
             "requirements": self.requirements,
             "feasible": self.feasible,
             "searched": int(self.searched.sum()),
+            **({} if self.endless is None else {"judged_seconds": self.endless}),
         }
 
 
@@ -131,6 +134,7 @@ def score(
     return Score(
         accuracy=accuracy,
         interval=wilson(accuracy, n),
+        endless=None if task.compiled.recurring is None else mission_steps(task) * task.dt,
         requirements={rule.name: float(share) for rule, share in zip(task.rules, shares, strict=True)},
         feasible=_feasible(known, searched, failing),
         states=states,

@@ -31,6 +31,8 @@ GLIMPSES = 4
 """States that are handed out of every leg of a mission."""
 STARTS = 0.1
 """Share of mission starts among the states that are handed out."""
+ROUNDS = 5
+"""How often what recurs for ever is driven round: so long what policies come to is on record."""
 GIVE_UP = 0.3
 """Chance that a mission ends with a leg whose plan fails."""
 
@@ -124,9 +126,13 @@ class Missions:
 
 
 def mission_steps(task: Task) -> int:
-    """How long missions are driven: past the last step that the specification names."""
-    named = task.compiled.mission
-    return task.horizon * 4 if named is None else named + task.horizon
+    """How long missions are driven: past the last step that is named; of those without end, some rounds."""
+    named, recurring = task.compiled.mission, task.compiled.recurring
+    if named is None:
+        return task.horizon * 4
+    if recurring is None:
+        return named + task.horizon
+    return named + ROUNDS * max(task.horizon, recurring)
 
 
 @torch.no_grad()

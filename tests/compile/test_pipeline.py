@@ -10,6 +10,7 @@ import pytest
 from mission_strategies import augmented
 
 from stlc.compile import ir
+from stlc.compile.arith import Program
 from stlc.compile.dump import dump
 from stlc.compile.graph import evaluate
 from stlc.compile.interface import Grid
@@ -197,6 +198,25 @@ REWRITTEN = {
 def test_time_becomes_state(written: str, rewritten: str) -> None:
     (rule,) = compiled(f"require a: {written}").requirements
     assert show_formula(rule.formula) == rewritten
+
+
+def test_what_recurs_for_ever_is_known_and_draws() -> None:
+    spec = compiled(
+        "require a: always@[2 s, end] once[0, 2 s] x > 1 m\nrequire b: always@[2 s, end] once[0, 1 s] y > 1 m"
+    )
+    assert (spec.mission, spec.recurring) == (20, 21)
+    assert spec.pull is not None
+    gap = Program({"gap": spec.pull})
+
+    def drawn(clock: float, a: float, b: float) -> float:
+        timers = {"clock": clock, "a_since": a, "b_since": b, "a": 0.0, "b": 0.0}
+        env = {name: np.array([value]) for name, value in (timers | {"x": -1.0, "y": -4.0}).items()}
+        return float(gap(env, NUMPY)["gap"][0])
+
+    assert drawn(40.0, 18.0, 3.0) == 2.0, "a is due in 2 steps, b in 7"
+    assert drawn(40.0, 5.0, 8.0) == 5.0, "b is due in 2 steps, a in 15"
+    ending = compiled("require a: always@[2 s, 4 s] once[0, 2 s] x > 1 m")
+    assert (ending.mission, ending.recurring) == (40, None)
 
 
 def test_equal_states_are_kept_once() -> None:

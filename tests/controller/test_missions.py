@@ -15,7 +15,7 @@ from stlc.controller.config import TrainConfig, decide
 from stlc.controller.deploy import Guard
 from stlc.controller.drive import Recorder, Recording, Setting, drive
 from stlc.controller.executed import judge_executed
-from stlc.controller.missions import GLIMPSES, POOL, Missions, visited
+from stlc.controller.missions import GLIMPSES, POOL, ROUNDS, Missions, mission_steps, visited
 from stlc.controller.policy import Mlp, PlanNetwork
 from stlc.controller.supply import Draws
 from stlc.controller.task import Judged, Task
@@ -66,6 +66,13 @@ def task_of(text: str, system: System) -> Task:
 @pytest.fixture
 def task(system: System) -> Task:
     return task_of(MISSION, system)
+
+
+def test_missions_without_end_are_driven_for_several_rounds(system: System) -> None:
+    ending = task_of("state signal x [m]\nrequire a: always@[2 s, 4 s] once[0, 2 s] x > 1 m", system)
+    assert mission_steps(ending) == 40 + ending.horizon
+    task = task_of("state signal x [m]\nrequire a: always@[2 s, end] once[0, 2 s] x > 1 m", system)
+    assert mission_steps(task) == 20 + ROUNDS * 21
 
 
 def steered(task: Task, x: Tensor) -> Tensor:
