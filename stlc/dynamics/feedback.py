@@ -155,9 +155,9 @@ def linearised(decl: SystemDecl, state: NDArray[np.float64], control: NDArray[np
         points[1 + 2 * row, index] += size
         points[2 + 2 * row, index] -= size
     after = _stepped(decl, points)[:, moving]
-    slopes = (after[1::2] - after[2::2]) / (2.0 * nudge[:, None])
     if not np.isfinite(after).all():
         raise NoFeedbackError("the dynamics give no number at the point of operation")
+    slopes = (after[1::2] - after[2::2]) / (2.0 * nudge[:, None])
     count = len(moving)
     return Linear(
         slopes[:count].T,

@@ -296,6 +296,12 @@ def test_an_unstable_plant_is_told_of(make: Make) -> None:
     assert "W602" in [each.code for each in plain.probe(64)]
 
 
+def test_a_plant_that_gives_no_number_at_rest_is_not_called_unstable(make: Make) -> None:
+    plain = one(make, "hidden: [8]").decl.source.text
+    for wild in ("1 / x * 1 m^2 / (1 s)", "log(x / (1 m)) * (1 m/s)", "sqrt(x / (1 m) - 2) * (1 m/s)"):
+        assert unstable(make(plain.replace("4 / (1 s) * x", wild)).decl) == ()
+
+
 @pytest.mark.parametrize("name", ["car", "maze", "panda", "rover", "ship_safe", "ship_track", "unicycle"])
 def test_the_benchmarks_are_not(name: str) -> None:
     system = System.load(Path(__file__).parents[2] / "examples" / f"{name}.yaml")
