@@ -366,9 +366,9 @@ def _short(formula: typed.Formula) -> str:
 
 
 def _back(window: ir.Window, span: Span) -> typed.Interval:
-    """A window of the past that ends now."""
+    """A window of the past."""
     hi = None if window.hi is None else typed.Time(steps=Fraction(window.hi), span=span)
-    return typed.Interval(typed.Time(), hi, span=span)
+    return typed.Interval(typed.Time(steps=Fraction(window.lo), span=span), hi, span=span)
 
 
 def _since_inside(
