@@ -20,7 +20,7 @@ from stlc.compile.arith import Program
 from stlc.compile.horizon import columns, nodes, numbers, reach, uses_end
 from stlc.compile.inputs import inputs
 from stlc.compile.ops import Array, Ops
-from stlc.compile.samples import Reach, held_by, looks_on
+from stlc.compile.samples import Reach, held_by, looks_at_ends
 from stlc.compile.schedule import Extent, Run, reads, upto, within
 
 Env: TypeAlias = Mapping[str, Array]
@@ -154,7 +154,7 @@ def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
     """How many samples before and after its instant a formula reads where they exist; inf: all."""
     past, future = reach(body)
     on_clock = any(isinstance(node, ir.AtStart) for node in nodes(body))
-    if on_clock or any(map(looks_on, numbers(body))):
+    if on_clock or any(map(looks_at_ends, numbers(body))):
         return math.inf, math.inf
     back = any(isinstance(node, (ir.Past, ir.Since)) and node.window.hi is None for node in nodes(body))
     return math.inf if back else past, math.inf if uses_end(body) else future

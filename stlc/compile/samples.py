@@ -81,6 +81,11 @@ def looks_on(num: ir.Num) -> bool:
     return any(isinstance(leaf, ir.At) and leaf.clamped and leaf.steps > 0 for leaf in leaves(num))
 
 
+def looks_at_ends(num: ir.Num) -> bool:
+    """Whether the value of a number depends on where the trace begins, or on where it ends."""
+    return any(isinstance(leaf, ir.At) and leaf.clamped for leaf in leaves(num))
+
+
 def reach_of(num: ir.Num) -> Reach:
     """How many samples before and after the one at hand have to exist for a number to have a value."""
     steps = [leaf.steps for leaf in leaves(num) if isinstance(leaf, ir.At) and not leaf.clamped]
