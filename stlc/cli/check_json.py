@@ -46,7 +46,7 @@ def entry_of(result: Checked, end: str) -> dict[str, Any]:
 
 
 def gap_entry(gap: Gap, time: Callable[[int], float]) -> dict[str, Any]:
-    """Where a signal is not known."""
+    """Samples at which a signal is unknown."""
     return {"samples": gap.samples, "first": time(gap.first), "last": time(gap.last)}
 
 

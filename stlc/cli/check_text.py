@@ -161,7 +161,7 @@ def _count(judged: Judgement, verdict: Verdict) -> str:
 
 
 def _gaps(result: Checked) -> list[str]:
-    """Where signals are not known that are needed."""
+    """Samples that are needed and unknown, a line a signal."""
     return [f"  {text}" for text in _gap_texts(result).values()]
 
 

@@ -24,7 +24,7 @@ ERRORS = {
 """Errors of a scenario, in words."""
 TITLES = {"none": "no guard", "paper": "paper's guard", "full": "full guard"}
 COMPARED = ("obeyed every rule", "plan accuracy")
-"""What scenarios are compared by; drives that are lost are not counted."""
+"""Columns by which scenarios are compared; drives that are lost are not counted."""
 
 ROWS = {
     "plan accuracy": "plan_accuracy",
@@ -87,7 +87,7 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
 
 
 def _starts(document: Record) -> Iterator[str]:
-    """Which starts were taken, where not all were."""
+    """A line on the starts that were taken, where not all were."""
     known = {"savable": "a safe plan", "feasible": "a plan that satisfies everything"}.get(document["starts"])
     if known:
         yield f"  starts from which {known} is known; {document['redrawn']:,} others were drawn again"

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 BESIDE = 10.0
 """Seconds that a command has beside its budget."""
 AFTER = 1.2
-"""What pictures and the end of a process take, beside what came before the training."""
+"""Seconds for pictures and the end of a process, beside those before the training."""
 FAILURES = "failures.png"
 """What the report draws of the starts that fail."""
 
@@ -115,7 +115,7 @@ class Sitting:
         self._forced.close()
 
     def _ended(self, _code: int = INTERRUPTED) -> None:
-        """What is left of a run that was ended on the spot: its last checkpoint."""
+        """The remains of a run that was ended on the spot: its last checkpoint."""
         with suppress(StlcError):
             self.folder.finish("interrupted")
         self._say_interrupted()

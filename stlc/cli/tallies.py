@@ -109,7 +109,7 @@ def _row(name: str, tally: Tally, online: Online, cause: Cause | None) -> Row:
 
 
 def _gap_texts(online: Online) -> dict[str, str]:
-    """Where signals are not known."""
+    """Samples that are unknown, a line a signal."""
     return {
         name: gap_text(name, gap, online.samples, (_moment(online, gap.first), _moment(online, gap.last)))
         for name, gap in online.gaps.items()

@@ -21,7 +21,7 @@ Entry: TypeAlias = ir.Lit | ir.Col | ir.At
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """What a shape stands for, row by row.
+    """Constants and columns of each row that has a shape.
 
     Attributes:
         rows: how many there are.

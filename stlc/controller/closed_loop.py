@@ -35,8 +35,8 @@ SEED = 1 << 40
 """Seed of the first drives; those of `simulate` begin at 0."""
 GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
 """From the cheapest to the dearest."""
-NARROW = 0.03
-"""Half the width of an interval at which a share is known well enough."""
+NARROW = 0.005
+"""Half the width of an interval at which a share is known: small, so that drives take the time they have."""
 NEAR = 0.02
 """Share by which a cheaper guard may be worse than the best one and still be recommended."""
 LEAST = 20

@@ -51,7 +51,7 @@ class Prepared:
 
 
 def gap_text(name: str, gap: Gap, samples: int, moments: tuple[str, str]) -> str:
-    """Where a signal is not known: ``rpm` is unknown at 120 of 6,000 samples (t = 8 s to 20 s)`."""
+    """Samples at which a signal is unknown: ``rpm` is unknown at 120 of 6,000 samples (t = 8 s to 20 s)`."""
     first, last = moments
     where = first if gap.samples == 1 else f"{first} to {last.removeprefix('t = ')}"
     return f"`{visible(name)}` is unknown at {gap.samples:,} of {samples:,} samples ({where})"
