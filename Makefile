@@ -1,5 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
+# Hundreds of tests start the program: what Python compiles is kept, whatever the shell says.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: help demo test format docs environment clean
 

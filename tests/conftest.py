@@ -16,9 +16,14 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells start what ru
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.register_profile(
-    "stlc", deadline=None, derandomize=True, print_blob=True, suppress_health_check=[HealthCheck.too_slow]
+    "stlc",
+    max_examples=40,
+    deadline=None,
+    derandomize=True,
+    print_blob=True,
+    suppress_health_check=[HealthCheck.too_slow],
 )
-settings.register_profile("explore", parent=settings.get_profile("stlc"), derandomize=False)
+settings.register_profile("explore", parent=settings.get_profile("stlc"), max_examples=200, derandomize=False)
 settings.load_profile("explore" if os.environ.get("STLC_EXPLORE") else "stlc")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -134,18 +135,22 @@ def module_name(path: Path) -> str:
 
 
 MODULES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
-TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
+
+
+@cache
+def tree_of(name: str) -> ast.Module:
+    return ast.parse(MODULES[name].read_text(encoding="utf-8"))
 
 
 def imports_of(name: str) -> Iterator[Import]:
     guarded = {
         id(node)
-        for block in ast.walk(TREES[name])
+        for block in ast.walk(tree_of(name))
         if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
         for statement in block.body
         for node in ast.walk(statement)
     }
-    for node in ast.walk(TREES[name]):
+    for node in ast.walk(tree_of(name)):
         for target in targets_of(node):
             yield Import(name, target, node.lineno, id(node) in guarded)
 
@@ -174,7 +179,9 @@ def room_of(module: str) -> int:
     return room
 
 
-EVERY_IMPORT = [entry for name in MODULES for entry in imports_of(name)]
+@cache
+def every_import() -> list[Import]:
+    return [entry for name in MODULES for entry in imports_of(name)]
 
 
 def test_every_module_has_one_room():
@@ -186,7 +193,7 @@ def test_every_module_has_one_room():
 def test_imports_go_down_only():
     upward = [
         f"{entry.module}:{entry.line} imports {entry.target}"
-        for entry in EVERY_IMPORT
+        for entry in every_import()
         if entry.target.partition(".")[0] == "stlc" and room_of(entry.target) > room_of(entry.module)
     ]
     assert not upward, "\n".join(upward)
@@ -194,7 +201,7 @@ def test_imports_go_down_only():
 
 def test_no_cycles():
     graph: dict[str, set[str]] = {name: set() for name in MODULES}
-    for entry in EVERY_IMPORT:
+    for entry in every_import():
         if entry.target in MODULES and entry.target != entry.module and not entry.typing_only:
             graph[entry.module].add(entry.target)
     try:
@@ -207,7 +214,7 @@ def test_no_cycles():
 def test_a_library_is_imported_only_where_it_belongs(library):
     strays = [
         f"{entry.module}:{entry.line}"
-        for entry in EVERY_IMPORT
+        for entry in every_import()
         if entry.target.partition(".")[0] == library
         and not entry.typing_only
         and not entry.module.startswith(HOMES[library])
@@ -218,7 +225,7 @@ def test_a_library_is_imported_only_where_it_belongs(library):
 def test_schemas_do_not_import_torch():
     strays = [
         entry
-        for entry in EVERY_IMPORT
+        for entry in every_import()
         if entry.module.startswith("stlc.dynamics.schema") and entry.target.partition(".")[0] == "torch"
     ]
     assert not strays
@@ -243,7 +250,7 @@ def calls(tree: ast.Module) -> Iterator[tuple[str, ast.Call]]:
 
 @pytest.mark.parametrize("name", MODULES)
 def test_nothing_that_a_user_gives_is_run(name):
-    for function, call in calls(TREES[name]):
+    for function, call in calls(tree_of(name)):
         options = {option.arg: ast.unparse(option.value) for option in call.keywords}
         assert function not in DANGEROUS, f"{name}:{call.lineno}: {function} {DANGEROUS[function]}"
         assert options.get("shell", "False") == "False", f"{name}:{call.lineno}: a shell"

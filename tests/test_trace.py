@@ -278,7 +278,7 @@ def damaged(data: bytes, cut: int, flips: list[tuple[int, int]]) -> bytes:
     cut=st.integers(0, 2000),
     flips=st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), max_size=4),
 )
-@settings(deadline=None, max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damage_is_a_diagnostic_or_harmless(tmp_path: Path, cut: int, flips: list[tuple[int, int]]) -> None:
     whole = tmp_path / "whole.npz"
     if not whole.exists():

@@ -78,7 +78,7 @@ def outcome(data: bytes) -> object:
 
 @pytest.mark.usefixtures("reader")
 @given(st.lists(st.one_of(DECIMALS, HALVES), min_size=1, max_size=60))
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=50)
 def test_every_number_is_the_nearest_double(cells: list[str]) -> None:
     room = [*cells, *["0"] * (40 * len(cells))]  # a few may be doubts
     columns = read_lines(Lines("\n".join(room).encode(), 0, 1, ","))

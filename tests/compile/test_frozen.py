@@ -44,7 +44,7 @@ def lowered(formula: typed.Formula) -> ir.Formula:
     return out
 
 
-@settings(max_examples=200)
+@settings(max_examples=50)
 @given(looking, traces(high=10))
 def test_cut_windows_give_the_definition(formula: typed.Formula, env: Env) -> None:
     wanted = expected(formula, env, "truncate")
@@ -53,14 +53,14 @@ def test_cut_windows_give_the_definition(formula: typed.Formula, env: Env) -> No
         np.testing.assert_allclose(signal, wanted, atol=1e-9, rtol=0)
 
 
-@settings(max_examples=200)
+@settings(max_examples=50)
 @given(bounded, traces(high=16))
 def test_strict_is_the_definition_or_undefined(formula: typed.Formula, env: Env) -> None:
     signal = robustness_signal(lowered(formula), env, ops=NUMPY, end="strict")
     np.testing.assert_allclose(signal, expected(formula, env, "strict"), atol=1e-9, rtol=0)
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(looking, traces(high=7))
 def test_bounds_over_all_continuations(formula: typed.Formula, env: Env) -> None:
     node = lowered(formula)
@@ -69,7 +69,7 @@ def test_bounds_over_all_continuations(formula: typed.Formula, env: Env) -> None
         np.testing.assert_allclose(signal, expected(formula, env, "open", side), atol=1e-9, rtol=0)
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(looking, traces(low=2, high=10), st.sampled_from([1, 16, 60]))
 def test_torch_agrees_whatever_is_laid_out_at_once(formula: typed.Formula, env: Env, most: int) -> None:
     node = simplify(lowered(formula))
@@ -81,7 +81,7 @@ def test_torch_agrees_whatever_is_laid_out_at_once(formula: typed.Formula, env: 
     np.testing.assert_allclose(signal.numpy(), wanted, atol=1e-9, rtol=0)
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(looking, traces(high=10))
 def test_truth_goes_with_the_sign(formula: typed.Formula, env: Env) -> None:
     signal = robustness_signal(lowered(formula), env, ops=NUMPY, end="truncate")

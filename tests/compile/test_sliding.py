@@ -82,7 +82,7 @@ def random(window: Sliding, seed: int, batch: int = 3) -> torch.Tensor:
 
 @pytest.mark.usefixtures("_layout")
 @BOTH
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(window=windows(), seed=st.integers(0, 999))
 def test_values_and_gradients_are_those_of_loops(pick: Pick, window: Sliding, seed: int) -> None:
     x, y = random(window, seed).requires_grad_(), random(window, seed + 1).requires_grad_()
@@ -103,7 +103,7 @@ def test_values_and_gradients_are_those_of_loops(pick: Pick, window: Sliding, se
 
 
 @BOTH
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(window=windows(), seed=st.integers(0, 999))
 def test_windows_side_by_side_are_those_of_loops(pick: Pick, window: Sliding, seed: int) -> None:
     x, y = random(window, seed).requires_grad_(), random(window, seed + 1).requires_grad_()
@@ -146,7 +146,7 @@ def plain(value: torch.Tensor | np.ndarray) -> np.ndarray:
 
 @pytest.mark.usefixtures("_layout")
 @BOTH
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(window=windows(), seed=st.integers(0, 999))
 def test_gradients_where_operands_tie_are_subgradients(pick: Pick, window: Sliding, seed: int) -> None:
     """The gradient of every window goes, whole, to operands that have its value."""

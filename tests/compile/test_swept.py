@@ -103,7 +103,7 @@ def test_regions_in_space_are_exact(region, now, then) -> None:
     )
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(now=places, then=places)
 def test_a_polygon_that_is_not_convex(now, then) -> None:
     """Exact where it is satisfied, and of the right sign everywhere."""

@@ -456,7 +456,7 @@ def mutations(draw: st.DrawFn) -> str:
     return text
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(mutations())
 def test_damaged_texts_give_findings_or_trees(text):
     found = findings(parse, text)
@@ -466,7 +466,7 @@ def test_damaged_texts_give_findings_or_trees(text):
         assert 0 <= finding.span.start <= finding.span.end <= len(text)
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(st.text(max_size=60) | st.lists(st.sampled_from(PIECES), max_size=20).map(" ".join))
 def test_any_text_gives_findings_or_a_tree(text):
     for read in (parse, parse_expr):

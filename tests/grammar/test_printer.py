@@ -22,7 +22,7 @@ def expr(text: str) -> ast.Expr:
     return parse_expr(Source("text", text))
 
 
-@settings(max_examples=250)
+@settings(max_examples=60)
 @given(expressions)
 def test_an_expression_reads_back(tree):
     assert expr(show(tree)) == tree

@@ -32,7 +32,7 @@ def nodes(blame: Blame) -> Iterator[Blame]:
         yield from nodes(part)
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(formula=formulas(), env=traces(low=3, batch=1))
 def test_every_node_is_what_it_is_said_to_be(formula: typed.Formula, env: dict[str, np.ndarray]) -> None:
     trace = reference.Trace({name: column[:, 0] for name, column in env.items()}, GRID, "open")

@@ -33,7 +33,7 @@ from stlc.monitor.values import Record, bounds
 from stlc.monitor.verdict import Monitor
 from stlc.monitor.windowed import Windowed
 
-EXAMPLES = int(os.environ.get("STLC_CASES", "150"))
+EXAMPLES = int(os.environ.get("STLC_CASES", "60"))
 """How many random formulas and traces are tried."""
 
 
