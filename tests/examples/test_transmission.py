@@ -94,7 +94,9 @@ def test_a_jittered_clock(
     assert set(found.values()) <= {"satisfied", "violated"}
 
 
-@pytest.mark.parametrize("options", [("--resample", "50ms"), ("--max-gap", "0.3s")])
+@pytest.mark.parametrize(
+    "options", [("--resample", "50ms"), pytest.param(("--max-gap", "0.3s"), marks=pytest.mark.slow)]
+)
 def test_a_jittered_log_with_holes(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...]
 ) -> None:
