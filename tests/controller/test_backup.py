@@ -94,7 +94,7 @@ def test_batches_do_not_change_the_choice_and_bound_the_memory(car_task: Task) -
 
 def test_a_decision_without_time_takes_the_best_of_what_it_has(car_task: Task) -> None:
     """The clock is looked at after each batch; one of them is always judged."""
-    x, plan = failing(car_task, 10.0, n=24)
+    x, plan = failing(car_task, 10.0, n=60)
     whole = Backup(car_task, Constant(car_task, 10.0), grid=grid(batch=3)).search(x, plan)
     backup = Backup(car_task, Constant(car_task, 10.0), grid=grid(batch=3), seconds=0.0)
     hurried = backup.search(x, plan)
