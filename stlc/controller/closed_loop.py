@@ -40,7 +40,9 @@ NARROW = 0.005
 NEAR = 0.02
 """Share by which a cheaper guard may be worse than the best one and still be recommended."""
 LEAST = 20
-"""Drives from which on a guard may be recommended that is hardly known to be better."""
+"""Drives from which on a share is taken as it is."""
+SURE = 0.9
+"""Chance that a guard of fewer drives is better, from which on it is recommended."""
 FEWER = 4
 """A seed whose drives take too long is driven with so many times fewer agents."""
 
@@ -78,9 +80,9 @@ class Share:
         return wilson(self.share, self.drives)
 
     def better_than(self, other: Share) -> bool:
-        """Whether it is worth its cost: by more than `NEAR`, and over `LEAST` drives or beyond doubt."""
-        proved = self.drives >= LEAST or self.interval[0] > other.interval[1]
-        return proved and self.share > other.share + NEAR
+        """Whether it is worth its cost: better by more than `NEAR`, and surely so where drives are few."""
+        better = self.share > other.share + NEAR
+        return better and (self.drives >= LEAST or _superiority(self, other, NEAR) >= SURE)
 
     def summary(self) -> dict[str, object]:
         """For JSON documents."""
@@ -136,6 +138,17 @@ class ClosedLoop:
             "judge": self.judge,
             "why": self.why,
         }
+
+
+def _superiority(first: Share, second: Share, by: float) -> float:
+    """Chance that the first share is the larger one by so much, of uniform priors (a beta posterior each)."""
+    grid = np.linspace(0.0, 1.0, 2001)
+    mass = []
+    for share in (first, second):
+        density = grid**share.satisfied * (1.0 - grid) ** (share.drives - share.satisfied)
+        mass.append(density / density.sum())
+    below = np.interp(grid + by, grid, np.cumsum(mass[0]))
+    return float(((1.0 - below) * mass[1]).sum())
 
 
 class _LateError(Exception):

@@ -119,6 +119,10 @@ def test_few_drives_prove_little() -> None:
     best = ClosedLoop(shares, 10).recommended
     assert best is not None
     assert best.guard == "none"
+    shares = (Share("none", 10, 2, 2), Share("paper", 1, 1, 1))
+    best = ClosedLoop(shares, 10).recommended
+    assert best is not None
+    assert best.guard == "paper"
     shares = (Share("none", 20, 0, 0), Share("full", 5, 5, 5))
     best = ClosedLoop(shares, 10).recommended
     assert best is not None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +45,7 @@ def test_rotors_hold_the_weight_and_forget_a_tilt() -> None:
 
 
 def test_the_pole_swings_and_keeps_its_energy() -> None:
-    system = task("cart_pole").plain
+    system = System.load(TASKS / "cart_pole.yaml", {"policy.feedback": "null"})
     x0 = torch.tensor([[0.0, 0.0, 2.0, 0.0]], dtype=torch.float64)
     x = system.rollout(x0, torch.zeros(1, 60, 1, dtype=torch.float64))[0].numpy()
     (_, v, a, w), (m, cart, half, g) = x.T, (0.1, 1.0, 0.5, 9.8)
@@ -71,25 +70,7 @@ def test_the_pump_stays_in_a_mode_for_ten_minutes() -> None:
 
 
 def test_upright_is_where_a_pole_falls_from() -> None:
-    assert growth_of(task("cart_pole").plain.decl) > 1e3
+    free = System.load(TASKS / "cart_pole.yaml", {"policy.feedback": "null"})
+    assert growth_of(free.decl) > 1e3
+    assert growth_of(task("cart_pole").plain.decl) < 1.0
     assert growth_of(task("quadrotor_rotors").plain.decl) < 10.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", PLANTS)
-def test_a_minute_of_training_satisfies_it(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """At least 95 % of 40 drives, with the guard that does best."""
-    budget = ["--budget", "60s", "--clock", "processor", "--threads", "1", "--seed", "3", "--no-pictures"]
-    assert main(["train", str(TASKS / f"{name}.stl"), *budget, "--runs", str(tmp_path)]) == 0
-    best = 0
-    for guard in ("none", "paper", "full"):
-        words = ["simulate", str(tmp_path / name / "latest"), "--guard", guard, "--seeds", "4"]
-        capsys.readouterr()
-        assert main([*words, "--time-limit", "none", "--no-pictures", "--json"]) == 0
-        drives = json.loads(capsys.readouterr().out)["result"]["guards"][guard]["drives"]
-        best = max(best, drives["obeyed"])
-        if best >= 38:
-            return
-    assert best >= 38
