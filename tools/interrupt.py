@@ -8,6 +8,7 @@ is checked:
 
 - it ends within 2 s of the signal, or has used no more processor time, on one core, than its budget plus 20 %
   and 10 s (so that what else goes on does not matter; a compiler that it has started counts);
+- it takes at most 2 GB of memory, and so does each process that it has started;
 - its exit code is that of the signal (or of its end, where it was quicker), without a traceback;
 - no process is left that it has started, and no file that is half written;
 - run folders open, and `stlc train --resume` goes on with what was interrupted.
@@ -38,6 +39,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 ANSWER = 2.0
 """Seconds from the signal to the end of the process."""
+MEMORY = 2048
+"""MB of a command, or of a process that it has started."""
 _FOREIGN = re.compile(r"matplotlib|torchinductor|\.ses$")
 """Folders that libraries make for themselves."""
 MARK = "STLC_INTERRUPTED_COMMAND"
@@ -123,6 +126,7 @@ class Result:
         sent: the signal, and when, in seconds; "" where it ran to its end.
         took: seconds from the signal to the end, or of the whole command where none was sent.
         allowed: seconds that it may take.
+        memory: MB at most, of the command or of a process that it has waited for.
         code: its exit code.
         wrong: what was not as it should be.
         said: the end of what it said, where something was wrong.
@@ -133,6 +137,7 @@ class Result:
     sent: str = ""
     took: float = 0.0
     allowed: float = ANSWER
+    memory: int = 0
     code: int = 0
     wrong: list[str] = field(default_factory=list)
     said: str = ""
@@ -238,26 +243,30 @@ def _watched(
         signalled = not kind.budget and _signal(process, kind, draw, slow, result)
         since = time.monotonic() if signalled else began
         result.allowed = ANSWER if signalled or not kind.budget else 1.2 * kind.budget + 10.0
-        result.took = _wait(process, 60.0 if signalled else 900.0, since, clocked=bool(kind.budget))
+        _wait(process, 60.0 if signalled else 900.0, since, kind, result)
     if process.poll() is None:
         result.wrong.append("did not end")
         os.killpg(process.pid, signal.SIGKILL)
     elif result.took > result.allowed and (signalled or kind.budget):
         result.wrong.append(f"took {result.took:.2f} s")
+    if result.memory > MEMORY:
+        result.wrong.append(f"took {result.memory} MB")
     result.code = process.wait()
     _look(kind, folder, values, result, signalled=signalled)
 
 
-def _wait(process: subprocess.Popen[bytes], most: float, since: float, *, clocked: bool) -> float:
-    """Wait for the end; seconds since then, or where it is `clocked` the processor time of the command."""
+def _wait(process: subprocess.Popen[bytes], most: float, since: float, kind: Kind, result: Result) -> None:
+    """Wait for the end: seconds since then, or the processor time of a command with a budget; memory."""
     deadline = time.monotonic() + most
-    while time.monotonic() < deadline:
+    while time.monotonic() < deadline and process.returncode is None:
         pid, status, usage = os.wait4(process.pid, os.WNOHANG)
+        result.took = time.monotonic() - since
         if pid:
             process.returncode = os.waitstatus_to_exitcode(status)
-            return usage.ru_utime + usage.ru_stime if clocked else time.monotonic() - since
+            result.memory = usage.ru_maxrss // 1024
+            result.took = usage.ru_utime + usage.ru_stime if kind.budget else result.took
+            return
         time.sleep(0.005)
-    return time.monotonic() - since
 
 
 def _signal(
@@ -265,8 +274,8 @@ def _signal(
 ) -> bool:
     """Send a signal at a random moment; False where the command was quicker."""
     delay = draw.uniform(0.3, kind.seconds) * slow
-    with suppress(subprocess.TimeoutExpired):
-        process.wait(delay)
+    _wait(process, delay, time.monotonic(), kind, result)
+    if process.returncode is not None:
         return False
     number = signal.SIGTERM if draw.random() < 0.25 else signal.SIGINT
     group = draw.random() < 0.5
@@ -395,6 +404,7 @@ def summary(results: list[Result]) -> str:
             parts.append(f"answered in {answers[len(answers) // 2]:.2f} s, at most {answers[-1]:.2f} s")
         if whole:
             parts.append(f"{len(whole)} to the end, at most {whole[-1]:.1f} s")
+        parts.append(f"{max(result.memory for result in results if result.kind == kind)} MB")
         lines.append("  ".join(parts))
     lines += [
         f"{result.kind} ({result.number}, {result.sent}): {'; '.join(result.wrong)}"
