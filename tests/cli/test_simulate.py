@@ -9,6 +9,7 @@ import pytest
 from documents import misfits
 
 from stlc.cli.app import main
+from stlc.cli.simulate_text import screen
 from stlc.cli.schema import load_schema
 from stlc.controller.worlds import Worlds
 from stlc.dynamics.scenario import DISTURBED
@@ -112,6 +113,16 @@ def test_windows_are_shown_where_they_are_asked_for(
     lines = capsys.readouterr().out.splitlines()
     assert any(line.strip().startswith("plan accuracy") and "±" in line for line in lines)
     assert any("driven safely" in line for line in lines)
+
+
+def test_safety_is_spoken_of_only_where_something_is_tagged(
+    there: RunDir, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["simulate", there.name, *SMALL, "--steps", "30", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)["result"]
+    assert result["safety"]
+    assert any("safely" in line for line in screen(result, windows=True))
+    assert not any("safe" in line for line in screen(result | {"safety": []}, windows=True))
 
 
 def test_without_rules_drives_are_judged_as_plans_are(

@@ -16,7 +16,7 @@ from stlc.files import read_source
 from stlc.grammar.parser import parse
 
 TASKS = Path(__file__).parents[2] / "examples" / "tasks"
-PLANTS = ("cart_pole", "quadrotor_rates", "quadrotor_rotors", "thermostat")
+PLANTS = ("cart_pole", "quadrotor_rates", "quadrotor_rotors", "thermostat", "watch")
 
 
 def task(name: str) -> Task:
