@@ -71,9 +71,13 @@ def age() -> float:
 def finish(code: int) -> int:
     """End an interrupted process at once with its code, the buffers written: libraries take long to unload.
 
-    Gives the code back where nobody has interrupted it.
+    Gives the code back where nobody has interrupted it: what was asked for is done then, and a signal while
+    libraries are unloaded does not take its exit code away.
     """
     if not _asked and code not in (128 + signal.SIGINT, 128 + signal.SIGTERM):
+        with suppress(ValueError):  # not the main thread
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, signal.SIG_IGN)
         return code
     for stream in (sys.stdout, sys.stderr):
         with suppress(Exception):

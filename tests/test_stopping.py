@@ -41,6 +41,25 @@ def test_what_does_not_unwind_is_ended_and_undone(tmp_path: Path, number: int) -
     assert (tmp_path / "undone").read_text() == str(code)
 
 
+UNLOADING = """
+import atexit, sys, time
+from stlc import stopping
+stopping.arm()
+atexit.register(time.sleep, 1.0)
+atexit.register(print, "unloading", flush=True)
+sys.exit(stopping.finish(4))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_command_that_is_done_keeps_its_exit_code(number: int) -> None:
+    with subprocess.Popen([sys.executable, "-c", UNLOADING], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"unloading\n"
+        process.send_signal(number)
+        assert process.wait(timeout=60) == 4
+
+
 def test_what_came_to_its_end_is_not_undone() -> None:
     before = dict(stopping._undone)
     with stopping.leaving(lambda _code: None):
