@@ -281,7 +281,7 @@ class _Trial:
         """Drives to their end. Raises _LateError where that would take more than a share of what is left."""
         setting = Setting(tuple(seeds), agents, self.test.steps, self.test.replan)
         guard = Guard(self.task, self.policy, mode, limits=Limits(seconds=setting.limit))
-        begun, recorder = self.left(), Recorder(agents)
+        begun, recorder = self.left(), Recorder(agents, pictured=False)
 
         def watch(moment: Moment) -> None:
             spent = begun - self.left()

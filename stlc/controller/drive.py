@@ -73,9 +73,13 @@ class Recording:
 
 @dataclass
 class Recorder:
-    """Gathers a recording step by step, so that what happened before a failure is not lost."""
+    """Gathers a recording step by step, so that what happened before a failure is not lost.
+
+    `pictured`: whether the plans that a guard replaces are wanted, for pictures.
+    """
 
     agents: int
+    pictured: bool = True
     states: list[Tensor] = field(default_factory=list)
     actions: list[Tensor] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
@@ -236,7 +240,7 @@ def drive(
             recorder.chosen(x, options)
         decision, action = pilot.decide(x, seen, due)
         seconds = perf_counter() - begun
-        replaced = _replaced(worlds, guard, decision, seen, due)
+        replaced = _replaced(worlds, guard, decision, seen, due) if recorder.pictured else None
         if replaced is not None:
             recorder.replaced.append(replaced)
         _require_numbers(action, x, step, guard)

@@ -9,8 +9,8 @@ import pytest
 from documents import misfits
 
 from stlc.cli.app import main
-from stlc.cli.simulate_text import screen
 from stlc.cli.schema import load_schema
+from stlc.cli.simulate_text import screen
 from stlc.controller.worlds import Worlds
 from stlc.dynamics.scenario import DISTURBED
 from stlc.monitor.verdict import Monitor

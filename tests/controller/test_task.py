@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -58,3 +59,19 @@ def test_satisfying_plans_come_first_then_cheap_ones_then_robust_ones(
         assert cost[best] <= cost[good].min() + 1e-9
     else:
         assert rho[best] >= rho.max() - 1e-9
+
+
+@pytest.mark.parametrize("steps", [0, 1, 7, None])
+def test_plans_of_any_length_are_rolled_out_as_the_system_says(car_task: Task, steps: int | None) -> None:
+    assert car_task.native is not None
+    x0 = car_task.sample(20, seed=3, dtype=torch.float64)
+    low, high = car_task.system.control_low.double(), car_task.system.control_high.double()
+    length = car_task.horizon if steps is None else steps
+    u = low + (high - low) * torch.rand((20, length, 1), dtype=torch.float64)
+    found = car_task.rollout(x0, u)
+    assert found.shape == (20, length + 1, len(car_task.names))
+    torch.testing.assert_close(found, car_task.system.rollout(x0, u), rtol=1e-12, atol=1e-12)
+    car_task.rollout(x0, u.requires_grad_())
+    if length:
+        car_task.rollout(x0, u).sum().backward()
+        assert u.grad is not None
