@@ -1,5 +1,7 @@
 """Physical units: dimensions as exponent vectors, scales to SI as exact fractions.
 
+`degC` counts from a zero of its own, 273.15 K. A number in it is a point of that scale; the difference of two
+is in kelvin (`Unit.interval`), and no product has it as a factor.
 Angles are dimensionless (`rad` is 1, `deg` is pi/180), and so are `%` and `1`. `steps` is no physical unit;
 whoever reads an interval handles it.
 """
@@ -9,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from types import MappingProxyType
 
@@ -30,11 +32,13 @@ class Unit:
         dims: exponents of m, kg, s, A and K.
         ratio: how many SI units one of it is, exactly (pi to double precision).
         text: as written; "" where nothing was written, which is how undeclared units are told from `1`.
+        offset: its zero in SI units, exactly; 0 for all but scales like `degC`.
     """
 
     dims: Dims = _NONE
     ratio: Fraction = Fraction(1)
     text: str = field(default="", compare=False)
+    offset: Fraction = Fraction(0)
 
     @property
     def scale(self) -> float:
@@ -49,7 +53,19 @@ class Unit:
     @property
     def si(self) -> Unit:
         """The SI unit of the same dimensions."""
-        return self if self.ratio == 1 else Unit(self.dims, text=_si_text(self.dims))
+        plain = self.ratio == 1 and not self.offset
+        return self if plain else Unit(self.dims, text=_si_text(self.dims))
+
+    @property
+    def interval(self) -> Unit:
+        """The unit of differences: kelvin for `degC`, any other unit itself."""
+        if not self.offset:
+            return self
+        return Unit(self.dims, self.ratio, _si_text(self.dims) if self.ratio == 1 else f"Δ{self.text}")
+
+    def of_si(self, value: float) -> float:
+        """A number in SI units as one in this unit."""
+        return (value - float(self.offset)) / self.scale
 
     def __mul__(self, other: Unit) -> Unit:
         return _product(((self, 1), (other, 1)))
@@ -64,6 +80,8 @@ class Unit:
             raise ValueError(f"[{self}] to the power {power} is out of bounds")
         if power.denominator == 1:
             return _product(((self, int(power)),))
+        if self.offset:
+            return self.interval**power
         dims = tuple(exponent * power for exponent in self.dims)
         if any(exponent.denominator != 1 for exponent in dims):
             raise ValueError(f"[{self}] to the power {power} has no unit")
@@ -133,6 +151,8 @@ def _symbols() -> Mapping[str, Unit]:
     ):
         define(text, dims, ratio)
     table["Ω"] = table["ohm"]
+    table["degC"] = Unit((0, 0, 0, 0, 1), Fraction(1), "degC", Fraction("273.15"))
+    table["°C"] = replace(table["degC"], text="°C")
     return MappingProxyType(table)
 
 
@@ -149,10 +169,15 @@ def parse_unit(text: str) -> Unit:
     if not cleaned:
         raise ValueError("an empty unit")
     dims, ratio = _NONE, Fraction(1)
-    for symbol, power in _factors(cleaned):
+    factors = _factors(cleaned)
+    for symbol, power in factors:
         unit = SYMBOLS.get(symbol)
         if unit is None:
             raise ValueError(f"unknown unit `{symbol}`")
+        if unit.offset:
+            if factors == [(symbol, 1)]:
+                return replace(unit, text=cleaned)
+            raise ValueError(f"`{symbol}` has a zero of its own and stands alone: {_in_kelvin(factors)}")
         if abs(power) > _MAX_POWER:
             raise ValueError(f"the power {power} of `{symbol}` is too large")
         dims = _dims(a + b * power for a, b in zip(dims, unit.dims, strict=True))
@@ -165,12 +190,12 @@ def written_unit(text: str) -> Unit:
     return parse_unit(text) if text else DIMENSIONLESS
 
 
-KELVIN = "temperatures are in kelvin, [K]; one in degrees Celsius is declared without a unit"
-_CELSIUS = re.compile("deg_?C|°C|celsius|centigrade", re.IGNORECASE)
+CELSIUS = "degrees Celsius are written `degC`, kelvin `K`"
+_CELSIUS = re.compile("deg_?C|°_?C|celsius|centigrade", re.IGNORECASE)
 
 
 def means_celsius(text: str) -> bool:
-    """Whether somebody means degrees Celsius, which have an offset and are no unit here."""
+    """Whether somebody means degrees Celsius, however written."""
     return _CELSIUS.fullmatch(text.strip()) is not None
 
 
@@ -205,10 +230,21 @@ def _factors(text: str) -> list[tuple[str, int]]:
         position = len(text) - len(tail.lstrip())
 
 
+def _in_kelvin(factors: Iterable[tuple[str, int]]) -> str:
+    """What to write for a product with `degC`."""
+    powers: dict[str, int] = {}
+    for symbol, power in factors:
+        known = SYMBOLS.get(symbol)
+        name = str(known.interval) if known is not None and known.offset else symbol
+        powers[name] = powers.get(name, 0) + power
+    return f"write `{_text(powers)}`"
+
+
 def _product(parts: Iterable[tuple[Unit, int]]) -> Unit:
     """The product of units to whole powers; its text keeps the symbols that were written."""
     dims, ratio = _NONE, Fraction(1)
     powers: dict[str, int] = {}
+    parts = [(unit.interval, power) for unit, power in parts]
     for unit, power in parts:
         dims = _dims(a + b * power for a, b in zip(dims, unit.dims, strict=True))
         ratio *= unit.ratio**power

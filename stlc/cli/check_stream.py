@@ -22,6 +22,7 @@ from stlc.files import find_spec, read_source
 
 if TYPE_CHECKING:
     from stlc.monitor.online import Decision, Online
+    from stlc.monitor.signals import Conversion
     from stlc.monitor.verdict import Monitor
     from stlc.trace_live import Sample, Uniform
 
@@ -50,10 +51,10 @@ def outcome_of_stream(question: Question, *, talk: bool) -> Outcome:
     raw = iter(lambda: sys.stdin.buffer.readline(MAX_LINE + 1), b"")
     uniform = on_grid(lines.moments(raw), reading, NAME)
     online = _online(monitor, question, uniform)
-    factors = _factors(online, lines.units)
+    changes = _conversions(online, lines.units)
     for sample in uniform.samples:
         try:
-            decisions = online.push(_in_units(sample, factors, online))
+            decisions = online.push(_in_units(sample, changes, online))
         except TraceError as error:
             where = f"sample {online.samples} of the {NAME}"
             raise TraceError(*(finding.with_note(where) for finding in error.diagnostics)) from None
@@ -74,8 +75,8 @@ def _online(monitor: Monitor, question: Question, uniform: Uniform) -> Online:
     return monitor.online(how, require=question.require, dt=uniform.dt)
 
 
-def _factors(online: Online, units: Mapping[str, str]) -> dict[str, float]:
-    """By what the numbers of signals are multiplied that come in other units than are declared.
+def _conversions(online: Online, units: Mapping[str, str]) -> dict[str, Conversion]:
+    """How the numbers of signals are converted that come in other units than are declared.
 
     Raises:
         TraceError: E605, a unit that is none, or of something else.
@@ -83,7 +84,7 @@ def _factors(online: Online, units: Mapping[str, str]) -> dict[str, float]:
     from stlc.monitor.signals import conversion
     from stlc.units import parse_unit
 
-    factors: dict[str, float] = {}
+    changes: dict[str, Conversion] = {}
     for column in online.compiled.signature.columns:
         if not units.get(column.name):
             continue
@@ -92,13 +93,15 @@ def _factors(online: Online, units: Mapping[str, str]) -> dict[str, float]:
         except ValueError as error:
             message = f"column `{column.name}` of the {NAME}: {error}"
             raise TraceError(Diagnostic("E605", message)) from None
-        factors[column.name] = conversion(NAME, column, recorded)
-    return {name: factor for name, factor in factors.items() if factor != 1.0}
+        change = conversion(NAME, column, recorded)
+        if change is not None:
+            changes[column.name] = change
+    return changes
 
 
-def _in_units(sample: Sample, factors: Mapping[str, float], online: Online) -> Sample:
+def _in_units(sample: Sample, changes: Mapping[str, Conversion], online: Online) -> Sample:
     """The sample in the units that are declared, and its time."""
-    converted = {name: sample[name] * factor for name, factor in factors.items() if name in sample}
+    converted = {name: change(sample[name]) for name, change in changes.items() if name in sample}
     return {CLOCK: online.time(online.samples), **sample, **converted}
 
 

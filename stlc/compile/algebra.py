@@ -1,4 +1,9 @@
-"""Functions applied to numbers: units agree, constants fold."""
+"""Functions applied to numbers: units agree, constants fold.
+
+A number in a unit with a zero of its own (`degC`) is a point. Points are compared, chosen from and
+subtracted, which gives a difference in kelvin; a point and kelvin are a point; `abs` and its like refuse
+points, and any other function takes them in kelvin.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +12,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
+from typing import Literal
 
 from stlc.compile import ir
 from stlc.compile.functions import FUNCTIONS, Function
@@ -19,8 +25,13 @@ from stlc.source import Span
 from stlc.units import DIMENSIONLESS, Unit, nearest, same_dims
 
 _MAX_BITS = 512
-_QUANTITY = re.compile(r"([\d.]+(?:[eE][+-]?\d+)?) *[^\W\d]\S*")
+_QUANTITY = re.compile(r"(-? *[\d.]+(?:[eE][+-]?\d+)?) *(?:[^\W\d]|°)\S*")
 """A number with its unit, as written."""
+_OF_POINTS = ("min", "max", "clip", "choice", "uniform")
+"""Functions that choose from points, or draw between them."""
+
+_LENGTHS = ("abs", "norm", "norm1", "norminf")
+_TEMPERATURE = (0, 0, 0, 0, 1)
 _MISSING = {
     (1, 0, 0, 0, 0): ("length", "m"),
     (0, 1, 0, 0, 0): ("mass", "kg"),
@@ -67,12 +78,61 @@ def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[
     for other in rigid[1:]:
         if not same_dims(rigid[0].unit, other.unit):
             scope.fail(_mismatch(rigid[0], other, what, span))
+    if any(arg.unit.offset for arg in args):
+        return _on_one_scale(args, what, span, scope)
     known = rigid or [arg for arg in args if not arg.bare]
     if not known:
         return tuple(args), Number(ir.Lit(0.0), DIMENSIONLESS, True, True, span=span)
     unit = known[0].unit
-    blank = Number(ir.Lit(0.0), unit, not rigid, span=span)
+    blank = Number(ir.Lit(0.0), unit, not rigid, sense=_sense(args), span=span)
     return tuple(in_unit(arg, unit, scope) if arg.bare else arg for arg in args), blank
+
+
+def gap(left: Number, right: Number, span: Span, scope: Scope) -> Number:
+    """`left - right` of what is compared: two points, or two numbers. Raises Failed (E203)."""
+    if left.unit.offset or right.unit.offset:
+        (left, right), _ = agree((left, right), "subtract", span, scope)
+    return apply("sub", (left, right), span, scope)
+
+
+def rebased(number: Number, unit: Unit) -> Number:
+    """The same number, counted from the zero of `unit`, which it takes."""
+    shift = number.unit.offset - unit.offset
+    if not shift:
+        return replace(number, unit=unit)
+    value, amount = number.constant, float(shift)
+    exact = None if number.exact is None else number.exact + shift
+    num: ir.Num
+    match number.num:
+        case ir.Lit():
+            assert value is not None
+            num = ir.Lit(nearest(exact) if exact is not None else value + amount)
+        case ir.Op("add" | "sub" as name, (inner, ir.Lit(before))) if before == (
+            -amount if name == "add" else amount
+        ):
+            num = inner
+        case inner:
+            num = ir.Op("add" if amount > 0 else "sub", (inner, ir.Lit(abs(amount))))
+    return replace(number, num=num, unit=unit, exact=exact, kind="real", sense="")
+
+
+def absolute(number: Number) -> Number:
+    """The number in SI units from their zero: 20 degC is 293.15 K."""
+    return rebased(number, number.unit.interval)
+
+
+def on_scale(number: Number, unit: Unit, place: Span | None, scope: Scope) -> Number:
+    """A number of the dimensions of `unit` as one in it. Raises Failed (E203): a difference is no point."""
+    if unit.offset and number.sense == "difference":
+        scope.fail(difference_for_point(number, unit, place))
+    return rebased(number, unit)
+
+
+def difference_for_point(number: Number, unit: Unit, place: Span | None) -> Diagnostic:
+    """E203: a difference where a point of a scale is needed."""
+    message = f"a difference of temperatures, in [{unit.interval}], is no temperature in [{unit}]"
+    help_ = (f"declare it in [{unit.interval}], or add it to a temperature: `20 {unit} + …`",)
+    return Diagnostic("E203", message, number.span or place, "a difference", help=help_)
 
 
 def too_large(span: Span | None) -> Diagnostic:
@@ -113,9 +173,10 @@ def _units(
 ) -> tuple[tuple[Number, ...], Number]:
     """The arguments in the units that the rule asks for, and a blank with the result's unit."""
     flexible, bare = any(arg.flexible for arg in args), all(arg.bare for arg in args)
+    if function.rule == "same":
+        return _alike(function, args, span, scope)
+    args = _in_kelvin(function, args, span, scope)
     match function.rule:
-        case "same":
-            return agree(args, _verb(function), span, scope)
         case "ratio":
             return agree(args, _verb(function), span, scope)[0], Number(ir.Lit(0.0), span=span)
         case "mul":
@@ -133,7 +194,191 @@ def _units(
             if function.rule == "plain":
                 _check_plain(function, args, scope)
             unit, flexible = DIMENSIONLESS, bare
-    return tuple(args), Number(ir.Lit(0.0), unit, flexible, bare, span=span)
+    sense: Sense = "difference" if _multiple(function, args) else ""
+    return tuple(args), Number(ir.Lit(0.0), unit, flexible, bare, sense=sense, span=span)
+
+
+# ---------------------------------------------------------------------- points of a scale
+
+Sense = Literal["", "difference", "open"]
+Agreed = tuple[tuple[Number, ...], Number]
+
+
+def _alike(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> Agreed:
+    """Arguments of one unit."""
+    name, verb = function.name, _verb(function)
+    if name in ("normal", "truncnorm"):
+        return _spread(function, args, span, scope)
+    if name in ("add", "sub") and any(arg.unit.offset for arg in args):
+        return _sum(function, (args[0], args[1]), span, scope)
+    if name not in ("add", "sub", *_OF_POINTS):
+        args = [_length(function, arg, span, scope) for arg in args]
+    found, blank = agree(args, verb, span, scope)
+    if name in _LENGTHS and blank.unit.dims == _TEMPERATURE:
+        blank = replace(blank, sense="difference")
+    elif name in ("add", "sub") and any(not arg.sense and arg.constant is None for arg in args):
+        blank = replace(blank, sense="")
+    return found, blank
+
+
+def _in_kelvin(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> list[Number]:
+    if function.rule == "sign":
+        args = [_length(function, arg, span, scope) for arg in args]
+    return [absolute(arg) for arg in args]
+
+
+def _sense(args: Sequence[Number]) -> Sense:
+    return "difference" if any(arg.sense == "difference" for arg in args) else ""
+
+
+def _multiple(function: Function, args: Sequence[Number]) -> bool:
+    """Whether this is a plain number times a difference, which is one again."""
+    if function.rule not in ("mul", "div"):
+        return False
+    first, second = args
+    if second.sense == "difference" and function.rule == "mul":
+        first, second = second, first
+    return first.sense == "difference" and not second.sense and second.unit.dimensionless
+
+
+def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -> Agreed:
+    """Numbers, some of them points, from one zero: that of a point that varies, if there is one."""
+    points = [arg for arg in args if arg.unit.offset]
+    told = [arg for arg in args if not arg.bare]
+    bare = next((arg for arg in args if arg.bare), None)
+    difference = next((arg for arg in told if arg.sense == "difference"), None)
+    undecided = all(arg.sense == "open" for arg in points)
+    if difference is not None:
+        if not undecided:
+            fixed = next(arg for arg in points if arg.sense != "open")
+            scope.fail(_compared_with_point(difference, fixed, what, span))
+        unit = points[0].unit.interval
+    else:
+        varying = [arg for arg in told if arg.constant is None]
+        moved = next((arg for arg in varying if arg.unit.offset), None) or next(iter(varying), points[0])
+        unit = moved.unit if moved.unit.offset else points[0].unit.interval
+        if bare is not None and (undecided or not unit.offset):
+            scope.fail(_which(bare, points[0].unit, span))
+    sense: Sense = "difference" if difference is not None else "open" if undecided and unit.offset else ""
+    blank = Number(ir.Lit(0.0), unit, sense=sense, span=span)
+    return tuple(in_unit(arg, unit, scope) if arg.bare else rebased(arg, unit) for arg in args), blank
+
+
+def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Scope) -> Agreed:
+    """A sum or difference with a point in it."""
+    left, right = args
+    point, other = (left, right) if left.unit.offset else (right, left)
+    if not other.flexible and not same_dims(point.unit, other.unit):
+        scope.fail(_mismatch(left, right, _verb(function), span))
+    if function.name == "sub" and right.unit.offset:
+        found, blank = agree(args, _verb(function), span, scope)
+        return found, replace(blank, unit=point.unit.interval, sense="difference")
+    if other.unit.offset:
+        scope.fail(_sum_of_points(left, right, span))
+    if other.bare and function.name == "sub":
+        scope.fail(_which(other, point.unit, span))
+    if other.bare:
+        other = in_unit(other, point.unit.interval, scope)
+    drops = function.name == "sub" and other.constant is None and other.sense != "difference"
+    blank = Number(ir.Lit(0.0), point.unit, sense="open" if drops else point.sense, span=span)
+    return (point, other) if left.unit.offset else (other, point), blank
+
+
+def _spread(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> Agreed:
+    """A middle, a deviation, and perhaps ends: the deviation is a difference."""
+    middle, deviation, *ends = args
+    places = [middle, *ends]
+    if deviation.unit.offset:
+        scope.fail(point_for_amount(f"the deviation of `{function.name}`", deviation, span))
+    point = next((place for place in places if place.unit.offset), None)
+    if point is None:
+        found, blank = agree(args, _verb(function), span, scope)
+        told = not deviation.bare and deviation.unit.dims == _TEMPERATURE
+        around = told and all(place.bare for place in places)
+        return found, replace(blank, sense="difference" if around else blank.sense)
+    if not deviation.flexible and not same_dims(point.unit, deviation.unit):
+        scope.fail(_mismatch(middle, deviation, _verb(function), span))
+    (middle, *ends), blank = agree(places, _verb(function), span, scope)
+    if deviation.bare:
+        deviation = in_unit(deviation, blank.unit.interval, scope)
+    return (middle, deviation, *ends), blank
+
+
+def _length(function: Function, arg: Number, span: Span, scope: Scope) -> Number:
+    """The argument of `abs` and its like, which take no point: an undecided one is a difference to them."""
+    if not arg.unit.offset:
+        return arg
+    if arg.sense == "open":
+        return replace(absolute(arg), sense="difference")
+    name = function.symbol or function.name
+    return scope.fail(point_for_amount(f"`{name}`", arg, span))
+
+
+def refuse_point(what: str, number: Number, span: Span, scope: Scope) -> None:
+    """Fail (E203) for a point where an amount is needed: `what` names the place."""
+    if number.unit.offset:
+        scope.fail(point_for_amount(what, number, span))
+
+
+def point_for_amount(what: str, number: Number, span: Span) -> Diagnostic:
+    """E203: a point of a scale where an amount is needed; `what` names the place."""
+    unit = number.unit
+    text = (number.span or span).text
+    written = _QUANTITY.fullmatch(text)
+    help_ = (
+        f"write the amount in [{unit.interval}]: `{written[1]} {unit.interval}`"
+        if written is not None
+        else f"subtract another one first: `{text} - 20 {unit}` is a difference in [{unit.interval}]"
+    )
+    message = f"{what} takes no temperature in [{unit}], which counts from 0 {unit}"
+    return Diagnostic("E203", message, number.span or span, f"[{unit}]", help=(help_,))
+
+
+def _compared_with_point(difference: Number, point: Number, what: str, span: Span) -> Diagnostic:
+    """E203: `abs(temp - 21 degC) <= 0.5 degC`."""
+    unit = point.unit
+    text = (point.span or span).text
+    written = _QUANTITY.fullmatch(text)
+    if written is not None and point.constant is not None:
+        label = f"{float(point.constant + unit.offset):g} {unit.interval}"
+        help_ = f"write the difference in kelvin: `{written[1]} {unit.interval}`"
+    else:
+        label = f"[{unit}]"
+        help_ = f"make it a difference too: `{text} - 0 {unit}`"
+    labels: tuple[Label, ...] = ()
+    if difference.span is not None and point.span is not None and difference.span != span:
+        labels = (Label(difference.span, f"a difference, in [{unit.interval}]"),)
+    verb = what if what.startswith("`") else f"cannot {what}"
+    message = f"{verb} a difference of temperatures with a temperature"
+    return Diagnostic("E203", message, point.span or span, label, labels, help=(help_,))
+
+
+def _sum_of_points(left: Number, right: Number, span: Span) -> Diagnostic:
+    unit = right.unit
+    first, second = ((side.span or span).text for side in (left, right))
+    written = _QUANTITY.fullmatch(second)
+    labels = tuple(
+        Label(side.span, f"[{side.unit}]")
+        for side in (left, right)
+        if side.span is not None and side.span != span
+    )
+    help_ = (
+        f"a difference is in kelvin: `{first} + {written[1]} {unit.interval}`"
+        if written is not None
+        else f"a mean of both: `{first} + ({second} - {first}) / 2`"
+    )
+    return Diagnostic("E203", "cannot add two temperatures", span, labels=labels, help=(help_,))
+
+
+def _which(bare: Number, unit: Unit, span: Span) -> Diagnostic:
+    """E203: a bare number that may count from the zero of a scale, or be in SI units."""
+    text, kelvin = (bare.span or span).text, unit.interval
+    help_ = (f"`{text} {unit}` is a temperature, `{text} {kelvin}` a difference or a temperature in kelvin",)
+    message = f"`{text}` may be in [{unit}] or in [{kelvin}] here"
+    return Diagnostic("E203", message, bare.span or span, "no unit", help=help_)
+
+
+# ---------------------------------------------------------------------- rules
 
 
 def _root(arg: Number, span: Span, scope: Scope) -> Unit:

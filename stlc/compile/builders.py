@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
+from stlc.compile.algebra import absolute
 from stlc.compile.polygons import area, points, simple
 from stlc.compile.regions import dimension
 from stlc.compile.scope import Scope
@@ -112,6 +113,8 @@ def _box(call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scope) 
         message = f"corners of {len(lower.items)} and {len(upper.items)} components do not span a box"
         scope.fail(Diagnostic("E205", message, call.span))
     for low, high in zip(lower.items, upper.items, strict=True):
+        if not (low.bare or high.bare):
+            low, high = absolute(low), absolute(high)
         if low.constant is not None and high.constant is not None and low.constant > high.constant:
             scope.fail(
                 Diagnostic("E205", "this box is empty: a lower bound is above the upper one", call.span)

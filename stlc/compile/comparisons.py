@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from stlc.compile import ir, typed
-from stlc.compile.algebra import agree, apply, half
+from stlc.compile.algebra import agree, apply, half, in_unit
 from stlc.compile.regions import signed_distance
 from stlc.compile.scope import Scope
 from stlc.compile.sorts import Need, as_formula, as_number, loose_number
@@ -88,12 +88,14 @@ def _above(big: Number, small: Number, strict: bool, span: Span, scope: Scope) -
     """
     written = _compared(big, small)
     if (big.kind, small.kind) == ("int", "int"):
-        big = apply("sub" if strict else "add", (big, half(span)), span, scope)
+        step = half(span)
+        step = in_unit(step, big.unit.interval, scope) if big.unit.offset else step
+        big = apply("sub" if strict else "add", (big, step), span, scope)
     return _pred(span, apply("sub", (big, small), span, scope), strict=strict, written=written)
 
 
 def _pred(span: Span, margin: Number, *, strict: bool = False, written: Unit | None = None) -> typed.Pred:
-    unit = margin.unit if written is None else written
+    unit = (margin.unit if written is None else written).interval
     return typed.Pred(span, margin.num, strict, unit=unit.si, written=unit)
 
 
@@ -150,7 +152,7 @@ def _real_equality(a: Number, b: Number, left: ast.Expr, right: ast.Expr, place:
     first, second = left.span.text, right.span.text
     gap = f"abs({first})" if b.constant == 0 else f"abs({first} - {second})"
     unit = next((n.unit for n in (a, b) if not n.unit.dimensionless), None)
-    tolerance = "0.05" if unit is None else f"0.05 {unit}"
+    tolerance = "0.05" if unit is None else f"0.05 {unit.interval}"
     label = f"its robustness is -|{first} - {second}|: at best 0, so it can never hold with a margin"
     return Diagnostic(
         "E204",

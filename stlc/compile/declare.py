@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from stlc.compile.algebra import rebased
 from stlc.compile.externs import external
 from stlc.compile.functions import FUNCTIONS, callable_names
 from stlc.compile.interface import Interface
@@ -172,8 +173,8 @@ def _column_entry(
 def _read_in(value: Value, unit: Unit) -> Value:
     """A signal whose bare numbers are in the unit that the file declares, whatever the system stores."""
     if isinstance(value, Vector):
-        return replace(value, items=tuple(replace(item, unit=unit) for item in value.items))
-    return replace(value, unit=unit) if isinstance(value, Number) else value
+        return replace(value, items=tuple(rebased(item, unit) for item in value.items))
+    return rebased(value, unit) if isinstance(value, Number) else value
 
 
 def _macro(item: ast.Def, about: str, found: Declared, scope: Scope) -> Definition:

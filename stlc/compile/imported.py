@@ -94,7 +94,11 @@ def _check_same(column: Column, place: Span, first: tuple[Column, Span], scope: 
     units = (
         not column.unit.text
         or not known.unit.text
-        or (same_dims(column.unit, known.unit) and math.isclose(column.unit.scale, known.unit.scale))
+        or (
+            same_dims(column.unit, known.unit)
+            and column.unit.offset == known.unit.offset
+            and math.isclose(column.unit.scale, known.unit.scale)
+        )
     )
     if column.kind == known.kind and column.labels == known.labels and units:
         return

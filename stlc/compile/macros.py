@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from stlc.compile import typed
-from stlc.compile.algebra import in_unit
+from stlc.compile.algebra import in_unit, on_scale
 from stlc.compile.functions import REGIONS
 from stlc.compile.meter import MAX_LEVELS, MAX_NODES, Meter
 from stlc.compile.scope import Definition, Scope
@@ -81,7 +81,7 @@ def _number_in(number: Number, unit: Unit, span: Span, scope: Scope) -> Number:
     if not number.flexible and not same_dims(number.unit, unit):
         message = f"declared as [{unit}], but this is {unit_text(number) or '[1]'}"
         scope.fail(Diagnostic("E203", message, number.span or span))
-    return replace(number, unit=unit, flexible=False)
+    return replace(on_scale(number, unit, span, scope), flexible=False)
 
 
 def cycle(entry: Definition, scope: Scope) -> Diagnostic:

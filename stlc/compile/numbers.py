@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from stlc.compile import ir, typed
-from stlc.compile.algebra import in_unit
+from stlc.compile.algebra import difference_for_point, in_unit, rebased
 from stlc.compile.conditions import condition, is_state
 from stlc.compile.expressions import evaluate
 from stlc.compile.scope import Failed, Scope
@@ -22,7 +22,7 @@ __all__ = ["Number", "resolve_number", "resolve_numbers", "stored"]
 def resolve_number(
     expr: ast.Expr, scope: Scope, *, expected: Column | None = None, what: str = "a value"
 ) -> Number:
-    """The expression as one number, in SI units.
+    """The expression as one number, in SI units from the zero of its unit.
 
     Args:
         expr: as parsed.
@@ -57,7 +57,8 @@ def resolve_numbers(
 
 
 def stored(number: Number, unit: Unit) -> ir.Num:
-    """The number as a column of `unit` stores it: SI divided by the scale of the unit."""
+    """The number as a column of `unit` stores it: SI from the zero of the unit, divided by its scale."""
+    number = rebased(number, unit)
     if unit.ratio == 1:
         return number.num
     value = number.constant
@@ -117,4 +118,6 @@ def _fitted(number: Number, expr: ast.Expr, column: Column, scope: Scope) -> Num
     if not number.flexible and column.unit.text and not same_dims(number.unit, column.unit):
         message = f"`{column.name}` is in [{column.unit}], this is in [{number.unit}]"
         scope.fail(Diagnostic("E203", message, expr.span, f"[{number.unit}]"))
+    if column.unit.offset and number.sense == "difference":
+        scope.fail(difference_for_point(number, column.unit, expr.span))
     return number

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 from stlc.compile import comparisons, moments, typed
-from stlc.compile.algebra import too_large
+from stlc.compile.algebra import refuse_point, too_large
 from stlc.compile.calls import unsupported
 from stlc.compile.choices import choose
 from stlc.compile.functions import OPERATORS
@@ -53,7 +53,7 @@ def _quantity(expr: ast.Quantity, _values: Sequence[Value], scope: Scope) -> Val
 
 @lru_cache(maxsize=256)
 def _measured(value: Fraction, unit_text: str) -> Number | None:
-    """A number with a unit; None where it is too large for a float. Raises ValueError for an unknown unit."""
+    """A number with a unit, from its zero; None: too large for a float. Raises ValueError: no such unit."""
     unit = parse_unit(unit_text)
     exact = value * unit.ratio
     if not math.isfinite(nearest(exact)):
@@ -99,9 +99,12 @@ def _neg(expr: ast.Neg, values: Sequence[Value], scope: Scope) -> Value:
     (value,) = values
     if isinstance(value, Moment):
         return moments.negative(value, expr.span, scope)
-    if isinstance(value, Vector):
-        return negate(value, expr.span)
-    return negate(as_number(value, expr.operand, Need("`-` takes a number"), scope), expr.span)
+    if not isinstance(value, Vector):
+        value = as_number(value, expr.operand, Need("`-` takes a number"), scope)
+    if not isinstance(expr.operand, ast.Quantity):  # -5 degC is below zero; a temperature has no negation
+        for item in value.items if isinstance(value, Vector) else (value,):
+            refuse_point("`-`", item, expr.operand.span, scope)
+    return negate(value, expr.span)
 
 
 def _binary(expr: ast.Binary, values: Sequence[Value], scope: Scope) -> Value:

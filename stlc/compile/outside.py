@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from stlc.compile import ir
+from stlc.compile.algebra import absolute
 from stlc.compile.scope import External, Scope
 from stlc.compile.sorts import Need, as_vector, loose_number
 from stlc.compile.values import Number, Value, Vector
@@ -20,12 +21,12 @@ def outside(entry: External, call: ast.Call, values: Sequence[Value], scope: Sco
     for arg, value, size in zip(call.args, values, entry.arguments, strict=True):
         need = Need(f"`{entry.name}` takes {'a number' if size is None else f'a vector of {size}'}", "this")
         if size is None:
-            flat.append(loose_number(value, arg.value, need, scope).num)
+            flat.append(absolute(loose_number(value, arg.value, need, scope)).num)
             continue
         vector = as_vector(value, arg.value, need, scope)
         if len(vector.items) != size:
             scope.fail(Diagnostic("E205", f"{need.who}, this has {len(vector.items)} components", arg.span))
-        flat += [item.num for item in vector.items]
+        flat += [absolute(item).num for item in vector.items]
     numbers = [_output(entry, index, tuple(flat)) for index in range(entry.result or 1)]
     if entry.result is None:
         return replace(numbers[0], span=call.span)

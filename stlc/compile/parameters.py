@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from stlc.compile import ir, typed
+from stlc.compile.algebra import in_unit, on_scale
 from stlc.compile.expressions import evaluate
 from stlc.compile.interface import Interface
 from stlc.compile.numbers import resolve_numbers, stored
@@ -109,12 +110,14 @@ def _in_column(number: Number, expr: ast.Expr, target: tuple[Column, Unit], scop
         scope.fail(Diagnostic("E205", message, expr.span))
     if number.bare:
         wanted = unit if unit.text else column.unit
+        if wanted.offset != column.unit.offset:
+            return stored(in_unit(number, wanted, scope), column.unit)
         factor = wanted.scale / column.unit.scale
         return number.num if factor == 1 else ir.Op("mul", (number.num, ir.Lit(factor)))
     if not number.flexible and column.unit.text and not same_dims(number.unit, column.unit):
         message = f"`{column.name}` is in [{column.unit}], this is in [{number.unit}]"
         scope.fail(Diagnostic("E203", message, expr.span, f"[{number.unit}]"))
-    return stored(number, column.unit)
+    return stored(on_scale(number, column.unit, expr.span, scope), column.unit)
 
 
 def _agree(decl: ast.Param, columns: Sequence[Column], interface: Interface, scope: Scope) -> None:

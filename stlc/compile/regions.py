@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from stlc.compile import ir
-from stlc.compile.algebra import apply, negated
+from stlc.compile.algebra import apply, gap, negated
 from stlc.compile.polygons import triangles
 from stlc.compile.scope import Scope
 from stlc.compile.values import (
@@ -59,12 +59,12 @@ def signed_distance(point: Vector, region: Region, span: Span, scope: Scope) -> 
         scope.fail(Diagnostic("E205", message, span))
     match region:
         case Ball(center, radius):
-            gap = norm(minus(point, center, span, scope), span, scope)
-            return apply("sub", (radius, gap), span, scope)
+            away = norm(minus(point, center, span, scope), span, scope)
+            return apply("sub", (radius, away), span, scope)
         case Box(lower, upper):
             return _box(point, lower, upper, span, scope)
         case HalfSpace(normal, offset):
-            room = apply("sub", (offset, dot(normal, point, span, scope)), span, scope)
+            room = gap(offset, dot(normal, point, span, scope), span, scope)
             return apply("div", (room, norm(normal, span, scope)), span, scope)
         case Polygon(corners):
             return _polygon(point, corners, span, scope)
@@ -80,7 +80,7 @@ def signed_distance(point: Vector, region: Region, span: Span, scope: Scope) -> 
 def _box(point: Vector, lower: Vector, upper: Vector, span: Span, scope: Scope) -> Number:
     """Min of the room to each face inside; minus the Euclidean distance outside."""
     room = [
-        apply("min", (apply("sub", (p, low), span, scope), apply("sub", (high, p), span, scope)), span, scope)
+        apply("min", (gap(p, low, span, scope), gap(high, p, span, scope)), span, scope)
         for p, low, high in zip(point.items, lower.items, upper.items, strict=True)
     ]
     least = apply("min", room, span, scope)

@@ -15,6 +15,7 @@ from pathlib import PurePath
 from typing import TypeVar
 
 from stlc.compile import ir, typed
+from stlc.compile.algebra import absolute
 from stlc.compile.contradiction import contradictions
 from stlc.compile.declare import Declared
 from stlc.compile.expressions import evaluate
@@ -114,7 +115,7 @@ def _elsewhere(interface: Interface | None) -> dict[str, str]:
         sort = "" if name == column.name else f": real[{sizes[name]}]"
         found[name] = f"{interface.where} has it; declare it here too: `signal {name}{sort}{unit}`"
     for name, (value, unit_) in interface.constants.items():
-        amount = _amount(value / unit_.scale, unit_.text)
+        amount = _amount(unit_.of_si(value), unit_.text)
         found[name] = f"{interface.where} has it; declare it here too: `const {name} = {amount}`"
     return found
 
@@ -152,9 +153,9 @@ def _constants(spec: ast.Spec, interface: Interface | None, scope: Scope) -> tup
 def _scalars(name: str, value: Value) -> list[tuple[str, float]]:
     match value:
         case Number() if value.constant is not None:
-            return [(name, value.constant)]
+            return [(name, absolute(value).constant or 0.0)]
         case Vector(items):
-            return [(f"{name}[{i}]", item.constant or 0.0) for i, item in enumerate(items)]
+            return [(f"{name}[{i}]", absolute(item).constant or 0.0) for i, item in enumerate(items)]
         case typed.Truth(_, truth):
             return [(name, float(truth))]
         case _:
@@ -167,12 +168,13 @@ def _compare(item: ast.Const, value: Number, interface: Interface, scope: Scope)
         return
     theirs, unit = interface.constants[item.name]
     free = value.flexible or not unit.text
-    if math.isclose(value.constant, theirs, rel_tol=1e-9) and (free or same_dims(value.unit, unit)):
+    ours = absolute(value).constant or 0.0
+    if math.isclose(ours, theirs, rel_tol=1e-9) and (free or same_dims(value.unit, unit)):
         return
     place = interface.places.get(item.name)
     labels = () if place is None else (Label(place, "declared here"),)
     here = _amount(value.constant / value.unit.scale, str(value.unit) if value.unit.text else "")
-    there = _amount(theirs / unit.scale, unit.text)
+    there = _amount(unit.of_si(theirs), unit.text)
     message = f"`{item.name}` is {here} here and {there} in {interface.where}"
     both = f"make them agree, or change both at once: `--set {item.name}={here.replace(' ', '')}`"
     help_ = (both,) if free or same_dims(value.unit, unit) else ()

@@ -18,7 +18,7 @@ from stlc.grammar import ast
 from stlc.registry import closest
 from stlc.signature import Column, Kind
 from stlc.source import Span
-from stlc.units import DIMENSIONLESS, Unit
+from stlc.units import DIMENSIONLESS, Unit, nearest
 
 TIME_WORDS = ("T", "end", "dt")
 _MAX_PAIRS = 20_000
@@ -186,7 +186,7 @@ class Scope:
 
 
 def column_value(column: Column, origin: Origin | None = None) -> Number:
-    """The number that a column holds, in SI units."""
+    """The number that a column holds, in SI units from the zero of its unit."""
     num: ir.Num = ir.Col(column.name)
     if column.unit.ratio != 1:
         num = ir.Op("mul", (num, ir.Lit(column.unit.scale)))
@@ -221,11 +221,11 @@ def member_entries(enums: Iterable[tuple[tuple[str, float], ...]]) -> dict[str, 
 
 
 def constant_value(value: float, unit: Unit = DIMENSIONLESS) -> Number:
-    """A known number in SI units; without a written unit it is as good as a bare one."""
+    """A number known in SI units; without a written unit it is as good as a bare one."""
     bare = not unit.text
-    exact = Fraction(repr(value))
+    exact = Fraction(repr(value)) - unit.offset
     kind: Literal["int", "real"] = "int" if bare and exact.denominator == 1 else "real"
-    return Number(ir.Lit(float(value)), unit, bare, bare, exact, kind)
+    return Number(ir.Lit(nearest(exact)), unit, bare, bare, exact, kind)
 
 
 def constant_entries(

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
-from stlc.compile.algebra import in_unit
+from stlc.compile.algebra import in_unit, on_scale
 from stlc.compile.expressions import evaluate_all
 from stlc.compile.interface import Interface
 from stlc.compile.scope import Scope
@@ -16,7 +16,7 @@ from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
 from stlc.registry import closest
 from stlc.signature import Column, Kind, Role
-from stlc.units import DIMENSIONLESS, KELVIN, Unit, nearest, parse_unit, same_dims
+from stlc.units import CELSIUS, DIMENSIONLESS, Unit, nearest, parse_unit, same_dims
 
 Labels = tuple[tuple[str, float], ...]
 
@@ -39,7 +39,7 @@ def declared_unit(text: str, decl: ast.Declaration, scope: Scope) -> Unit:
         )
     if text.strip() == "C" and _TEMPERATURE.search(decl.name_span.text):
         message = f"`{decl.name_span.text}` is declared in coulombs [C]"
-        scope.report(Diagnostic("W107", message, decl.name_span, help=(KELVIN,)))
+        scope.report(Diagnostic("W107", message, decl.name_span, help=(CELSIUS,)))
     return unit
 
 
@@ -198,5 +198,6 @@ def _stored(exprs: Sequence[ast.Expr], target: tuple[Column, Unit], scope: Scope
             scope.fail(Diagnostic("E203", message, expr.span, f"[{number.unit}]"))
         if number.constant is None:
             scope.fail(Diagnostic("E205", "the ends of a range are constants", expr.span))
-        exact = number.exact
-        yield nearest(exact / column.unit.ratio) if exact is not None else number.constant / column.unit.scale
+        number = on_scale(number, column.unit, expr.span, scope)
+        exact, amount = number.exact, number.constant or 0.0
+        yield nearest(exact / column.unit.ratio) if exact is not None else amount / column.unit.scale

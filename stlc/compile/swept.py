@@ -15,7 +15,7 @@ from dataclasses import replace
 from itertools import combinations, product
 
 from stlc.compile import ir
-from stlc.compile.algebra import apply, negated
+from stlc.compile.algebra import apply, gap, negated
 from stlc.compile.polygons import convex
 from stlc.compile.regions import dimension, signed_distance, to_segment
 from stlc.compile.samples import later
@@ -111,7 +111,7 @@ class _Sweep:
         for axis, sides in enumerate(zip(box.lower.items, box.upper.items, strict=True)):
             for side, sign in zip(sides, (1, -1), strict=True):
                 room = [
-                    self.apply("sub", *(pair if sign > 0 else pair[::-1]))
+                    gap(*(pair if sign > 0 else pair[::-1]), self.span, self.scope)
                     for pair in zip((end.items[axis] for end in self.ends), _both(side), strict=True)
                 ]
                 faces.append((room[0], room[1]))

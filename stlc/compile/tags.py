@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from stlc.compile import ir
+from stlc.compile.algebra import refuse_point
 from stlc.compile.expressions import evaluate
 from stlc.compile.scope import Failed, Scope
 from stlc.compile.sorts import Need, as_number
@@ -124,6 +125,7 @@ def _number(tag: ast.Tag, scope: Scope) -> ir.Num:
     if expr is None:
         scope.fail(Diagnostic("E501", f"`@{tag.name}` takes one number: `@{tag.name}(2)`", tag.span))
     number = as_number(evaluate(expr, scope), expr, Need(f"`@{tag.name}` takes a number"), scope)
+    refuse_point(f"`@{tag.name}`", number, expr.span, scope)
     if number.constant is not None and number.constant <= 0:
         scope.fail(Diagnostic("E205", f"`@{tag.name}` takes a positive constant", expr.span))
     return number.num

@@ -24,14 +24,17 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A scalar in SI units.
+    """A scalar in SI units, counted from the zero of its unit: 20 degC is 20, a point of that scale.
 
     Attributes:
         num: how it is computed.
-        unit: its physical unit, for checks and messages; `num` is in SI whatever the unit's scale.
+        unit: its physical unit, for checks and messages; `num` is in SI whatever the unit's scale. One with
+            an offset makes the number a point.
         flexible: of unknown unit (nothing was declared, or a factor is a bare number): agrees with any unit.
         bare: made of bare numbers alone: takes the unit that is needed, with its scale (`psi < 30`).
         exact: the value of a constant that is rational.
+        sense: `difference` of two points, which is compared with no point; `open`: a point less something in
+            kelvin that varies, which is a difference where that is a temperature.
         kind: `bool` stands for 0/1 and is a formula too; `enum` is one of `labels`.
         labels: (label, value) pairs of an enum.
         formula: of a choice between bools: the choice between formulas, with their margins.
@@ -45,6 +48,7 @@ class Number:
     bare: bool = False
     exact: Fraction | None = None
     kind: Kind = "real"
+    sense: Literal["", "difference", "open"] = ""
     labels: Labels = ()
     formula: typed.Formula | None = None
     span: Span | None = field(default=None, compare=False, repr=False)
@@ -52,7 +56,7 @@ class Number:
 
     @property
     def constant(self) -> float | None:
-        """Its value in SI units, if it is known now."""
+        """Its value in SI units from the zero of its unit, if it is known now."""
         return self.num.value if isinstance(self.num, ir.Lit) else None
 
 

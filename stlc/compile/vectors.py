@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import reduce
 
-from stlc.compile.algebra import apply, negated
+from stlc.compile.algebra import apply, gap, negated
 from stlc.compile.scope import Scope
 from stlc.compile.values import Number, Vector
 from stlc.diagnostics import Diagnostic
@@ -17,12 +17,17 @@ def broadcast(name: str, args: Sequence[Number | Vector], span: Span, scope: Sco
     lengths = {len(arg.items) for arg in args if isinstance(arg, Vector)}
     if not lengths:
         return apply(name, [arg for arg in args if isinstance(arg, Number)], span, scope)
-    if len(lengths) > 1:
-        long, short = sorted(lengths, reverse=True)[:2]
-        scope.fail(Diagnostic("E205", f"vectors of {short} and {long} components do not go together", span))
+    check_lengths(lengths, span, scope)
     size = lengths.pop()
     rows = [arg.items if isinstance(arg, Vector) else (arg,) * size for arg in args]
     return Vector(tuple(apply(name, row, span, scope) for row in zip(*rows, strict=True)), span)
+
+
+def check_lengths(lengths: set[int], span: Span, scope: Scope) -> None:
+    """Refuse vectors of different lengths (E205)."""
+    if len(lengths) > 1:
+        long, short = sorted(lengths, reverse=True)[:2]
+        scope.fail(Diagnostic("E205", f"vectors of {short} and {long} components do not go together", span))
 
 
 def negate(value: Number | Vector, span: Span) -> Number | Vector:
@@ -33,10 +38,10 @@ def negate(value: Number | Vector, span: Span) -> Number | Vector:
 
 
 def minus(left: Vector, right: Vector, span: Span, scope: Scope) -> Vector:
-    """`left - right` of two vectors of one length."""
-    result = broadcast("sub", (left, right), span, scope)
-    assert isinstance(result, Vector)
-    return result
+    """From one point to another, both of so many components. Raises Failed (E203, E205)."""
+    check_lengths({len(left.items), len(right.items)}, span, scope)
+    pairs = zip(left.items, right.items, strict=True)
+    return Vector(tuple(gap(a, b, span, scope) for a, b in pairs), span)
 
 
 def norm(vector: Vector, span: Span, scope: Scope) -> Number:

@@ -9,8 +9,9 @@ from fractions import Fraction
 from typing import TypeVar
 
 from stlc.compile import ir
+from stlc.compile.algebra import difference_for_point, point_for_amount
 from stlc.compile.formulas import resolve_region, resolve_state_formula
-from stlc.compile.numbers import resolve_number, resolve_numbers
+from stlc.compile.numbers import resolve_number, resolve_numbers, stored
 from stlc.compile.scope import Entry, Scope
 from stlc.compile.values import Number
 from stlc.diagnostics import Diagnostic, StlcError
@@ -21,7 +22,7 @@ from stlc.dynamics.yaml_nodes import Sequence as ListNode
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
 from stlc.source import Span
-from stlc.units import Unit, nearest, parse_unit, same_dims
+from stlc.units import Unit, parse_unit, same_dims
 
 _T = TypeVar("_T")
 SECOND = parse_unit("s")
@@ -42,17 +43,20 @@ class Expressions:
         reader: where findings go.
         scope: what names mean.
         ready: columns that have a value here; None where all of them do.
+        amounts: numbers are added to what columns hold: differences, where those are points of a scale.
     """
 
     reader: Reader
     scope: Scope
     ready: frozenset[str] | None = None
+    amounts: bool = False
 
     def extended(
         self, entries: Mapping[str, Entry], *, samplers: bool = False, ready: frozenset[str] | None = None
     ) -> Expressions:
         """The same with more names."""
-        return Expressions(self.reader, self.scope.extended(entries, samplers=samplers), ready)
+        scope = self.scope.extended(entries, samplers=samplers)
+        return Expressions(self.reader, scope, ready, self.amounts)
 
     # ------------------------------------------------------------------ parsing
 
@@ -93,7 +97,7 @@ class Expressions:
     # -------------------------------------------------------------------- typing
 
     def number(self, node: Node | None, where: str) -> Number | None:
-        """The number that a field holds, in SI units."""
+        """The number that a field holds, in SI units from the zero of its unit."""
         expr = self.parse(node, where)
         if expr is None:
             return None
@@ -103,7 +107,7 @@ class Expressions:
         return number
 
     def numbers(self, node: Node | None, where: str) -> tuple[Number, ...] | None:
-        """The components that a field holds, in SI units: one expression, or a list of them."""
+        """The components that a field holds, as `number` gives them: one expression, or a list of them."""
         if isinstance(node, ListNode):
             each = [self.number(item, f"a component of {where}") for item in self.reader.items(node, where)]
             found = tuple(number for number in each if number is not None)
@@ -202,6 +206,14 @@ class Expressions:
     def _in_unit(self, number: Number, node: Node, where: str, unit: Unit) -> ir.Num | None:
         """A number as it is stored in a column of `unit`, or None with E203 reported."""
         if self._fits(number, unit):
+            place = first_line(node.span)
+            if self.amounts and number.unit.offset:
+                self._report((point_for_amount(where, number, place),))
+                return None
+            unit = unit.interval if self.amounts else unit
+            if unit.offset and number.sense == "difference":
+                self._report((difference_for_point(number, unit, place),))
+                return None
             return in_stored_unit(number, unit)
         message = f"{where} is in [{unit}], this is in [{number.unit}]"
         self.reader.report("E203", message, first_line(node.span), label=f"[{number.unit}]")
@@ -288,12 +300,7 @@ class Expressions:
 
 def in_stored_unit(number: Number, unit: Unit) -> ir.Num:
     """SI to the unit of a column; a bare number is in that unit already."""
-    if number.bare or unit.ratio == 1:
-        return number.num
-    if isinstance(number.num, ir.Lit):
-        exact = number.exact
-        return ir.Lit(nearest(exact / unit.ratio) if exact is not None else number.num.value / unit.scale)
-    return ir.Op("div", (number.num, ir.Lit(unit.scale)))
+    return number.num if number.bare else stored(number, unit)
 
 
 def written(node: Node | None) -> str:

@@ -11,7 +11,7 @@ from stlc.compile.scope import Known
 from stlc.compile.values import Number, Vector
 from stlc.dynamics.decl_init import FileDecl, GridDecl, InitDecl, Situation
 from stlc.dynamics.decl_model import Assign
-from stlc.dynamics.schema_expressions import Expressions, in_stored_unit, written
+from stlc.dynamics.schema_expressions import Expressions, written
 from stlc.dynamics.schema_flow import state_assigns, states_of
 from stlc.dynamics.schema_names import Names, base_name, component_names
 from stlc.dynamics.schema_points import read_file, read_grid
@@ -211,8 +211,7 @@ class _Draws:
             vector = len(numbers) > 1 or isinstance(node, Sequence)
             called = component_names(name, len(numbers) if vector else None)
             assigns = [
-                Assign(each, in_stored_unit(number, number.unit.si), written(node))
-                for each, number in zip(called, numbers, strict=True)
+                Assign(each, number.num, written(node)) for each, number in zip(called, numbers, strict=True)
             ]
             self.found.extend(shared_draws(assigns))
             items = tuple(

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from fractions import Fraction
 
+from stlc.compile.algebra import absolute
 from stlc.compile.scope import (
     Definition,
     Entry,
@@ -153,7 +154,8 @@ def read_constants(node: Node | None, reader: Reader, names: Names) -> None:
             if number.constant is None:
                 reader.wrong(entry.value, where, "a number that is known now")
                 break
-            names.constants[component] = (number.constant, Unit() if number.bare else number.unit)
+            known = absolute(number).constant or 0.0
+            names.constants[component] = (known, Unit() if number.bare else number.unit)
         names.place_components(name, called)
         value = Vector(numbers) if vector else numbers[0]
         names.entries[name] = Known(value, "constant", entry.key.span)

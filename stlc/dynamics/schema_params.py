@@ -63,7 +63,8 @@ def _columns(entry: Entry, fields: dict[str, Node], here: Expressions) -> tuple[
     columns = plain_columns(entry.key.text, fields, f"the parameter `{entry.key.text}`", here)
     if isinstance(entry.value, Scalar):
         number = replace(here, reader=Reader(here.reader.source)).number(entry.value, "")
-        unit = Unit() if number is None or number.bare else number.unit.si
+        unit = Unit() if number is None or number.bare else number.unit
+        unit = unit if unit.offset else unit.si
         columns = tuple(replace(column, unit=unit) for column in columns)
     return tuple(replace(column, role="env") for column in columns)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import MappingProxyType
 
 from stlc.compile import ir
@@ -52,6 +53,7 @@ def _scenario(entry: Entry, reader: Reader, names: Names, clock: Clockwork) -> S
     where = f"the scenario `{entry.key.text}`"
     found = reader.fields(entry.value, where, SCENARIO_KEYS)
     timed = _timed(names.expressions(reader), names)
+    added = replace(timed, amounts=True)
     items = reader.items(found.get("events"), f"`events` of {where}")
     return ScenarioDecl(
         entry.key.text,
@@ -60,8 +62,8 @@ def _scenario(entry: Entry, reader: Reader, names: Names, clock: Clockwork) -> S
         MappingProxyType(_constants(found.get("const"), f"`const` of {where}", reader, names)),
         read_sets(found.get("override"), f"`override` of {where}", timed, names),
         tuple(read_event(item, index, timed, names, clock.dt) for index, item in enumerate(items)),
-        _rates(found.get("disturb"), f"`disturb` of {where}", timed, (names, clock)),
-        read_sets(found.get("noise"), f"`noise` of {where}", timed, names),
+        _rates(found.get("disturb"), f"`disturb` of {where}", added, (names, clock)),
+        read_sets(found.get("noise"), f"`noise` of {where}", added, names),
         MappingProxyType(
             _constants(found.get("model_mismatch"), f"`model_mismatch` of {where}", reader, names)
         ),

@@ -7,6 +7,7 @@ from dataclasses import replace
 from types import MappingProxyType
 
 from stlc.compile import ir
+from stlc.compile.algebra import absolute
 from stlc.compile.scope import Entry, Known
 from stlc.compile.values import Number, Vector
 from stlc.dynamics.algebra import names_in, substitute
@@ -97,7 +98,7 @@ def _term(node: Node, here: Expressions) -> tuple[Term, ...]:
     name = reader.name(found.get("name"), "`name` of a term") or written(found.get("expr"))
     weight = reader.number(found.get("weight"), "`weight`")
     value = here.number(found.get("expr"), f"the term `{name}`")
-    return () if value is None else (Term(name, 1.0 if weight is None else weight, value.num),)
+    return () if value is None else (Term(name, 1.0 if weight is None else weight, absolute(value).num),)
 
 
 def read_policy(node: Node | None, reader: Reader, names: Names) -> PolicyDecl:

@@ -26,6 +26,7 @@ from stlc.dynamics.schema_reader import Reader
 from stlc.dynamics.yaml_nodes import Node
 from stlc.grammar import ast
 from stlc.grammar.children import children, descendants
+from stlc.units import SYMBOLS
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +110,11 @@ def _factor(name: str) -> str:
     return f"?{name}"
 
 
+def _is_point(node: ast.Quantity) -> bool:
+    known = SYMBOLS.get(node.unit)
+    return known is not None and bool(known.offset)
+
+
 def _place(node: ast.Quantity) -> str:
     return f"?{node.span.source.name}:{node.span.start}"
 
@@ -126,6 +132,9 @@ def _times(entry: Entry, factor: ir.Num) -> Entry:
 
 
 def _scaled(number: Number, factor: ir.Num) -> Number:
+    """A number with a factor; a point of a scale has no share that it could be wrong by."""
+    if number.unit.offset:
+        return number
     return replace(number, num=multiply(number.num, factor), exact=None)
 
 
@@ -150,7 +159,7 @@ class _Marked(Names):
 
     def expressions(self, reader: Reader) -> Expressions:
         """A compiler of rewritten expressions."""
-        return _Rewriting(reader, Names.expressions(self, reader).scope, None, self.rewrite)
+        return _Rewriting(reader, Names.expressions(self, reader).scope, rewrite=self.rewrite)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +191,7 @@ class _Seen:
         """An expression with a factor at each number that it computes with; definitions are put in."""
         match expr:
             case ast.Quantity(span=span, value=value):
-                if called or not value:
+                if called or not value or _is_point(expr):
                     return expr
                 self.literals[_place(expr)] = expr
                 return ast.Binary(span, "*", expr, ast.Name(span, _place(expr)))

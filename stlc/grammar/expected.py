@@ -15,7 +15,7 @@ from stlc.grammar.tokens import near_unit
 from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, RESERVED, ROLES, UNARY_TEMPORAL
 from stlc.registry import closest
 from stlc.source import Span
-from stlc.units import KELVIN, means_celsius
+from stlc.units import CELSIUS, means_celsius
 
 MAX_WORDS = 4
 
@@ -101,7 +101,7 @@ def unknown_unit(stumble: Stumble) -> Diagnostic | None:
     if found.text in RESERVED or "UNIT" not in stumble.accepts or _begins_line(stumble, found):
         return None
     near = near_unit(found.text)
-    advice = (KELVIN,) if means_celsius(found.text) else (f"did you mean `{near}`?",) if near else ()
+    advice = (CELSIUS,) if means_celsius(found.text) else (f"did you mean `{near}`?",) if near else ()
     product = f"a product is written with a sign: `{previous.text} * {found.text}`"
     return Diagnostic("E101", f"unknown unit `{found.text}`", stumble.of(found), help=(*advice, product))
 

@@ -10,7 +10,7 @@ from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar.words import BUILT_IN, UNIT_NAMES
 from stlc.registry import closest
 from stlc.source import Source, Span
-from stlc.units import KELVIN, SYMBOLS, means_celsius, parse_unit
+from stlc.units import CELSIUS, SYMBOLS, means_celsius, parse_unit
 
 MAX_DIGITS = 400
 _UNIT_LENGTH = 60
@@ -83,7 +83,7 @@ def _bad_unit(leaf: Leaf, text: str, reason: str) -> Diagnostic:
     if "," in text:
         advice: tuple[str, ...] = (f"a range is written `in {leaf.text}`",)
     elif means_celsius(text.strip("[] ")):
-        advice = (KELVIN,)
+        advice = (CELSIUS,)
     else:
         near = next((found for word in _WORD.findall(text) if (found := near_unit(word))), None)
         advice = (f"did you mean `{near}`?",) if near else ()

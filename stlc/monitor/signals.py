@@ -19,7 +19,7 @@ from stlc.registry import closest
 from stlc.signature import Column
 from stlc.source import Span
 from stlc.trace import Trace
-from stlc.units import Unit, same_dims
+from stlc.units import SYMBOLS, Unit, same_dims
 
 Given: TypeAlias = Mapping[str, Any]
 """Signal -> array (time,) or (…, time); a vector is (…, time, k)."""
@@ -216,30 +216,48 @@ def _in_units(columns: Mapping[str, Array], needs: Sequence[Need], trace: Trace)
         if name not in trace.signature:
             continue
         try:
-            factor = conversion(trace.name, need.column, trace.signature[name].unit, need.span)
+            change = conversion(trace.name, need.column, trace.signature[name].unit, need.span)
         except TraceError as error:
             findings += error.diagnostics
             continue
-        if factor != 1.0:
-            converted[name] = converted[name] * factor
+        if change is not None:
+            converted[name] = change(converted[name])
     if findings:
         raise TraceError(*findings)
     return converted
 
 
-def conversion(trace: str, column: Column, recorded: Unit, span: Span | None = None) -> float:
-    """By what recorded numbers are multiplied; 1 where one side does not say what they mean.
+@dataclass(frozen=True, slots=True)
+class Conversion:
+    """From one unit to another: `x * factor + shift`."""
+
+    factor: float
+    shift: float
+
+    def __call__(self, values: Any) -> Any:
+        """The same values in the other unit."""
+        scaled = values if self.factor == 1.0 else values * self.factor
+        return scaled + self.shift if self.shift else scaled
+
+
+def conversion(trace: str, column: Column, recorded: Unit, span: Span | None = None) -> Conversion | None:
+    """How recorded numbers become those of a column; None where they are, or one side does not say its unit.
 
     Raises:
         TraceError: E605, they measure something else than is declared.
     """
     wanted = column.unit
     if not wanted.text or not recorded.text:
-        return 1.0
+        return None
     if not same_dims(recorded, wanted):
         message = f"`{column.name}` is in [{recorded}] in `{trace}`, the specification declares [{wanted}]"
-        raise TraceError(Diagnostic("E605", message, span))
-    return float(recorded.ratio / wanted.ratio)
+        coulombs = wanted.dims == SYMBOLS["K"].dims and recorded.text == "C"
+        help_ = (f"[C] is coulombs: name the column `{column.name} [degC]`",) if coulombs else ()
+        raise TraceError(Diagnostic("E605", message, span, help=help_))
+    found = Conversion(
+        float(recorded.ratio / wanted.ratio), float((recorded.offset - wanted.offset) / wanted.ratio)
+    )
+    return None if found == Conversion(1.0, 0.0) else found
 
 
 def _check_finite(signals: Signals, needs: Sequence[Need]) -> None:
