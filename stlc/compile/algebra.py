@@ -90,9 +90,11 @@ def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[
 
 def gap(left: Number, right: Number, span: Span, scope: Scope) -> Number:
     """`left - right` of what is compared: two points, or two numbers. Raises Failed (E203)."""
-    if left.unit.offset or right.unit.offset:
-        (left, right), _ = agree((left, right), "subtract", span, scope)
-    return apply("sub", (left, right), span, scope)
+    if not (left.unit.offset or right.unit.offset):
+        return apply("sub", (left, right), span, scope)
+    sides, _ = agree((left, right), "subtract", span, scope)
+    plain = [replace(side, unit=side.unit.interval, sense="") for side in sides]
+    return replace(apply("sub", plain, span, scope), sense="difference")
 
 
 def rebased(number: Number, unit: Unit) -> Number:
@@ -267,13 +269,15 @@ def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -
 def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Scope) -> Agreed:
     """A sum or difference with a point in it."""
     left, right = args
-    point, other = (left, right) if left.unit.offset else (right, left)
+    first = left.unit.offset and (not right.unit.offset or left.sense != "open")
+    point, other = (left, right) if first else (right, left)
     if not other.flexible and not same_dims(point.unit, other.unit):
         scope.fail(_mismatch(left, right, _verb(function), span))
     if function.name == "sub" and right.unit.offset:
-        found, blank = agree(args, _verb(function), span, scope)
-        return found, replace(blank, unit=point.unit.interval, sense="difference")
-    if other.unit.offset:
+        return _less_point(left, right, span, scope)
+    if other.sense == "open":
+        other = absolute(other)
+    elif other.unit.offset:
         scope.fail(_sum_of_points(left, right, span))
     if other.bare and function.name == "sub":
         scope.fail(_which(other, point.unit, span))
@@ -281,7 +285,16 @@ def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Sco
         other = in_unit(other, point.unit.interval, scope)
     drops = function.name == "sub" and other.constant is None and other.sense != "difference"
     blank = Number(ir.Lit(0.0), point.unit, sense="open" if drops else point.sense, span=span)
-    return (point, other) if left.unit.offset else (other, point), blank
+    return (point, other) if first else (other, point), blank
+
+
+def _less_point(left: Number, right: Number, span: Span, scope: Scope) -> Agreed:
+    """`left - right` of a point: a difference of two; undecided where the point is."""
+    if right.sense == "open" and not left.bare and left.sense != "difference":
+        sense: Sense = "open" if left.unit.offset else ""
+        return (left, absolute(right)), Number(ir.Lit(0.0), left.unit, left.flexible, sense=sense, span=span)
+    found, _ = agree((left, right), "subtract", span, scope)
+    return found, Number(ir.Lit(0.0), right.unit.interval, sense="difference", span=span)
 
 
 def _spread(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> Agreed:
@@ -338,10 +351,9 @@ def _compared_with_point(difference: Number, point: Number, what: str, span: Spa
     """E203: `abs(temp - 21 degC) <= 0.5 degC`."""
     unit = point.unit
     text = (point.span or span).text
-    written = _QUANTITY.fullmatch(text)
-    if written is not None and point.constant is not None:
+    if point.constant is not None:
         label = f"{float(point.constant + unit.offset):g} {unit.interval}"
-        help_ = f"write the difference in kelvin: `{written[1]} {unit.interval}`"
+        help_ = f"write the difference in kelvin: `{point.constant / unit.scale:g} {unit.interval}`"
     else:
         label = f"[{unit}]"
         help_ = f"make it a difference too: `{text} - 0 {unit}`"

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from stlc.compile import ir, typed
-from stlc.compile.algebra import agree, apply, half, in_unit
+from stlc.compile.algebra import agree, apply, gap, half, in_unit
 from stlc.compile.regions import signed_distance
 from stlc.compile.scope import Scope
 from stlc.compile.sorts import Need, as_formula, as_number, loose_number
@@ -91,7 +91,7 @@ def _above(big: Number, small: Number, strict: bool, span: Span, scope: Scope) -
         step = half(span)
         step = in_unit(step, big.unit.interval, scope) if big.unit.offset else step
         big = apply("sub" if strict else "add", (big, step), span, scope)
-    return _pred(span, apply("sub", (big, small), span, scope), strict=strict, written=written)
+    return _pred(span, gap(big, small, span, scope), strict=strict, written=written)
 
 
 def _pred(span: Span, margin: Number, *, strict: bool = False, written: Unit | None = None) -> typed.Pred:
@@ -131,8 +131,8 @@ def _equality(
         scope.fail(_real_equality(a, b, left[0], right[0], place))
     _check_labels(a, b, place, scope)
     plain = [replace(side, kind="real", labels=()) for side in (a, b)]
-    gap = apply("abs", (apply("sub", plain, whole, scope),), whole, scope)
-    return typed.Pred(whole, apply("sub", (half(whole), gap), whole, scope).num, strict=False)
+    apart = apply("abs", (gap(plain[0], plain[1], whole, scope),), whole, scope)
+    return typed.Pred(whole, apply("sub", (half(whole), apart), whole, scope).num, strict=False)
 
 
 def _meet(side: tuple[ast.Expr, Value], other: tuple[ast.Expr, Value], scope: Scope) -> Number:
@@ -207,7 +207,7 @@ def in_range(
             )
         )
     if scope.product and x.kind != "int":
-        sides = apply("sub", (x, low), span, scope), apply("sub", (high, x), span, scope)
+        sides = gap(x, low, span, scope), gap(high, x, span, scope)
         return _pred(span, apply("mul", sides, span, scope))
     above = _above(x, low, False, span, scope)
     below = _above(high, x, False, span, scope)

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
 from stlc.compile import ir
 
 _DEVIATIONS = 3.0
+_CHANGES: Mapping[str, Callable[[float, float], float]] = MappingProxyType(
+    {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv}
+)
+"""What a unit does to a draw."""
 
 
 def spread(num: ir.Num) -> tuple[float, float] | None:
@@ -27,11 +35,11 @@ def spread(num: ir.Num) -> tuple[float, float] | None:
             if len(found) < len(known):
                 return None
             return min(low for low, _ in found), max(high for _, high in found)
-        case ir.Op("mul" | "div" as op, (inner, ir.Lit(factor))) if factor:
+        case ir.Op("add" | "sub" | "mul" | "div" as op, (inner, ir.Lit(amount))) if amount:
             ends = spread(inner)
             if ends is None:
                 return None
-            scaled = [end * factor if op == "mul" else end / factor for end in ends]
-            return min(scaled), max(scaled)
+            moved = [_CHANGES[op](end, amount) for end in ends]
+            return min(moved), max(moved)
         case _:
             return None
