@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from stlc.units import DIMENSIONLESS, SYMBOLS, Unit, parse_unit, same_dims
 
-_factors = st.lists(st.tuples(st.sampled_from(sorted(SYMBOLS)), st.integers(-3, 3)), min_size=1, max_size=3)
+_PRODUCTS = sorted(symbol for symbol, unit in SYMBOLS.items() if not unit.offset)
+_factors = st.lists(st.tuples(st.sampled_from(_PRODUCTS), st.integers(-3, 3)), min_size=1, max_size=3)
 
 
 def _text(factors: list[tuple[str, int]]) -> str:
@@ -112,3 +113,33 @@ def test_si_keeps_the_dimensions(a: Unit) -> None:
 @pytest.mark.parametrize(("text", "si"), [("1 mph", 0.44704), ("1 ft", 0.3048), ("1 lb", 0.45359237)])
 def test_units_of_elsewhere(text: str, si: float) -> None:
     assert parse_unit(text.split()[1]).scale == si
+
+
+@pytest.mark.parametrize("text", ["degC", "°C"])
+def test_degrees_have_a_zero_of_their_own(text: str) -> None:
+    unit = parse_unit(text)
+    assert (str(unit), unit.offset, unit.ratio) == (text, Fraction("273.15"), 1)
+    assert same_dims(unit, parse_unit("K"))
+    assert unit != parse_unit("K")
+    assert unit.interval == unit.si == parse_unit("K")
+    assert str(unit.interval) == "K"
+    assert unit.of_si(293.15) == pytest.approx(20)
+    assert str(parse_unit("J") / unit) == "J/K"
+    assert unit**2 == parse_unit("K^2")
+    assert unit * DIMENSIONLESS == parse_unit("K")
+
+
+@pytest.mark.parametrize(
+    ("text", "instead"),
+    [
+        ("kJ/degC", "kJ/K"),
+        ("W/m^2/°C", "W/m^2/K"),
+        ("degC/min", "K/min"),
+        ("degC^2", "K^2"),
+        ("1/degC", "1/K"),
+    ],
+)
+def test_a_zero_of_its_own_is_no_factor(text: str, instead: str) -> None:
+    with pytest.raises(ValueError, match="stands alone") as caught:
+        parse_unit(text)
+    assert f"write `{instead}`" in str(caught.value)

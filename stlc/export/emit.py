@@ -21,6 +21,7 @@ from stlc.export import c_numbers, c_weights
 from stlc.runtime.prefixes import generators
 
 if TYPE_CHECKING:
+    from stlc.signature import Column
     from collections.abc import Sequence
 
     from stlc.compile.c_steps import Plan
@@ -112,10 +113,17 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
     }
 
 
+def _in_its_unit(text: str, column: Column) -> str:
+    return f"{text} [{column.unit.text}]" if column.unit.text else text
+
+
 def _added(task: Task) -> dict[str, object]:
     """What the specification adds to states: what it holds, how it begins and how it goes on."""
     system, first = task.system, len(task.system.decl.signature.names)
-    tables = [("parameter, the caller's", each.column) for each in system.parameters]
+    measured = [_in_its_unit("measured", column) for column in system.decl.signature.columns]
+    tables = [
+        (_in_its_unit("parameter, the caller's", each.column), each.column) for each in system.parameters
+    ]
     tables += [(_holds(timer), timer.column) for timer in system.timers]
     place = first + len(system.parameters)
     listed = [f"     {c_comment(column.name)}: {c_comment(text)}" for text, column in tables]
@@ -124,7 +132,7 @@ def _added(task: Task) -> dict[str, object]:
         "PARAMETERS": len(system.parameters),
         "TIMERS": len(system.timers),
         "ADDED": "\n".join(listed) or "     nothing",
-        "ABOUT": ", ".join(map(c_string, ["measured"] * first + [text for text, _ in tables])),
+        "ABOUT": ", ".join(map(c_string, [*measured, *(text for text, _ in tables)])),
         "BEGIN": _block(
             [f"x[{place + i}] = {literal(each.initial)};" for i, each in enumerate(system.timers)]
         ),

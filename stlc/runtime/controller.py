@@ -129,8 +129,8 @@ class Controller:
         """Decide.
 
         Args:
-            state: (n,), or (agents, n) for a batch, or columns by name; SI units. Ranges of states are
-                nominal: beyond them the monitor judges as anywhere.
+            state: (n,), or (agents, n) for a batch, or columns by name; in the units of `facts`. Ranges
+                of states are nominal: beyond them the monitor judges as anywhere.
             elapsed: steps since the decision before.
 
         Returns:
@@ -171,7 +171,7 @@ class Controller:
             given = np.asarray(stacked, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise _misfit(
-                f"the state is no array of numbers: {error}", "SI units, one row an agent"
+                f"the state is no array of numbers: {error}", "numbers in the units of the system, one row an agent"
             ) from None
         single, x = given.ndim == 1, np.atleast_2d(given)
         known = len(self.facts.states) - len(self.facts.added)

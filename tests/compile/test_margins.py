@@ -112,9 +112,10 @@ def test_a_number_in_a_unit_is_the_number_over_its_scale(num: ir.Num, x: float) 
 
 
 @pytest.mark.parametrize(
-    ("declared", "codes"), [("temp [C]", ["W107"]), ("charge [C]", []), ("temp [K]", [])]
+    ("declared", "codes"), [("temp [C]", ["W107"]), ("charge [C]", []), ("temp [K]", []), ("temp [degC]", [])]
 )
 def test_a_temperature_in_coulombs(declared: str, codes: list[str]) -> None:
     name = declared.split()[0]
     compiled = Monitor(f"signal {declared}\nrequire r: always[0 s, 1 s] {name} > 1", dt=0.1).compiled
     assert [finding.code for finding in compiled.warnings] == codes
+    assert all("`degC`" in finding.help[0] for finding in compiled.warnings)
