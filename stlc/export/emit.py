@@ -21,7 +21,6 @@ from stlc.export import c_numbers, c_weights
 from stlc.runtime.prefixes import generators
 
 if TYPE_CHECKING:
-    from stlc.signature import Column
     from collections.abc import Sequence
 
     from stlc.compile.c_steps import Plan
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
     from stlc.compile.timers import Timer
     from stlc.controller.policy import PlanNetwork
     from stlc.controller.task import Task
+    from stlc.signature import Column
 
 
 def header(task: Task, network: PlanNetwork) -> str:

@@ -171,7 +171,8 @@ class Controller:
             given = np.asarray(stacked, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise _misfit(
-                f"the state is no array of numbers: {error}", "numbers in the units of the system, one row an agent"
+                f"the state is no array of numbers: {error}",
+                "numbers in the units of the system, one row an agent",
             ) from None
         single, x = given.ndim == 1, np.atleast_2d(given)
         known = len(self.facts.states) - len(self.facts.added)

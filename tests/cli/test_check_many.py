@@ -130,6 +130,28 @@ def test_junit() -> None:
     assert [suite.get("name") for suite in root] == [*names, "bro<ken.npz"]
 
 
+@pytest.mark.parametrize("suffix", [".npz", ".mcap", ".csv"])
+def test_robustness_signals_have_units(suffix: str) -> None:
+    Path("u.stl").write_text(
+        "signal temp [degC]\nsignal speed [km/h]\n"
+        "require hot: always[0 s, 0.1 s] temp <= 60 degC\n"
+        "require fast: always[0 s, 0.1 s] speed <= 30 m/s\n"
+        "require both: always[0 s, 0.1 s] (temp <= 60 degC and speed <= 30 m/s)\n",
+        encoding="utf-8",
+    )
+    Path("u.csv").write_text("t,temp [K],speed [m/s]\n0,293.15,10\n0.1,333.15,20\n", encoding="utf-8")
+    assert check("u.stl", "u.csv", "--out", f"margins{suffix}", "-q") == 0
+    margins = load_trace(f"margins{suffix}")
+    assert [(c.name, c.unit.text) for c in margins.signature.columns] == [
+        ("hot", "K"),
+        ("fast", "km/h"),
+        ("both", ""),
+    ]
+    assert [margins.data[name][0, 0] for name in ("hot", "fast", "both")] == pytest.approx(
+        [0, 36, 0], abs=1e-9
+    )
+
+
 def test_robustness_signals() -> None:
     names = files(a_trace(), a_trace(peak=3))
     check("s.stl", names[1], "--out", "rob.npz", "-q")

@@ -148,7 +148,9 @@ def test_operators_that_are_misspelt(formula, near):
     assert finding.fix is None
 
 
-@pytest.mark.parametrize("text", ["signal t [deg_C]\nrequire a: t > 1", "signal t\nrequire a: t > 20 celsius"])
+@pytest.mark.parametrize(
+    "text", ["signal t [deg_C]\nrequire a: t > 1", "signal t\nrequire a: t > 20 celsius"]
+)
 def test_degrees_celsius_are_not_taken_for_angles(text):
     (finding,) = findings(text)
     assert (finding.code, "`degC`" in finding.help[0]) == ("E101", True)
