@@ -22,7 +22,7 @@ from stlc.compile.values import Number, literal, unit_text
 from stlc.diagnostics import Diagnostic, Label
 from stlc.signature import Kind
 from stlc.source import Span
-from stlc.units import DIMENSIONLESS, Unit, nearest, same_dims
+from stlc.units import DIMENSIONLESS, SYMBOLS, Unit, nearest, same_dims
 
 _MAX_BITS = 512
 _QUANTITY = re.compile(r"(-? *[\d.]+(?:[eE][+-]?\d+)?) *(?:[^\W\d]|°)\S*")
@@ -83,8 +83,11 @@ def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[
     known = rigid or [arg for arg in args if not arg.bare]
     if not known:
         return tuple(args), Number(ir.Lit(0.0), DIMENSIONLESS, True, True, span=span)
-    unit = known[0].unit
-    blank = Number(ir.Lit(0.0), unit, not rigid, sense=_sense(args), span=span)
+    unit, sense = known[0].unit, _sense(args)
+    bare = next((arg for arg in args if arg.bare), None)
+    if bare is not None and sense == "open":
+        scope.fail(_which(bare, SYMBOLS["degC"], span))
+    blank = Number(ir.Lit(0.0), unit, not rigid, sense=sense, span=span)
     return tuple(in_unit(arg, unit, scope) if arg.bare else arg for arg in args), blank
 
 
@@ -177,6 +180,7 @@ def _units(
     flexible, bare = any(arg.flexible for arg in args), all(arg.bare for arg in args)
     if function.rule == "same":
         return _alike(function, args, span, scope)
+    scaled = _scaled_point(function, args)
     args = _in_kelvin(function, args, span, scope)
     match function.rule:
         case "ratio":
@@ -196,7 +200,7 @@ def _units(
             if function.rule == "plain":
                 _check_plain(function, args, scope)
             unit, flexible = DIMENSIONLESS, bare
-    sense: Sense = "difference" if _multiple(function, args) else ""
+    sense: Sense = "difference" if _multiple(function, args) else "open" if scaled else ""
     return tuple(args), Number(ir.Lit(0.0), unit, flexible, bare, sense=sense, span=span)
 
 
@@ -218,7 +222,7 @@ def _alike(function: Function, args: Sequence[Number], span: Span, scope: Scope)
     found, blank = agree(args, verb, span, scope)
     if name in _LENGTHS and blank.unit.dims == _TEMPERATURE:
         blank = replace(blank, sense="difference")
-    elif name in ("add", "sub") and any(not arg.sense and arg.constant is None for arg in args):
+    elif blank.sense == "difference" and any(not arg.sense and arg.constant is None for arg in args):
         blank = replace(blank, sense="")
     return found, blank
 
@@ -230,7 +234,8 @@ def _in_kelvin(function: Function, args: Sequence[Number], span: Span, scope: Sc
 
 
 def _sense(args: Sequence[Number]) -> Sense:
-    return "difference" if any(arg.sense == "difference" for arg in args) else ""
+    senses = [arg.sense for arg in args]
+    return "open" if "open" in senses else "difference" if "difference" in senses else ""
 
 
 def _multiple(function: Function, args: Sequence[Number]) -> bool:
@@ -241,6 +246,15 @@ def _multiple(function: Function, args: Sequence[Number]) -> bool:
     if second.sense == "difference" and function.rule == "mul":
         first, second = second, first
     return first.sense == "difference" and not second.sense and second.unit.dimensionless
+
+
+def _scaled_point(function: Function, args: Sequence[Number]) -> bool:
+    """Whether this is a plain number times a point: a part of a mean, or of a conversion to another scale."""
+    told = [arg for arg in args if arg.unit.offset or arg.sense == "open"]
+    rest = [arg for arg in args if arg not in told]
+    plain = all(arg.bare or (arg.unit.dimensionless and not arg.flexible) for arg in rest)
+    first = function.rule == "mul" or (function.rule == "div" and told[:1] == [args[0]])
+    return first and len(told) == 1 and plain
 
 
 def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -> Agreed:

@@ -178,6 +178,8 @@ def _compare(item: ast.Const, value: Number, interface: Interface, scope: Scope)
     message = f"`{item.name}` is {here} here and {there} in {interface.where}"
     both = f"make them agree, or change both at once: `--set {item.name}={here.replace(' ', '')}`"
     help_ = (both,) if free or same_dims(value.unit, unit) else ()
+    if value.bare and unit.offset:
+        help_ = (f"say its unit: `const {item.name} = {here} {unit}`",)
     scope.report(Diagnostic("E104", message, item.name_span, here, labels, help=help_))
 
 

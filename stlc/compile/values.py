@@ -34,7 +34,7 @@ class Number:
         bare: made of bare numbers alone: takes the unit that is needed, with its scale (`psi < 30`).
         exact: the value of a constant that is rational.
         sense: `difference` of two points, which is compared with no point; `open`: a point less something in
-            kelvin that varies, which is a difference where that is a temperature.
+            kelvin that varies, which is a difference where that is a temperature, or a multiple of a point.
         kind: `bool` stands for 0/1 and is a formula too; `enum` is one of `labels`.
         labels: (label, value) pairs of an enum.
         formula: of a choice between bools: the choice between formulas, with their margins.

@@ -238,6 +238,8 @@ def _product(stumble: Stumble) -> tuple[str, ...]:
     previous, found = stumble.previous, stumble.found
     if previous is None or found is None or "MULOP" not in stumble.accepts or "UNIT" in stumble.accepts:
         return ()
+    if previous.text in ("deg", "°") and found.text == "C":
+        return (CELSIUS,)
     if not stumble.piece.repaired_by(previous.end, previous.end, " *"):
         return ()
     return (f"a product is written with a sign: {stumble.line_with((previous.end, previous.end, ' *'))}",)

@@ -34,6 +34,20 @@ def test_a_computed_constant(write):
     assert "= 6 m" in hover(document, offset)[1]
 
 
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [("20 degC + 5 K", "= 25 degC"), ("20 degC - 5 degC", "= 15 K"), ("2 * 20 degC", "= 586.3 K")],
+)
+def test_a_temperature_and_a_difference(write, value, shown):
+    document, offset = write(f"const a│ = {value}\n")
+    assert shown in hover(document, offset)[1]
+
+
+def test_a_signal_in_degrees(write):
+    document, offset = write("signal temp│ [degC] in [10, 300 K]\n")
+    assert "real [degC], 10 to 26.85 degC" in hover(document, offset)[1]
+
+
 def test_an_enum_and_its_member(traffic):
     assert "enum Sign { stop = 0, light = 1 }" in say(traffic, "Sign")
     assert "member of `Sign`, 1" in say(traffic, "light = 1")

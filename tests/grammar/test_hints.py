@@ -148,6 +148,12 @@ def test_operators_that_are_misspelt(formula, near):
     assert finding.fix is None
 
 
+@pytest.mark.parametrize("unit", ["deg C", "° C"])
+def test_degrees_celsius_in_two_words(unit):
+    (finding,) = findings(f"signal t\nrequire a: t > 20 {unit}\n")
+    assert (finding.code, "`degC`" in finding.help[0]) == ("E010", True)
+
+
 @pytest.mark.parametrize(
     "text", ["signal t [deg_C]\nrequire a: t > 1", "signal t\nrequire a: t > 20 celsius"]
 )
