@@ -200,7 +200,7 @@ def _units(
             if function.rule == "plain":
                 _check_plain(function, args, scope)
             unit, flexible = DIMENSIONLESS, bare
-    sense: Sense = "difference" if _multiple(function, args) else "open" if scaled else ""
+    sense: Sense = "difference" if _length_or_multiple(function, args, unit) else "open" if scaled else ""
     return tuple(args), Number(ir.Lit(0.0), unit, flexible, bare, sense=sense, span=span)
 
 
@@ -238,8 +238,10 @@ def _sense(args: Sequence[Number]) -> Sense:
     return "open" if "open" in senses else "difference" if "difference" in senses else ""
 
 
-def _multiple(function: Function, args: Sequence[Number]) -> bool:
-    """Whether this is a plain number times a difference, which is one again."""
+def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) -> bool:
+    """Whether this is a plain number times a difference, or the root of squares: differences again."""
+    if function.rule in ("sqrt", "pow"):
+        return unit.dims == _TEMPERATURE != args[0].unit.dims
     if function.rule not in ("mul", "div"):
         return False
     first, second = args

@@ -150,16 +150,19 @@ def _meet(side: tuple[ast.Expr, Value], other: tuple[ast.Expr, Value], scope: Sc
 
 def _real_equality(a: Number, b: Number, left: ast.Expr, right: ast.Expr, place: Span) -> Diagnostic:
     first, second = left.span.text, right.span.text
-    gap = f"abs({first})" if b.constant == 0 else f"abs({first} - {second})"
     unit = next((n.unit for n in (a, b) if not n.unit.dimensionless), None)
+    if unit is not None and unit.offset:
+        first, second = (f"{n} {unit}" if m.bare else n for n, m in ((first, a), (second, b)))
+    apart = f"{first} - {second}"
+    away = first if b.constant == 0 and (unit is None or not unit.offset) else apart
     tolerance = "0.05" if unit is None else f"0.05 {unit.interval}"
-    label = f"its robustness is -|{first} - {second}|: at best 0, so it can never hold with a margin"
+    label = f"its robustness is -|{apart}|: at best 0, so it can never hold with a margin"
     return Diagnostic(
         "E204",
         "`==` between reals is never robustly true",
         place,
         label,
-        help=(f"{gap} <= {tolerance}",),
+        help=(f"abs({away}) <= {tolerance}",),
         note=("`==` is exact and allowed on whole numbers, truth values and enums",),
     )
 

@@ -94,6 +94,24 @@ def test_temperatures(formula: str, margin: float, unit: str) -> None:
     assert found.unit == unit
 
 
+@pytest.mark.parametrize(
+    ("formula", "instead"),
+    [
+        ("temp == 20", "abs(temp - 20 degC) <= 0.05 K"),
+        ("temp == 0", "abs(temp - 0 degC) <= 0.05 K"),
+        ("temp in {20 degC}", "abs(temp - 20 degC) <= 0.05 K"),
+        ("wall == 20 degC", "abs(wall - 20 degC) <= 0.05 K"),
+        ("wall == 0", "abs(wall) <= 0.05 K"),
+    ],
+)
+def test_the_way_out_of_equality_is_one(formula: str, instead: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        judged(formula)
+    (finding,) = caught.value.diagnostics
+    assert (finding.code, finding.help) == ("E204", (instead,))
+    judged(instead)
+
+
 def test_a_product_of_both_sides() -> None:
     monitor = Monitor(f"{HEAD}@product require r: temp in [18, 24]", dt=0.1)
     assert monitor.check({name: [value] for name, value in VALUES.items()})["r"].robustness == 8.0
@@ -114,6 +132,7 @@ def test_nothing_is_lost_at_the_limit() -> None:
         ("2 * abs(temp - t2) <= 1 degC", "1 degC", "`1 K`"),
         ("temp - t2 + 1 K < 0.5 degC", "0.5 degC", "`0.5 K`"),
         ("delta(temp) <= 1 degC", "1 degC", "`1 K`"),
+        ("sqrt((temp - 21 degC)^2) < 2 degC", "2 degC", "`2 K`"),
         ("err < t_max", "t_max", "`60 K`"),
         ("err < t2", "t2", "`t2 - 0 °C`"),
         ("err in [-1 K, 1 degC]", "1 degC", "`1 K`"),
