@@ -14,7 +14,7 @@ from stlc.diagnostics import Diagnostic, TraceError
 from stlc.registry import closest
 from stlc.signature import Column
 from stlc.trace_meta import TraceMeta
-from stlc.units import DIMENSIONLESS, Unit, parse_unit
+from stlc.units import CELSIUS, DIMENSIONLESS, Unit, means_celsius, parse_unit
 
 Array = NDArray[Any]
 Floats = NDArray[np.float64]
@@ -117,7 +117,8 @@ def unit_of(path: Path, name: str, text: str) -> Unit:
     try:
         return parse_unit(text) if text else DIMENSIONLESS
     except ValueError as error:
-        raise TraceError(Diagnostic("E605", f"column `{name}` of `{path}`: {error}")) from None
+        help_ = (CELSIUS,) if means_celsius(text) else ()
+        raise TraceError(Diagnostic("E605", f"column `{name}` of `{path}`: {error}", help=help_)) from None
 
 
 def fit(name: str, arrays: Mapping[str, Array], samples: int) -> dict[str, Array]:

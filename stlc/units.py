@@ -191,7 +191,7 @@ def written_unit(text: str) -> Unit:
 
 
 CELSIUS = "degrees Celsius are written `degC`, kelvin `K`"
-_CELSIUS = re.compile("deg_?C|°_?C|celsius|centigrade", re.IGNORECASE)
+_CELSIUS = re.compile(r"deg(?:ree)?s?[_. ]*C(?:elsius)?|°[_ ]*C|Cel(?:sius)?|centigrade", re.IGNORECASE)
 
 
 def means_celsius(text: str) -> bool:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.units import DIMENSIONLESS, SYMBOLS, Unit, parse_unit, same_dims
+from stlc.units import DIMENSIONLESS, SYMBOLS, Unit, means_celsius, parse_unit, same_dims
 
 _PRODUCTS = sorted(symbol for symbol, unit in SYMBOLS.items() if not unit.offset)
 _factors = st.lists(st.tuples(st.sampled_from(_PRODUCTS), st.integers(-3, 3)), min_size=1, max_size=3)
@@ -143,3 +143,15 @@ def test_a_zero_of_its_own_is_no_factor(text: str, instead: str) -> None:
     with pytest.raises(ValueError, match="stands alone") as caught:
         parse_unit(text)
     assert f"write `{instead}`" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text", ["celsius", "Celsius", "deg_C", "DegC", "degrees C", "degree_celsius", "Cel", "° C"]
+)
+def test_other_spellings_of_degrees_celsius(text: str) -> None:
+    assert means_celsius(text)
+
+
+@pytest.mark.parametrize("text", ["deg", "C", "degrees", "cell", "degF", "c"])
+def test_what_means_something_else(text: str) -> None:
+    assert not means_celsius(text)

@@ -82,7 +82,7 @@ def _conversions(online: Online, units: Mapping[str, str]) -> dict[str, Conversi
         TraceError: E605, a unit that is none, or of something else.
     """
     from stlc.monitor.signals import conversion
-    from stlc.units import parse_unit
+    from stlc.units import CELSIUS, means_celsius, parse_unit
 
     changes: dict[str, Conversion] = {}
     for column in online.compiled.signature.columns:
@@ -92,7 +92,8 @@ def _conversions(online: Online, units: Mapping[str, str]) -> dict[str, Conversi
             recorded = parse_unit(units[column.name])
         except ValueError as error:
             message = f"column `{column.name}` of the {NAME}: {error}"
-            raise TraceError(Diagnostic("E605", message)) from None
+            help_ = (CELSIUS,) if means_celsius(units[column.name]) else ()
+            raise TraceError(Diagnostic("E605", message, help=help_)) from None
         change = conversion(NAME, column, recorded)
         if change is not None:
             changes[column.name] = change

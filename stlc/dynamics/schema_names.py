@@ -24,7 +24,7 @@ from stlc.dynamics.yaml_nodes import Mapping, Node, Scalar, Sequence
 from stlc.grammar import ast
 from stlc.signature import Column, Signature
 from stlc.source import Span
-from stlc.units import Unit, parse_unit
+from stlc.units import CELSIUS, Unit, means_celsius, parse_unit
 
 TIME_KEYS = ("dt", "horizon", "integrator", "substeps", "discrete")
 INTEGRATORS = ("euler", "heun", "rk4")
@@ -169,7 +169,8 @@ def read_unit(node: Node | None, reader: Reader) -> Unit:
     try:
         return parse_unit(text)
     except ValueError as error:
-        reader.report("S103", str(error), node.span, "a unit is a product of powers, for example `m/s^2`")
+        advice = CELSIUS if means_celsius(text) else "a unit is a product of powers, for example `m/s^2`"
+        reader.report("S103", str(error), node.span, advice)
         return Unit()
 
 

@@ -92,6 +92,7 @@ def test_what_is_added_is_a_difference(make: Make, flow: dict[str, str]) -> None
         ("hot - 5 K", "hot - temp", "no temperature in [degC]"),
         ("0.6 K * power", "0.6 degC * outside", "cannot add"),
         ("wanted: {unit: degC", "wanted: {unit: degC/s", "write `K/s`"),
+        ("wanted: {unit: degC", "wanted: {unit: celsius", "are written `degC`"),
     ],
 )
 def test_what_is_none_of_them(make: Make, before: str, after: str, words: str) -> None:

@@ -63,6 +63,18 @@ def test_a_file_in_coulombs_is_told_how_degrees_are_written() -> None:
     assert "temp [degC]" in caught.value.diagnostics[0].help[0]
 
 
+@pytest.mark.parametrize("stream", [False, True])
+def test_a_file_in_celsius_is_told_how_they_are_written(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, stream: bool
+) -> None:
+    Path("s.stl").write_text(SPEC.format(unit="degC"), encoding="utf-8")
+    text = "t,temp [celsius]\n0,20\n0.1,21\n"
+    Path("t.csv").write_text(text, encoding="utf-8")
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(text.encode())))
+    assert main(["check", "s.stl", "-" if stream else "t.csv"]) == 3
+    assert "are written `degC`" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".npz", ".mcap"])
 def test_units_of_files(suffix: str) -> None:
     for unit in ("degC", "K"):
