@@ -20,11 +20,11 @@ from stlc.version import __version__
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from stlc.controller.launch import train_here as train
-    from stlc.controller.run import Run
-    from stlc.controller.task import Task
+    from stlc.controller.problem.task import Task
+    from stlc.controller.training.launch import train_here as train
+    from stlc.controller.training.run import Run
     from stlc.diagnostics import SpecError, StlcError
-    from stlc.dynamics.system import System
+    from stlc.dynamics.model.system import System
     from stlc.grammar import ast
     from stlc.monitor.verdict import Monitor
     from stlc.trace import Trace
@@ -52,13 +52,13 @@ __all__ = [
 
 _HOMES = {
     "Monitor": "stlc.monitor.verdict:Monitor",
-    "Run": "stlc.controller.run:Run",
+    "Run": "stlc.controller.training.run:Run",
     "SpecError": "stlc.diagnostics:SpecError",
     "StlcError": "stlc.diagnostics:StlcError",
-    "System": "stlc.dynamics.system:System",
-    "Task": "stlc.controller.task:Task",
+    "System": "stlc.dynamics.model.system:System",
+    "Task": "stlc.controller.problem.task:Task",
     "Trace": "stlc.trace:Trace",
-    "train": "stlc.controller.launch:train_here",
+    "train": "stlc.controller.training.launch:train_here",
 }
 
 
@@ -83,14 +83,14 @@ def load(path: Path | str) -> ast.Spec:
         SpecError: the text is no specification; the error carries all diagnostics.
     """
     from stlc.files import find_spec, read_source
-    from stlc.grammar.parser import parse as parse_source
+    from stlc.grammar.parse.parser import parse as parse_source
 
     return parse_source(read_source(find_spec(path)))
 
 
 def parse(text: str, name: str = "<text>") -> ast.Spec:
     """Parse the text of a specification; `name` stands for it in messages. Raises SpecError."""
-    from stlc.grammar.parser import parse as parse_source
+    from stlc.grammar.parse.parser import parse as parse_source
     from stlc.source import Source
 
     return parse_source(Source(name, text))
@@ -109,7 +109,7 @@ class _CallablePackage(ModuleType):
         Raises:
             SpecError: the specification is invalid, or does not fit the system.
         """
-        from stlc.controller.task import Task
+        from stlc.controller.problem.task import Task
 
         return Task.of(spec, system)
 

@@ -9,7 +9,7 @@ def main() -> int:
     """Run the command line; Ctrl-C while it is being imported is an interruption like any other."""
     try:
         stopping.arm()
-        from stlc.cli.app import main as run
+        from stlc.cli.framework.app import main as run
 
         return stopping.finish(run())
     except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""What can be wrong, as data: codes, labels, help. Rendering is done in `stlc.cli.render`."""
+"""What can be wrong, as data: codes, labels, help. Rendering is done in `stlc.cli.framework.render`."""
 
 from __future__ import annotations
 

@@ -17,18 +17,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stlc.compile import ir
-from stlc.compile.graph import evaluate
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.ranges import bounds
-from stlc.compile.semantics import TOLERANCE
-from stlc.controller.task import Task
-from stlc.controller.world import world_type
-from stlc.controller.worlds import Setting, Worlds
+from stlc.compile.analysis.ranges import bounds
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir import nodes as ir
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.deployment.batched import Setting, Worlds
+from stlc.controller.deployment.world import world_type
+from stlc.controller.problem.task import Task
 from stlc.diagnostics import Diagnostic, UsageError
-from stlc.dynamics.system import System
+from stlc.dynamics.model.system import System
 from stlc.files import find_spec, find_system, read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 
 try:
     import gymnasium

@@ -89,7 +89,7 @@ class Climb:
 
 
 class Kernel:
-    """A built `judge` and `climb`; see `stlc.compile.emit_c`."""
+    """A built `judge` and `climb`; see `stlc.compile.backends.c.emit`."""
 
     def __init__(self, library: ctypes.CDLL, *, states: int, rules: int, steps: int) -> None:
         self._judge, self._climb = library.judge, library.climb
@@ -177,7 +177,7 @@ class Outcome:
 
 
 class Adjoint:
-    """A built `pull`; see `stlc.compile.c_adjoint`."""
+    """A built `pull`; see `stlc.compile.backends.c.adjoint`."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
         self._pull = library.pull

@@ -13,8 +13,8 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map_only
 
-from stlc.compile import ops_torch
-from stlc.dynamics import controls
+from stlc.compile.backends.torch import ops as ops_torch
+from stlc.dynamics.model import controls
 
 AWAY = torch.device("meta")
 _INDEXING = {

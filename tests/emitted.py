@@ -12,18 +12,19 @@ from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 from reference import number
 
-from stlc.compile import ir, typed
-from stlc.compile.arith import Program
-from stlc.compile.c_adjoint import emit_adjoint
-from stlc.compile.defined import defined
-from stlc.compile.emit_c import Motion, emit
-from stlc.compile.graph import evaluate
-from stlc.compile.lower import lower
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.ops_torch import TORCH
-from stlc.compile.samples import everything, leaves
-from stlc.compile.simplify import simplify
-from stlc.compile.switch import StraightThrough
+from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.c.adjoint import emit_adjoint
+from stlc.compile.backends.c.emit import Motion, emit
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.defined import defined
+from stlc.compile.ir.samples import everything, leaves
+from stlc.compile.lowering.lower import lower
+from stlc.compile.lowering.simplify import simplify
+from stlc.compile.semantics.switch import StraightThrough
 from stlc.native import Adjoint, Kernel, Outcome, load
 
 T = TypeVar("T")

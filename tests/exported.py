@@ -10,15 +10,15 @@ from pathlib import Path
 
 import torch
 
-from stlc.controller.config import TrainConfig
-from stlc.controller.launch import Launch, open_folder
-from stlc.controller.policy import Mlp, PlanNetwork
-from stlc.controller.run import Run
-from stlc.controller.task import Task
-from stlc.dynamics.system import System
+from stlc.controller.policies.policy import Mlp, PlanNetwork
+from stlc.controller.problem.task import Task
+from stlc.controller.training.config import TrainConfig
+from stlc.controller.training.launch import Launch, open_folder
+from stlc.controller.training.run import Run
+from stlc.dynamics.model.system import System
 from stlc.export.write import export
 from stlc.files import read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 
 ROOT = Path(__file__).parents[1]
 

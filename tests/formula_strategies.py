@@ -8,9 +8,10 @@ from fractions import Fraction
 import numpy as np
 from hypothesis import strategies as st
 
-from stlc.compile import ir, typed
-from stlc.compile.horizon import reach, uses_end
-from stlc.compile.interface import Grid
+from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.horizon import reach, uses_end
 from stlc.compile.pipeline import Rule
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source, Span

@@ -81,7 +81,7 @@ class Installed:
 
 _COMMANDS = """
 import contextlib, io, json, sys
-from stlc.cli.app import main
+from stlc.cli.framework.app import main
 results = []
 for line in json.loads(sys.argv[1]):
     out, err = io.StringIO(), io.StringIO()

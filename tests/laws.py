@@ -17,14 +17,21 @@ from formula_strategies import GRID, SPAN, formulas
 from hypothesis import strategies as st
 from reference import EXTREMA, Interval, Robustness, Trace
 
-from stlc.compile import ir, typed
-from stlc.compile.graph import robustness_signal
-from stlc.compile.lift import lifted, recorded
-from stlc.compile.lower import lower
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.semantics import ArithmeticGeometricMean, Exact, GeneralizedMean, LogSumExp, Semantics
-from stlc.compile.simplify import simplify
-from stlc.compile.walk import on_clock
+from stlc.compile.augment.lift import lifted, recorded
+from stlc.compile.backends.array.graph import robustness_signal
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.traverse import on_clock
+from stlc.compile.lowering.lower import lower
+from stlc.compile.lowering.simplify import simplify
+from stlc.compile.semantics.semantics import (
+    ArithmeticGeometricMean,
+    Exact,
+    GeneralizedMean,
+    LogSumExp,
+    Semantics,
+)
 
 SEMANTICS: Mapping[str, Semantics] = {
     "exact": Exact(),

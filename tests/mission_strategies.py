@@ -9,13 +9,14 @@ import numpy as np
 from formula_strategies import NAMES, SPAN
 from hypothesis import strategies as st
 
-from stlc.compile import ir, typed
-from stlc.compile.arith import Program
-from stlc.compile.interface import Grid
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.switch import Hard
-from stlc.compile.timers import Timer
-from stlc.grammar.parser import parse_expr
+from stlc.compile.augment.timers import Timer
+from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.semantics.switch import Hard
+from stlc.grammar.parse.parser import parse_expr
 from stlc.source import Source
 
 GRID = Grid(Fraction(1, 10), 5)

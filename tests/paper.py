@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from scipy.stats import ks_2samp
 
-from stlc.controller.task import Task
-from stlc.dynamics.schema import parse_system
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.controller.problem.task import Task
+from stlc.dynamics.model.system import System
+from stlc.dynamics.schema.schema import parse_system
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 ROOT = Path(__file__).parent.parent

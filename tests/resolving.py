@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from stlc.compile import ir, typed
-from stlc.compile.conditions import condition
-from stlc.compile.interface import Interface
-from stlc.compile.resolve import resolve
+from stlc.compile.frontend.interface import Interface
+from stlc.compile.frontend.resolve import resolve
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.conditions import condition
 from stlc.diagnostics import Diagnostic, StlcError
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 HEAD = """

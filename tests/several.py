@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from stlc.controller.ranks import Ranks, joined
+from stlc.controller.parallel.ddp import Ranks, joined
 
 ENVIRONMENT = {"WORLD_SIZE": 2, "LOCAL_WORLD_SIZE": 2, "MASTER_ADDR": "127.0.0.1"}
 """What `torchrun` tells each of two."""

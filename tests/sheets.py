@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import onnxruntime
 
-from stlc.compile.sheet import BATCH, Sheet, Value
+from stlc.compile.backends.onnx.sheet import BATCH, Sheet, Value
 from stlc.export.onnx_file import model_of
 
 

@@ -142,7 +142,7 @@ def test_commands_of_a_user_without_a_home_or_a_name(home, tmp_path):
     tmp_path.chmod(0o755)
     variables = {**os.environ, "TMPDIR": str(tmp_path / "none"), "XDG_CACHE_HOME": str(tmp_path)}
     script = (
-        "import os; from stlc.cli.app import main\n"
+        "import os; from stlc.cli.framework.app import main\n"
         "main(['doctor', '--quick'])\n"  # what is imported has been: Python may lie where only root reads
         "os.setgroups([]); os.setgid(54321); os.setuid(54321)\n"
         "for name in ('HOME', 'XDG_CACHE_HOME'): os.environ.pop(name, None)\n"

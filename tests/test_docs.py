@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 import typer
 
-from stlc.cli.app import app, main
-from stlc.cli.pages import read_page
+from stlc.cli.framework.app import app, main
+from stlc.cli.framework.pages import read_page
 from stlc.diagnostics import CODES
 
 ROOT = Path(__file__).resolve().parent.parent

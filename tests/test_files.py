@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from stlc import files
-from stlc.cli.render import render_text
+from stlc.cli.framework.render import render_text
 from stlc.diagnostics import MissingError, SpecError, StlcError, UsageError
 from stlc.files import MAX_BYTES, atomic_path, find_spec, find_system, find_trace, read_source, write_atomic
 

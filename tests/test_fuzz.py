@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from stlc.cli.render import render_text
+from stlc.cli.framework.render import render_text
 from stlc.diagnostics import StlcError
-from stlc.dynamics.schema import parse_system
+from stlc.dynamics.schema.schema import parse_system
 from stlc.source import Source
 
 TOOLS = Path(__file__).resolve().parents[1] / "tools"

@@ -133,7 +133,7 @@ def test_what_cannot_be_made_is_said() -> None:
 
 
 def test_the_rest_of_stlc_does_without_gymnasium() -> None:
-    code = "import sys, stlc, stlc.cli.app; sys.exit('gymnasium' in sys.modules)"
+    code = "import sys, stlc, stlc.cli.framework.app; sys.exit('gymnasium' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, cwd=ROOT).returncode == 0
 
 

@@ -19,14 +19,14 @@ import pytest
 from hostile import CANARY, NAMES, sample
 
 from stlc import escape
-from stlc.cli.app import main
-from stlc.compile.c_adjoint import emit_adjoint
-from stlc.compile.emit_c import Motion, emit
-from stlc.compile.interface import Grid
+from stlc.cli.framework.app import main
+from stlc.compile.backends.c.adjoint import emit_adjoint
+from stlc.compile.backends.c.emit import Motion, emit
+from stlc.compile.frontend.interface import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import TraceError
-from stlc.grammar.parser import parse
-from stlc.grammar.printer import show
+from stlc.grammar.parse.parser import parse
+from stlc.grammar.show.printer import show
 from stlc.signature import Column, Signature
 from stlc.source import Source
 from stlc.trace import Trace, TraceMeta, read_recording, save_trace
@@ -296,7 +296,7 @@ SHAPES = {
 def test_completion_offers_only_what_a_shell_takes_as_it_is(
     shell: str, judged: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from stlc.cli.completion import _fitting
+    from stlc.cli.framework.completion import _fitting
 
     for name in _fitting(judged, ""):
         assert re.fullmatch(r"[\w@%+=:,./][\w@%+=:,./-]*", name, re.A)

@@ -16,14 +16,14 @@ from hostile import CANARY, NAMES, sample
 from test_hostile_names import seen_in_markup, steering
 
 from stlc import escape, native
-from stlc.cli.app import main
-from stlc.controller.task import Task
+from stlc.cli.framework.app import main
+from stlc.controller.problem.task import Task
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.schema import load_system_decl
-from stlc.dynamics.system import System
+from stlc.dynamics.model.system import System
+from stlc.dynamics.schema.schema import load_system_decl
 from stlc.export.emit import header, main_of
 from stlc.files import read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.jsontext import dumps
 from stlc.rundir import RunDir
 
@@ -139,7 +139,7 @@ def without_comments(text: str) -> str:
 
 
 def network_of(task: Task) -> Any:
-    from stlc.controller.policy import PlanNetwork
+    from stlc.controller.policies.policy import PlanNetwork
 
     network = PlanNetwork(task, hidden=(4,), plans=1).eval()
     network.normalise(task.sample(8, seed=1))

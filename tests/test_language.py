@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 from doc_examples import BOUNDS, VALUE, Claim, Example, Recorded, codes, examples, recorded
 
-from stlc.compile.interface import Grid
+from stlc.compile.frontend.interface import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import Diagnostic, SpecError
-from stlc.dynamics.schema import load_system_decl
+from stlc.dynamics.schema.schema import load_system_decl
 from stlc.files import find_system
 from stlc.grammar import ast
-from stlc.grammar.format import format_text
-from stlc.grammar.parser import parse
+from stlc.grammar.format.format import format_text
+from stlc.grammar.parse.parser import parse
 from stlc.grammar.words import RESERVED
 from stlc.lint.lint import Selection, lint
 from stlc.monitor.verdict import Monitor

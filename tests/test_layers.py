@@ -14,33 +14,6 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "stlc"
 
-TRACE_FORMATS = (
-    *(
-        "trace_bag",
-        "trace_cells",
-        "trace_chunks",
-        "trace_live",
-        "trace_csv",
-        "trace_extras",
-        "trace_formats",
-        "trace_mat",
-        "trace_mat5",
-        "trace_mcap",
-        "trace_messages",
-        "trace_meta",
-    ),
-    *(
-        "trace_npz",
-        "trace_parquet",
-        "trace_recording",
-        "trace_resample",
-        "trace_ros",
-        "trace_table",
-        "trace_time",
-    ),
-    "trace_words",
-)
-
 # From the bottom up; what stands in one line is one room.
 ROOMS = (
     {"source", "version", "stopping"},
@@ -48,7 +21,7 @@ ROOMS = (
     {"escape"},
     {"registry", "units", "words", "jsontext"},
     {"signature"},
-    {"rundir", "files", "provenance", "cache", "toolchain", "native", "trace", *TRACE_FORMATS},
+    {"rundir", "files", "provenance", "cache", "toolchain", "native", "trace"},
     {"grammar"},
     {"compile"},
     {"runtime"},
@@ -68,7 +41,7 @@ ROOMS = (
 # Where a library may be imported, as prefixes of module names. What is not listed may be used anywhere.
 HOMES = {
     "torch": (
-        "stlc.compile.ops_torch",
+        "stlc.compile.backends.torch",
         "stlc.dynamics",
         "stlc.controller",
         "stlc.export",
@@ -78,11 +51,11 @@ HOMES = {
         "stlc.cli",
     ),
     "safetensors": ("stlc.controller",),
-    "lark": ("stlc.grammar.parser",),
+    "lark": ("stlc.grammar.parse",),
     "rich": ("stlc.cli", "stlc.view"),
     "typer": ("stlc.cli",),
     "click": (),
-    "yaml": ("stlc.dynamics.yaml_nodes",),
+    "yaml": ("stlc.dynamics.schema.yaml_nodes",),
     "pydantic": (),
     "matplotlib": ("stlc.view", "stlc.controller.sketch"),  # what worlds draw with, while they draw
     "pygls": ("stlc.editor",),
@@ -105,13 +78,13 @@ HOMES = {
     ),
     "onnx": ("stlc.export",),
     "onnxruntime": ("stlc.runtime",),
-    "pyarrow": ("stlc.trace_parquet", "stlc.trace_cells"),
-    "h5py": ("stlc.trace_mat",),
-    "mcap": ("stlc.trace_mcap",),
-    "tensorboardX": ("stlc.controller.logbook",),
-    "ray": ("stlc.controller.cluster",),
-    "rosbags": ("stlc.trace_bag",),
-    "pytorch_kinematics": ("stlc.dynamics.crosscheck",),
+    "pyarrow": ("stlc.trace.formats.parquet", "stlc.trace.formats.cells"),
+    "h5py": ("stlc.trace.formats.mat",),
+    "mcap": ("stlc.trace.formats.mcap",),
+    "tensorboardX": ("stlc.controller.training.tensorboard",),
+    "ray": ("stlc.controller.parallel.ray_cluster",),
+    "rosbags": ("stlc.trace.formats.bag",),
+    "pytorch_kinematics": ("stlc.dynamics.robots.crosscheck",),
     "pickle": (),
     "marshal": (),
     "shelve": (),

@@ -13,8 +13,8 @@ import pytest
 
 from stlc import native, toolchain
 from stlc.cache import lasting
-from stlc.compile import ir
-from stlc.compile.emit_c import LANES, Motion, emit
+from stlc.compile.backends.c.emit import LANES, Motion, emit
+from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Notice
 
 MOTION = Motion(("x",), ("u",), (), {"x": ir.Op("add", (ir.Col("x"), ir.Col("u")))}, 5, 0.1)

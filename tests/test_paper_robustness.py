@@ -11,10 +11,10 @@ import pytest
 import reference
 import torch
 
-from stlc.compile.graph import RobustnessGraph
-from stlc.compile.interface import Grid
+from stlc.compile.backends.array.graph import RobustnessGraph
+from stlc.compile.frontend.interface import Grid
 from stlc.compile.pipeline import Compiled, compile_spec
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 GRID = Grid(Fraction(1, 10), 25)

@@ -11,7 +11,7 @@ import pytest
 import torch
 from paper import Array
 
-from stlc.dynamics.system import System
+from stlc.dynamics.model.system import System
 
 ROOT = Path(__file__).parents[1]
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from stlc.compile.pipeline import compile_spec
-from stlc.dynamics.schema import load_system_decl
-from stlc.grammar.format import format_text
-from stlc.grammar.parser import parse
+from stlc.dynamics.schema.schema import load_system_decl
+from stlc.grammar.format.format import format_text
+from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from stlc.cli.app import main
+from stlc.cli.framework.app import main
 from stlc.version import __version__
 
 ROOT = Path(__file__).resolve().parent.parent

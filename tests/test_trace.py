@@ -16,11 +16,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from stlc import trace_csv
 from stlc.diagnostics import StlcError, TraceError, UsageError
 from stlc.signature import Column, Signature
 from stlc.trace import Reading, Trace, TraceMeta, as_fraction, load_trace, save_trace
-from stlc.trace_words import TRUTH
+from stlc.trace.enums import TRUTH
+from stlc.trace.formats import csv as trace_csv
 from stlc.units import parse_unit
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
@@ -208,7 +208,7 @@ def test_a_huge_declared_shape_asks_for_no_memory(tmp_path: Path) -> None:
 
 
 def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stlc.trace_npz.MAX_BYTES", 1_000_000)
+    monkeypatch.setattr("stlc.trace.formats.npz.MAX_BYTES", 1_000_000)
     np.savez_compressed(tmp_path / "a.npz", t=np.zeros(1_000_000))
     assert (tmp_path / "a.npz").stat().st_size < 20_000
     assert "unpacks to" in message_of(tmp_path / "a.npz")
@@ -218,14 +218,14 @@ def test_a_small_archive_that_unpacks_to_a_large_one(tmp_path: Path, monkeypatch
     path = tmp_path / "a.npz"
     np.savez_compressed(path, t=np.arange(1_000_000.0), x=np.zeros(1_000_000))
     assert load_trace(path).samples == 1_000_000
-    monkeypatch.setattr("stlc.trace_npz._ROOM", 1_000_000)
+    monkeypatch.setattr("stlc.trace.formats.npz._ROOM", 1_000_000)
     assert load_trace(path).samples == 1_000_000, "what is not all alike is packed far less"
     np.savez_compressed(path, t=np.zeros(1_000_000), x=np.zeros(1_000_000))
     assert "unpacks to" in message_of(path)
 
 
 def test_too_many_arrays_and_arrays_given_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stlc.trace_npz.MAX_ARRAYS", 2)
+    monkeypatch.setattr("stlc.trace.formats.npz.MAX_ARRAYS", 2)
     assert "3 arrays" in message_of(npz(tmp_path / "a.npz", t=[0.0], x=[0.0], y=[0.0]))
     with zipfile.ZipFile(tmp_path / "b.npz", "w") as archive:
         archive.writestr("x.npy", header((0,)))

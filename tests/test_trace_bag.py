@@ -15,8 +15,8 @@ import pytest
 from stlc.diagnostics import StlcError
 from stlc.files import find_trace
 from stlc.trace import Reading, Trace, load_trace
-from stlc.trace_messages import DamageError
-from stlc.trace_ros import decoder
+from stlc.trace.formats.messages import DamageError
+from stlc.trace.formats.ros import decoder
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 

@@ -14,10 +14,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc import native, trace_cells, trace_csv
+from stlc import native
 from stlc.diagnostics import StlcError
-from stlc.trace_cells import Lines, read_lines
-from stlc.trace_csv import table_of_text
+from stlc.trace.formats import cells as trace_cells
+from stlc.trace.formats import csv as trace_csv
+from stlc.trace.formats.cells import Lines, read_lines
+from stlc.trace.formats.csv import table_of_text
 
 NAME = Path("table.csv")
 ALWAYS, NEVER = 0, 1 << 62

@@ -9,7 +9,7 @@ import pytest
 
 from stlc.diagnostics import StlcError, TraceError
 from stlc.trace import Reading, load_trace
-from stlc.trace_chunks import pieces
+from stlc.trace.chunks import pieces
 
 TIMES = {
     "seconds": [repr(k / 10) for k in range(23)],

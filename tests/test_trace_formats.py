@@ -127,7 +127,7 @@ def test_parquet_that_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     parquet.write_table(pa.table({"word": ["a"]}), tmp_path / "b.parquet")
     assert code_of(tmp_path / "b.parquet") == "E603"
     assert code_of(tmp_path / "none.parquet") == "U102"
-    monkeypatch.setattr("stlc.trace_parquet.MAX_BYTES", 100)
+    monkeypatch.setattr("stlc.trace.formats.parquet.MAX_BYTES", 100)
     assert "unpacks to" in message_of(a_parquet(tmp_path / "c.parquet"))
 
 
@@ -177,7 +177,7 @@ def test_mat5_that_declares_more_than_it_holds(tmp_path: Path, monkeypatch: pyte
     (tmp_path / "a.mat").write_bytes(raw)
     assert "declares 1 x 2147483647 values" in message_of(tmp_path / "a.mat")
     bomb = zlib.compress(b"\0" * 10_000_000)
-    monkeypatch.setattr("stlc.trace_npz.MAX_BYTES", 1_000_000)
+    monkeypatch.setattr("stlc.trace.formats.npz.MAX_BYTES", 1_000_000)
     head = b"MATLAB 5.0".ljust(124) + b"\x00\x01IM"
     (tmp_path / "b.mat").write_bytes(head + struct.pack("<II", 15, len(bomb)) + bomb)
     assert "unpacks to" in message_of(tmp_path / "b.mat")

@@ -17,7 +17,7 @@ from typing import Literal
 
 import pytest
 
-from stlc.cli.app import main
+from stlc.cli.framework.app import main
 
 BLOCK = re.compile(r"^(?:<!-- file: ([\w./]+) -->\n)?```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import torch
 
-from stlc.controller.closed_loop import closed_loop, fresh_share
-from stlc.controller.run import Run
+from stlc.controller.evaluation.closed_loop import closed_loop, fresh_share
+from stlc.controller.training.run import Run
 
 
 def main() -> None:

@@ -115,7 +115,7 @@ def run_one(plan, index, limits):
 
 def _call(arguments, limits, typed=b""):
     """Exit code, output and Python's warnings of a command line."""
-    from stlc.cli.app import main
+    from stlc.cli.framework.app import main
 
     out = io.TextIOWrapper(io.BytesIO(), encoding="utf-8", errors="backslashreplace")
     noise, before = [], sys.stdin
@@ -173,7 +173,7 @@ def worker(plan, indices, limits, results):
     os.chdir(folder)
     tempfile.tempdir = str(folder)  # crash reports
     limit_address_space(4 * limits.memory)
-    from stlc.cli import app
+    from stlc.cli.framework import app
 
     app._asked = functools.cache(
         app._asked

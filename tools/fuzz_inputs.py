@@ -149,7 +149,7 @@ def commands() -> frozenset[str]:
     """Names of the commands that there are."""
     import typer
 
-    from stlc.cli.app import app
+    from stlc.cli.framework.app import app
 
     return frozenset(typer.main.get_command(app).commands)
 

@@ -21,11 +21,11 @@ def laws(source, limit: float, *, one_in: int = 1) -> int:
         limit: seconds of processor time that one stage may take.
         one_in: of so many texts one is laid out, which takes longer than everything else.
     """
-    from stlc.compile.interface import Grid
+    from stlc.compile.frontend.interface import Grid
     from stlc.compile.pipeline import compile_spec
     from stlc.diagnostics import StlcError
-    from stlc.grammar.english import sentence
-    from stlc.grammar.parser import parse
+    from stlc.grammar.parse.parser import parse
+    from stlc.grammar.show.english import sentence
     from stlc.lint.lint import Selection, Surroundings, lint
 
     decl = _system()
@@ -57,15 +57,15 @@ def laws(source, limit: float, *, one_in: int = 1) -> int:
 
 def _some(findings) -> None:
     """Render findings; every one has a headline."""
-    from stlc.cli.render import render_text
+    from stlc.cli.framework.render import render_text
 
     assert all(finding.message for finding in findings)
     assert not findings or render_text(tuple(findings), color=False)
 
 
 def _formatted(spec, source, limit) -> None:
-    from stlc.grammar.format import format_text
-    from stlc.grammar.parser import parse
+    from stlc.grammar.format.format import format_text
+    from stlc.grammar.parse.parser import parse
     from stlc.source import Source
 
     with stage("format", limit):
@@ -96,7 +96,7 @@ def stage(name: str, limit: float):
 
 @cache
 def _system():
-    from stlc.dynamics.schema import parse_system
+    from stlc.dynamics.schema.schema import parse_system
     from stlc.source import Source
 
     return parse_system(Source("b.yaml", SYSTEM), Path("b.yaml"))

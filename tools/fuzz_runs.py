@@ -151,7 +151,11 @@ def prepare() -> list[str]:
         run_files()
     except ModuleNotFoundError as error:
         return [f"run ({error.name} is not installed)"]
-    for name in ("stlc.controller.run", "stlc.controller.drive", "stlc.controller.training"):
+    for name in (
+        "stlc.controller.training.run",
+        "stlc.controller.deployment.simulator",
+        "stlc.controller.training.loop",
+    ):
         try:
             importlib.import_module(name)
         except ModuleNotFoundError:

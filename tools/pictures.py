@@ -24,7 +24,7 @@ import numpy as np
 from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 
-from stlc.cli.app import main as stlc
+from stlc.cli.framework.app import main as stlc
 from stlc.controller.sketch import (
     BANK,
     DECIDED,

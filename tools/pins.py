@@ -64,12 +64,12 @@ from proof.cases import Case
 from proof.draw import DT, HORIZON, Taste
 
 from stlc import Monitor, Run, System, Task, load
-from stlc.cli.app import main as stlc_main
-from stlc.compile.c_adjoint import emit_adjoint
-from stlc.compile.emit_c import emit
-from stlc.controller.deploy import Guard
-from stlc.controller.kernel import motion_of
-from stlc.controller.polish import Limits
+from stlc.cli.framework.app import main as stlc_main
+from stlc.compile.backends.c.adjoint import emit_adjoint
+from stlc.compile.backends.c.emit import emit
+from stlc.controller.guard.guard import Guard
+from stlc.controller.guard.plan_repair import Limits
+from stlc.controller.problem.kernel import motion_of
 
 NO_LIMIT = Limits(seconds=None, paper=None)
 """Of a guard's decision: time plays no part."""

@@ -12,7 +12,7 @@ from statistics import fmean
 from typing import Any
 
 from stlc.bench.cells import Cell, Length, length_of
-from stlc.controller.config import HELD_OUT
+from stlc.controller.training.config import HELD_OUT
 
 BENCHMARK = "traffic"
 LENGTHS = (Length(60.0),)

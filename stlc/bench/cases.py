@@ -9,7 +9,7 @@ from typing import TypeAlias
 from torch import Tensor
 
 from stlc.bench import plain
-from stlc.compile import ir
+from stlc.compile.ir import nodes as ir
 
 Plain: TypeAlias = Callable[[Tensor, Tensor, int], Tensor]
 """Signals x and y `(time, batch)` and the width of a window in steps -> robustness at every sample."""

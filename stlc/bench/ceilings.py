@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from stlc.bench.cells import BENCHMARKS, load, pack, read_json, union, unpack
-from stlc.controller.config import HELD_OUT_SEED
-from stlc.controller.held_out import wilson
-from stlc.controller.run import Run
-from stlc.controller.search import Searcher
-from stlc.controller.task import Task, satisfied
+from stlc.controller.evaluation.held_out import wilson
+from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.training.config import HELD_OUT_SEED
+from stlc.controller.training.local_search import Searcher
+from stlc.controller.training.run import Run
 from stlc.diagnostics import StlcError
 from stlc.files import write_atomic
 from stlc.jsontext import dumps

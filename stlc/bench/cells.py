@@ -10,19 +10,26 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from stlc.compile.modules import library_of
-from stlc.controller.config import ENGINE_VERSION, HELD_OUT, HELD_OUT_SEED, Engine, TrainConfig, decide
-from stlc.controller.task import Task
+from stlc.compile.frontend.modules import library_of
+from stlc.controller.problem.task import Task
+from stlc.controller.training.config import (
+    ENGINE_VERSION,
+    HELD_OUT,
+    HELD_OUT_SEED,
+    Engine,
+    TrainConfig,
+    decide,
+)
 from stlc.diagnostics import Diagnostic, UsageError
-from stlc.dynamics.functions import function_files
-from stlc.dynamics.system import System
+from stlc.dynamics.model.system import System
+from stlc.dynamics.robots.functions import function_files
 from stlc.files import SPECS, find_system, read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.jsontext import dumps, plain
 from stlc.provenance import sha256
 
 if TYPE_CHECKING:
-    from stlc.controller.config import Clock, Method
+    from stlc.controller.training.config import Clock, Method
 
 Study: TypeAlias = Literal["paper", "ablation", "family"]
 

@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from stlc.bench.cells import BENCHMARKS, read_json
-from stlc.controller.asked import Asked, parse_margins
-from stlc.controller.deploy import Guard, Mode
-from stlc.controller.drive import Recorder, Setting, drive
-from stlc.controller.evaluate import decided, feasible_states, measure
-from stlc.controller.executed import judge_executed
-from stlc.controller.intervals import Interval
-from stlc.controller.polish import Limits
-from stlc.controller.run import SPEC, SYSTEM, Run
-from stlc.controller.savable import savable
-from stlc.controller.world import world_type
+from stlc.controller.deployment.simulator import Recorder, Setting, drive
+from stlc.controller.deployment.world import world_type
+from stlc.controller.evaluation.deployment import decided, feasible_states, measure
+from stlc.controller.evaluation.executed import judge_executed
+from stlc.controller.evaluation.stats import Interval
+from stlc.controller.guard.feasibility import savable
+from stlc.controller.guard.guard import Guard, Mode
+from stlc.controller.guard.margin_request import Asked, parse_margins
+from stlc.controller.guard.plan_repair import Limits
+from stlc.controller.training.run import SPEC, SYSTEM, Run
 from stlc.diagnostics import Diagnostic, UsageError
-from stlc.dynamics.decl_deployment import ErrorsDecl
-from stlc.dynamics.scenario import DISTURBED
+from stlc.dynamics.declaration.deployment import ErrorsDecl
+from stlc.dynamics.scenarios.scenario import DISTURBED
 from stlc.files import write_atomic
 from stlc.jsontext import dumps
 from stlc.provenance import git_state, hardware, sha256, versions
@@ -33,7 +33,7 @@ from stlc.rundir import RunDir, now
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from stlc.controller.task import Task
+    from stlc.controller.problem.task import Task
 
 FORMAT = "bench-disturbed/1"
 FILE = "disturbed.json"
@@ -41,7 +41,7 @@ NOMINAL = "as it is"
 SCENARIOS = (NOMINAL, *DISTURBED)
 GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
 USUAL = (*GUARDS, "full+auto")
-"""Guards, and behind a `+` what they ask safety requirements to spare; see `stlc.controller.asked`."""
+"""Guards, and behind a `+` what they ask safety requirements to spare; see `guard.margin_request`."""
 SHOWN = (
     *(
         "saved",
@@ -56,7 +56,7 @@ SHOWN = (
     ),
     *("plan_accuracy", "plan_safety", "policy_accuracy", "feasible", "feasible_followed"),
 )
-"""The metrics that are kept; see `stlc.controller.evaluate.METRICS`."""
+"""The metrics that are kept; see `stlc.controller.evaluation.deployment.METRICS`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,8 @@ class Extent:
         agents: in each, at most; None: as many as the system says.
         steps: of each, at most; None: as many as the system says.
         limit: seconds that a decision of the full guard may take per agent.
-        ceiling: visited states that are searched for a plan; see `stlc.controller.evaluate.feasible_states`.
+        ceiling: visited states that are searched for a plan; see
+            `stlc.controller.evaluation.deployment.feasible_states`.
         file: that the deployments are kept in.
     """
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from stlc.bench.disturbed import NOMINAL, Row, disturbed_rows
 from stlc.bench.results import WIDTH, commit_of, markdown
-from stlc.controller.asked import AUTO
+from stlc.controller.guard.margin_request import AUTO
 
 _HEAD = """\
 Written by `stlc bench disturbed` from `bench/disturbed.json`. Each policy is driven as it is and in worlds

@@ -130,8 +130,8 @@ def judge(
 
 def _verdict(run: RunDir, family: Family, value: float, held_out: int) -> dict[str, Any]:
     """How the policy does where the parameter has one value."""
-    from stlc.controller.held_out import score
-    from stlc.controller.run import Run
+    from stlc.controller.evaluation.held_out import score
+    from stlc.controller.training.run import Run
 
     policy = Run.open(run.path, overrides={family.parameter: f"{value}{family.unit}"}).policy
     return score(policy, n=held_out).summary()
@@ -217,7 +217,7 @@ def family_rows(documents: Iterable[Mapping[str, Any]], folder: Path) -> list[Ro
 
 
 def _row(order: int, length: str, value: float, group: list[tuple[Cell, Mapping[str, Any]]]) -> Row:
-    from stlc.controller.held_out import wilson
+    from stlc.controller.evaluation.held_out import wilson
 
     family = FAMILIES[order]
     low, high = family.sampled()

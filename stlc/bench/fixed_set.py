@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from stlc.controller.checkpoint import load_checkpoint
-from stlc.controller.run import Run, spec_hash, system_hash
-from stlc.controller.task import satisfied
+from stlc.controller.problem.task import satisfied
+from stlc.controller.training.checkpoint import load_checkpoint
+from stlc.controller.training.run import Run, spec_hash, system_hash
 
 if TYPE_CHECKING:
     from stlc.rundir import RunDir

@@ -16,11 +16,11 @@ import torch
 from numpy.typing import NDArray
 
 from stlc.bench.measure import one_thread
-from stlc.controller.deploy import Guard, Mode
-from stlc.controller.drive import Recorder, Recording, Setting, drive
-from stlc.controller.polish import Limits
-from stlc.controller.run import Run
-from stlc.controller.world import world_type
+from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
+from stlc.controller.deployment.world import world_type
+from stlc.controller.guard.guard import Guard, Mode
+from stlc.controller.guard.plan_repair import Limits
+from stlc.controller.training.run import Run
 
 if TYPE_CHECKING:
     from stlc.rundir import RunDir

@@ -9,7 +9,7 @@ from statistics import median
 
 import torch
 
-from stlc.dynamics.memory import keep_freed_memory
+from stlc.dynamics.model.memory import keep_freed_memory
 
 _SLICE = 0.01
 """Seconds that one measurement takes at least."""

@@ -8,10 +8,10 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 from stlc.bench.cells import BENCHMARKS, Cell, Length, length_of
-from stlc.controller.config import HELD_OUT
+from stlc.controller.training.config import HELD_OUT
 
 if TYPE_CHECKING:
-    from stlc.controller.config import Method
+    from stlc.controller.training.config import Method
 
 LENGTHS = (Length(60.0), Length(300.0))
 METHODS: tuple[Method, ...] = ("guided", "gradient")
@@ -109,7 +109,7 @@ def _place(row: Row) -> tuple[int, str, int, float]:
 
 
 def _row(key: tuple[str, str, str], group: Sequence[Mapping[str, Any]], ceiling: float | None) -> Row:
-    from stlc.controller.held_out import wilson
+    from stlc.controller.evaluation.held_out import wilson
 
     ordered = sorted(group, key=lambda document: int(document["seed"]))
     accuracies = tuple(float(document["accuracy"]) for document in ordered)

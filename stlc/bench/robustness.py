@@ -15,8 +15,8 @@ from torch import Tensor
 
 from stlc.bench.cases import CASES, Case
 from stlc.bench.measure import interleaved, one_thread, ratio
-from stlc.compile.graph import robustness_signal
-from stlc.compile.ops_torch import TORCH
+from stlc.compile.backends.array.graph import robustness_signal
+from stlc.compile.backends.torch.ops import TORCH
 
 SAMPLES = (20, 100, 1000, 10_000)
 BATCHES = (1, 1000)

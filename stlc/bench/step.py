@@ -18,15 +18,15 @@ from torch import Tensor
 
 from stlc.bench.cells import BENCHMARKS, load
 from stlc.bench.measure import interleaved, one_thread
-from stlc.compile.ops_torch import TORCH
-from stlc.compile.switch import StraightThrough
-from stlc.controller.config import TrainConfig, decide
-from stlc.controller.objective import loss
-from stlc.controller.task import rank, satisfied
-from stlc.controller.trainer import Trainer
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.semantics.switch import StraightThrough
+from stlc.controller.problem.task import rank, satisfied
+from stlc.controller.training.config import TrainConfig, decide
+from stlc.controller.training.learner import Trainer
+from stlc.controller.training.objective import loss
 
 if TYPE_CHECKING:
-    from stlc.controller.task import Task
+    from stlc.controller.problem.task import Task
 
 WARM = 120
 """Steps before the measurement: by then the search has found plans to learn from."""

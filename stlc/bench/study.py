@@ -20,9 +20,9 @@ from stlc.bench.cells import (
     spec_path,
 )
 from stlc.bench.fixed_set import training_accuracy
-from stlc.compile.semantics import TOLERANCE
-from stlc.controller.inputs import input_files
-from stlc.controller.sweep import Errand, Returned, side_by_side
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.parallel.jobs import Errand, Returned, side_by_side
+from stlc.controller.training.inputs import input_files
 from stlc.diagnostics import StlcError
 from stlc.files import write_atomic
 from stlc.jsontext import dumps
@@ -126,7 +126,7 @@ def _sent(errands: Sequence[Errand], place: Place, begun: Callable[[str], None])
     if place.cluster is None or not errands:
         yield from side_by_side(errands, jobs=place.jobs, begun=lambda errand: begun(errand.name))
         return
-    from stlc.controller.cluster import Cluster, on_cluster
+    from stlc.controller.parallel.ray_cluster import Cluster, on_cluster
 
     cluster = Cluster(place.cluster, place.threads)
     yield from on_cluster(errands, cluster, begun=lambda errand: begun(errand.name))

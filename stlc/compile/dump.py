@@ -9,16 +9,16 @@ from itertools import zip_longest
 from textwrap import wrap
 from typing import Literal, TypeAlias
 
-from stlc.compile import ir
-from stlc.compile.bounds import in_words
-from stlc.compile.horizon import columns, nodes
-from stlc.compile.interface import Grid
-from stlc.compile.ir_text import show_formula, shown
+from stlc.compile.augment.timers import Timer
+from stlc.compile.frontend.bounds import in_words
+from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.horizon import columns, nodes
+from stlc.compile.ir.text import show_formula, shown
 from stlc.compile.pipeline import Compiled, Rule
-from stlc.compile.timers import Timer
 from stlc.escape import screen
-from stlc.grammar.printer import show
-from stlc.grammar.printer_expr import show_name
+from stlc.grammar.show.expressions import show_name
+from stlc.grammar.show.printer import show
 
 WIDTH, LEFT = 110, 44
 """Columns of the whole text, and at most of what was written."""

@@ -6,7 +6,7 @@
     simplify  ir.Formula    -> ir.Formula                 fewer nodes, no constants
     horizon   ir.Formula    -> int                        how far it looks
 
-`stlc.compile.graph` evaluates what comes out. torch is not needed for any of this.
+`stlc.compile.backends.array.graph` evaluates what comes out. torch is not needed for any of this.
 """
 
 from __future__ import annotations
@@ -16,26 +16,27 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Literal, TypeAlias, final
 
-from stlc.compile import ir, typed
-from stlc.compile.augment import Augmented, augment
-from stlc.compile.bounds import in_words
-from stlc.compile.defined import defined
-from stlc.compile.horizon import columns, reach, uses_end
-from stlc.compile.interface import Grid, Interface
-from stlc.compile.lift import recorded
-from stlc.compile.lower import lower
-from stlc.compile.margins import as_written
-from stlc.compile.mission import Goal, endless, mission_steps
-from stlc.compile.modulo import jumps
-from stlc.compile.pull import pull
-from stlc.compile.ranges import Facts
-from stlc.compile.resolve import resolve
-from stlc.compile.safety import safe_part
-from stlc.compile.scales import nominal
-from stlc.compile.semantics import Semantics
-from stlc.compile.simplify import simplify
-from stlc.compile.timers import Ledger, Timer
-from stlc.compile.walk import absolute, margin_unit, mentions_horizon
+from stlc.compile.analysis.margins import as_written
+from stlc.compile.analysis.modulo import jumps
+from stlc.compile.analysis.ranges import Facts
+from stlc.compile.augment.augment import Augmented, augment
+from stlc.compile.augment.guidance import pull
+from stlc.compile.augment.lift import recorded
+from stlc.compile.augment.mission import Goal, endless, mission_steps
+from stlc.compile.augment.timers import Ledger, Timer
+from stlc.compile.frontend.bounds import in_words
+from stlc.compile.frontend.interface import Grid, Interface
+from stlc.compile.frontend.resolve import resolve
+from stlc.compile.frontend.scales import nominal
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.defined import defined
+from stlc.compile.ir.horizon import columns, reach, uses_end
+from stlc.compile.ir.traverse import absolute, margin_unit, mentions_horizon
+from stlc.compile.lowering.lower import lower
+from stlc.compile.lowering.safety import safe_part
+from stlc.compile.lowering.simplify import simplify
+from stlc.compile.semantics.semantics import Semantics
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar import ast
 from stlc.signature import Signature

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 Scene: TypeAlias = Mapping[str, NDArray[Any]]
 
 DECIDED = ("#0072b2", "#e69f00", "#cc79a7", "#56b4e9")
-"""Colours by `stlc.controller.deploy.SOURCES`; told apart by the colour-blind, too."""
+"""Colours by `stlc.controller.guard.guard.SOURCES`; told apart by the colour-blind, too."""
 DECIDERS = ("policy", "backup", "safest prefix", "polished plan")
 """The same in words."""
 VIOLATED = "#c4161c"

@@ -12,16 +12,16 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from stlc.compile.functions import callable_names
+from stlc.compile.ir.functions import callable_names
 from stlc.editor.document import Document
 from stlc.editor.hover import about, about_shared, summary
 from stlc.editor.modules import shared
 from stlc.editor.symbols import inside
 from stlc.editor.vocabulary import BUILT_IN, FUNCTIONS, KEYWORDS, TAGS, TEMPORAL, TYPES
 from stlc.grammar import ast
-from stlc.grammar.parser_accepts import acceptable
-from stlc.grammar.printer_expr import own_name
+from stlc.grammar.parse.accepts import acceptable
 from stlc.grammar.scan import declaration_starts, lexemes
+from stlc.grammar.show.expressions import own_name
 from stlc.grammar.words import BINARY_TEMPORAL, PRAGMAS, RESERVED, ROLES, UNARY_TEMPORAL
 from stlc.units import SYMBOLS
 

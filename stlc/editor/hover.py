@@ -6,20 +6,20 @@ from collections.abc import Iterator
 from dataclasses import fields, replace
 from fractions import Fraction
 
-from stlc.compile import typed
-from stlc.compile.bounds import in_words
-from stlc.compile.interface import Grid
-from stlc.compile.ir import Window
-from stlc.compile.modules import STD
-from stlc.compile.values import Number, Value, Vector, describe
+from stlc.compile.frontend.bounds import in_words
+from stlc.compile.frontend.interface import Grid
+from stlc.compile.frontend.modules import STD
+from stlc.compile.frontend.values import Number, Value, Vector, describe
+from stlc.compile.ir import typed
+from stlc.compile.ir.nodes import Window
 from stlc.editor.document import Document
 from stlc.editor.modules import borrowed_at
 from stlc.editor.symbols import Symbol
 from stlc.editor.vocabulary import BUILT_IN, FUNCTIONS, KEYWORDS, TAGS, TEMPORAL, TYPES
 from stlc.escape import markdown, markdown_code, screen
 from stlc.grammar import ast
-from stlc.grammar.printer import show
 from stlc.grammar.scan import Lexeme, lexemes
+from stlc.grammar.show.printer import show
 from stlc.grammar.words import BINARY_TEMPORAL, UNARY_TEMPORAL
 from stlc.signature import Column
 from stlc.source import Span

@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 
-from stlc.compile import typed
-from stlc.compile.bounds import to_window
-from stlc.compile.expressions import evaluate
-from stlc.compile.formulas import resolve_formula
-from stlc.compile.horizon import reach
-from stlc.compile.imported import declared
-from stlc.compile.interface import Grid, Interface
-from stlc.compile.ir import Window
-from stlc.compile.lower import lower
-from stlc.compile.modules import Module
-from stlc.compile.scope import Definition, Failed, Known, Scope
-from stlc.compile.signals import ranged
-from stlc.compile.simplify import simplify
-from stlc.compile.values import Value
+from stlc.compile.frontend.bounds import to_window
+from stlc.compile.frontend.expressions import evaluate
+from stlc.compile.frontend.formulas import resolve_formula
+from stlc.compile.frontend.imported import declared
+from stlc.compile.frontend.interface import Grid, Interface
+from stlc.compile.frontend.modules import Module
+from stlc.compile.frontend.scope import Definition, Failed, Known, Scope
+from stlc.compile.frontend.signals import ranged
+from stlc.compile.frontend.values import Value
+from stlc.compile.ir import typed
+from stlc.compile.ir.horizon import reach
+from stlc.compile.ir.nodes import Window
+from stlc.compile.lowering.lower import lower
+from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.signature import Column

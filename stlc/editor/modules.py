@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from stlc.compile.modules import Module
+from stlc.compile.frontend.modules import Module
 from stlc.grammar import ast
 from stlc.grammar.children import descendants
 from stlc.grammar.scan import lexemes

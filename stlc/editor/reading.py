@@ -11,7 +11,7 @@ from bisect import bisect_right
 
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar import ast
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.grammar.scan import declaration_starts
 from stlc.source import Source
 

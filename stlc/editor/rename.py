@@ -9,8 +9,8 @@ from stlc.diagnostics import SpecError
 from stlc.editor.document import Document
 from stlc.editor.symbols import Names, Occurrence, names_of
 from stlc.grammar import ast
-from stlc.grammar.parser import parse
-from stlc.grammar.printer_expr import own_name
+from stlc.grammar.parse.parser import parse
+from stlc.grammar.show.expressions import own_name
 from stlc.source import Source, Span
 
 Edit = tuple[Span, str]

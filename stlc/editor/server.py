@@ -17,7 +17,7 @@ from stlc.editor.hover import hover, summary
 from stlc.editor.navigation import definition, outline, system_place
 from stlc.editor.positions import Encoding, Layout, Place
 from stlc.editor.rename import RenameError, can_rename, rename
-from stlc.grammar.format import format_text
+from stlc.grammar.format.format import format_text
 from stlc.source import Source
 from stlc.version import __version__
 

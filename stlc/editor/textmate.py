@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
-from stlc.compile.functions import REGIONS, callable_names
+from stlc.compile.ir.functions import REGIONS, callable_names
 from stlc.editor.vocabulary import FUNCTIONS
 from stlc.grammar.words import (
     BINARY_TEMPORAL,

@@ -6,15 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 from typing import TYPE_CHECKING
 
-from stlc.compile import ir
-from stlc.compile.c_numbers import Leaf, NumberWriter, Untranslatable, literal
-from stlc.controller.task import KEPT, PULL, SHORT, Task
-from stlc.dynamics.decl_learning import START
-from stlc.dynamics.step import commands
+from stlc.compile.backends.c.numbers import Leaf, NumberWriter, Untranslatable, literal
+from stlc.compile.ir import nodes as ir
+from stlc.controller.problem.task import KEPT, PULL, SHORT, Task
+from stlc.dynamics.declaration.learning import START
+from stlc.dynamics.model.step import commands
 
 if TYPE_CHECKING:
-    from stlc.controller.promises import Promise
-    from stlc.dynamics.mirror import Mirror
+    from stlc.controller.problem.pending_goals import Promise
+    from stlc.dynamics.model.mirror import Mirror
 
 
 def observed(task: Task) -> list[str]:

@@ -11,7 +11,7 @@ from torch import nn
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from stlc.controller.policy import PlanNetwork
+    from stlc.controller.policies.policy import PlanNetwork
 
 
 def weights(network: PlanNetwork) -> str:

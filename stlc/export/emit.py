@@ -7,15 +7,15 @@ from importlib.resources import files
 from string import Template
 from typing import TYPE_CHECKING, assert_never
 
-from stlc.compile.c_formulas import Forward
-from stlc.compile.c_numbers import literal
-from stlc.compile.c_parts import declared, in_parts
-from stlc.compile.c_plan import plan_of
-from stlc.compile.emit_c import CHECK, HEAD, passes, roots_out, state_index
-from stlc.controller.backup import grid_of
-from stlc.controller.kernel import motion_of
-from stlc.controller.prefix import BEYOND, anchored, open_ended
-from stlc.dynamics.controls import raw_width
+from stlc.compile.backends.c.emit import CHECK, HEAD, passes, roots_out, state_index
+from stlc.compile.backends.c.formulas import Forward
+from stlc.compile.backends.c.numbers import literal
+from stlc.compile.backends.c.parts import declared, in_parts
+from stlc.compile.backends.c.plan import plan_of
+from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
+from stlc.controller.guard.shooting import grid_of
+from stlc.controller.problem.kernel import motion_of
+from stlc.dynamics.model.controls import raw_width
 from stlc.escape import c_comment, c_string
 from stlc.export import c_numbers, c_weights
 from stlc.runtime.prefixes import generators
@@ -23,12 +23,12 @@ from stlc.runtime.prefixes import generators
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from stlc.compile.c_steps import Plan
-    from stlc.compile.emit_c import Motion
+    from stlc.compile.augment.timers import Timer
+    from stlc.compile.backends.c.emit import Motion
+    from stlc.compile.backends.c.steps import Plan
     from stlc.compile.pipeline import Rule
-    from stlc.compile.timers import Timer
-    from stlc.controller.policy import PlanNetwork
-    from stlc.controller.task import Task
+    from stlc.controller.policies.policy import PlanNetwork
+    from stlc.controller.problem.task import Task
     from stlc.signature import Column
 
 

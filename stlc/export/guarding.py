@@ -1,7 +1,7 @@
 """The paper's backup policy as a module that can be recorded: every T0 is tried, the first that does decides.
 
-`stlc.controller.backup` goes on to a longer T0 only where a shorter one found nothing. A recorded program
-has no such turns, so it costs what its longest prefixes cost, and gives the same plans.
+`stlc.controller.guard.shooting` goes on to a longer T0 only where a shorter one found nothing. A recorded
+program has no such turns, so it costs what its longest prefixes cost, and gives the same plans.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from stlc.compile.semantics import TOLERANCE
-from stlc.controller.backup import best, finite, grid_of
-from stlc.controller.prefix import prefix_robustness
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.guard.safe_prefix import prefix_robustness
+from stlc.controller.guard.shooting import best, finite, grid_of
 from stlc.export.programs import Deciding, judged_openly, unmoved
 from stlc.runtime.prefixes import Grid
 
 if TYPE_CHECKING:
     from torch.export import ExportedProgram
 
-    from stlc.controller.policy import PlanNetwork
-    from stlc.controller.task import Task
+    from stlc.controller.policies.policy import PlanNetwork
+    from stlc.controller.problem.task import Task
 
 AT_ONCE = 32_768
 """Plans of one state that are judged at once."""
@@ -47,7 +47,8 @@ class Guarding(nn.Module):
     """States (B, n) and the policy's plans (B, T, m) -> what the backup policy does instead; float64.
 
     The outputs are plan (B, T, m), rho and safe (B,), requirements (B, R), and int64 source (1 where phi or
-    phi_safe holds, 2 where the longest safe prefix decided) and t0 (B,), as `stlc.controller.backup.Found`.
+    phi_safe holds, 2 where the longest safe prefix decided) and t0 (B,), as
+    `stlc.controller.guard.shooting.Found`.
     """
 
     def __init__(self, task: Task, network: PlanNetwork, grid: Grid | None = None) -> None:
@@ -59,7 +60,7 @@ class Guarding(nn.Module):
         self._prefixes = [torch.from_numpy(self.grid.prefixes(length)) for length in self.grid.lengths]
 
     def forward(self, x: Tensor, plan: Tensor) -> tuple[Tensor, ...]:
-        """Choose as `stlc.controller.backup.Backup.search` does."""
+        """Choose as `stlc.controller.guard.shooting.Backup.search` does."""
         own = finite(plan, self._task)
         nobody = torch.zeros_like(x[:, 0])
         if not self._prefixes:

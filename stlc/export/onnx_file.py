@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from stlc.compile.sheet import BATCH, Body, Value
+from stlc.compile.backends.onnx.sheet import BATCH, Body, Value
 from stlc.diagnostics import Diagnostic, MissingError
 from stlc.version import __version__
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from onnx import GraphProto, NodeProto, TensorProto, ValueInfoProto
 
-    from stlc.compile.sheet import Node, Sheet
+    from stlc.compile.backends.onnx.sheet import Node, Sheet
 
 OPSET = 18
 """The functions of ONNX 1.13 (2022), which every runtime since knows."""

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from stlc.compile.ops_onnx import ONNX_OPS as ONNX
-from stlc.compile.semantics import TOLERANCE
-from stlc.compile.sheet import BATCH, Sheet, Value, joined
+from stlc.compile.backends.onnx.ops import ONNX_OPS as ONNX
+from stlc.compile.backends.onnx.sheet import BATCH, Sheet, Value, joined
+from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.export.onnx_judge import columns_of, deepened, falls, judged, rank
 from stlc.export.onnx_policy import proposed
 from stlc.export.onnx_rollout import assigned
@@ -17,8 +17,8 @@ from stlc.export.onnx_rollout import assigned
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from stlc.controller.policy import PlanNetwork
-    from stlc.controller.task import Task
+    from stlc.controller.policies.policy import PlanNetwork
+    from stlc.controller.problem.task import Task
 
 
 def deciding(task: Task, network: PlanNetwork) -> dict[str, Value]:

@@ -8,18 +8,18 @@ from dataclasses import dataclass
 from functools import reduce
 from typing import TYPE_CHECKING
 
-from stlc.compile.ops_onnx import ONNX_OPS as ONNX
-from stlc.compile.semantics import TOLERANCE
-from stlc.compile.sheet import BATCH, Value, joined
-from stlc.compile.unrolled import written
-from stlc.controller.prefix import BEYOND, anchored, open_ended
-from stlc.controller.promises import HELD
-from stlc.controller.task import KEPT, PULL, SHORT, TIE, Task
-from stlc.dynamics.decl_learning import START
+from stlc.compile.backends.array.unrolled import written
+from stlc.compile.backends.onnx.ops import ONNX_OPS as ONNX
+from stlc.compile.backends.onnx.sheet import BATCH, Value, joined
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
+from stlc.controller.problem.pending_goals import HELD
+from stlc.controller.problem.task import KEPT, PULL, SHORT, TIE, Task
+from stlc.dynamics.declaration.learning import START
 from stlc.export.onnx_rollout import assigned, rolled
 
 if TYPE_CHECKING:
-    from stlc.compile import ir
+    from stlc.compile.ir import nodes as ir
     from stlc.compile.pipeline import Rule
 
 Columns = Mapping[str, Value]
@@ -108,7 +108,7 @@ def _reduced(op: str, x: Value, axes: tuple[int, ...]) -> Value:
 
 
 def rank(found: Verdicts) -> Value:
-    """`stlc.controller.task.rank`, (1, batch)."""
+    """`stlc.controller.problem.task.rank`, (1, batch)."""
     rho, cost = found.rho, found.cost
     unknown = cost.apply("IsNaN", kind="bool")
     cheap = ONNX.where(unknown, 0.0, 1.0 / (1.0 + ONNX.clamp(ONNX.where(unknown, 0.0, cost), 0.0, None)))
@@ -186,7 +186,7 @@ def deepened(task: Task, states: Columns) -> Value:
 
 
 def falls(task: Task, start: Columns, plans: Value) -> Value:
-    """`stlc.controller.prefix.prefix_robustness`, (T + 1, batch).
+    """`stlc.controller.guard.safe_prefix.prefix_robustness`, (T + 1, batch).
 
     Every prefix is a trajectory of its own, as there: columns are (T + 1, prefixes * batch).
     """

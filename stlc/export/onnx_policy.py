@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 from torch import nn
 
-from stlc.compile import ir
-from stlc.compile.ops_onnx import ONNX_OPS as ONNX
-from stlc.compile.sheet import BATCH, Value, joined
-from stlc.dynamics.controls import EPS, raw_width
+from stlc.compile.backends.onnx.ops import ONNX_OPS as ONNX
+from stlc.compile.backends.onnx.sheet import BATCH, Value, joined
+from stlc.compile.ir import nodes as ir
+from stlc.dynamics.model.controls import EPS, raw_width
 from stlc.export.onnx_rollout import assigned
 
 if TYPE_CHECKING:
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from stlc.controller.policy import PlanNetwork
-    from stlc.controller.task import Task
-    from stlc.dynamics.decl_model import ControlDecl
+    from stlc.controller.policies.policy import PlanNetwork
+    from stlc.controller.problem.task import Task
+    from stlc.dynamics.declaration.model import ControlDecl
 
 
 def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Value:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from stlc.compile import ir
-from stlc.compile.arith import Program
-from stlc.compile.ops_onnx import ONNX
-from stlc.compile.sheet import BATCH, Sheet, Value
-from stlc.compile.unrolled import Columns, require_numbers
-from stlc.dynamics.algebra import names_in
-from stlc.dynamics.schedule import Stage, schedule
-from stlc.dynamics.step import Step
+from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.unrolled import Columns, require_numbers
+from stlc.compile.backends.onnx.ops import ONNX
+from stlc.compile.backends.onnx.sheet import BATCH, Sheet, Value
+from stlc.compile.ir import nodes as ir
+from stlc.dynamics.model.algebra import names_in
+from stlc.dynamics.model.schedule import Stage, schedule
+from stlc.dynamics.model.step import Step
 
 
 def rolled(step: Step, start: Mapping[str, Value], controls: Mapping[str, Value]) -> Columns:

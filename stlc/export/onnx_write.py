@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from stlc.compile.c_numbers import Untranslatable
-from stlc.controller import backup
-from stlc.controller.run import spec_hash, system_hash
+from stlc.compile.backends.c.numbers import Untranslatable
+from stlc.controller.guard import shooting as backup
+from stlc.controller.training.run import spec_hash, system_hash
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.export.onnx_file import model_of, require_onnx
 from stlc.export.onnx_graphs import deciding, falling, following, judging
@@ -24,9 +24,9 @@ from stlc.runtime.facts import DECIDE, FACTS, FALL, FOLLOW, FORMAT, JUDGE, Quant
 from stlc.version import __version__
 
 if TYPE_CHECKING:
-    from stlc.compile.sheet import Value
-    from stlc.controller.run import Run
-    from stlc.controller.task import Task
+    from stlc.compile.backends.onnx.sheet import Value
+    from stlc.controller.problem.task import Task
+    from stlc.controller.training.run import Run
 
 TIMED = 200
 """Decisions that are timed."""

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from stlc.compile.ops_torch import TORCH
-from stlc.controller.task import Judged, Task, rank
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.controller.problem.task import Judged, Task, rank
 
 if TYPE_CHECKING:
     from torch.export import ExportedProgram
 
-    from stlc.controller.policy import PlanNetwork
+    from stlc.controller.policies.policy import PlanNetwork
 
 
 class Deciding(nn.Module):

@@ -11,16 +11,16 @@ import torch
 from torch import Tensor
 
 from stlc import toolchain
-from stlc.controller.backup import Backup
-from stlc.controller.deploy import Guard
-from stlc.controller.prefix import prefix_robustness
-from stlc.controller.task import rank
+from stlc.controller.guard.guard import Guard
+from stlc.controller.guard.safe_prefix import prefix_robustness
+from stlc.controller.guard.shooting import Backup
+from stlc.controller.problem.task import rank
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.export.programs import unmoved
 
 if TYPE_CHECKING:
-    from stlc.controller.policy import Mlp
-    from stlc.controller.task import Task
+    from stlc.controller.policies.policy import Mlp
+    from stlc.controller.problem.task import Task
     from stlc.runtime.graphs import Graphs, Judged
 
 PLAN = 1e-4

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 import torch
 
-from stlc.compile.c_numbers import Untranslatable
+from stlc.compile.backends.c.numbers import Untranslatable
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.export import c_weights, emit
 from stlc.export.c_public import public
@@ -34,7 +34,7 @@ from stlc.runtime.facts import read_facts
 from stlc.runtime.graphs import Graphs
 
 if TYPE_CHECKING:
-    from stlc.controller.run import Run
+    from stlc.controller.training.run import Run
 
 Target: TypeAlias = Literal["torch", "c", "onnx"]
 TARGETS: tuple[Target, ...] = get_args(Target)

@@ -1,4 +1,4 @@
-"""The syntax as written. One expression grammar: types are found later, in `stlc.compile.resolve`.
+"""The syntax as written. One expression grammar: types are found later, in `stlc.compile.frontend.resolve`.
 
 Every node carries a span, which says where and not what: equality ignores it.
 """
@@ -383,7 +383,8 @@ class Spec(Node):
         imports: in order.
         items: declarations in order.
         source: the text itself.
-        library: texts of what it imports, by key (`stlc.compile.modules`); None where the files are read.
+        library: texts of what it imports, by key (`stlc.compile.frontend.modules`); None where the files are
+            read.
     """
 
     name: str

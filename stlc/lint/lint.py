@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from stlc.compile.interface import Grid, Interface
-from stlc.compile.resolve import resolve
+from stlc.compile.frontend.interface import Grid, Interface
+from stlc.compile.frontend.resolve import resolve
 from stlc.diagnostics import CODES, Diagnostic, SpecError, UsageError
 from stlc.grammar import ast
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.lint.rules import RULES
 from stlc.registry import closest
 from stlc.source import Source

@@ -15,9 +15,9 @@ from typing import Literal, TypeAlias, assert_never
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile import ir
-from stlc.compile.horizon import columns, nodes
-from stlc.compile.samples import farthest
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.horizon import columns, nodes
+from stlc.compile.ir.samples import farthest
 
 Floats: TypeAlias = NDArray[np.float64]
 

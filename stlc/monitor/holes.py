@@ -16,8 +16,8 @@ from typing import TypeAlias, assert_never
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile import ir
-from stlc.compile.samples import leaves
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.samples import leaves
 
 Floats: TypeAlias = NDArray[np.float64]
 

@@ -15,12 +15,12 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.defined import defined
-from stlc.compile.graph import robustness_signal
-from stlc.compile.interface import Grid
-from stlc.compile.ops import Array
+from stlc.compile.backends.array.graph import robustness_signal
+from stlc.compile.backends.array.namespace import Array
+from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir.defined import defined
 from stlc.compile.pipeline import Rule
-from stlc.compile.schedule import End
+from stlc.compile.schedule.schedule import End
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.monitor.holes import unsure
 from stlc.monitor.values import Ends, Record, bounds, window_bounds

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.pipeline import Rule
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.prepared import Prepared

@@ -6,10 +6,10 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from stlc.compile import ir
-from stlc.compile.horizon import columns, numbers
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.horizon import columns, numbers
+from stlc.compile.ir.samples import everything
 from stlc.compile.pipeline import Compiled, Rule
-from stlc.compile.samples import everything
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.grammar import ast
 from stlc.signature import Column

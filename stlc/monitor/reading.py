@@ -8,7 +8,7 @@ from dataclasses import replace
 from stlc.grammar import ast
 from stlc.signature import Kind
 from stlc.trace import AS_IT_IS, Reading
-from stlc.trace_words import TRUTH, Words
+from stlc.trace.enums import TRUTH, Words
 
 _KINDS: Mapping[str, Kind] = {"real": "real", "int": "int", "bool": "bool"}
 

@@ -11,8 +11,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.ops import Array, Ops
-from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.monitor.needs import Need
 from stlc.registry import closest
@@ -93,7 +93,7 @@ def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False)
         tensors = []
     shape, samples = _common_shape(arrays, name)
     if tensors:
-        from stlc.compile.ops_torch import TORCH
+        from stlc.compile.backends.torch.ops import TORCH
 
         return Signals(_torch_columns(arrays, tensors, (*shape, samples)), shape, samples, TORCH, name)
     columns = _numpy_columns(arrays, (*shape, samples))

@@ -8,15 +8,15 @@ from typing import Literal, TypeAlias, assert_never
 
 import numpy as np
 
-from stlc.compile import ir
-from stlc.compile.defined import defined
-from stlc.compile.graph import evaluate
-from stlc.compile.horizon import parts
-from stlc.compile.ops import Array, Ops
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.samples import columns_of, everything, farthest
-from stlc.compile.schedule import End
-from stlc.compile.semantics import Exact, Semantics
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.defined import defined
+from stlc.compile.ir.horizon import parts
+from stlc.compile.ir.samples import columns_of, everything, farthest
+from stlc.compile.schedule.schedule import End
+from stlc.compile.semantics.semantics import Exact, Semantics
 from stlc.monitor.holes import holes_in, unsure, without_holes
 
 Ends: TypeAlias = Literal["open", "truncate"]

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from stlc.compile.interface import Grid
-from stlc.compile.ops import Array
+from stlc.compile.backends.array.namespace import Array
+from stlc.compile.frontend.interface import Grid
 from stlc.compile.pipeline import Compiled, Rule, compile_spec
-from stlc.compile.schedule import End
-from stlc.compile.semantics import TOLERANCE, Exact, Semantics, semantics_of
+from stlc.compile.schedule.schedule import End
+from stlc.compile.semantics.semantics import TOLERANCE, Exact, Semantics, semantics_of
 from stlc.diagnostics import Diagnostic, SpecError, UsageError
 from stlc.files import read_source
 from stlc.grammar import ast
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.monitor.grid import Times, given_times, named_times, recorded_times, system_of
 from stlc.monitor.instants import (
     At,
@@ -39,7 +39,7 @@ from stlc.source import Source
 from stlc.trace import Trace, load_trace
 
 if TYPE_CHECKING:
-    from stlc.monitor.online import How, Online
+    from stlc.monitor.online.online import How, Online
 
 __all__ = ["Judgement", "Monitor", "Status", "Verdict"]
 
@@ -165,7 +165,7 @@ class Monitor:
             end: "strict" leaves NaN where a window is not whole, "truncate" cuts windows.
             at: at this sample only.
             smoothing: scale k of log-sum-exp, which it asks for by itself.
-            semantics: of min and max, or its name in `stlc.compile.semantics.SEMANTICS`.
+            semantics: of min and max, or its name in `stlc.compile.semantics.semantics.SEMANTICS`.
 
         Returns:
             The shape of the signals, or with `at` that shape without the time axis.
@@ -226,7 +226,7 @@ class Monitor:
         Raises:
             UsageError: U101, an unknown requirement, or none at all.
         """
-        from stlc.monitor.online import Online
+        from stlc.monitor.online.online import Online
 
         recorded = given_times(dt, None) if like is None else recorded_times(like, self._asked)
         compiled = self._ready(recorded)

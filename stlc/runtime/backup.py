@@ -1,4 +1,4 @@
-"""The paper's backup policy over the graphs of a controller, as `stlc.controller.backup` is over torch."""
+"""The paper's backup policy over the graphs of a controller, as `guard.shooting` is over torch."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.semantics import TOLERANCE
+from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.runtime.facts import Quantity
 from stlc.runtime.graphs import Graphs, Judged, Numbers, joined
 

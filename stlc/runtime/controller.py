@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stlc.compile.semantics import TOLERANCE
+from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.diagnostics import Diagnostic, RunError, UsageError
 from stlc.runtime.backup import POLICY, search
 from stlc.runtime.facts import Facts, read_facts

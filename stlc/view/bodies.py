@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
-from stlc.dynamics.urdf import read_urdf, robot_of
+from stlc.dynamics.robots.urdf import read_urdf, robot_of
 
 ROD = 0.05  # m, radius
 _UNIT_MASS = {"ixx": "1", "iyy": "1", "izz": "1", "ixy": "0", "ixz": "0", "iyz": "0"}

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.walk import margin_unit
+from stlc.compile.ir.traverse import margin_unit
 from stlc.diagnostics import StlcError
 from stlc.grammar import ast
-from stlc.grammar.parser import parse
-from stlc.monitor.explain import Cause, explain_all
+from stlc.grammar.parse.parser import parse
+from stlc.monitor.explain.report import Cause, explain_all
 from stlc.monitor.prepared import beside
 from stlc.monitor.verdict import Judgement, Monitor, Verdict
 from stlc.source import Source

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.monitor.explain import explain_at
+from stlc.monitor.explain.report import explain_at
 from stlc.monitor.judgement import Judgement, Verdict
 
 MOST = 240

@@ -15,7 +15,7 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.semantics import TOLERANCE
+from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.signature import Signature
 
 MAX_CONDITIONS = 4

@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from stlc.compile.walk import margin_unit
+from stlc.compile.ir.traverse import margin_unit
 from stlc.diagnostics import StlcError
-from stlc.dynamics.decl import SystemDecl
-from stlc.dynamics.scenario import under
-from stlc.dynamics.schema import load_system_decl
+from stlc.dynamics.declaration.decl import SystemDecl
+from stlc.dynamics.scenarios.scenario import under
+from stlc.dynamics.schema.schema import load_system_decl
 from stlc.grammar import ast
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.rundir import RunDir
 from stlc.signature import Signature

@@ -14,7 +14,7 @@ from typing import Literal, TypeAlias, assert_never
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile import typed
+from stlc.compile.ir import typed
 from stlc.compile.pipeline import Rule
 from stlc.diagnostics import StlcError
 from stlc.grammar import ast

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.semantics import TOLERANCE
+from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.sketch import DECIDED
 from stlc.escape import script_json
 from stlc.jsontext import dumps

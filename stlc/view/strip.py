@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.semantics import TOLERANCE
+from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.sketch import DECIDED
 from stlc.escape import picture
 from stlc.view.signals import margin_limits

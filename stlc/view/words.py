@@ -87,7 +87,7 @@ CAUSES = {
     "later": "no plan is known from {} on, although the one followed until then was good",
     "missed": "a plan is known at {}, and another one was followed",
 }
-"""Why a rule was broken, as `stlc.controller.rules.Lost` has it."""
+"""Why a rule was broken, as `stlc.controller.evaluation.rules.Lost` has it."""
 
 
 def viable_sentence(simulation: Mapping[str, Any]) -> str:

@@ -16,8 +16,8 @@ from stlc.bench.cells import BENCHMARKS, read_json
 from stlc.bench.disturbed import FILE, NOMINAL, SCENARIOS, Row, _Starts, disturbed_rows
 from stlc.bench.disturbed_text import COLUMNS, disturbed_section, spread
 from stlc.bench.worlds_text import wholly_savable
-from stlc.cli.app import main
-from stlc.cli.schema import load_schema
+from stlc.cli.commands.schema import load_schema
+from stlc.cli.framework.app import main
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[2]

@@ -16,15 +16,15 @@ from stlc.bench.cells import BENCHMARKS, Length, inputs_of, load, read_json, spe
 from stlc.bench.family import FAMILIES, FILE, Extent, Family, Row, family_cells, tables
 from stlc.bench.results import family_section
 from stlc.bench.study import Place, runs_of
-from stlc.cli.app import main
-from stlc.cli.schema import load_schema
-from stlc.controller.config import HELD_OUT_SEED
-from stlc.controller.launch import Launch, open_folder
-from stlc.controller.run import Run
-from stlc.controller.task import Task, satisfied
-from stlc.controller.train import train
+from stlc.cli.commands.schema import load_schema
+from stlc.cli.framework.app import main
+from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.training.config import HELD_OUT_SEED
+from stlc.controller.training.launch import Launch, open_folder
+from stlc.controller.training.loop import train
+from stlc.controller.training.run import Run
 from stlc.grammar import ast
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.rundir import every_run
 from stlc.source import Source
 

@@ -10,9 +10,9 @@ import pytest
 from documents import misfits
 
 from stlc.bench.latency import GUARDS, Times, picked
-from stlc.cli.app import main
-from stlc.cli.schema import load_schema
-from stlc.controller.drive import Recording
+from stlc.cli.commands.schema import load_schema
+from stlc.cli.framework.app import main
+from stlc.controller.deployment.simulator import Recording
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from documents import misfits
 
-from stlc.cli.app import main
-from stlc.cli.schema import load_schema
+from stlc.cli.commands.schema import load_schema
+from stlc.cli.framework.app import main
 
 SYSTEM = """\
 stlc: 1

@@ -11,9 +11,9 @@ import torch
 from stlc.bench.cases import CASES, Case
 from stlc.bench.measure import interleaved, one_thread, ratio
 from stlc.bench.robustness import Timing, robustness_timings, width_of
-from stlc.cli.app import main
-from stlc.compile.graph import robustness_signal
-from stlc.compile.ops_torch import TORCH
+from stlc.cli.framework.app import main
+from stlc.compile.backends.array.graph import robustness_signal
+from stlc.compile.backends.torch.ops import TORCH
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)

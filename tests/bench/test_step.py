@@ -9,7 +9,7 @@ import pytest
 
 from stlc.bench.cells import load
 from stlc.bench.step import speed, step_timing
-from stlc.cli.app import main
+from stlc.cli.framework.app import main
 
 
 def test_the_parts_of_a_step_are_measured_and_written(

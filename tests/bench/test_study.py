@@ -20,14 +20,14 @@ from stlc.bench.ceilings import TRIES, ceilings_of, search_on
 from stlc.bench.cells import BENCHMARKS, Cell, Length, inputs_of, load, pack, read_json, union, unpack
 from stlc.bench.paper import Extent, paper_cells, paper_rows
 from stlc.bench.study import Filled, Place, cell_of, fill, runs_of, valid_results, write_result
-from stlc.cli.app import main
-from stlc.cli.bench_options import _left
-from stlc.cli.schema import load_schema
-from stlc.controller.config import HELD_OUT_SEED
-from stlc.controller.launch import Launch, open_folder
-from stlc.controller.run import Run
-from stlc.controller.task import satisfied
-from stlc.controller.train import Watch, train
+from stlc.cli.bench.options import _left
+from stlc.cli.commands.schema import load_schema
+from stlc.cli.framework.app import main
+from stlc.controller.problem.task import satisfied
+from stlc.controller.training.config import HELD_OUT_SEED
+from stlc.controller.training.launch import Launch, open_folder
+from stlc.controller.training.loop import Watch, train
+from stlc.controller.training.run import Run
 from stlc.rundir import every_run
 
 ROOT = Path(__file__).parents[2]

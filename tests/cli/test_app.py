@@ -19,8 +19,8 @@ import pytest
 import typer
 from documents import misfits
 
-from stlc.cli.app import app, main
-from stlc.cli.schema import load_schema
+from stlc.cli.commands.schema import load_schema
+from stlc.cli.framework.app import app, main
 from stlc.diagnostics import (
     Diagnostic,
     MissingError,
@@ -57,7 +57,7 @@ def boundary(monkeypatch, tmp_path):
             action()
             assert not as_json
 
-        monkeypatch.setattr("stlc.cli.app.app", fake)
+        monkeypatch.setattr("stlc.cli.framework.app.app", fake)
         return main(["act", *options])
 
     return run
@@ -360,7 +360,8 @@ def test_a_closed_standard_output_is_no_error():
 
 def imported_by(*arguments):
     program = (
-        "import sys; from stlc.cli.app import main; main(sys.argv[1:]); print(*sys.modules, file=sys.stderr)"
+        "import sys; from stlc.cli.framework.app import main; main(sys.argv[1:]); "
+        "print(*sys.modules, file=sys.stderr)"
     )
     done = subprocess.run(
         [sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=True

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from stlc.cli.app import main
-from stlc.controller.run import Run
+from stlc.cli.framework.app import main
+from stlc.controller.training.run import Run
 from stlc.rundir import RunDir
 
 CART = """
@@ -40,7 +40,7 @@ LOW = "require low: eventually[0, T] ((v + 2 m/s) / 1 m/s)^0.25 <= -0.1\n"
 @pytest.fixture(autouse=True)
 def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("stlc.controller.trainer.MARGIN_STATES", 8)
+    monkeypatch.setattr("stlc.controller.training.learner.MARGIN_STATES", 8)
 
 
 def _trained(

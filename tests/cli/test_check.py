@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stlc.cli.app import main
+from stlc.cli.framework.app import main
 from stlc.signature import Column, Signature
 from stlc.trace import Trace, TraceMeta, save_trace
 
@@ -383,7 +383,7 @@ def test_torch_is_not_imported() -> None:
     saved(bad_drive())
     code = (
         "import sys\n"
-        "from stlc.cli.app import main\n"
+        "from stlc.cli.framework.app import main\n"
         "assert main(['check', 'trace.npz']) == 1\n"
         "assert 'torch' not in sys.modules and 'yaml' not in sys.modules\n"
     )

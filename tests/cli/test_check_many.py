@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from stlc.cli.app import main
+from stlc.cli.framework.app import main
 from stlc.signature import Column, Signature
 from stlc.trace import Trace, load_trace, save_trace
 from stlc.units import parse_unit
@@ -237,9 +237,9 @@ def test_pieces_that_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_file_that_is_too_large_is_read_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     (name,) = files(a_trace(peak=3))
-    monkeypatch.setattr("stlc.trace_chunks.LARGE", 100)
-    monkeypatch.setattr("stlc.cli.many.SMALL", 100)
-    monkeypatch.setattr("stlc.trace_npz.MAX_BYTES", 100)
+    monkeypatch.setattr("stlc.trace.chunks.LARGE", 100)
+    monkeypatch.setattr("stlc.cli.check.many.SMALL", 100)
+    monkeypatch.setattr("stlc.trace.formats.npz.MAX_BYTES", 100)
     assert check("s.stl", name, "-q") == 1
 
 

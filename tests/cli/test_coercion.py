@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import pytest
 import typer
 
-from stlc.cli.coercion import spare_adapters
+from stlc.cli.framework.coercion import spare_adapters
 
 ROOT = Path(__file__).resolve().parents[2]
 HEAVY = ("torch", "numpy", "pydantic", "yaml", "rich", "matplotlib")
@@ -22,7 +22,7 @@ HEAVY = ("torch", "numpy", "pydantic", "yaml", "rich", "matplotlib")
 )
 def test_a_light_command_imports_little(words):
     program = (
-        "import sys; from stlc.cli.app import main; code = main(sys.argv[1:]); "
+        "import sys; from stlc.cli.framework.app import main; code = main(sys.argv[1:]); "
         f"print([name for name in {HEAVY} if name in sys.modules], file=sys.stderr); sys.exit(code)"
     )
     done = subprocess.run(

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from stlc.cli.app import main
-from stlc.cli.watch import watch
-from stlc.dynamics.schema import load_system_decl
+from stlc.cli.framework.app import main
+from stlc.cli.framework.watch import watch
+from stlc.dynamics.schema.schema import load_system_decl
 from stlc.files import read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -136,7 +136,7 @@ def test_a_deep_tree(capsys):
 
 def test_watching(monkeypatch, capsys):
     rounds = []
-    monkeypatch.setattr("stlc.cli.watch.PERIOD", 0.0)
+    monkeypatch.setattr("stlc.cli.framework.watch.PERIOD", 0.0)
 
     def action():
         rounds.append(Path("a.stl").read_text())
@@ -150,7 +150,7 @@ def test_watching(monkeypatch, capsys):
 
 
 def test_lint_watches(monkeypatch, capsys):
-    monkeypatch.setattr("stlc.cli.watch.watch", lambda files, action: [action() for _ in files])
+    monkeypatch.setattr("stlc.cli.framework.watch.watch", lambda files, action: [action() for _ in files])
     assert main(["lint", "a.stl", "--watch", "--strict"]) == 0
     assert "warning[W106]" in capsys.readouterr().out
 

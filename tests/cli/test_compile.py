@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from stlc.cli.app import main
+from stlc.cli.framework.app import main
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 SPEC = "specs/traffic.stl"
@@ -43,7 +43,7 @@ def test_watching_compiles_again_when_a_file_changes(tmp_path, monkeypatch, caps
             raise KeyboardInterrupt
         edit()
 
-    monkeypatch.setattr("stlc.cli.watch.time.sleep", change)
+    monkeypatch.setattr("stlc.cli.framework.watch.time.sleep", change)
     assert main(["compile", "specs/traffic.stl", "--watch"]) == 130
     out, err = capsys.readouterr()
     assert out.count("phi_safe") == 2
@@ -108,7 +108,8 @@ def test_a_changed_horizon_changes_the_steps(capsys):
 
 def test_torch_is_not_needed():
     program = (
-        "import sys; from stlc.cli.app import main; sys.exit(main(sys.argv[1:]) or 'torch' in sys.modules)"
+        "import sys; from stlc.cli.framework.app import main; "
+        "sys.exit(main(sys.argv[1:]) or 'torch' in sys.modules)"
     )
     done = subprocess.run(
         [sys.executable, "-c", program, "compile", SPEC], cwd=ROOT, check=False, capture_output=True

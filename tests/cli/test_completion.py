@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stlc.cli.app import main
+from stlc.cli.framework.app import main
 from stlc.rundir import RunDir
 from stlc.signature import Column, Signature
 from stlc.trace import Trace, TraceMeta, save_trace

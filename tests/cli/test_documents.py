@@ -9,8 +9,8 @@ import pytest
 from documents import misfits
 from jsonschema import Draft202012Validator
 
-from stlc.cli.app import main
-from stlc.cli.schema import load_schema, names
+from stlc.cli.commands.schema import load_schema, names
+from stlc.cli.framework.app import main
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from stlc.cli.app import main
+from stlc.cli.framework.app import main
 from stlc.rundir import RunDir
 
 GOOD = "signal x [m]\n\nrequire low: always[0 s, 0.2 s] x < 3 m\n"
@@ -112,7 +112,7 @@ def test_an_exit_code(words, code, capsys):
 
 
 def test_missing_packages_are_told(monkeypatch, capsys):
-    monkeypatch.setattr("stlc.cli.doctor._NEEDED", ("numpy", "no-such-package"))
+    monkeypatch.setattr("stlc.cli.commands.doctor._NEEDED", ("numpy", "no-such-package"))
     assert main(["doctor", "--quick"]) == 5
     assert "no-such-package" in capsys.readouterr().err
     monkeypatch.setattr("stlc.view.find_spec", lambda _: None)

@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 from documents import misfits
 
-from stlc.cli.app import main
-from stlc.cli.schema import load_schema
-from stlc.controller.config import TrainConfig
-from stlc.controller.launch import Launch, open_folder
-from stlc.controller.task import Task
-from stlc.dynamics.system import System
+from stlc.cli.commands.schema import load_schema
+from stlc.cli.framework.app import main
+from stlc.controller.problem.task import Task
+from stlc.controller.training.config import TrainConfig
+from stlc.controller.training.launch import Launch, open_folder
+from stlc.dynamics.model.system import System
 from stlc.files import read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 
 ROOT = Path(__file__).parents[2]
 

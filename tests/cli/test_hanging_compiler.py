@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from stlc import native, toolchain, trace_cells, trace_csv
-from stlc.cli.app import main
-from stlc.compile import ops_torch_kernel
-from stlc.controller.config import TrainConfig
+from stlc import native, toolchain
+from stlc.cli.framework.app import main
+from stlc.compile.backends.torch import kernel as ops_torch_kernel
+from stlc.controller.training.config import TrainConfig
+from stlc.trace.formats import cells as trace_cells
+from stlc.trace.formats import csv as trace_csv
 
 TRAIN = ["train", "specs/cart.stl", "--steps", "2", "--no-pictures"]
 SIMULATE = ["simulate", "--backup", "--seeds", "1", "--steps", "2", "--agents", "2", "--no-pictures"]
@@ -38,9 +40,11 @@ def hanging(monkeypatch, tmp_path):
         (trace_csv, "LARGE", 1),
     ):
         monkeypatch.setattr(module, name, value)
-    monkeypatch.setattr("stlc.controller.config.TrainConfig", functools.partial(TrainConfig, held_out=64))
-    monkeypatch.setattr("stlc.controller.evaluate.LATENCY_SECONDS", 0.01)
-    monkeypatch.setattr("stlc.controller.trainer.MARGIN_STATES", 16)
+    monkeypatch.setattr(
+        "stlc.controller.training.config.TrainConfig", functools.partial(TrainConfig, held_out=64)
+    )
+    monkeypatch.setattr("stlc.controller.evaluation.deployment.LATENCY_SECONDS", 0.01)
+    monkeypatch.setattr("stlc.controller.training.learner.MARGIN_STATES", 16)
     caches = (trace_cells._library, ops_torch_kernel._library)
     for each in caches:
         each.cache_clear()

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import typer
 
-from stlc.cli.one_voice import one_voice
-from stlc.cli.output import emit, say
+from stlc.cli.framework.one_voice import one_voice
+from stlc.cli.framework.output import emit, say
 from stlc.diagnostics import Diagnostic, MissingError, SpecError, StlcError
 
 COMMON = SpecError(Diagnostic("E101", "there is no `x`"))

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from stlc.cli.options import describe, parse_overrides
+from stlc.cli.framework.options import describe, parse_overrides
 from stlc.diagnostics import UsageError
 
 

@@ -6,8 +6,17 @@ import os
 
 import pytest
 
-from stlc.cli import output
-from stlc.cli.output import COLOR, console, emit, emit_json, say, show_diagnostics, table, wants_color
+from stlc.cli.framework import output
+from stlc.cli.framework.output import (
+    COLOR,
+    console,
+    emit,
+    emit_json,
+    say,
+    show_diagnostics,
+    table,
+    wants_color,
+)
 from stlc.diagnostics import Diagnostic
 
 

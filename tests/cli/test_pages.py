@@ -14,11 +14,11 @@ import pytest
 from exported import exported
 from several import ENVIRONMENT, free_port
 
-from stlc.cli.app import main
-from stlc.cli.pages import FOLDER, Example, read_page
-from stlc.controller.config import TrainConfig
+from stlc.cli.framework.app import main
+from stlc.cli.framework.pages import FOLDER, Example, read_page
+from stlc.controller.training.config import TrainConfig
 from stlc.diagnostics import CODES, StlcError
-from stlc.grammar.parser_tables import load_parser
+from stlc.grammar.parse.tables import load_parser
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = {code: read_page(code) for code in CODES}
@@ -124,14 +124,14 @@ def test_a_program(code, example, tmp_path, monkeypatch):
 
 # ---------------------------------------------------------------------- runs, commands, bugs
 
-WORLD = "from stlc.controller.world import ModelWorld\n\n\nclass Yard(ModelWorld):\n    pass\n"
+WORLD = "from stlc.controller.deployment.world import ModelWorld\n\n\nclass Yard(ModelWorld):\n    pass\n"
 
 
 def quicken(patch: pytest.MonkeyPatch) -> None:
     """Judge fewer states and decisions than a run is worth: only what is said matters here."""
-    patch.setattr("stlc.controller.config.TrainConfig", functools.partial(TrainConfig, held_out=64))
-    patch.setattr("stlc.controller.evaluate.LATENCY_SECONDS", 0.01)
-    patch.setattr("stlc.controller.trainer.MARGIN_STATES", 16)
+    patch.setattr("stlc.controller.training.config.TrainConfig", functools.partial(TrainConfig, held_out=64))
+    patch.setattr("stlc.controller.evaluation.deployment.LATENCY_SECONDS", 0.01)
+    patch.setattr("stlc.controller.training.learner.MARGIN_STATES", 16)
 
 
 @pytest.fixture(scope="module")
@@ -223,14 +223,14 @@ def arranged(monkeypatch, machine):
             case "R301":
                 monkeypatch.setattr("stlc.view.find_spec", no_package)
             case "R402":
-                monkeypatch.setattr("stlc.controller.policy.Mlp.candidates", no_number)
+                monkeypatch.setattr("stlc.controller.policies.policy.Mlp.candidates", no_number)
             case "R105":
                 monkeypatch.setattr("stlc.export.verify.PLAN", -1.0)  # nothing agrees as well as that
             case "R404":
                 path = Path("specs/cart.stl")
                 path.write_text(path.read_text().replace("abs(x) < 0.1 m", "x > 100 m"))
             case "R403":
-                monkeypatch.setattr("stlc.controller.ranks.PATIENCE", timedelta(seconds=0.1))
+                monkeypatch.setattr("stlc.controller.parallel.ddp.PATIENCE", timedelta(seconds=0.1))
                 for name, value in {**ENVIRONMENT, "RANK": 0, "MASTER_PORT": free_port()}.items():
                     monkeypatch.setenv(name, str(value))
 
@@ -297,8 +297,8 @@ def test_an_unknown_code(capsys):
 
 
 def test_precedence_is_that_of_the_grammar():
-    from stlc.grammar.parser import parse_expr
-    from stlc.grammar.printer import show
+    from stlc.grammar.parse.parser import parse_expr
+    from stlc.grammar.show.printer import show
     from stlc.source import Source
 
     for written, meant in [

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from walks import walk
 
-from stlc.cli.app import main
-from stlc.cli.plot import _with_units
-from stlc.grammar.parser import parse
+from stlc.cli.commands.plot import _with_units
+from stlc.cli.framework.app import main
+from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 from stlc.trace import load_trace, save_trace

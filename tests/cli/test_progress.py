@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from stlc.cli.progress import (
+from stlc.cli.train.progress import (
     BLOCKS,
     Progress,
     RunInfo,

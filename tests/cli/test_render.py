@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.cli.render import MAX_COLUMNS, render_text, to_json
+from stlc.cli.framework.render import MAX_COLUMNS, render_text, to_json
 from stlc.diagnostics import Diagnostic, Fix, Label
 from stlc.source import Source, Span
 

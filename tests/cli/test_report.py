@@ -6,8 +6,8 @@ import pytest
 from documents import misfits
 
 import stlc.view
-from stlc.cli.app import main
-from stlc.cli.schema import load_schema
+from stlc.cli.commands.schema import load_schema
+from stlc.cli.framework.app import main
 from stlc.rundir import RunDir
 
 

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 from documents import misfits
 
-from stlc.cli.app import main
-from stlc.cli.schema import load_schema
-from stlc.cli.simulate_text import screen
-from stlc.controller.worlds import Worlds
-from stlc.dynamics.scenario import DISTURBED
+from stlc.cli.commands.schema import load_schema
+from stlc.cli.framework.app import main
+from stlc.cli.simulate.text import screen
+from stlc.controller.deployment.batched import Worlds
+from stlc.dynamics.scenarios.scenario import DISTURBED
 from stlc.monitor.verdict import Monitor
 from stlc.rundir import RunDir
 from stlc.trace import load_trace
@@ -40,7 +40,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def there(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> RunDir:
     monkeypatch.chdir(home)
-    monkeypatch.setattr("stlc.controller.evaluate.LATENCY_SECONDS", 0.2)
+    monkeypatch.setattr("stlc.controller.evaluation.deployment.LATENCY_SECONDS", 0.2)
     capsys.readouterr()
     return RunDir.newest()
 
@@ -364,7 +364,7 @@ def test_an_interruption_while_it_is_judged_keeps_everything(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(
-        "stlc.controller.evaluate.judge_executed", lambda *_: signal.raise_signal(signal.SIGINT)
+        "stlc.controller.evaluation.deployment.judge_executed", lambda *_: signal.raise_signal(signal.SIGINT)
     )
     assert main(["simulate", *SMALL]) == 130
     assert "the first 6 steps are in" in capsys.readouterr().err

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.cli.app import main
-from stlc.controller.checkpoint import load_checkpoint, save_checkpoint
-from stlc.controller.run import spec_hash, system_hash
+from stlc.cli.framework.app import main
+from stlc.controller.training.checkpoint import load_checkpoint, save_checkpoint
+from stlc.controller.training.run import spec_hash, system_hash
 from stlc.rundir import RunDir
 from stlc.trace import load_trace
 
@@ -82,7 +82,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def run(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> RunDir:
     monkeypatch.chdir(home)
-    monkeypatch.setattr("stlc.controller.evaluate.LATENCY_SECONDS", 0.01)
+    monkeypatch.setattr("stlc.controller.evaluation.deployment.LATENCY_SECONDS", 0.01)
     capsys.readouterr()
     found = RunDir.newest()
     (found.path / "trace.npz").unlink(missing_ok=True)

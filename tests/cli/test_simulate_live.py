@@ -11,15 +11,15 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from stlc.cli.simulate_live import LiveView, _fitting, _shown, _signed
-from stlc.controller.deploy import Guard, Mode
-from stlc.controller.drive import Recorder, Setting, drive
-from stlc.controller.oversight import Oversight
-from stlc.controller.task import Task
-from stlc.controller.world import world_type
-from stlc.dynamics.schema import parse_system
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.cli.simulate.live import LiveView, _fitting, _shown, _signed
+from stlc.controller.deployment.live import Oversight
+from stlc.controller.deployment.simulator import Recorder, Setting, drive
+from stlc.controller.deployment.world import world_type
+from stlc.controller.guard.guard import Guard, Mode
+from stlc.controller.problem.task import Task
+from stlc.dynamics.model.system import System
+from stlc.dynamics.schema.schema import parse_system
+from stlc.grammar.parse.parser import parse
 from stlc.signature import Column
 from stlc.source import Source
 

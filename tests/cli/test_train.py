@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from documents import misfits
 
-from stlc.cli.app import main
-from stlc.cli.schema import load_schema
-from stlc.controller.trainer import Trainer
+from stlc.cli.commands.schema import load_schema
+from stlc.cli.framework.app import main
+from stlc.controller.training.learner import Trainer
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[2]

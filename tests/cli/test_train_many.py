@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from documents import misfits
 
-from stlc.cli.app import main
-from stlc.cli.schema import load_schema
-from stlc.controller.sweep import Errand, Returned
+from stlc.cli.commands.schema import load_schema
+from stlc.cli.framework.app import main
+from stlc.controller.parallel.jobs import Errand, Returned
 from stlc.rundir import every_run
 
 ROOT = Path(__file__).parents[2]
@@ -56,7 +56,7 @@ def test_the_table_has_a_line_for_each_and_the_mean_of_those_that_ended_well(
             begun(errand)
             yield returned(errand, int(errand.arguments[errand.arguments.index("--seed") + 1]), ended)
 
-    monkeypatch.setattr("stlc.controller.sweep.side_by_side", pretended)
+    monkeypatch.setattr("stlc.controller.parallel.jobs.side_by_side", pretended)
     assert main(["train", SPEC, "--seeds", "0..2", "--jobs", "3", "--steps", "2"]) == code
     told = capsys.readouterr()
     header, *lines = told.out.splitlines()
@@ -93,7 +93,7 @@ def test_the_table_of_several_specifications_has_a_mean_for_each(
             begun(errand)
             yield returned(errand, int(errand.arguments[errand.arguments.index("--seed") + 1]), 3)
 
-    monkeypatch.setattr("stlc.controller.sweep.side_by_side", pretended)
+    monkeypatch.setattr("stlc.controller.parallel.jobs.side_by_side", pretended)
     assert main(["train", "a.stl", "b.stl", "a.stl", "--seeds", "0..2", "--steps", "2"]) == 3
     header, *lines = capsys.readouterr().out.splitlines()
     assert header.split()[:2] == ["specification", "seed"]

@@ -10,12 +10,12 @@ from formula_strategies import NAMES, numbers, state_formulas
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile import ir
-from stlc.compile.arith import Program
-from stlc.compile.functions import FUNCTIONS
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.ops_torch import TORCH
-from stlc.compile.switch import Hard, StraightThrough, Switch, Tanh
+from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.functions import FUNCTIONS
+from stlc.compile.semantics.switch import Hard, StraightThrough, Switch, Tanh
 
 X, Y, Z = (ir.Col(name) for name in NAMES)
 

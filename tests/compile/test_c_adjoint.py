@@ -7,8 +7,8 @@ import pytest
 from emitted import OPERATIONS, STEPS, adjoint_of, choosing, gradients_agree, near_switches, slopes_agree
 from formula_strategies import NAMES
 
-from stlc.compile import ir
-from stlc.compile.emit_c import Motion
+from stlc.compile.backends.c.emit import Motion
+from stlc.compile.ir import nodes as ir
 from stlc.native import Outcome, compiler
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="there is no C compiler here")

@@ -23,12 +23,13 @@ from emitted import (
 from formula_strategies import NAMES, formulas
 
 from stlc import native
-from stlc.compile import c_families, ir
-from stlc.compile.c_adjoint import emit_adjoint
-from stlc.compile.c_families import families
-from stlc.compile.c_plan import plan_of
-from stlc.compile.c_steps import Tabled
-from stlc.compile.emit_c import emit
+from stlc.compile.backends.c import families as c_families
+from stlc.compile.backends.c.adjoint import emit_adjoint
+from stlc.compile.backends.c.emit import emit
+from stlc.compile.backends.c.families import families
+from stlc.compile.backends.c.plan import plan_of
+from stlc.compile.backends.c.steps import Tabled
+from stlc.compile.ir import nodes as ir
 from stlc.native import Outcome
 
 X, Y, Z = (ir.Col(name) for name in NAMES)

@@ -19,12 +19,12 @@ from emitted import (
 from formula_strategies import NAMES, formulas
 
 from stlc import native
-from stlc.compile import ir
-from stlc.compile.c_plan import plan_of
-from stlc.compile.emit_c import emit
-from stlc.compile.graph import evaluate
-from stlc.compile.horizon import nodes
-from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.c.emit import emit
+from stlc.compile.backends.c.plan import plan_of
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.horizon import nodes
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
 

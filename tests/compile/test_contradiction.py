@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from stlc.compile.interface import Grid
+from stlc.compile.frontend.interface import Grid
 from stlc.compile.pipeline import compile_spec
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 

@@ -12,9 +12,9 @@ from emitted import OPERATIONS, STEPS, follower, values_agree
 from formula_strategies import NAMES
 
 from stlc import native
-from stlc.compile import ir
-from stlc.compile.c_numbers import Untranslatable
-from stlc.compile.emit_c import emit
+from stlc.compile.backends.c.emit import emit
+from stlc.compile.backends.c.numbers import Untranslatable
+from stlc.compile.ir import nodes as ir
 from stlc.native import compiler
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="there is no C compiler here")

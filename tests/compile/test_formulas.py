@@ -6,12 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from resolving import HEAD, formula, state
 
-from stlc.compile import ir, typed
-from stlc.compile.conditions import condition
-from stlc.compile.formulas import resolve_state_formula
-from stlc.compile.scope import Scope, column_entries
+from stlc.compile.frontend.formulas import resolve_state_formula
+from stlc.compile.frontend.scope import Scope, column_entries
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.conditions import condition
 from stlc.diagnostics import SystemFileError
-from stlc.grammar.parser import parse_expr
+from stlc.grammar.parse.parser import parse_expr
 from stlc.signature import Column
 from stlc.source import Source
 from stlc.units import parse_unit

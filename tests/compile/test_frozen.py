@@ -11,12 +11,14 @@ from formula_strategies import GRID, SPAN, formulas, traces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile import frozen, ir, typed
-from stlc.compile.graph import evaluate, robustness_signal
-from stlc.compile.lower import lower
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.ops_torch import TORCH
-from stlc.compile.simplify import simplify
+from stlc.compile.backends.array.graph import evaluate, robustness_signal
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.lowering.lower import lower
+from stlc.compile.lowering.simplify import simplify
+from stlc.compile.schedule import frozen
 
 Env = dict[str, np.ndarray]
 

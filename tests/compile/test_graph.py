@@ -11,15 +11,16 @@ from formula_strategies import GRID, NAMES, formulas, traces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile import ir, typed
-from stlc.compile.graph import RobustnessGraph, evaluate, planned, robustness_signal
-from stlc.compile.horizon import nodes, parts
-from stlc.compile.lower import lower
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.ops_torch import TORCH
-from stlc.compile.schedule import Extent, Run
-from stlc.compile.semantics import Exact, LogSumExp, Semantics
-from stlc.compile.simplify import simplify
+from stlc.compile.backends.array.graph import RobustnessGraph, evaluate, planned, robustness_signal
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.horizon import nodes, parts
+from stlc.compile.lowering.lower import lower
+from stlc.compile.lowering.simplify import simplify
+from stlc.compile.schedule.schedule import Extent, Run
+from stlc.compile.semantics.semantics import Exact, LogSumExp, Semantics
 from stlc.signature import Column, Signature
 
 Env = dict[str, np.ndarray]

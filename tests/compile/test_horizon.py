@@ -5,12 +5,13 @@ import pytest
 from formula_strategies import GRID, formulas, traces
 from hypothesis import given, settings
 
-from stlc.compile import ir, typed
-from stlc.compile.defined import defined
-from stlc.compile.graph import robustness_signal
-from stlc.compile.horizon import columns, nodes, reach, uses_end
-from stlc.compile.lower import lower
-from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.backends.array.graph import robustness_signal
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.defined import defined
+from stlc.compile.ir.horizon import columns, nodes, reach, uses_end
+from stlc.compile.lowering.lower import lower
 
 P, Q = ir.Atom(ir.Col("p")), ir.Atom(ir.Col("q"))
 

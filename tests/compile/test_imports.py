@@ -12,19 +12,19 @@ import reference
 from formula_strategies import GRID, traces
 from hypothesis import given, settings
 
-from stlc.compile import typed
-from stlc.compile.graph import robustness_signal
-from stlc.compile.interface import Grid
-from stlc.compile.lower import lower
-from stlc.compile.modules import file_of, library_of, spec_sha256
-from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.backends.array.graph import robustness_signal
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.frontend.interface import Grid
+from stlc.compile.frontend.modules import file_of, library_of, spec_sha256
+from stlc.compile.frontend.resolve import resolve
+from stlc.compile.ir import typed
+from stlc.compile.lowering.lower import lower
 from stlc.compile.pipeline import compile_spec
-from stlc.compile.resolve import resolve
 from stlc.diagnostics import Diagnostic, SpecError, StlcError
 from stlc.files import read_source
 from stlc.grammar import ast
-from stlc.grammar.parser import parse
-from stlc.monitor.explain import explain
+from stlc.grammar.parse.parser import parse
+from stlc.monitor.explain.report import explain
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 from stlc.trace import Trace, TraceMeta, load_trace, save_trace
@@ -215,7 +215,7 @@ def test_a_bare_time_takes_the_unit_of_the_file_that_calls() -> None:
 
 
 def test_the_library_documents_every_pattern() -> None:
-    from stlc.compile import modules
+    from stlc.compile.frontend import modules
 
     spec = parse(read_source(modules._STD_FILE))
     assert all(isinstance(item, ast.Def) and item.doc for item in spec.items)

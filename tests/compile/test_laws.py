@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from laws import ALL, LAWS, Formula, defined, logic, steps, windowed
 
-from stlc.compile import ir, typed
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
 
 short = traces(high=9, batch=1)
 

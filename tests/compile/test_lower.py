@@ -8,14 +8,15 @@ import pytest
 from effort import effort
 from formula_strategies import GRID, SPAN
 
-from stlc.compile import ir, typed
-from stlc.compile.defined import defined
-from stlc.compile.graph import robustness_signal
-from stlc.compile.horizon import reach
-from stlc.compile.interface import Grid
-from stlc.compile.ir_text import show_formula
-from stlc.compile.lower import lower
-from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.backends.array.graph import robustness_signal
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.defined import defined
+from stlc.compile.ir.horizon import reach
+from stlc.compile.ir.text import show_formula
+from stlc.compile.lowering.lower import lower
 from stlc.diagnostics import Diagnostic
 
 X = typed.Pred(SPAN, ir.Col("x"), strict=True)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from resolving import codes, findings, formula, spec
 
-from stlc.compile import typed
+from stlc.compile.ir import typed
 
 DEFS = """
 const k = 2

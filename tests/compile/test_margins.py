@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.compile import ir
-from stlc.compile.margins import in_unit
-from stlc.monitor.explain import explain
-from stlc.monitor.online import How
+from stlc.compile.analysis.margins import in_unit
+from stlc.compile.ir import nodes as ir
+from stlc.monitor.explain.report import explain
+from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor
 from stlc.units import parse_unit
 
@@ -100,8 +100,8 @@ numbers = st.recursive(
 
 @given(num=numbers, x=st.floats(-1e3, 1e3))
 def test_a_number_in_a_unit_is_the_number_over_its_scale(num: ir.Num, x: float) -> None:
-    from stlc.compile.graph import evaluate
-    from stlc.compile.ops_numpy import NUMPY
+    from stlc.compile.backends.array.graph import evaluate
+    from stlc.compile.backends.array.numpy_ops import NUMPY
 
     unit = parse_unit("km/h")
     env = {"x": np.array([[x]])}

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from mission_strategies import bodies, missions, nested
 from proof.missions import check_margins, check_mission, check_nested, check_past, check_recorded
 
-from stlc.compile import typed
+from stlc.compile.ir import typed
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from resolving import codes, formula
 
-from stlc.compile import typed
-from stlc.compile.typed import Time
+from stlc.compile.ir import typed
+from stlc.compile.ir.typed import Time
 
 
 def interval(

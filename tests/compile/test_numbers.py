@@ -9,10 +9,8 @@ import reference
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from stlc.compile import ir
-from stlc.compile.functions import FUNCTIONS
-from stlc.compile.numbers import Number, resolve_number, resolve_numbers, stored
-from stlc.compile.scope import (
+from stlc.compile.frontend.numbers import Number, resolve_number, resolve_numbers, stored
+from stlc.compile.frontend.scope import (
     Definition,
     Scope,
     column_entries,
@@ -20,8 +18,10 @@ from stlc.compile.scope import (
     enforced,
     member_entries,
 )
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.functions import FUNCTIONS
 from stlc.diagnostics import SpecError, StlcError, SystemFileError
-from stlc.grammar.parser import parse_expr
+from stlc.grammar.parse.parser import parse_expr
 from stlc.signature import Column
 from stlc.source import Source
 from stlc.units import DIMENSIONLESS, parse_unit, same_dims

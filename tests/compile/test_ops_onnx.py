@@ -9,11 +9,11 @@ from emitted import OPERATIONS
 from formula_strategies import NAMES
 from sheets import columns_on, computed
 
-from stlc.compile import ir
-from stlc.compile.arith import Program
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.ops_onnx import ONNX
-from stlc.compile.sheet import Sheet
+from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.onnx.ops import ONNX
+from stlc.compile.backends.onnx.sheet import Sheet
+from stlc.compile.ir import nodes as ir
 
 ROWS = 7
 

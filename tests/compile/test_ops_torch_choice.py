@@ -7,9 +7,9 @@ from functools import reduce
 import pytest
 import torch
 
-from stlc.compile.extremum import Pick
-from stlc.compile.ops_torch import TORCH
-from stlc.compile.ops_torch_choice import choice, reduction
+from stlc.compile.backends.array.extremum import Pick
+from stlc.compile.backends.torch.choice import choice, reduction
+from stlc.compile.backends.torch.ops import TORCH
 
 SHAPES = [(2, 3), (40, 700)]
 

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from stlc import native
-from stlc.compile import ops_torch_kernel
-from stlc.compile.extremum import Pick, Sliding
-from stlc.compile.ops_torch import TORCH
-from stlc.compile.ops_torch_kernel import by_kernel
-from stlc.compile.semantics import Exact
-from stlc.compile.windows import Windows
+from stlc.compile.backends.array.extremum import Pick, Sliding
+from stlc.compile.backends.array.windows import Windows
+from stlc.compile.backends.torch import kernel as ops_torch_kernel
+from stlc.compile.backends.torch.kernel import by_kernel
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.semantics.semantics import Exact
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from mission_strategies import augmented
 
-from stlc.compile import ir
-from stlc.compile.arith import Program
+from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.dump import dump
-from stlc.compile.graph import evaluate
-from stlc.compile.interface import Grid
-from stlc.compile.ir_text import show_formula
-from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.text import show_formula
 from stlc.compile.pipeline import Compiled, Purpose, compile_spec
 from stlc.diagnostics import SpecError
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 ROOT = Path(__file__).parents[2]
@@ -285,9 +285,9 @@ def test_numbers_read_like_mathematics() -> None:
 def test_torch_is_not_needed() -> None:
     code = (
         "import sys; from pathlib import Path; from fractions import Fraction\n"
-        "from stlc.grammar.parser import parse; from stlc.source import Source\n"
-        "from stlc.compile.pipeline import compile_spec; from stlc.compile.interface import Grid\n"
-        "from stlc.compile.dump import dump; import stlc.compile.graph\n"
+        "from stlc.grammar.parse.parser import parse; from stlc.source import Source\n"
+        "from stlc.compile.pipeline import compile_spec; from stlc.compile.frontend.interface import Grid\n"
+        "from stlc.compile.dump import dump; import stlc.compile.backends.array.graph\n"
         "text = Path('specs/traffic.stl').read_text()\n"
         "dump(compile_spec(parse(Source('a', text)), grid=Grid(Fraction(1, 10), 25)))\n"
         "sys.exit('torch' in sys.modules)"

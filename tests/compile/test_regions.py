@@ -8,8 +8,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from resolving import margin
 
-from stlc.compile import ir
-from stlc.compile.polygons import area, simple
+from stlc.compile.frontend.polygons import area, simple
+from stlc.compile.ir import nodes as ir
 
 L_SHAPE = ((0.0, 0.0), (4.0, 0.0), (4.0, 1.0), (1.0, 1.0), (1.0, 3.0), (0.0, 3.0))
 SQUARE = ((0.0, 0.0), (2.0, 0.0), (2.0, 2.0), (0.0, 2.0))

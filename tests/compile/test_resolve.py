@@ -9,9 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from resolving import codes, findings, formula, spec
 
-from stlc.compile import ir, typed
-from stlc.compile.interface import Interface
-from stlc.compile.typed import Time
+from stlc.compile.frontend.interface import Interface
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.typed import Time
 from stlc.diagnostics import SpecError, UsageError
 from stlc.signature import Column, Signature
 from stlc.units import parse_unit

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from stlc.cli.render import render_text
-from stlc.compile.interface import Interface
-from stlc.compile.resolve import resolve
+from stlc.cli.framework.render import render_text
+from stlc.compile.frontend.interface import Interface
+from stlc.compile.frontend.resolve import resolve
 from stlc.diagnostics import CODES, Diagnostic, SpecError
-from stlc.grammar.parser import MAX_ERRORS, parse
+from stlc.grammar.parse.parser import MAX_ERRORS, parse
 from stlc.signature import Column, Signature
 from stlc.source import Source
 from stlc.units import parse_unit

@@ -8,9 +8,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from resolving import HEAD
 
-from stlc.compile.resolve import resolve
+from stlc.compile.frontend.resolve import resolve
 from stlc.diagnostics import CODES, Diagnostic, SpecError
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 DEFS = """

@@ -11,13 +11,13 @@ from formula_strategies import GRID, formulas, traces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile import typed
-from stlc.compile.graph import robustness_signal
-from stlc.compile.lower import lower
-from stlc.compile.ops import Ops
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.ops_torch import TORCH
-from stlc.compile.semantics import (
+from stlc.compile.backends.array.graph import robustness_signal
+from stlc.compile.backends.array.namespace import Ops
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.ir import typed
+from stlc.compile.lowering.lower import lower
+from stlc.compile.semantics.semantics import (
     SEMANTICS,
     TOLERANCE,
     ArithmeticGeometricMean,

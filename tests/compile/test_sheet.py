@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from sheets import computed
 
-from stlc.compile import sheet as sheets
-from stlc.compile.sheet import BATCH, Sheet, joined
+from stlc.compile.backends.onnx import sheet as sheets
+from stlc.compile.backends.onnx.sheet import BATCH, Sheet, joined
 
 ARRAY = np.arange(15.0).reshape(5, 3) - 4.0
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from stlc.compile import ir
-from stlc.compile.simplify import simplify
+from stlc.compile.ir import nodes as ir
+from stlc.compile.lowering.simplify import simplify
 
 P, Q, R = (ir.Atom(ir.Col(name)) for name in "pqr")
 TRUE, FALSE = ir.Truth(True), ir.Truth(False)

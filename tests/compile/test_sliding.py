@@ -11,15 +11,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile import extremum, scans
-from stlc.compile.extremum import Pick, Sliding
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.ops_torch import TORCH
-from stlc.compile.ops_torch_small import block_extrema, small_extrema, small_until
-from stlc.compile.ops_torch_windows import SlidingExtremum, SlidingUntil
-from stlc.compile.semantics import Exact
-from stlc.compile.sliding import Asked, extrema, until
-from stlc.compile.windows import Windows
+from stlc.compile.backends.array import extremum, scans
+from stlc.compile.backends.array.extremum import Pick, Sliding
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.array.sliding import Asked, extrema, until
+from stlc.compile.backends.array.windows import Windows
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.backends.torch.small import block_extrema, small_extrema, small_until
+from stlc.compile.backends.torch.windows import SlidingExtremum, SlidingUntil
+from stlc.compile.semantics.semantics import Exact
 
 BOTH = pytest.mark.parametrize("pick", ["min", "max"])
 

@@ -12,12 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from resolving import formula, margin
 
-from stlc.compile import ir, typed
-from stlc.compile.graph import evaluate, robustness_signal
-from stlc.compile.interface import Grid
-from stlc.compile.lower import lower
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.ops_torch import TORCH
+from stlc.compile.backends.array.graph import evaluate, robustness_signal
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.lowering.lower import lower
 
 GRID = Grid()
 L_SHAPE = "polygon([0, 0], [4, 0], [4, 1], [1, 1], [1, 3], [0, 3])"

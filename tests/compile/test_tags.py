@@ -10,15 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from resolving import codes, formula, spec
 
-from stlc.compile import typed
-from stlc.compile.graph import evaluate
-from stlc.compile.interface import Grid
-from stlc.compile.lower import lower
-from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir import typed
+from stlc.compile.ir.samples import columns_of
+from stlc.compile.ir.traverse import nodes
+from stlc.compile.lowering.lower import lower
 from stlc.compile.pipeline import compile_spec
-from stlc.compile.samples import columns_of
-from stlc.compile.walk import nodes
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 SIGNALS = """

@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from stlc.compile import ir, schedule
-from stlc.compile.graph import MAX_BEYOND, evaluate, planned
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.schedule import Extent, Run
-from stlc.compile.semantics import SEMANTICS, semantics_of
+from stlc.compile.backends.array.graph import MAX_BEYOND, evaluate, planned
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir import nodes as ir
+from stlc.compile.schedule import schedule
+from stlc.compile.schedule.schedule import Extent, Run
+from stlc.compile.semantics.semantics import SEMANTICS, semantics_of
 from stlc.diagnostics import StlcError
 
 Env = dict[str, np.ndarray]

@@ -8,13 +8,13 @@ from emitted import STEPS, gathered, planned, traces_of
 from formula_strategies import NAMES, formulas
 from sheets import columns_on, computed
 
-from stlc.compile import ir
-from stlc.compile.c_numbers import Untranslatable
-from stlc.compile.graph import evaluate
-from stlc.compile.horizon import nodes
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.sheet import Sheet
-from stlc.compile.unrolled import written
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.array.unrolled import written
+from stlc.compile.backends.c.numbers import Untranslatable
+from stlc.compile.backends.onnx.sheet import Sheet
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.horizon import nodes
 
 X, Y, Z = (ir.Atom(ir.Col(name)) for name in NAMES)
 

@@ -9,10 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile import windows as module
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.semantics import ArithmeticGeometricMean, Exact, GeneralizedMean, LogSumExp, Pick, Semantics
-from stlc.compile.windows import Windows
+from stlc.compile.backends.array import windows as module
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.array.windows import Windows
+from stlc.compile.semantics.semantics import (
+    ArithmeticGeometricMean,
+    Exact,
+    GeneralizedMean,
+    LogSumExp,
+    Pick,
+    Semantics,
+)
 
 
 @pytest.mark.parametrize(

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from stlc.controller.config import TrainConfig
-from stlc.controller.launch import Launch, open_folder
-from stlc.controller.task import Task
-from stlc.dynamics.system import System
+from stlc.controller.problem.task import Task
+from stlc.controller.training.config import TrainConfig
+from stlc.controller.training.launch import Launch, open_folder
+from stlc.dynamics.model.system import System
 from stlc.files import read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[2]

@@ -10,12 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.controller import ascent
-from stlc.controller.ascent import APART, KEPT, Ascent
-from stlc.controller.task import Task
-from stlc.dynamics.system import System
+from stlc.controller.guard import gradient_refine as ascent
+from stlc.controller.guard.gradient_refine import APART, KEPT, Ascent
+from stlc.controller.problem.task import Task
+from stlc.dynamics.model.system import System
 from stlc.files import read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from tests.controller.test_backup import F64, failing
 
 ROOT = Path(__file__).parents[2]

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from stlc.controller.backup import Backup, best, finite, grid_of
-from stlc.controller.prefix import prefix_robustness
-from stlc.controller.task import Task
+from stlc.controller.guard.safe_prefix import prefix_robustness
+from stlc.controller.guard.shooting import Backup, best, finite, grid_of
+from stlc.controller.problem.task import Task
 from stlc.runtime.prefixes import Grid
 
 F64 = torch.float64
@@ -198,7 +198,7 @@ def test_prefix_robustness_is_the_bound_over_continuations(car_task: Task, seed:
 
 
 def _torch() -> object:
-    from stlc.compile.ops_torch import TORCH
+    from stlc.compile.backends.torch.ops import TORCH
 
     return TORCH
 

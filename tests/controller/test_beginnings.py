@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from stlc.controller.beginnings import Beginnings
-from stlc.controller.task import Task
+from stlc.controller.guard.sampled_shooting import Beginnings
+from stlc.controller.problem.task import Task
 from stlc.runtime.prefixes import Grid
 from tests.controller.test_backup import F64, Constant, grid
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.controller.checkpoint import load_checkpoint, restoring, save_checkpoint
-from stlc.controller.run import load_engine
+from stlc.controller.training.checkpoint import load_checkpoint, restoring, save_checkpoint
+from stlc.controller.training.run import load_engine
 from stlc.diagnostics import MissingError, RunError
 from stlc.provenance import sha256
 from stlc.rundir import RunDir

@@ -10,16 +10,16 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.controller.closed_loop import LEAST, NEAR, SEED, ClosedLoop, Share, closed_loop, reserve
-from stlc.controller.config import DRIVES, HELD_OUT_SEED, TrainConfig, decide
-from stlc.controller.launch import Launch, open_folder
-from stlc.controller.policy import Mlp, network_of
-from stlc.controller.run import Run
-from stlc.controller.task import Task
-from stlc.controller.train import train
-from stlc.dynamics.system import System
+from stlc.controller.evaluation.closed_loop import LEAST, NEAR, SEED, ClosedLoop, Share, closed_loop, reserve
+from stlc.controller.policies.policy import Mlp, network_of
+from stlc.controller.problem.task import Task
+from stlc.controller.training.config import DRIVES, HELD_OUT_SEED, TrainConfig, decide
+from stlc.controller.training.launch import Launch, open_folder
+from stlc.controller.training.loop import train
+from stlc.controller.training.run import Run
+from stlc.dynamics.model.system import System
 from stlc.files import read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.view.learning import Commands, driven_lines, recommended
 
 ROOT = Path(__file__).parents[2]

@@ -7,14 +7,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from stlc.controller.closest import Closest
-from stlc.controller.deploy import Decision, Guard
-from stlc.controller.polish import POLISHED, FullBackup, Limits
-from stlc.controller.spare import sparing
-from stlc.controller.task import Task
-from stlc.dynamics.schema import parse_system
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.controller.guard.guard import Decision, Guard
+from stlc.controller.guard.plan_repair import POLISHED, FullBackup, Limits
+from stlc.controller.guard.relaxed import Closest
+from stlc.controller.guard.tightened import sparing
+from stlc.controller.problem.task import Task
+from stlc.dynamics.model.system import System
+from stlc.dynamics.schema.schema import parse_system
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 SYSTEM = """\

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from stlc.cli.app import main
-from stlc.controller.cluster import Cluster, on_cluster
-from stlc.controller.sweep import Errand
+from stlc.cli.framework.app import main
+from stlc.controller.parallel.jobs import Errand
+from stlc.controller.parallel.ray_cluster import Cluster, on_cluster
 from stlc.rundir import every_run
 
 ROOT = Path(__file__).parents[2]

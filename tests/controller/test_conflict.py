@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from stlc.controller.conflict import conflict, refuted
-from stlc.controller.task import Task
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.controller.problem.task import Task
+from stlc.controller.training.conflict import conflict, refuted
+from stlc.dynamics.model.system import System
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 SYSTEM = """

@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.controller.deploy import Guard
-from stlc.controller.task import Task
+from stlc.controller.guard.guard import Guard
+from stlc.controller.problem.task import Task
 
 F64 = torch.float64
 

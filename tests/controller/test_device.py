@@ -12,13 +12,13 @@ import pytest
 import torch
 from elsewhere import AWAY, Elsewhere, Far
 
-from stlc.controller.checkpoint import load_checkpoint, save_checkpoint
-from stlc.controller.config import TrainConfig, decide
-from stlc.controller.task import Task
-from stlc.controller.trainer import Trainer
-from stlc.dynamics.system import System
+from stlc.controller.problem.task import Task
+from stlc.controller.training.checkpoint import load_checkpoint, save_checkpoint
+from stlc.controller.training.config import TrainConfig, decide
+from stlc.controller.training.learner import Trainer
+from stlc.dynamics.model.system import System
 from stlc.files import read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[2]

@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 from traffic_drivers import careful
 
-from stlc.controller.archive import save_scene, save_trace_of
-from stlc.controller.deploy import Decision, Guard
-from stlc.controller.drive import Recorder, Recording, Setting, drive
-from stlc.controller.evaluate import (
+from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
+from stlc.controller.evaluation.archive import save_scene, save_trace_of
+from stlc.controller.evaluation.deployment import (
     METRICS,
     InterruptedDeploymentError,
     as_json,
@@ -23,12 +22,13 @@ from stlc.controller.evaluate import (
     feasible_states,
     measure,
 )
-from stlc.controller.executed import judge_executed
-from stlc.controller.intervals import Interval, student
-from stlc.controller.policy import Mlp
-from stlc.controller.run import Run
-from stlc.controller.savable import solvable
-from stlc.controller.task import Task
+from stlc.controller.evaluation.executed import judge_executed
+from stlc.controller.evaluation.stats import Interval, student
+from stlc.controller.guard.feasibility import solvable
+from stlc.controller.guard.guard import Decision, Guard
+from stlc.controller.policies.policy import Mlp
+from stlc.controller.problem.task import Task
+from stlc.controller.training.run import Run
 from stlc.diagnostics import MissingError, RunError, SystemFileError
 from stlc.monitor.verdict import Monitor
 from stlc.rundir import RunDir
@@ -51,7 +51,7 @@ class Careful:
 
 @pytest.fixture(scope="module")
 def recorded(car_task: Task) -> Recording:
-    from stlc.controller.world import world_type
+    from stlc.controller.deployment.world import world_type
 
     recorder = Recorder(SETTING.agents)
     drive(Guard(car_task, Careful(car_task)), world_type(car_task.system.decl), SETTING, recorder)
@@ -191,7 +191,9 @@ class Failing:
 def test_a_world_that_fails_leaves_what_happened_until_then(
     car_task: Task, monkeypatch: pytest.MonkeyPatch, how: str, code: str
 ) -> None:
-    monkeypatch.setattr("stlc.controller.evaluate.world_type", lambda _decl: Failing(how, 5, car_task))
+    monkeypatch.setattr(
+        "stlc.controller.evaluation.deployment.world_type", lambda _decl: Failing(how, 5, car_task)
+    )
     with pytest.raises(InterruptedDeploymentError) as caught:
         deploy(car_task, Careful(car_task), Setting((0,), 4, 10), "none")
     cause = caught.value.__cause__

@@ -7,15 +7,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stlc.compile import ir
-from stlc.compile.semantics import TOLERANCE
-from stlc.controller.config import TrainConfig, decide
-from stlc.controller.explore import Exploration, pieces
-from stlc.controller.search import Searcher
-from stlc.controller.task import Task
-from stlc.controller.trainer import Look, Trainer
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.compile.ir import nodes as ir
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.problem.task import Task
+from stlc.controller.training.config import TrainConfig, decide
+from stlc.controller.training.exploration import Exploration, pieces
+from stlc.controller.training.learner import Look, Trainer
+from stlc.controller.training.local_search import Searcher
+from stlc.dynamics.model.system import System
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 SYSTEM = """
@@ -99,8 +99,8 @@ def test_one_sweep_is_made_where_there_is_no_time(puzzle: Task) -> None:
 def test_a_training_explores_where_climbing_leads_nowhere(
     puzzle: Task, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stlc.controller.trainer.MARGIN_STATES", 8)
-    monkeypatch.setattr("stlc.controller.trainer.BARREN", 2.0)  # whatever a climb solves
+    monkeypatch.setattr("stlc.controller.training.learner.MARGIN_STATES", 8)
+    monkeypatch.setattr("stlc.controller.training.learner.BARREN", 2.0)  # whatever a climb solves
     engine = replace(decide(puzzle, TrainConfig(seed=0, batch=8, threads=1)), pool=16, most=8, every=1)
     trainer = Trainer(puzzle, engine, steps=8, device=torch.device("cpu"))
     looks: list[Look] = []

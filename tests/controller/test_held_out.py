@@ -6,14 +6,14 @@ from pathlib import Path
 
 import torch
 
-from stlc.controller.config import HELD_OUT_SEED, TrainConfig, decide
-from stlc.controller.held_out import save_states, score
-from stlc.controller.policy import Mlp, PlanNetwork
-from stlc.controller.savable import solvable
-from stlc.controller.task import Task, satisfied
-from stlc.dynamics.system import System
+from stlc.controller.evaluation.held_out import save_states, score
+from stlc.controller.guard.feasibility import solvable
+from stlc.controller.policies.policy import Mlp, PlanNetwork
+from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.training.config import HELD_OUT_SEED, TrainConfig, decide
+from stlc.dynamics.model.system import System
 from stlc.files import read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.view.held_out import load_held_out, unsolved_text
 
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.controller.config import TrainConfig
-from stlc.controller.launch import Launch, open_folder
-from stlc.controller.run import load_task, spec_hash
-from stlc.controller.task import Task
-from stlc.dynamics.system import System
+from stlc.controller.problem.task import Task
+from stlc.controller.training.config import TrainConfig
+from stlc.controller.training.launch import Launch, open_folder
+from stlc.controller.training.run import load_task, spec_hash
+from stlc.dynamics.model.system import System
 from stlc.files import read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 
 DATA = Path(__file__).parent.parent / "data"
 

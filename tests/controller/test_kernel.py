@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from stlc import native
-from stlc.controller.kernel import NativeJudge
-from stlc.controller.task import Judged, Task
-from stlc.dynamics.system import System
+from stlc.controller.problem.kernel import NativeJudge
+from stlc.controller.problem.task import Judged, Task
+from stlc.dynamics.model.system import System
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
 

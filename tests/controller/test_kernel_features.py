@@ -11,13 +11,13 @@ from emitted import gathered
 from system_strategies import formulas, spec_of, systems
 
 from stlc import native
-from stlc.compile.ops_torch import TORCH
-from stlc.compile.switch import Hard, StraightThrough
-from stlc.controller.task import Task
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.semantics.switch import Hard, StraightThrough
+from stlc.controller.problem.task import Task
 from stlc.diagnostics import SpecError
-from stlc.dynamics.schema import parse_system
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.dynamics.model.system import System
+from stlc.dynamics.schema.schema import parse_system
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from stlc.cli.app import main
-from stlc.controller import logbook
-from stlc.controller.logbook import Logbook, find_writer
+from stlc.cli.framework.app import main
+from stlc.controller.training import tensorboard as logbook
+from stlc.controller.training.tensorboard import Logbook, find_writer
 from stlc.diagnostics import MissingError
 from stlc.rundir import RunDir
 

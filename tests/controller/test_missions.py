@@ -10,19 +10,19 @@ import torch
 from mission_strategies import augmented
 from torch import Tensor
 
-from stlc.compile.ops_torch import TORCH
-from stlc.controller.config import TrainConfig, decide
-from stlc.controller.deploy import Guard
-from stlc.controller.drive import Recorder, Recording, Setting, drive
-from stlc.controller.executed import judge_executed
-from stlc.controller.missions import GLIMPSES, POOL, ROUNDS, Missions, mission_steps, visited
-from stlc.controller.policy import Mlp, PlanNetwork
-from stlc.controller.supply import Draws
-from stlc.controller.task import Judged, Task
-from stlc.controller.trainer import Trainer
-from stlc.controller.world import ModelWorld
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
+from stlc.controller.deployment.world import ModelWorld
+from stlc.controller.evaluation.executed import judge_executed
+from stlc.controller.guard.guard import Guard
+from stlc.controller.policies.policy import Mlp, PlanNetwork
+from stlc.controller.problem.task import Judged, Task
+from stlc.controller.training.config import TrainConfig, decide
+from stlc.controller.training.learner import Trainer
+from stlc.controller.training.missions import GLIMPSES, POOL, ROUNDS, Missions, mission_steps, visited
+from stlc.controller.training.samplers import Draws
+from stlc.dynamics.model.system import System
+from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from stlc import native
-from stlc.controller.config import TrainConfig, decide
-from stlc.controller.natives import by_torch
-from stlc.controller.objective import guided_objective, loss
-from stlc.controller.task import Task
+from stlc.controller.problem.natives import by_torch
+from stlc.controller.problem.task import Task
+from stlc.controller.training.config import TrainConfig, decide
+from stlc.controller.training.objective import guided_objective, loss
 from stlc.diagnostics import Notice
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.dynamics.model.system import System
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
@@ -63,7 +63,7 @@ def test_the_paper_s_objective_a_device_and_a_missing_compiler(
     assert set(by_torch(car_task, engine, "cuda").values()) == {"the device is cuda"}
     fresh = Task(car_task.compiled, System(car_task.system.decl))
     monkeypatch.setattr(native, "compiler", lambda: None)
-    monkeypatch.setattr("stlc.controller.natives.compiler", lambda: None)
+    monkeypatch.setattr("stlc.controller.problem.natives.compiler", lambda: None)
     assert set(by_torch(fresh, engine, "cpu").values()) == {"there is no C compiler"}
     monkeypatch.undo()
     fresh = Task(car_task.compiled, System(car_task.system.decl))

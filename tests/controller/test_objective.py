@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from stlc import native
-from stlc.compile.switch import Hard, Tanh
-from stlc.controller.objective import Objective, guided_objective, loss, paper_objective
-from stlc.controller.task import Task
-from stlc.dynamics.schema import parse_system
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.compile.semantics.switch import Hard, Tanh
+from stlc.controller.problem.task import Task
+from stlc.controller.training.objective import Objective, guided_objective, loss, paper_objective
+from stlc.dynamics.model.system import System
+from stlc.dynamics.schema.schema import parse_system
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 

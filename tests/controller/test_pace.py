@@ -16,10 +16,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.controller.checkpoint import load_checkpoint
-from stlc.controller.config import TrainConfig
-from stlc.controller.launch import Launch, open_folder
-from stlc.controller.pace import (
+from stlc.controller.problem.task import Task
+from stlc.controller.training.budget import (
     PROVISIONAL,
     Pace,
     Planned,
@@ -27,9 +25,11 @@ from stlc.controller.pace import (
     clock_of,
     verdict_reserve,
 )
-from stlc.controller.run import spec_hash, system_hash
-from stlc.controller.task import Task
-from stlc.controller.train import Watch, resume, train
+from stlc.controller.training.checkpoint import load_checkpoint
+from stlc.controller.training.config import TrainConfig
+from stlc.controller.training.launch import Launch, open_folder
+from stlc.controller.training.loop import Watch, resume, train
+from stlc.controller.training.run import spec_hash, system_hash
 from stlc.rundir import RunDir, every_run
 
 EVERY = 50
@@ -197,11 +197,11 @@ TINY = {"pool": 32, "every": 10, "most": 8, "hidden": (8,)}
 
 @pytest.fixture
 def ticking(monkeypatch: pytest.MonkeyPatch) -> None:
-    from stlc.controller import train as module
+    from stlc.controller.training import loop as module
 
     decided = module.decide
     monkeypatch.setattr(module, "decide", lambda task, config: replace(decided(task, config), **TINY))
-    monkeypatch.setattr("stlc.controller.trainer.MARGIN_STATES", 8)
+    monkeypatch.setattr("stlc.controller.training.learner.MARGIN_STATES", 8)
     monkeypatch.setattr(module, "clock_of", lambda _name: Ticks())
 
 

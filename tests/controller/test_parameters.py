@@ -10,21 +10,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stlc import native
-from stlc.compile.interface import Grid
+from stlc.compile.frontend.interface import Grid
 from stlc.compile.pipeline import compile_spec
-from stlc.controller.archive import save_trace_of
-from stlc.controller.config import TrainConfig
-from stlc.controller.drive import Setting
-from stlc.controller.evaluate import deploy
-from stlc.controller.kernel import NativeJudge
-from stlc.controller.launch import Launch, open_folder
-from stlc.controller.run import Run
-from stlc.controller.task import Task, satisfied
-from stlc.controller.train import train
+from stlc.controller.deployment.simulator import Setting
+from stlc.controller.evaluation.archive import save_trace_of
+from stlc.controller.evaluation.deployment import deploy
+from stlc.controller.problem.kernel import NativeJudge
+from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.training.config import TrainConfig
+from stlc.controller.training.launch import Launch, open_folder
+from stlc.controller.training.loop import train
+from stlc.controller.training.run import Run
 from stlc.diagnostics import StlcError, TraceError
-from stlc.dynamics.schema import parse_system
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.dynamics.model.system import System
+from stlc.dynamics.schema.schema import parse_system
+from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from stlc.controller.inputs import input_files
-from stlc.controller.parcel import Delivery, bring_home, carry, claimed, pack, unpack, wrap
-from stlc.controller.sweep import Errand, core_shares
+from stlc.controller.parallel.bundle import Delivery, bring_home, carry, claimed, pack, unpack, wrap
+from stlc.controller.parallel.jobs import Errand, core_shares
+from stlc.controller.training.inputs import input_files
 from stlc.rundir import RunDir, every_run
 
 ROOT = Path(__file__).parents[2]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from stlc.controller.policy import Mlp, PlanNetwork
-from stlc.controller.task import Task, rank
+from stlc.controller.policies.policy import Mlp, PlanNetwork
+from stlc.controller.problem.task import Task, rank
 
 
 def _policy(task: Task, plans: int) -> Mlp:

@@ -8,12 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.controller.ascent import Ascent
-from stlc.controller.backup import Backup
-from stlc.controller.deploy import SOURCES, Guard
-from stlc.controller.polish import POLISHED, FullBackup, Limits
-from stlc.controller.savable import safely, savable
-from stlc.controller.task import Task
+from stlc.controller.guard.feasibility import safely, savable
+from stlc.controller.guard.gradient_refine import Ascent
+from stlc.controller.guard.guard import SOURCES, Guard
+from stlc.controller.guard.plan_repair import POLISHED, FullBackup, Limits
+from stlc.controller.guard.shooting import Backup
+from stlc.controller.problem.task import Task
 from tests.controller.test_backup import F64, Constant, failing, grid
 
 QUICK = Limits(seconds=None, tries=256, drawn=30, places=2)

@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.controller.deploy import Guard
-from stlc.controller.promises import Promises
-from stlc.controller.task import KEPT, Task
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.controller.guard.guard import Guard
+from stlc.controller.problem.pending_goals import Promises
+from stlc.controller.problem.task import KEPT, Task
+from stlc.dynamics.model.system import System
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 LINE = """

@@ -15,14 +15,14 @@ import torch
 from several import together
 from torch import nn
 
-from stlc.controller.checkpoint import load_checkpoint
-from stlc.controller.config import TrainConfig
-from stlc.controller.launch import Launch, open_folder
-from stlc.controller.ranks import ALONE, Ranks, expected, joined
-from stlc.controller.run import spec_hash, system_hash
-from stlc.controller.task import Task
-from stlc.controller.train import Outcome, Watch, resume, train
-from stlc.controller.trainer import Trainer
+from stlc.controller.parallel.ddp import ALONE, Ranks, expected, joined
+from stlc.controller.problem.task import Task
+from stlc.controller.training.checkpoint import load_checkpoint
+from stlc.controller.training.config import TrainConfig
+from stlc.controller.training.launch import Launch, open_folder
+from stlc.controller.training.learner import Trainer
+from stlc.controller.training.loop import Outcome, Watch, resume, train
+from stlc.controller.training.run import spec_hash, system_hash
 from stlc.diagnostics import MissingError, StlcError, UsageError
 from stlc.rundir import RunDir, every_run
 
@@ -40,11 +40,11 @@ def _tensors(run: RunDir) -> dict[str, torch.Tensor]:
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch, car_task: Task) -> Task:
     """Traffic, and an engine that is through in a moment."""
-    from stlc.controller import train as module
+    from stlc.controller.training import loop as module
 
     decided = module.decide
     monkeypatch.setattr(module, "decide", lambda task, config: replace(decided(task, config), **TINY))
-    monkeypatch.setattr("stlc.controller.trainer.MARGIN_STATES", 8)
+    monkeypatch.setattr("stlc.controller.training.learner.MARGIN_STATES", 8)
     # what takes long is done before the ranks are forked
     importlib.import_module("torch._dynamo")
     assert car_task.gradient is not None
@@ -135,7 +135,7 @@ def test_a_run_of_two_that_was_stopped_equals_one_that_was_not(tiny: Task, tmp_p
 def test_a_rank_that_dies_is_told_and_costs_no_checkpoint(
     tiny: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stlc.controller.train.SAVE_EVERY", 5)
+    monkeypatch.setattr("stlc.controller.training.loop.SAVE_EVERY", 5)
     folder = open_folder(tiny, CONFIG, Launch(root=tmp_path))
     advance = Trainer.advance
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.controller.checkpoint import load_checkpoint
-from stlc.controller.run import spec_hash, system_hash
+from stlc.controller.training.checkpoint import load_checkpoint
+from stlc.controller.training.run import spec_hash, system_hash
 from stlc.rundir import RunDir, every_run
 
 ROOT = Path(__file__).parents[2]
@@ -24,7 +24,7 @@ import sys
 from stlc.controller import train, trainer
 train.SAVE_EVERY = 20
 trainer.MARGIN_STATES = 16
-from stlc.cli.app import main
+from stlc.cli.framework.app import main
 sys.exit(main(sys.argv[1:]))
 """
 

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 import torch
 
-from stlc.controller.config import TrainConfig
-from stlc.controller.drive import Recording
-from stlc.controller.launch import Launch, open_folder
-from stlc.controller.rules import Lost, Rules, drives_json, drives_of_plans, judge_drives, rules_of
-from stlc.controller.run import Run, load_task
-from stlc.controller.task import Task
+from stlc.controller.deployment.simulator import Recording
+from stlc.controller.evaluation.rules import Lost, Rules, drives_json, drives_of_plans, judge_drives, rules_of
+from stlc.controller.problem.task import Task
+from stlc.controller.training.config import TrainConfig
+from stlc.controller.training.launch import Launch, open_folder
+from stlc.controller.training.run import Run, load_task
 from stlc.diagnostics import RunError, SpecError, SystemFileError
-from stlc.dynamics.system import System
+from stlc.dynamics.model.system import System
 from stlc.files import read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.rundir import RunDir
 
 SYSTEM = """stlc: 1
@@ -236,7 +236,7 @@ def searched(monkeypatch: pytest.MonkeyPatch, known: float) -> list[tuple[int, l
         asked.append((len(task.rules), x0[:, 0].tolist()))
         return x0[:, 0] > known
 
-    monkeypatch.setattr("stlc.controller.rules.solvable", solvable)
+    monkeypatch.setattr("stlc.controller.evaluation.rules.solvable", solvable)
     return asked
 
 

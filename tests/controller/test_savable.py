@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import torch
 
-from stlc.controller.savable import MOST, extremes, savable
-from stlc.controller.task import Task
+from stlc.controller.guard.feasibility import MOST, extremes, savable
+from stlc.controller.problem.task import Task
 
 
 def states(task: Task, **columns: list[float]) -> torch.Tensor:

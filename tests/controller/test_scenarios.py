@@ -10,18 +10,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.controller.backup import grid_of
-from stlc.controller.deploy import Guard
-from stlc.controller.disturbance import Disturbance, errors_of
-from stlc.controller.drive import Recorder, Recording, Setting, drive
-from stlc.controller.task import Task
-from stlc.controller.world import world_type
+from stlc.controller.deployment.disturbance import Disturbance, errors_of
+from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
+from stlc.controller.deployment.world import world_type
+from stlc.controller.guard.guard import Guard
+from stlc.controller.guard.shooting import grid_of
+from stlc.controller.problem.task import Task
 from stlc.diagnostics import StlcError
-from stlc.dynamics.decl_deployment import ErrorsDecl
-from stlc.dynamics.scenario import standard, under
-from stlc.dynamics.schema import parse_system
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.dynamics.declaration.deployment import ErrorsDecl
+from stlc.dynamics.model.system import System
+from stlc.dynamics.scenarios.scenario import standard, under
+from stlc.dynamics.schema.schema import parse_system
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 SYSTEM = """\

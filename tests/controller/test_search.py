@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from stlc import native
-from stlc.controller.buffer import CAPACITY, Buffer
-from stlc.controller.kernel import Effort
-from stlc.controller.search import Searcher
-from stlc.controller.task import Task
-from stlc.dynamics.system import System
+from stlc.controller.problem.kernel import Effort
+from stlc.controller.problem.task import Task
+from stlc.controller.training.local_search import Searcher
+from stlc.controller.training.replay import CAPACITY, Buffer
+from stlc.dynamics.model.system import System
 
 
 @pytest.fixture(params=["native", "torch"])

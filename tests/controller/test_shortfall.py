@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.controller.asked import Asked, parse_margins
-from stlc.controller.shortfall import measured_margin
-from stlc.controller.task import Task
+from stlc.controller.guard.margin_calibration import measured_margin
+from stlc.controller.guard.margin_request import Asked, parse_margins
+from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
-from stlc.dynamics.scenario import under
-from stlc.dynamics.schema import parse_system
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.dynamics.model.system import System
+from stlc.dynamics.scenarios.scenario import under
+from stlc.dynamics.schema.schema import parse_system
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 SYSTEM = """\

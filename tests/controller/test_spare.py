@@ -8,19 +8,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.compile.ir import Atom, Col
-from stlc.controller.deploy import Guard, Mode
-from stlc.controller.drive import Recorder, Recording, Setting, drive
-from stlc.controller.policy import Mlp, PlanNetwork
-from stlc.controller.polish import Limits
-from stlc.controller.prefix import prefix_robustness, robustness_until
-from stlc.controller.spare import sparing, tighter
-from stlc.controller.task import Task
-from stlc.controller.world import world_type
-from stlc.dynamics.scenario import under
-from stlc.dynamics.schema import parse_system
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.compile.ir.nodes import Atom, Col
+from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
+from stlc.controller.deployment.world import world_type
+from stlc.controller.guard.guard import Guard, Mode
+from stlc.controller.guard.plan_repair import Limits
+from stlc.controller.guard.safe_prefix import prefix_robustness, robustness_until
+from stlc.controller.guard.tightened import sparing, tighter
+from stlc.controller.policies.policy import Mlp, PlanNetwork
+from stlc.controller.problem.task import Task
+from stlc.dynamics.model.system import System
+from stlc.dynamics.scenarios.scenario import under
+from stlc.dynamics.schema.schema import parse_system
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 SYSTEM = """\

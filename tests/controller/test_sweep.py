@@ -8,7 +8,7 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.controller.sweep import Errand, core_shares, side_by_side
+from stlc.controller.parallel.jobs import Errand, core_shares, side_by_side
 from stlc.rundir import every_run
 
 ROOT = Path(__file__).parents[2]

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.controller.policy import PlanNetwork
-from stlc.controller.symmetry import check_mirror
-from stlc.controller.task import Task
+from stlc.controller.policies.policy import PlanNetwork
+from stlc.controller.problem.symmetry import check_mirror
+from stlc.controller.problem.task import Task
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.schema import parse_system
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.dynamics.model.system import System
+from stlc.dynamics.schema.schema import parse_system
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 ROOT = Path(__file__).parent.parent.parent

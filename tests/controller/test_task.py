@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.controller.task import Task, rank, satisfied
+from stlc.controller.problem.task import Task, rank, satisfied
 
 
 def _plans(task: Task, n: int, seed: int) -> torch.Tensor:

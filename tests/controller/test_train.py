@@ -9,18 +9,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.controller.checkpoint import load_checkpoint
-from stlc.controller.config import TrainConfig, decide
-from stlc.controller.held_out import score, wilson
-from stlc.controller.launch import Launch, open_folder
-from stlc.controller.run import Run, spec_hash, system_hash
-from stlc.controller.task import Task
-from stlc.controller.train import Watch, resume, train
-from stlc.controller.trainer import Trainer
+from stlc.controller.evaluation.held_out import score, wilson
+from stlc.controller.problem.task import Task
+from stlc.controller.training.checkpoint import load_checkpoint
+from stlc.controller.training.config import TrainConfig, decide
+from stlc.controller.training.launch import Launch, open_folder
+from stlc.controller.training.learner import Trainer
+from stlc.controller.training.loop import Watch, resume, train
+from stlc.controller.training.run import Run, spec_hash, system_hash
 from stlc.diagnostics import MissingError, RunError
-from stlc.dynamics.system import System
+from stlc.dynamics.model.system import System
 from stlc.files import read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[2]
@@ -118,7 +118,7 @@ def test_the_system_file_chooses_the_method_unless_told() -> None:
 def test_a_slow_run_is_saved_by_the_clock(
     car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stlc.controller.train.SAVE_SECONDS", 0.0)
+    monkeypatch.setattr("stlc.controller.training.loop.SAVE_SECONDS", 0.0)
     config = TrainConfig(held_out=50, steps=3, batch=16)
     folder = _folder(car_task, tmp_path, config)
     seen: list[bool] = []
@@ -264,7 +264,7 @@ def test_without_a_compiler_torch_judges_in_parts(car_task: Task, monkeypatch: p
     x0 = task.sample(100, seed=7, dtype=torch.float64)
     plans = torch.zeros(100, task.horizon, 1, dtype=torch.float64)
     whole = task.judge(x0, plans)
-    monkeypatch.setattr("stlc.controller.task.MOST_VALUES", 7 * task._values_of_a_row)
+    monkeypatch.setattr("stlc.controller.problem.task.MOST_VALUES", 7 * task._values_of_a_row)
     parts = task.judge(x0, plans)
     assert torch.equal(whole.rho, parts.rho)
     assert all(torch.equal(column, parts.columns[name]) for name, column in whole.columns.items())

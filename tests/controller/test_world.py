@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from stlc.controller.world import ModelWorld, world_type
+from stlc.controller.deployment.world import ModelWorld, world_type
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.system import System
+from stlc.dynamics.model.system import System
 
 F64 = torch.float64
 

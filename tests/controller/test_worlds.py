@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 import torch
 
-from stlc.controller.savable import savable, solvable
-from stlc.controller.task import Task
-from stlc.controller.world import ModelWorld, world_type
-from stlc.controller.worlds import Setting, Worlds
+from stlc.controller.deployment.batched import Setting, Worlds
+from stlc.controller.deployment.world import ModelWorld, world_type
+from stlc.controller.guard.feasibility import savable, solvable
+from stlc.controller.problem.task import Task
 from stlc.diagnostics import RunError, SystemFileError
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.dynamics.model.system import System
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from stlc.cli.app import main
+from stlc.cli.framework.app import main
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics import crosscheck
-from stlc.dynamics.decl_model import FunctionDecl
-from stlc.dynamics.kinematics import position
-from stlc.dynamics.urdf import chain
+from stlc.dynamics.declaration.model import FunctionDecl
+from stlc.dynamics.robots import crosscheck
+from stlc.dynamics.robots.kinematics import position
+from stlc.dynamics.robots.urdf import chain
 
 ROBOT = """<robot name="crane">
   <link name="ground"/><link name="mast"/><link name="boom"/><link name="hook"/>

@@ -15,15 +15,15 @@ import torch
 from dynamics.test_motion_in_c import agree
 from exported import untrained
 
-from stlc.controller.task import Task
-from stlc.controller.world import world_type
-from stlc.controller.worlds import Setting, Worlds
+from stlc.controller.deployment.batched import Setting, Worlds
+from stlc.controller.deployment.world import world_type
+from stlc.controller.problem.task import Task
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.feedback import growth_of, linearised, riccati, unstable
-from stlc.dynamics.scenario import truth, under
-from stlc.dynamics.system import System
+from stlc.dynamics.model.feedback import growth_of, linearised, riccati, unstable
+from stlc.dynamics.model.system import System
+from stlc.dynamics.scenarios.scenario import truth, under
 from stlc.export.write import export
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.native import compiler
 from stlc.runtime import Controller
 from stlc.source import Source

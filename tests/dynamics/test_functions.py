@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from stlc.compile.interface import Grid
+from stlc.compile.frontend.interface import Grid
 from stlc.compile.pipeline import compile_spec
-from stlc.controller.task import Task
+from stlc.controller.problem.task import Task
 from stlc.diagnostics import SpecError, StlcError, SystemFileError, UsageError
-from stlc.dynamics.schema import load_system_decl
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.dynamics.model.system import System
+from stlc.dynamics.schema.schema import load_system_decl
+from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 

@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile import ir
-from stlc.compile.arith import Program
-from stlc.compile.ops_numpy import NUMPY
+from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.kinematics import position
-from stlc.dynamics.schema import parse_system
-from stlc.dynamics.urdf import Joint, chain
+from stlc.dynamics.robots.kinematics import position
+from stlc.dynamics.robots.urdf import Joint, chain
+from stlc.dynamics.schema.schema import parse_system
 from stlc.source import Source
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -10,10 +10,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile import ir
-from stlc.compile.switch import Hard, StraightThrough, Switch, Tanh
-from stlc.compile.timers import Timer, clock_of
-from stlc.dynamics.system import System
+from stlc.compile.augment.timers import Timer, clock_of
+from stlc.compile.ir import nodes as ir
+from stlc.compile.semantics.switch import Hard, StraightThrough, Switch, Tanh
+from stlc.dynamics.model.system import System
 
 Make = Callable[..., System]
 SWITCHES = [Hard(), Tanh(20.0), StraightThrough(5.0)]

@@ -10,9 +10,9 @@ import torch
 from dynamics.test_motion import RICH
 from dynamics.test_vectors import ARM
 
-from stlc.compile.emit_c import Motion, emit
-from stlc.dynamics.step import build_step
-from stlc.dynamics.system import System
+from stlc.compile.backends.c.emit import Motion, emit
+from stlc.dynamics.model.step import build_step
+from stlc.dynamics.model.system import System
 from stlc.native import Kernel, compiler, load
 
 Make = Callable[..., System]

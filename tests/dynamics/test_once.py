@@ -7,8 +7,8 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from stlc.compile.switch import Tanh
-from stlc.dynamics.system import System
+from stlc.compile.semantics.switch import Tanh
+from stlc.dynamics.model.system import System
 
 Make = Callable[..., System]
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.draws import Rows
-from stlc.dynamics.system import System
+from stlc.dynamics.init.draws import Rows
+from stlc.dynamics.model.system import System
 
 Make = Callable[..., System]
 

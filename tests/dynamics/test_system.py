@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.compile.switch import Tanh
+from stlc.compile.semantics.switch import Tanh
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.controls import raw_width, squash
-from stlc.dynamics.describe import describe
-from stlc.dynamics.schema import parse_system
-from stlc.dynamics.system import PROBED, System
+from stlc.dynamics.declaration.describe import describe
+from stlc.dynamics.model.controls import raw_width, squash
+from stlc.dynamics.model.system import PROBED, System
+from stlc.dynamics.schema.schema import parse_system
 from stlc.source import Source
 
 Make = Callable[..., System]
@@ -179,8 +179,8 @@ def test_the_description_is_a_table(make: Make) -> None:
 
 def test_a_declaration_needs_no_torch() -> None:
     code = (
-        "import sys; from stlc.dynamics.schema import load_system_decl;"
-        "from stlc.dynamics.describe import describe;"
+        "import sys; from stlc.dynamics.schema.schema import load_system_decl;"
+        "from stlc.dynamics.declaration.describe import describe;"
         "print(describe(load_system_decl('examples/car.yaml'))); assert 'torch' not in sys.modules"
     )
     root = Path(__file__).parent.parent.parent

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.decl import SystemDecl
-from stlc.dynamics.mistaken import Mistaken
-from stlc.dynamics.schema import load_system_decl, parse_system
-from stlc.dynamics.system import System
-from stlc.dynamics.uncertain import loosened
+from stlc.dynamics.declaration.decl import SystemDecl
+from stlc.dynamics.model.system import System
+from stlc.dynamics.scenarios.mistaken import Mistaken
+from stlc.dynamics.scenarios.uncertain import loosened
+from stlc.dynamics.schema.schema import load_system_decl, parse_system
 from stlc.source import Source
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

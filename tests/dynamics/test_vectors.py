@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.compile.interface import Grid
+from stlc.compile.frontend.interface import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import StlcError
-from stlc.dynamics.schema import parse_system
-from stlc.dynamics.system import System
-from stlc.grammar.parser import parse
+from stlc.dynamics.model.system import System
+from stlc.dynamics.schema.schema import parse_system
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 Make = Callable[..., System]

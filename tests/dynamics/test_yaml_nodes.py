@@ -11,8 +11,17 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
-from stlc.dynamics import yaml_nodes
-from stlc.dynamics.yaml_nodes import Mapping, Node, Scalar, Sequence, as_bool, as_float, as_int, load_yaml
+from stlc.dynamics.schema import yaml_nodes
+from stlc.dynamics.schema.yaml_nodes import (
+    Mapping,
+    Node,
+    Scalar,
+    Sequence,
+    as_bool,
+    as_float,
+    as_int,
+    load_yaml,
+)
 from stlc.source import Source
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from stlc.compile.functions import callable_names
+from stlc.compile.ir.functions import callable_names
 from stlc.editor.hover import hover
 from stlc.editor.vocabulary import BUILT_IN, FUNCTIONS, KEYWORDS, TEMPORAL
 from stlc.grammar import words

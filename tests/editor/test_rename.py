@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from stlc.compile.interface import Grid
+from stlc.compile.frontend.interface import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import SpecError
 from stlc.editor.document import Systems, look_at
 from stlc.editor.rename import RenameError, apply, can_rename, rename
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
 DATA = sorted((Path(__file__).parent.parent / "grammar/data").glob("*.stl"))

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from lsp_client import Client, LspError
 
-from stlc.cli.app import main
+from stlc.cli.framework.app import main
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 

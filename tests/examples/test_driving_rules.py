@@ -15,8 +15,8 @@ from torch import Tensor
 from traffic_drivers import Driver, careful, driver, reckless
 
 import stlc
-from stlc.controller.world import world_type
-from stlc.dynamics.system import System
+from stlc.controller.deployment.world import world_type
+from stlc.dynamics.model.system import System
 from stlc.monitor.verdict import Monitor
 
 ROOT = Path(__file__).parents[2]

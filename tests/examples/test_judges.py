@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import stlc
-from stlc.dynamics.schema import load_system_decl
+from stlc.dynamics.schema.schema import load_system_decl
 from stlc.monitor.verdict import Monitor
 
 ROOT = Path(__file__).parents[2]
@@ -127,8 +127,8 @@ def arm(goal: tuple[float, float, float], q: tuple[float, ...] = HOME, samples: 
 
 
 def flange(q: tuple[float, ...]) -> tuple[float, float, float]:
-    from stlc.controller.world import world_type
-    from stlc.dynamics.system import System
+    from stlc.controller.deployment.world import world_type
+    from stlc.dynamics.model.system import System
 
     links = sys.modules[world_type(System.load(ROOT / "examples/panda.yaml").decl).__module__].links
     x, y, z = links(np.array([q]))[0, -1].tolist()

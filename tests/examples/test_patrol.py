@@ -9,15 +9,15 @@ import pytest
 import torch
 
 from stlc.compile.dump import dump
-from stlc.controller.config import TrainConfig
-from stlc.controller.drive import Setting
-from stlc.controller.evaluate import deploy
-from stlc.controller.launch import Launch, open_folder
-from stlc.controller.task import Task
-from stlc.controller.train import train
-from stlc.dynamics.system import System
+from stlc.controller.deployment.simulator import Setting
+from stlc.controller.evaluation.deployment import deploy
+from stlc.controller.problem.task import Task
+from stlc.controller.training.config import TrainConfig
+from stlc.controller.training.launch import Launch, open_folder
+from stlc.controller.training.loop import train
+from stlc.dynamics.model.system import System
 from stlc.files import read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor
 
 ROOT = Path(__file__).resolve().parents[2]

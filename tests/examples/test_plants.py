@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from stlc.cli.app import main
-from stlc.controller.task import Task
-from stlc.dynamics.feedback import growth_of
-from stlc.dynamics.system import System
+from stlc.cli.framework.app import main
+from stlc.controller.problem.task import Task
+from stlc.dynamics.model.feedback import growth_of
+from stlc.dynamics.model.system import System
 from stlc.files import read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 
 TASKS = Path(__file__).parents[2] / "examples" / "tasks"
 PLANTS = ("cart_pole", "quadrotor_rates", "quadrotor_rotors", "thermostat", "watch")

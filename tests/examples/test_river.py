@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from stlc.controller.world import world_type
-from stlc.dynamics.system import System
+from stlc.controller.deployment.world import world_type
+from stlc.dynamics.model.system import System
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

@@ -12,14 +12,14 @@ import pytest
 import torch
 from examples.test_plants import PLANTS
 
-from stlc.cli.app import main
-from stlc.compile.semantics import TOLERANCE
-from stlc.controller.closed_loop import fresh_share
-from stlc.controller.run import Run
-from stlc.controller.task import Task
-from stlc.dynamics.system import System
+from stlc.cli.framework.app import main
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.evaluation.closed_loop import fresh_share
+from stlc.controller.problem.task import Task
+from stlc.controller.training.run import Run
+from stlc.dynamics.model.system import System
 from stlc.files import read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 from stlc.lint.lint import lint
 from stlc.monitor.verdict import Monitor
 from stlc.rundir import every_run

@@ -12,8 +12,8 @@ import pytest
 import torch
 from traffic_drivers import Driver, careful, reckless
 
-from stlc.controller.world import world_type
-from stlc.dynamics.system import System
+from stlc.controller.deployment.world import world_type
+from stlc.dynamics.model.system import System
 
 CAR = Path(__file__).parents[2] / "examples" / "car.yaml"
 STEPS = 150

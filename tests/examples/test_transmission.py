@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stlc.cli.app import main
+from stlc.cli.framework.app import main
 
 SPEC = Path(__file__).parents[2] / "examples/tasks/transmission.stl"
 GEARS = ("first", "second", "third", "fourth")

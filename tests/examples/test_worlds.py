@@ -11,18 +11,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.cli.app import main
-from stlc.controller.archive import save_trace_of
-from stlc.controller.config import TrainConfig
-from stlc.controller.drive import Setting
-from stlc.controller.evaluate import METRICS, deploy
-from stlc.controller.launch import Launch, open_folder
-from stlc.controller.run import Run
-from stlc.controller.task import Task
-from stlc.controller.world import Choosing, world_type
-from stlc.dynamics.system import System
+from stlc.cli.framework.app import main
+from stlc.controller.deployment.simulator import Setting
+from stlc.controller.deployment.world import Choosing, world_type
+from stlc.controller.evaluation.archive import save_trace_of
+from stlc.controller.evaluation.deployment import METRICS, deploy
+from stlc.controller.problem.task import Task
+from stlc.controller.training.config import TrainConfig
+from stlc.controller.training.launch import Launch, open_folder
+from stlc.controller.training.run import Run
+from stlc.dynamics.model.system import System
 from stlc.files import read_source
-from stlc.grammar.parser import parse
+from stlc.grammar.parse.parser import parse
 
 ROOT = Path(__file__).parents[2]
 WORLDS = {
@@ -108,8 +108,8 @@ def test_a_world_begins_anew(task: Task) -> None:
 def test_an_episode_ends_with_a_trace_that_check_reads(
     task: Task, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stlc.controller.evaluate.LATENCY_SECONDS", 0.05)
-    everybody = "stlc.controller.executed.search_safe"
+    monkeypatch.setattr("stlc.controller.evaluation.deployment.LATENCY_SECONDS", 0.05)
+    everybody = "stlc.controller.evaluation.executed.search_safe"
     monkeypatch.setattr(everybody, lambda _, x0: torch.ones(len(x0), dtype=torch.bool))
     setting = Setting((0, 1), 2, task.horizon + 4, task.system.decl.test.replan)
     found = deploy(task, Wild(task), setting, "none")  # type: ignore[arg-type]

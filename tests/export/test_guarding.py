@@ -8,7 +8,7 @@ import pytest
 import torch
 from exported import run_of
 
-from stlc.controller.backup import Backup, grid_of
+from stlc.controller.guard.shooting import Backup, grid_of
 from stlc.export import guarding
 from stlc.export.guarding import Guarding
 from stlc.runtime.prefixes import Grid

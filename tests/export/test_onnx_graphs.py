@@ -10,14 +10,14 @@ import torch
 from exported import CART, exported, mission, untrained
 from sheets import computed
 
-from stlc.compile import ir
-from stlc.compile import sheet as sheets
-from stlc.compile.sheet import BATCH, Sheet
-from stlc.compile.switch import Hard
-from stlc.dynamics.algebra import substitute
-from stlc.dynamics.integrators import rk4
-from stlc.dynamics.rollout import Stepper
-from stlc.dynamics.step import Step
+from stlc.compile.backends.onnx import sheet as sheets
+from stlc.compile.backends.onnx.sheet import BATCH, Sheet
+from stlc.compile.ir import nodes as ir
+from stlc.compile.semantics.switch import Hard
+from stlc.dynamics.model.algebra import substitute
+from stlc.dynamics.model.integrators import rk4
+from stlc.dynamics.model.rollout import Stepper
+from stlc.dynamics.model.step import Step
 from stlc.export.onnx_graphs import deciding, judging
 from stlc.export.onnx_judge import columns_of, deepened, judged
 from stlc.export.onnx_rollout import rolled

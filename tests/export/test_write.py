@@ -14,13 +14,13 @@ from documents import misfits
 from exported import CART, MISSION, run_of, untrained
 
 from stlc import native
-from stlc.cli.app import main
-from stlc.cli.schema import load_schema
-from stlc.controller.backup import Backup
-from stlc.controller.config import TrainConfig
-from stlc.controller.deploy import Guard
-from stlc.controller.launch import Launch, open_folder
-from stlc.controller.run import Run
+from stlc.cli.commands.schema import load_schema
+from stlc.cli.framework.app import main
+from stlc.controller.guard.guard import Guard
+from stlc.controller.guard.shooting import Backup
+from stlc.controller.training.config import TrainConfig
+from stlc.controller.training.launch import Launch, open_folder
+from stlc.controller.training.run import Run
 from stlc.diagnostics import RunError, UsageError
 from stlc.export.programs import unmoved
 from stlc.export.verify import BUILT, agreement, answers

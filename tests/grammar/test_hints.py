@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from stlc.cli.render import render_text
+from stlc.cli.framework.render import render_text
 from stlc.diagnostics import CODES, Fix, SpecError
-from stlc.grammar.parser import MAX_ERRORS, parse, parse_expr
+from stlc.grammar.parse.parser import MAX_ERRORS, parse, parse_expr
 from stlc.source import Source
 
 GOLDEN = Path(__file__).resolve().parent.parent / "golden" / "diagnostics"

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.files import read_source
 from stlc.grammar import ast
-from stlc.grammar.parser import MAX_DEPTH, MAX_TEXT, parse, parse_expr
+from stlc.grammar.parse.parser import MAX_DEPTH, MAX_TEXT, parse, parse_expr
 from stlc.source import Source
 from stlc.units import SYMBOLS
 
@@ -428,7 +428,8 @@ def test_an_enum_size_and_a_type_size_may_be_large_but_not_endless():
 
 def test_importing_the_grammar_does_not_import_lark():
     script = (
-        "import sys, stlc.grammar.ast, stlc.grammar.printer, stlc.source; sys.exit('lark' in sys.modules)"
+        "import sys, stlc.grammar.ast, stlc.grammar.show.printer, stlc.source; "
+        "sys.exit('lark' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
 

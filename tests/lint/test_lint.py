@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from stlc.compile.interface import Grid
+from stlc.compile.frontend.interface import Grid
 from stlc.diagnostics import UsageError
-from stlc.dynamics.schema import load_system_decl
+from stlc.dynamics.schema.schema import load_system_decl
 from stlc.files import read_source
-from stlc.grammar.format import format_text
-from stlc.grammar.parser import parse
+from stlc.grammar.format.format import format_text
+from stlc.grammar.parse.parser import parse
 from stlc.lint.fixes import fix
 from stlc.lint.lint import Selection, Surroundings, lint
 from stlc.lint.rules import RULES

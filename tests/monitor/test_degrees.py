@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stlc.cli.app import main
+from stlc.cli.framework.app import main
 from stlc.diagnostics import TraceError
-from stlc.monitor.online import How
+from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.trace import Trace, load_trace, save_trace

@@ -11,13 +11,13 @@ import reference
 from formula_strategies import GRID, formulas, traces
 from hypothesis import assume, given, settings
 
-from stlc.cli.render import render_place
-from stlc.compile import typed
-from stlc.compile.graph import evaluate_parts
-from stlc.compile.ops_numpy import NUMPY
+from stlc.cli.framework.render import render_place
+from stlc.compile.backends.array.graph import evaluate_parts
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir import typed
 from stlc.diagnostics import UsageError
-from stlc.monitor.blame import Blame, Blamer
-from stlc.monitor.explain import explain, explain_all, names_in, shown
+from stlc.monitor.explain.causes import Blame, Blamer
+from stlc.monitor.explain.report import explain, explain_all, names_in, shown
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column
@@ -213,7 +213,7 @@ def test_a_deep_formula_is_evaluated_once(monkeypatch: pytest.MonkeyPatch) -> No
         seen.append(given)
         return evaluate_parts(*given, **more)
 
-    monkeypatch.setattr("stlc.monitor.blame.evaluate_parts", counted)
+    monkeypatch.setattr("stlc.monitor.explain.causes.evaluate_parts", counted)
     cause = explain(verdict, "r")
     assert cause is not None
     assert (cause.predicate, cause.sample) == ("x > 0", 0)

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile.lower import lower
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.simplify import simplify
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.lowering.lower import lower
+from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import TraceError
-from stlc.monitor.asked import Asked
-from stlc.monitor.explain import explain
-from stlc.monitor.online import How
-from stlc.monitor.tracking import Trackers
+from stlc.monitor.explain.report import explain
+from stlc.monitor.online.asked import Asked
+from stlc.monitor.online.online import How
+from stlc.monitor.online.trackers import Trackers
 from stlc.monitor.values import Record, bounds, by_truth, window_bounds
 from stlc.monitor.verdict import Monitor
 

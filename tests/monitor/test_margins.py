@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.semantics import TOLERANCE
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.monitor.instants import rule_bounds
-from stlc.monitor.margins import Margins
-from stlc.monitor.tracking import Whole
+from stlc.monitor.online.margins import Margins
+from stlc.monitor.online.trackers import Whole
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
 

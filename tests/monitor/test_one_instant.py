@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from stlc.diagnostics import StlcError
-from stlc.monitor.explain import explain
-from stlc.monitor.online import How
+from stlc.monitor.explain.report import explain
+from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor
 
 REQUIREMENTS = {

@@ -15,23 +15,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile import ir
-from stlc.compile.lower import lower
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.simplify import simplify
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir import nodes as ir
+from stlc.compile.lowering.lower import lower
+from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import StlcError, UsageError
-from stlc.monitor import paced, tracking
-from stlc.monitor.asked import Asked
-from stlc.monitor.columns import FAR
 from stlc.monitor.endings import lengthened, may_end, with_seen
-from stlc.monitor.everywhere import Everywhere
-from stlc.monitor.online import How
-from stlc.monitor.paced import Paced
-from stlc.monitor.pairs import Paired
-from stlc.monitor.tracking import FromTheStart, Trackers, Whole
+from stlc.monitor.online import paced
+from stlc.monitor.online import trackers as tracking
+from stlc.monitor.online.asked import Asked
+from stlc.monitor.online.columns import FAR
+from stlc.monitor.online.everywhere import Everywhere
+from stlc.monitor.online.interval_columns import Paired
+from stlc.monitor.online.online import How
+from stlc.monitor.online.paced import Paced
+from stlc.monitor.online.trackers import FromTheStart, Trackers, Whole
+from stlc.monitor.online.windowed import Windowed
 from stlc.monitor.values import Record, bounds
 from stlc.monitor.verdict import Monitor
-from stlc.monitor.windowed import Windowed
 
 EXAMPLES = int(os.environ.get("STLC_CASES", "60"))
 """How many random formulas and traces are tried."""

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from stlc.diagnostics import StlcError
-from stlc.monitor.online import How
-from stlc.monitor.pairs import Paired
+from stlc.monitor.online.interval_columns import Paired
+from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor
 
 HEAD = "signal a\nsignal b\nsignal n: int\n"

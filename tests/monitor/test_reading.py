@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import stlc
-from stlc.cli.app import main
+from stlc.cli.framework.app import main
 from stlc.diagnostics import TraceError
 from stlc.monitor.reading import reading_of
 from stlc.trace import Reading

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stlc.monitor import recall
-from stlc.monitor.explain import Cause, explain
-from stlc.monitor.online import How, Online
+from stlc.monitor.explain.report import Cause, explain
+from stlc.monitor.online import recall
+from stlc.monitor.online.online import How, Online
 from stlc.monitor.verdict import Monitor
 
 REQUIREMENTS = {

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile import ir
-from stlc.compile.lower import lower
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.simplify import simplify
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir import nodes as ir
+from stlc.compile.lowering.lower import lower
+from stlc.compile.lowering.simplify import simplify
 from stlc.monitor.values import Ends, Record, bounds, history, window_bounds
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stlc.monitor.online import Online
-from stlc.monitor.paced import Paced
-from stlc.monitor.tracking import Whole
+from stlc.monitor.online.online import Online
+from stlc.monitor.online.paced import Paced
+from stlc.monitor.online.trackers import Whole
+from stlc.monitor.online.windowed import Windowed
 from stlc.monitor.verdict import Monitor
-from stlc.monitor.windowed import Windowed
 
 REQUIREMENTS = {
     "within": "always[0, T] (a > 0 or eventually[0, end] b > 0)",

@@ -17,13 +17,13 @@ from proof.cases import Case
 from proof.draw import Taste
 from proof.streamed import drawn
 
-from stlc.compile import typed
-from stlc.compile.walk import from_now, on_clock
+from stlc.compile.ir import typed
+from stlc.compile.ir.traverse import from_now, on_clock
 from stlc.diagnostics import TraceError
-from stlc.monitor.blame import Blame
-from stlc.monitor.explain import Cause, explain
+from stlc.monitor.explain.causes import Blame
+from stlc.monitor.explain.report import Cause, explain
 from stlc.monitor.instants import window_of
-from stlc.monitor.online import How
+from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor
 
 TASTES = (

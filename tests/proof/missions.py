@@ -12,16 +12,17 @@ from laws import OnTheClock
 from mission_strategies import GRID, SAMPLES, augmented, requirement, walks
 from reference import Interval, Trace
 
-from stlc.compile import ir, typed
-from stlc.compile.augment import augment
-from stlc.compile.graph import evaluate
-from stlc.compile.lift import recorded
-from stlc.compile.lower import lower
-from stlc.compile.ops_numpy import NUMPY
-from stlc.compile.semantics import TOLERANCE
-from stlc.compile.simplify import simplify
-from stlc.compile.timers import Ledger
-from stlc.compile.walk import absolute, nodes
+from stlc.compile.augment.augment import augment
+from stlc.compile.augment.lift import recorded
+from stlc.compile.augment.timers import Ledger
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.traverse import absolute, nodes
+from stlc.compile.lowering.lower import lower
+from stlc.compile.lowering.simplify import simplify
+from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.diagnostics import Diagnostic
 
 BATCH = 4

@@ -15,7 +15,7 @@ import torch
 from proof.cases import Case
 from proof.draw import Taste
 
-from stlc.compile.semantics import LogSumExp, Semantics, semantics_of
+from stlc.compile.semantics.semantics import LogSumExp, Semantics, semantics_of
 
 STEP = 1e-6
 SMOOTH = Taste(smooth=True, constants=False, off_grid=False, depth=3)

@@ -20,7 +20,7 @@ from proof.levels import robustness
 from stlc.compile.pipeline import Rule
 from stlc.diagnostics import SpecError, TraceError
 from stlc.monitor.instants import window_of
-from stlc.monitor.online import How, Online
+from stlc.monitor.online.online import How, Online
 from stlc.monitor.verdict import Monitor
 
 TASTES = (

@@ -12,7 +12,7 @@ from proof.amounts import seeds
 from proof.cases import Case
 from proof.levels import robustness, truth
 
-from stlc.cli.app import main
+from stlc.cli.framework.app import main
 
 CODES = {"satisfied": 0, "violated": 1, "inconclusive": 4}
 

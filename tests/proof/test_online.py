@@ -11,7 +11,8 @@ import pytest
 from proof.amounts import FULL, seeds
 from proof.streamed import TASTES, check_online, check_promise, check_stream, drawn
 
-from stlc.monitor import paced, tracking
+from stlc.monitor.online import paced
+from stlc.monitor.online import trackers as tracking
 
 FORMER = tuple(replace(taste, bools=False) for taste in TASTES)
 """Of the cases that are known by their seed."""

@@ -12,8 +12,8 @@ import pytest
 import torch
 from exported import ROOT, exported, mission, run_of
 
-from stlc.controller.deploy import SOURCES, Guard
-from stlc.controller.run import Run
+from stlc.controller.guard.guard import SOURCES, Guard
+from stlc.controller.training.run import Run
 from stlc.diagnostics import MissingError, RunError, UsageError
 from stlc.export.write import export
 from stlc.runtime import Controller

@@ -228,7 +228,7 @@ def test_the_deployment_can_be_repeated_as_it_was(deployed):
 
 
 def test_every_share_of_an_evaluation_has_words():
-    from stlc.controller.evaluate import METRICS
+    from stlc.controller.evaluation.deployment import METRICS
     from stlc.view.deployment import SHARES
 
     assert set(METRICS) <= set(SHARES)

@@ -1,0 +1,1 @@
+"""`stlc check` and `stlc explain` of traces."""

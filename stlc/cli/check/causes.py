@@ -1,0 +1,127 @@
+"""`stlc explain TRACE`: violations traced back to the sub-formula, the instant, the signal and its value."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from stlc.cli.check.text import in_unit
+from stlc.cli.framework.output import emit, emit_json, wants_color
+from stlc.compile.ir.traverse import margin_unit
+from stlc.escape import visible
+
+if TYPE_CHECKING:
+    from stlc.cli.check.checked import Checked
+    from stlc.cli.check.judge import Question
+    from stlc.monitor.explain.causes import Blame
+    from stlc.monitor.explain.report import Cause
+
+_WIDTH = 72
+
+
+def explain_trace(name: str, question: Question, runs: Path, *, as_json: bool) -> None:
+    """Judge a trace, print the tree of causes of every violated requirement, exit with the answer."""
+    from stlc.cli.check.checked import exit_code
+    from stlc.cli.check.judge import judge
+
+    result = judge(name, question, runs, talk=not as_json)
+    code = exit_code([result], None)
+    if as_json:
+        causes = [_values(cause, result) for cause in result.causes.values()]
+        found = {"trace": result.trace.name, "verdict": result.verdict.overall, "causes": causes}
+        emit_json("explain/1", ok=code == 0, exit_code=code, diagnostics=result.warnings, result=found)
+    else:
+        emit(_told(result), styled=True)
+    raise typer.Exit(code)
+
+
+def _told(result: Checked) -> str:
+    blocks = ["\n".join(_lines(cause, result)) for cause in result.causes.values()]
+    if blocks:
+        return "\n\n".join(blocks)
+    return f"{visible(result.trace.name)}: nothing is violated ({result.verdict.overall})"
+
+
+def _lines(cause: Cause, result: Checked) -> Iterator[str]:
+    """The place as `stlc check` shows it, and the tree below it."""
+    from stlc.cli.framework.render import render_place
+
+    judged = cause.judgement
+    of = f" in trace {cause.trace}" if result.verdict.traces > 1 else ""
+    started = result.verdict.subject.moment(cause.start)
+    margin = in_unit(f"{cause.tree.rho:+.6g}", judged.unit or cause.unit)
+    yield f"{visible(judged.name)} is violated{of}, judged from {started}: robustness {margin}"
+    advice = [("because", cause.because)]
+    yield render_place(cause.place, cause.labels, advice, color=wants_color(sys.stdout)).rstrip("\n")
+    yield ""
+    for depth, node in _walk(cause.tree):
+        yield f"  {'  ' * depth}{visible(_line(node, cause, result))}"
+
+
+def _walk(tree: Blame) -> Iterator[tuple[int, Blame]]:
+    """The tree, the part that decides first, without recursion."""
+    stack = [(0, tree)]
+    while stack:
+        depth, node = stack.pop()
+        yield depth, node
+        main = node.parts[node.main : node.main + 1]
+        others = [part for i, part in enumerate(node.parts) if i != node.main]
+        stack.extend((depth + 1, part) for part in reversed([*main, *others]))
+
+
+def _line(node: Blame, cause: Cause, result: Checked) -> str:
+    """One sub-formula: its text, what it is, when, and what its signals were."""
+    text = " ".join(node.span.text.split())
+    short = text if len(text) <= _WIDTH else f"{text[: _WIDTH - 1]}…"
+    subject = result.verdict.subject
+    when = subject.moment(node.sample)
+    if node.until is not None and node.until > node.sample:
+        when = f"from {when} to {subject.moment(node.until)}".replace("to t = ", "to ")
+    values = _readings(node, cause, result)
+    said = f", {', '.join(values)}" if values else ""
+    margin = in_unit(f"{node.rho:+.6g}", margin_unit(node.formula))
+    return f"{short}    is {str(node.holds).lower()} at {when}{said}, robustness {margin}"
+
+
+def _readings(node: Blame, cause: Cause, result: Checked) -> Sequence[str]:
+    from stlc.monitor.explain.report import shown
+
+    subject = result.verdict.subject
+    found = []
+    for name, later in node.reads:
+        if not 0 <= node.sample + later < subject.record.samples:
+            continue
+        value = float(subject.record.env[name][node.sample + later, cause.trace])
+        when = f" at {subject.moment(node.sample + later)}" if later else ""
+        found.append(f"{name} = {shown(value, subject.compiled.signature[name])}{when}")
+    return found
+
+
+def _values(cause: Cause, result: Checked) -> dict[str, Any]:
+    """A cause as values for JSON; the tree as a list with the depth of every node."""
+    subject = result.verdict.subject
+    nodes = [
+        {
+            "depth": depth,
+            "text": " ".join(node.span.text.split()),
+            "line": node.span.line,
+            "column": node.span.column,
+            "holds": node.holds,
+            "time": subject.time(node.sample),
+            "robustness": node.rho,
+            "unit": margin_unit(node.formula),
+            "readings": _readings(node, cause, result),
+        }
+        for depth, node in _walk(cause.tree)
+    ]
+    return {
+        "requirement": cause.judgement.name,
+        "trace": cause.trace,
+        "start": subject.time(cause.start),
+        "because": cause.because,
+        "tree": nodes,
+    }

@@ -1,0 +1,275 @@
+"""One recorded trace: read, judged by its specification, and explained."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from stlc.cli.framework.output import say, show_diagnostics
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.escape import operand
+from stlc.files import find_spec, read_source
+from stlc.source import Source
+
+if TYPE_CHECKING:
+    from stlc.cli.check.checked import Checked
+    from stlc.monitor.instants import At
+    from stlc.monitor.verdict import Monitor
+    from stlc.trace import Reading, Trace
+    from stlc.trace.meta import Carried
+    from stlc.trace.recording import Recording
+
+End = Literal["open", "strict", "truncate"]
+
+_AT = re.compile(r"(?P<number>\d+(?:\.\d*)?|\.\d+)\s*(?P<unit>[a-zµ]*)")
+_TIME = re.compile(r"(?P<number>\d+(?:\.\d*)?|\.\d+)\s*(?P<unit>[a-zµ]+)")
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What is asked of every trace.
+
+    Attributes:
+        spec: path of a specification; None takes the one in the trace.
+        system: of a system file.
+        names: specification's name of a signal -> its name in the trace.
+        require: names of the requirements; none means all.
+        at: `0`, `all`, a sample or a time; None leaves it to the requirements.
+        end: what to do where a trace is too short.
+        tolerance: a robustness of at least minus this is satisfied.
+        resample: put the signals on a grid of so many seconds.
+        overrides: constant -> its value, as text.
+        semantics: of the robustness that is told.
+        dt: seconds between samples that have no clock.
+        max_gap: the longest gap between samples, in seconds, in which signals are known.
+    """
+
+    spec: Path | None = None
+    system: str | None = None
+    names: Mapping[str, str] = field(default_factory=dict)
+    require: tuple[str, ...] = ()
+    at: str | None = None
+    end: End = "open"
+    tolerance: float = 1e-6
+    resample: float | None = None
+    overrides: Mapping[str, str] = field(default_factory=dict)
+    semantics: str = "exact"
+    dt: float | None = None
+    max_gap: float | None = None
+
+
+def usage(message: str, *advice: str) -> UsageError:
+    """U101."""
+    return UsageError(Diagnostic("U101", message, help=advice))
+
+
+def names_of(pairs: Iterable[str] | None) -> dict[str, str]:
+    """`["x=px"]` as `{"x": "px"}`. Raises UsageError (U101) for what is of another form."""
+    names: dict[str, str] = {}
+    for pair in pairs or ():
+        signal, sign, name = (part.strip() for part in pair.partition("="))
+        if not (signal and sign and name):
+            raise usage(f"`--map {pair}` is not of the form SIGNAL=NAME", "write it as --map v_lead=vlead")
+        if signal in names:
+            raise usage(f"`--map {signal}=…` is given twice")
+        names[signal] = name
+    return names
+
+
+def judge(name: str, question: Question, runs: Path, *, talk: bool) -> Checked:
+    """Load, judge and explain one trace; where `talk` says so, tell which one it is and what is to be said.
+
+    Raises:
+        StlcError: of whatever kind fits.
+    """
+    result, said = judged(found(name, runs), question)
+    if talk:
+        for line in [*taken(name, runs), *said]:
+            say(line)
+        show_diagnostics(result.warnings)
+    return result
+
+
+def found(name: str, runs: Path) -> Path:
+    """The file of a trace: as given, or in the newest run."""
+    from stlc.files import find_trace
+
+    path = find_trace(name, runs)
+    return path if path == Path(name) else _below(path.resolve())
+
+
+def taken(name: str, runs: Path) -> list[str]:
+    """What is to be said about where a trace was found."""
+    path = found(name, runs)
+    return [] if path == Path(name) else [f"taking {path}, of the newest run"]
+
+
+def judged(path: Path, question: Question) -> tuple[Checked, list[str]]:
+    """The result for one file, and what is to be said about it."""
+    from stlc.cli.check.checked import Checked
+    from stlc.monitor.explain.report import explain_all
+    from stlc.trace import read_recording
+
+    recording = read_recording(path)
+    carried = recording.meta.carried
+    source, note = specification(recording.name, question.spec, carried)
+    monitor = monitor_of(source, question, carried)
+    trace = laid_out(recording, monitor, question)
+    del recording  # what was converted is not kept twice
+    verdict = monitor.check(
+        trace,
+        at=instant(question.at, trace),
+        end=question.end,
+        tolerance=question.tolerance,
+        require=question.require,
+        semantics=question.semantics,
+    )
+    return Checked(trace, source, verdict, explain_all(verdict), spoken(question)), [note] if note else []
+
+
+def spoken(question: Question) -> tuple[str, ...]:
+    """The words of the command line that say how a trace is read and judged."""
+    words = [] if question.spec is None else [operand(str(question.spec))]
+    words += [] if question.system is None else ["--system", question.system]
+    for option, pairs in (("--map", question.names), ("--set", question.overrides)):
+        words += [word for name, value in pairs.items() for word in (option, f"{name}={value}")]
+    for option, seconds in (
+        ("--resample", question.resample),
+        ("--dt", question.dt),
+        ("--max-gap", question.max_gap),
+    ):
+        words += [] if seconds is None else [option, f"{seconds:.10g}s"]
+    return tuple(words)
+
+
+def laid_out(recording: Recording, monitor: Monitor, question: Question) -> Trace:
+    """The trace of a file, renamed and resampled as was asked."""
+    from stlc.trace import trace_of
+
+    return trace_of(recording, laid_reading(monitor, question))
+
+
+def laid_reading(monitor: Monitor | None, question: Question) -> Reading:
+    """How files are read: names and the grid; what a signal's values mean, where there is a monitor."""
+    from stlc.monitor.reading import reading_of
+    from stlc.trace import Reading
+
+    asked = Reading(question.names, question.resample, question.dt, question.max_gap)
+    return asked if monitor is None else reading_of(monitor.spec, asked)
+
+
+def _below(path: Path) -> Path:
+    """Relative to the working folder where it is below it."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
+def specification(name: str, spec: Path | None, carried: Carried) -> tuple[Source, str]:
+    """The specification to judge the trace `name` by, which carries one, and what is to be said about it."""
+    if spec is not None:
+        return read_source(find_spec(spec)), ""
+    if not carried.text:
+        raise usage(f"`{name}` carries no specification", f"stlc check SPEC {name}", "elsewhere: --spec SPEC")
+    source = Source(carried.path or f"{carried.name or 'specification'} in {name}", carried.text)
+    changed = ", ".join(f"{constant} = {text}" for constant, text in carried.overrides.items())
+    told = f"with {changed}, as it was recorded" if changed else ""
+    if carried.path and Path(carried.path).is_file() and read_source(carried.path).text != source.text:
+        since = (
+            f"{carried.path} has changed since; judging by the text in {name} "
+            f"(--spec {carried.path} takes the new one)"
+        )
+        told = f"{since}; {told}" if told else since
+    return source, told
+
+
+def monitor_of(source: Source, question: Question, carried: Carried | None = None) -> Monitor:
+    """The monitor for a specification; the same for every trace that carries the same one.
+
+    `carried` says what a trace keeps of imported files and of constants that were set; where the
+    specification was given as a file, only the question counts.
+    """
+    library: Mapping[str, str] = {}
+    changed = question.overrides
+    if carried is not None and question.spec is None:
+        library, changed = carried.library, {**carried.overrides, **changed}
+    spec = source.name, source.text, tuple(library.items())
+    return _monitor(spec, question.system, tuple(changed.items()))
+
+
+@lru_cache(maxsize=8)
+def _monitor(
+    spec: tuple[str, str, tuple[tuple[str, str], ...]],
+    system: str | None,
+    overrides: tuple[tuple[str, str], ...],
+) -> Monitor:
+    from stlc.grammar.parse.parser import parse
+    from stlc.monitor.verdict import Monitor
+
+    name, text, library = spec
+    parsed = replace(parse(Source(name, text)), library=dict(library) or None)
+    return Monitor(parsed, system=system, overrides=dict(overrides))
+
+
+# ------------------------------------------------------------------------ instants
+
+
+def instant(text: str | None, trace: Trace) -> At:
+    """A sample of `trace`; "all" and None as they are. Raises UsageError (U101)."""
+    return instant_of(text, trace.name, trace.dt, trace.t0, trace.samples)
+
+
+def instant_of(text: str | None, name: str, dt: float, t0: float, samples: int | None) -> At:
+    """The same of a trace that runs from `t0` on; None: nobody knows how long.
+
+    Raises:
+        UsageError: U101, it is no instant, or the trace has no sample then.
+    """
+    if text is None or text == "all":
+        return "all" if text else None
+    match = _AT.fullmatch(text.strip())
+    help_ = "a sample (0, 46), a time (4.6s) or all"
+    if match is None:
+        raise usage(f"`--at {text}` is not an instant", help_)
+    if not match["unit"]:
+        if not match["number"].isdigit():
+            raise usage(f"`--at {text}` is not a whole number of samples", help_)
+        return int(match["number"])
+    if not dt:
+        raise usage(
+            f"`--at {text}` is a time, and `{name}` has no time step", "a number counts samples: --at 46"
+        )
+    steps = (_seconds("--at", text, help_) - t0) / dt
+    sample = round(steps) if math.isfinite(steps) else -1
+    if abs(steps - sample) > 0.01 or sample < 0 or (samples is not None and sample >= samples):
+        last = "" if samples is None else f" to {t0 + (samples - 1) * dt:g} s"
+        raise usage(f"`{name}` has no sample at {text}", f"it runs from {t0:g} s{last} every {dt:g} s")
+    return sample
+
+
+def time_step(option: str, text: str | None) -> float | None:
+    """The seconds that an option gives as a step. Raises UsageError (U101)."""
+    if text is None:
+        return None
+    seconds = _seconds(option, text, "a time with its unit: 0.1s, 20ms")
+    if not 0 < seconds < float("inf"):
+        raise usage(f"`{option} {text}` is not a time above 0")
+    return seconds
+
+
+def _seconds(option: str, text: str, advice: str) -> float:
+    from stlc.units import parse_unit
+
+    match = _TIME.fullmatch(text.strip())
+    if match is None:
+        raise usage(f"`{option} {text}` is not a time", advice)
+    try:
+        unit = parse_unit(match["unit"])
+    except ValueError as error:
+        raise usage(f"`{option} {text}`: {error}", advice) from None
+    if unit.dims != parse_unit("s").dims:
+        raise usage(f"`{option} {text}` is not a time", advice)
+    return float(match["number"]) * unit.scale

@@ -1,0 +1,184 @@
+"""Many traces: judged side by side, summed up in a table."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from stlc.cli.check.judge import Question, found, judged, taken
+from stlc.cli.check.outcome import WORDS, Outcome, Row, overall
+from stlc.cli.framework.output import COLOR, ColorMode, table
+from stlc.diagnostics import Diagnostic, StlcError, UsageError
+from stlc.stopping import leaving
+
+SMALL = 1_000_000
+"""Bytes: no file of less unpacks to more than fits into memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """One file and what to do with it.
+
+    Attributes:
+        name: of the file as given.
+        question: what is asked of it.
+        runs: folder of all runs.
+        out: where its robustness signals go.
+        chunk: judge it piece by piece, so many samples at a time; 0 as a whole where it fits.
+        color: whether texts may be coloured.
+        mode: of the colour of the whole program.
+    """
+
+    name: str
+    question: Question
+    runs: Path
+    out: Path | None = None
+    chunk: int = 0
+    color: bool = False
+    mode: ColorMode = "never"
+
+
+def all_outcomes(works: Sequence[Work], jobs: int) -> Iterator[Outcome]:
+    """The outcomes in order; with several jobs, from as many processes.
+
+    One file that cannot be judged raises; among several it is an outcome.
+    """
+    if len(works) == 1:
+        yield outcome_of(works[0])
+    elif jobs == 1:
+        yield from map(safe_outcome, works)
+    else:
+        from concurrent.futures import ProcessPoolExecutor
+
+        with ProcessPoolExecutor(min(jobs or os.cpu_count() or 1, len(works))) as pool, leaving(_end_all):
+            try:
+                yield from pool.map(safe_outcome, works, chunksize=max(len(works) // 64, 1))
+            except (KeyboardInterrupt, SystemExit):
+                _end_all()
+                raise
+
+
+def _end_all(_code: int = 0) -> None:
+    """End the processes of all jobs at once: an interrupted check asks for no more outcomes."""
+    for process in multiprocessing.active_children():
+        process.kill()
+
+
+def safe_outcome(work: Work) -> Outcome:
+    """The outcome, of a file that cannot be judged too."""
+    try:
+        return outcome_of(work)
+    except StlcError as error:
+        entry = {"trace": work.name, "verdict": "invalid"}
+        return Outcome(work.name, errors=error.diagnostics, exit_code=error.exit_code, entry=entry)
+
+
+def outcome_of(work: Work) -> Outcome:
+    """Judge one file. Raises StlcError where that cannot be done."""
+    from stlc.cli.check.document import entry_of
+    from stlc.cli.check.text import describe_result, rows_of
+
+    COLOR.set(work.mode)
+    begun = time.perf_counter()
+    path = found(work.name, work.runs)
+    if work.chunk or _too_large(path):
+        from stlc.cli.check.chunks import outcome_in_chunks
+
+        return outcome_in_chunks(path, work)
+    result, said = judged(path, work.question)
+    if work.out is not None:
+        from stlc.cli.check.out import write_robustness
+
+        write_robustness(work.out, result, work.question)
+    return Outcome(
+        name=str(path),
+        status=result.verdict.overall if result.verdict.in_scope else "out of scope",
+        rows=rows_of(result),
+        text=describe_result(result, color=work.color),
+        entry=entry_of(result, work.question.end),
+        traces=result.verdict.in_scope,
+        holds=result.verdict.share,
+        fails=result.verdict.failed_share,
+        seconds=time.perf_counter() - begun,
+        warnings=result.warnings,
+        said=(*taken(work.name, work.runs), *said),
+    )
+
+
+def _too_large(path: Path) -> bool:
+    """Whether a file is better read in pieces; a small one never is, however well it is compressed."""
+    if path.stat().st_size < SMALL:
+        return False
+    from stlc.trace.chunks import LARGE, size_of
+
+    return size_of(path) > LARGE
+
+
+# -------------------------------------------------------------------------- summary
+
+
+def summary(outcomes: Sequence[Outcome]) -> str:
+    """A line for each file, and one for all."""
+    names = list(dict.fromkeys(row.name for outcome in outcomes for row in outcome.rows))
+    head = ("trace", "verdict", "least robustness", "requirement", "where")
+    lines = [_line(outcome) for outcome in outcomes]
+    satisfied = sum(outcome.status == "satisfied" for outcome in outcomes)
+    parts = [f"{satisfied} of {len(outcomes)} files satisfy every requirement"]
+    broken = sum(bool(outcome.errors) for outcome in outcomes)
+    outside = sum(outcome.status == "out of scope" for outcome in outcomes)
+    parts += [f"{broken} cannot be judged"] if broken else []
+    parts += [f"{outside} out of scope"] if outside else []
+    each = [_per_requirement(name, outcomes) for name in names]
+    tables = [
+        table(lines, header=head),
+        table(each, header=("requirement", "violated in", "inconclusive in")),
+    ]
+    return "\n\n".join([*tables, f"{overall(outcomes)}; {', '.join(parts)}"])
+
+
+def _line(outcome: Outcome) -> tuple[str, ...]:
+    if outcome.errors:
+        first = outcome.errors[0]
+        return (outcome.name, "INVALID", "", "", f"{first.code}: {first.message}")
+    if not outcome.rows:
+        return (outcome.name, WORDS[outcome.status])
+    worst = _worst(outcome.rows)
+    return (outcome.name, WORDS[outcome.status], worst.robustness, worst.name, worst.where)
+
+
+def _worst(rows: Sequence[Row]) -> Row:
+    """The requirement to look at first: a violated one, then one that is not known, then the tightest."""
+    order = {"violated": 0, "inconclusive": 1, "satisfied": 2, "out of scope": 3}
+    return min(rows, key=lambda row: (order[row.status], _number(row.robustness)))
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text.strip("[").split(",")[0].split()[0])
+    except (ValueError, IndexError):
+        return 0.0
+
+
+def _per_requirement(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:
+    rows = [row for outcome in outcomes for row in outcome.rows if row.name == name]
+    counts = [sum(row.status == status for row in rows) for status in ("violated", "inconclusive")]
+    return (name, *(str(count) if count else "" for count in counts))
+
+
+def out_paths(out: Path | None, names: Sequence[str]) -> list[Path | None]:
+    """Where the robustness signals of each file go; several files need a folder. Raises UsageError (U101)."""
+    if out is None:
+        return [None] * len(names)
+    if len(names) == 1 and not out.is_dir():
+        return [out]
+    if out.suffix:
+        message = f"`--out {out}` is one file, and {len(names)} traces are judged"
+        raise UsageError(Diagnostic("U101", message, help=("name a folder: --out robustness/",)))
+    stems = [Path(name).stem for name in names]
+    if len(set(stems)) < len(stems):
+        stems = [f"{i:04d}-{stem}" for i, stem in enumerate(stems)]
+    return [out / f"{stem}.npz" for stem in stems]

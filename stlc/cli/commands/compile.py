@@ -1,0 +1,182 @@
+"""`stlc compile`: what the solver sees of a specification."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from stlc.cli.framework.options import JsonOption, SetOption, SystemOption, describe, parse_overrides
+from stlc.cli.framework.output import emit, emit_json, say, show_diagnostics
+
+if TYPE_CHECKING:
+    from stlc.compile.augment.timers import Timer
+    from stlc.compile.ir import typed
+    from stlc.compile.pipeline import Compiled, Rule
+    from stlc.dynamics.declaration.decl import SystemDecl
+
+Part = Literal["all", "steps", "states", "ir"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command(
+        "compile",
+        help=describe(
+            "Show what the solver sees of a specification.",
+            "stlc compile specs/traffic.stl",
+            "stlc compile specs/traffic.stl --system car.yaml --set T_red=3s --show ir",
+            note="Each interval in seconds and in steps, added states, the safety part, the horizon.",
+        ),
+    )(compile_)
+
+
+def compile_(
+    spec: Annotated[Path, typer.Argument(metavar="SPEC", help="The specification, a .stl file.")],
+    system: SystemOption = None,
+    set_: SetOption = None,
+    show: Annotated[Part, typer.Option("--show", help="One part only.")] = "all",
+    watch: Annotated[bool, typer.Option("--watch", help="Compile again whenever a file changes.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Compile `spec` for a system and print the result."""
+    if not watch:
+        _show(spec, system, (set_, show), as_json=as_json)
+        return
+    from stlc.cli.framework.watch import watch as watch_files
+    from stlc.diagnostics import StlcError
+
+    def again() -> None:
+        try:
+            _show(spec, system, (set_, show), as_json=as_json)
+        except StlcError as error:
+            show_diagnostics(error.diagnostics)
+
+    watch_files(_files(spec, system), again)
+
+
+def _files(spec: Path, system: str | None) -> list[str]:
+    """The specification, and the system file as far as it can be found now."""
+    from stlc.diagnostics import StlcError
+    from stlc.files import find_spec, find_system, read_source
+    from stlc.grammar.parse.parser import parse
+
+    spec = find_spec(spec)
+    try:
+        wanted = system or parse(read_source(spec)).system
+        return [str(spec), *([str(find_system(wanted, spec))] if wanted else [])]
+    except StlcError:
+        return [str(spec)]
+
+
+def _show(spec: Path, system: str | None, how: tuple[list[str] | None, Part], *, as_json: bool) -> None:
+    from stlc.compile.dump import dump
+
+    set_, show = how
+    compiled, decl = _compiled(spec, system, parse_overrides(set_))
+    if as_json:
+        result = _result(compiled, decl)
+        emit_json("compile/1", ok=True, exit_code=0, diagnostics=compiled.warnings, result=result)
+        return
+    say(f"system {decl.path}")
+    show_diagnostics(compiled.warnings)
+    emit(dump(compiled, show).rstrip("\n"))
+
+
+def _compiled(path: Path, system: str | None, overrides: Mapping[str, str]) -> tuple[Compiled, SystemDecl]:
+    """Read both files and run the compiler; torch is not needed."""
+    from stlc.compile.frontend.interface import Grid
+    from stlc.compile.pipeline import compile_spec
+    from stlc.diagnostics import Diagnostic, UsageError
+    from stlc.dynamics.schema.schema import load_system_decl
+    from stlc.files import find_spec, find_system, read_source
+    from stlc.grammar.parse.parser import parse
+
+    path = find_spec(path)
+    spec = parse(read_source(path))
+    wanted = system or spec.system
+    if wanted is None:
+        raise UsageError(
+            Diagnostic(
+                "U101",
+                f"`{path}` names no system",
+                help=(f"stlc compile {path} --system FILE", 'or a line `system "FILE"` in the specification'),
+            )
+        )
+    decl = load_system_decl(find_system(wanted, path), overrides)
+    grid = Grid(decl.dt, decl.horizon)
+    return compile_spec(spec, grid=grid, interface=decl.interface(), overrides=overrides), decl
+
+
+def _result(compiled: Compiled, decl: SystemDecl) -> dict[str, Any]:
+    from stlc.provenance import sha256
+
+    steps = compiled.grid.horizon or 0
+    source = compiled.spec.source
+    added = [*map(_parameter, compiled.parameters), *map(_added, compiled.timers)]
+    return {
+        "spec": source.name,
+        "spec_sha256": sha256(source.text),
+        "system": str(decl.path),
+        "dt": float(decl.dt),
+        "horizon": {"seconds": float(decl.dt * steps), "steps": steps},
+        "states": [*decl.signature.names, *(item["name"] for item in added)],
+        "added": added,
+        "safety": [rule.name for rule in compiled.safety],
+        "requirements": [_requirement(rule, float(decl.dt)) for rule in compiled.requirements],
+    }
+
+
+def _parameter(each: typed.Parameter) -> dict[str, Any]:
+    """A parameter that the system does not carry."""
+    column = each.column
+    return {
+        "name": column.name,
+        "kind": "param",
+        "initial": None,
+        "range": [column.low, column.high],
+        "about": f"{each.text}, drawn for every trajectory",
+    }
+
+
+def _added(timer: Timer) -> dict[str, Any]:
+    """A state that the compiler adds."""
+    return {
+        "name": timer.name,
+        "kind": timer.kind,
+        "initial": timer.initial,
+        "range": [timer.low, timer.high],
+        "about": timer.about,
+    }
+
+
+def _requirement(rule: Rule, dt: float) -> dict[str, Any]:
+    return {
+        "name": rule.name,
+        "doc": rule.doc,
+        "tags": sorted(rule.tags),
+        "weight": rule.weight,
+        "scale": rule.scale,
+        "reach": {"seconds": rule.reach * dt, "steps": rule.reach},
+        "intervals": list(_intervals(rule, dt)),
+    }
+
+
+def _intervals(rule: Rule, dt: float) -> Iterator[dict[str, Any]]:
+    """The windows of a compiled formula; an upper end of None is the end of the trace."""
+    from stlc.compile.ir import nodes as ir
+    from stlc.compile.ir.horizon import nodes
+
+    for node in nodes(rule.formula):
+        if not isinstance(node, ir.Over | ir.Past | ir.Until | ir.Since):
+            continue
+        steps = (node.window.lo, node.window.hi)
+        yield {
+            "operator": node.op,
+            "steps": steps,
+            "seconds": [None if step is None else step * dt for step in steps],
+            "written": node.span.text if node.span else "",
+            "line": node.span.line if node.span else None,
+        }

@@ -1,0 +1,203 @@
+"""`stlc lint`: what is wrong with a specification, and what is worth a thought."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from stlc.cli.framework.options import JsonOption, SystemOption, describe
+from stlc.cli.framework.output import emit, emit_json, say, show_diagnostics, wants_color
+from stlc.diagnostics import Diagnostic, SpecError, StlcError, UsageError
+
+if TYPE_CHECKING:
+    from stlc.lint.lint import Selection, Surroundings
+    from stlc.source import Source
+
+Format = Literal["text", "json", "github", "sarif"]
+
+CLEAN, FOUND, INVALID = 0, 1, 3
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command(
+        help=describe(
+            "Say what is wrong with specifications, or worth a thought.",
+            "stlc lint specs/traffic.stl",
+            "stlc lint specs --strict --format github",
+            "stlc lint specs/traffic.stl --system car.yaml --fix",
+            note="Syntax, types, units, parentheses, unused names, requirements that say nothing; with "
+            "--system also what only the system knows. Exit code: 0 nothing wrong, 1 warnings and --strict, "
+            "3 errors. `stlc explain CODE` says what a code means.",
+        ),
+    )(lint)
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """What to do with every file."""
+
+    selection: Selection
+    system: str | None
+    fix: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Result:
+    """What was found and repaired."""
+
+    files: tuple[str, ...]
+    findings: tuple[Diagnostic, ...]
+    fixed: int
+
+    def code(self, *, strict: bool) -> int:
+        """The exit code."""
+        if any(finding.severity == "error" for finding in self.findings):
+            return INVALID
+        return FOUND if strict and self.findings else CLEAN
+
+
+def lint(
+    files: Annotated[list[str], typer.Argument(metavar="FILE…", help="Specifications, folders, or -.")],
+    fix: Annotated[bool, typer.Option("--fix", help="Repair what can be repaired, in place.")] = False,
+    select: Annotated[
+        str | None,
+        typer.Option(metavar="CODES", help="Warnings to look for, such as W1,W304; ALL for every one."),
+    ] = None,
+    ignore: Annotated[str | None, typer.Option(metavar="CODES", help="Warnings to leave out.")] = None,
+    format_: Annotated[Format, typer.Option("--format", help="How findings are written.")] = "text",
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if there are warnings.")] = False,
+    system: SystemOption = None,
+    watch: Annotated[bool, typer.Option("--watch", help="Look again whenever a file changes.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Look at `files` and print the findings."""
+    from stlc.cli.framework.spec_files import STDIN, spec_files
+    from stlc.lint.lint import Selection
+
+    layout: Format = "json" if as_json else format_
+    names = spec_files(files)
+    job = _Job(Selection(_codes(select), _codes(ignore)), system, fix)
+    if watch or fix:
+        for option, wanted in (("--watch", watch), ("--fix", fix)):
+            if wanted and STDIN in names:
+                raise UsageError(Diagnostic("U101", f"`{option}` needs files, not the standard input"))
+    if not watch:
+        result = _look(names, job)
+        code = result.code(strict=strict)
+        _show(result, layout, code)
+        raise typer.Exit(code)
+    from stlc.cli.framework.watch import watch as watch_files
+
+    def again() -> None:
+        try:
+            result = _look(names, job)
+        except StlcError as error:
+            show_diagnostics(error.diagnostics)
+            return
+        _show(result, layout, result.code(strict=strict))
+
+    watch_files(names, again)
+
+
+def _codes(text: str | None) -> tuple[str, ...]:
+    return tuple(code.strip().upper() for code in (text or "").split(",") if code.strip())
+
+
+def _look(names: Sequence[str], job: _Job) -> _Result:
+    """Lint every file, repairing it first where that is wanted."""
+    from stlc.files import find_spec, read_source
+
+    findings: list[Diagnostic] = []
+    fixed = 0
+    for name in names:
+        try:
+            source = read_source(name if job.fix else find_spec(name))
+        except SpecError as error:
+            findings += error.diagnostics
+            continue
+        count, found = _one(source, job)
+        fixed += count
+        findings += found
+    return _Result(tuple(names), tuple(findings), fixed)
+
+
+def _one(source: Source, job: _Job) -> tuple[int, Sequence[Diagnostic]]:
+    """How much of a file was repaired, and what is left to say."""
+    from stlc.files import write_atomic
+    from stlc.lint.fixes import fix
+    from stlc.lint.lint import lint as lint_text
+
+    within = _surroundings(job.system, source)
+
+    def look(text: Source) -> Sequence[Diagnostic]:
+        return lint_text(text, within=within, selection=job.selection)
+
+    if not job.fix:
+        return 0, look(source)
+    done = fix(source, look)
+    if done.count:
+        write_atomic(source.name, done.source.text)
+    return done.count, done.findings
+
+
+def _surroundings(system: str | None, source: Source) -> Surroundings | None:
+    """The system to look with; without one nothing of it is read."""
+    if system is None:
+        return None
+    from stlc.compile.frontend.interface import Grid
+    from stlc.dynamics.schema.schema import load_system_decl
+    from stlc.files import find_system
+    from stlc.lint.lint import Surroundings
+
+    decl = load_system_decl(find_system(system, Path(source.name)))
+    return Surroundings(decl.interface(), Grid(decl.dt, decl.horizon))
+
+
+def _show(result: _Result, layout: Format, code: int) -> None:
+    """Print the findings; the layout never changes the exit code."""
+    findings = result.findings
+    match layout:
+        case "json":
+            entry = {"files": result.files, "findings": len(findings), "fixed": result.fixed}
+            emit_json("lint/1", ok=code == CLEAN, exit_code=code, diagnostics=findings, result=entry)
+        case "github":
+            from stlc.cli.framework.annotations import github
+
+            if findings:
+                emit(github(findings))
+        case "sarif":
+            from stlc.cli.framework.annotations import sarif
+            from stlc.jsontext import dumps
+
+            emit(dumps(sarif(findings), indent=2))
+        case _:
+            if findings:
+                from stlc.cli.framework.render import render_text
+
+                emit(render_text(findings, color=wants_color(sys.stdout)).rstrip("\n") + "\n", styled=True)
+            say(_summary(result))
+
+
+def _summary(result: _Result) -> str:
+    """The last line: how many findings, in how many files, and what to do next."""
+    count = {"error": 0, "warning": 0}
+    for finding in result.findings:
+        count[finding.severity] += 1
+    files = _several(len(result.files), "file")
+    fixed = f"fixed {_several(result.fixed, 'finding')}; " if result.fixed else ""
+    if not result.findings:
+        return f"{fixed}{files}, nothing to say"
+    found = ", ".join(_several(number, kind) for kind, number in count.items() if number)
+    repairable = sum(finding.fix is not None for finding in result.findings)
+    more = f"; {repairable} can be repaired: stlc lint --fix" if repairable else ""
+    return f"{fixed}{found} in {files}{more}"
+
+
+def _several(number: int, word: str) -> str:
+    return f"{number} {word}" if number == 1 else f"{number} {word}s"

@@ -1,0 +1,219 @@
+"""`stlc plot`: what was recorded, and the robustness of each requirement beneath it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stlc.cli.check import options as given
+from stlc.cli.framework.options import (
+    JsonOption,
+    RequireOption,
+    SetOption,
+    SystemOption,
+    describe,
+    parse_overrides,
+)
+from stlc.cli.framework.output import emit, emit_json, say
+from stlc.diagnostics import Diagnostic, StlcError, UsageError
+from stlc.escape import visible
+
+if TYPE_CHECKING:
+    from stlc.grammar import ast
+    from stlc.monitor.verdict import Monitor
+    from stlc.trace import Trace
+    from stlc.view.signals import Choice, Margins
+    from stlc.view.style import Picture
+
+_FORMATS = (".svg", ".png", ".pdf")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command(
+        help=describe(
+            "Draw signals, and the robustness of requirements beneath them.",
+            "stlc plot trace.npz",
+            "stlc plot latest --require give_way -o give_way.svg",
+            "stlc plot latest --places -o map.png",
+            note="A run stands for the trace in its folder. The worst and a typical trace are shown unless "
+            "--trace names one. With --places all paths are drawn over the places of the requirements: "
+            "`[x, y] in dock` names one. The suffix of -o says what is written: .svg, .png or .pdf.",
+        )
+    )(plot)
+
+
+def plot(
+    what: Annotated[str, typer.Argument(metavar="TRACE|RUN", help="A trace, or a run with one.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="By default beside the trace, .svg.")
+    ] = None,
+    require: RequireOption = None,
+    trace: Annotated[int | None, typer.Option(min=0, metavar="K", help="Trace number K of the file.")] = None,
+    places: Annotated[
+        bool, typer.Option("--places", help="Paths over the places of the specification.")
+    ] = False,
+    spec: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The specification, instead of the trace's own.")
+    ] = None,
+    system: SystemOption = None,
+    map_: given.Names = None,
+    resample: given.Resample = None,
+    max_gap: given.MaxGap = None,
+    dt: given.Step = None,
+    set_: SetOption = None,
+    runs: Annotated[Path, typer.Option(help="Folder of all runs.")] = Path("runs"),
+    as_json: JsonOption = False,
+) -> None:
+    """Draw a trace and print where the picture is."""
+    from stlc.cli.check.judge import Question, laid_out, monitor_of, names_of, specification, time_step
+    from stlc.trace import read_recording
+    from stlc.view import require_drawing
+    from stlc.view.driven import margins_of, units_of
+    from stlc.view.signals import draw_signals
+
+    require_drawing()
+    path = _find(what, runs)
+    target = _target(output, path)
+    question = Question(
+        spec,
+        system,
+        names_of(map_),
+        resample=time_step("--resample", resample),
+        overrides=parse_overrides(set_),
+        dt=time_step("--dt", dt),
+        max_gap=time_step("--max-gap", max_gap),
+    )
+    recording = read_recording(path)
+    planned = recording.meta.planned  # margins over time are those of windows
+    source, note = specification(recording.name, question.spec, planned)
+    monitor = monitor_of(source, question, planned)
+    recorded = laid_out(recording, monitor, question)
+    if places:
+        shown = list(range(recorded.traces)) if trace is None else [trace]
+        picture = _map(monitor, _one(recorded, trace), require or [])
+    else:
+        verdict = monitor.check(recorded, require=require or [])
+        margins, units = margins_of(monitor, verdict, recorded), units_of(verdict)
+        choices = _choices(recorded, margins, trace)
+        picture = draw_signals(_with_units(recorded, monitor.spec), margins, choices, units)
+        shown = [choice.index for choice in choices]
+    _save(picture, target)
+    if as_json:
+        result = {"trace": str(path), "picture": str(target), "shown": shown}
+        emit_json("plot/1", ok=True, exit_code=0, result=result)
+        return
+    say(f"trace {path}")
+    if note:
+        say(note)
+    emit(visible(str(target)))
+
+
+def _find(what: str, runs: Path) -> Path:
+    """The trace called `what`, or that of the run called `what`."""
+    from stlc.files import find_trace
+    from stlc.rundir import RunDir
+
+    try:
+        if not Path(what).is_dir():
+            return find_trace(what, runs)
+    except UsageError as missing:
+        try:
+            folder = RunDir.open(what, runs)
+        except StlcError:
+            raise missing from None
+    else:
+        folder = RunDir.open(what, runs)
+    path = folder.path / "trace.npz"
+    if not path.is_file():
+        advice = (f"record one: stlc simulate {folder.name}",)
+        raise UsageError(Diagnostic("U102", f"`{folder.shown}` has no trace", help=advice))
+    return Path(folder.shown) / "trace.npz"
+
+
+def _target(output: Path | None, trace: Path) -> Path:
+    target = output or trace.with_suffix(".svg")
+    if target.suffix not in _FORMATS:
+        raise UsageError(
+            Diagnostic(
+                "U101", f"`{target}` is no picture", help=(f"its suffix is one of {' '.join(_FORMATS)}",)
+            )
+        )
+    return target
+
+
+def _with_units(trace: Trace, spec: ast.Spec) -> Trace:
+    """The trace with the units that the specification declares, where the file has none."""
+    from stlc.grammar import ast
+    from stlc.signature import Signature
+    from stlc.units import parse_unit
+
+    signals = [item for item in spec.items if isinstance(item, ast.Signal) and item.unit]
+    declared = {item.column or item.name: parse_unit(item.unit) for item in signals}
+    columns = (
+        replace(c, unit=declared[c.name]) if not c.unit.text and c.name in declared else c
+        for c in trace.signature.columns
+    )
+    return replace(trace, signature=Signature(tuple(columns)))
+
+
+def _one(trace: Trace, wanted: int | None) -> Trace:
+    """One trace of a file, or all of them."""
+    if wanted is None:
+        return trace
+    _require_trace(trace.traces, wanted)
+    return replace(
+        trace, data={name: rows[wanted : wanted + 1] for name, rows in trace.data.items()}, extras={}
+    )
+
+
+def _map(monitor: Monitor, trace: Trace, wanted: list[str]) -> Picture:
+    """Paths over the places of the requirements. Raises UsageError U101 where they name none."""
+    from stlc.view.chart import chart_of, draw_chart
+
+    chart = chart_of(monitor.spec, monitor.check(trace, require=wanted), trace)
+    if chart is None:
+        advice = ("a place is a region of two signals: `[x, y] in circle([0, 0], 1 m)`",)
+        raise UsageError(
+            Diagnostic("U101", f"no requirement of `{monitor.spec.name}` names a place", help=advice)
+        )
+    return draw_chart(chart)
+
+
+def _require_trace(traces: int, wanted: int) -> None:
+    if wanted >= traces:
+        advice = (f"they go from 0 to {traces - 1}",)
+        raise UsageError(Diagnostic("U101", f"there is no trace {wanted}", help=advice))
+
+
+def _choices(trace: Trace, margins: Margins, wanted: int | None) -> tuple[Choice, ...]:
+    import numpy as np
+
+    from stlc.view.driven import trace_names
+    from stlc.view.signals import Choice, acted_in, choose_traces
+
+    names = trace_names(trace)
+    if wanted is not None:
+        _require_trace(len(names), wanted)
+        return (Choice(wanted, names[wanted]),)
+    per_trace = [np.nanmin(np.where(np.isnan(rho), np.inf, rho), axis=1) for rho in margins.values()]
+    least = np.min(per_trace, axis=0) if per_trace else np.zeros(len(names))
+    return choose_traces(np.where(np.isfinite(least), least, np.nan), names, acted_in(trace))
+
+
+def _save(picture: object, target: Path) -> None:
+    from stlc.files import atomic_path, write_atomic
+    from stlc.view.style import Picture, look
+
+    assert isinstance(picture, Picture)
+    match target.suffix:
+        case ".svg":
+            write_atomic(target, picture.svg())
+        case ".png":
+            picture.save_png(target)
+        case _:
+            with look(), atomic_path(target) as beside:
+                picture.figure.savefig(beside, format="pdf")

@@ -1,0 +1,55 @@
+"""`stlc report`: the page that shows a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import typer
+
+from stlc.cli.framework.options import JsonOption, RunArgument, RunsOption, describe
+from stlc.cli.framework.output import emit, emit_json, say
+from stlc.escape import visible
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command(
+        help=describe(
+            "Write a self-contained report.html with the pictures of a run.",
+            "stlc report latest",
+            note="It goes into the run's folder: training curves, signals with the robustness of each "
+            "requirement, and the animation of a simulation, as far as the run has them. The page "
+            "opens without a network.",
+        )
+    )(report)
+
+
+def report(
+    run: RunArgument = "latest",
+    runs: RunsOption = Path("runs"),
+    as_json: JsonOption = False,
+) -> None:
+    """Write the report of `run` and print where it is."""
+    from stlc.rundir import RunDir
+    from stlc.view.learning import Commands, driven_lines, learning_of_run, recommended
+    from stlc.view.report import write_report
+
+    folder = RunDir.open(run, runs)
+    write_report(folder)
+    path = f"{folder.shown}/report.html"
+    record = folder.record()
+    learning = learning_of_run(folder, Commands.of(folder.shown, guard=recommended(record)))
+    if as_json:
+        result: dict[str, object] = {"run": folder.shown, "report": path}
+        result |= {} if learning is None else {"verdict": learning.summary()}
+        emit_json("report/1", ok=True, exit_code=0, result=result)
+    else:
+        for line in driven_lines(record.get("result") or {}):
+            say(line)
+        if learning is not None:
+            say(f"{learning.level}: {learning.sentence}")
+            if learning.worst:
+                say(learning.worst)
+        for advice in () if learning is None else learning.advice:
+            say(f"what helps: {advice}")
+        emit(visible(path))

@@ -1,0 +1,71 @@
+"""`stlc schema`: what the JSON documents of the commands look like."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from stlc.cli.framework.options import describe
+from stlc.cli.framework.output import emit
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.registry import closest
+
+FOLDER = Path(__file__).parents[2] / "schemas"
+_DIALECT = "https://json-schema.org/draft/2020-12/schema"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command(
+        help=describe(
+            "Print the JSON Schema of what --json prints, or list them.",
+            "stlc schema",
+            "stlc schema check/1",
+            note="Within a major number schemas only grow.",
+        )
+    )(schema)
+
+
+def schema(
+    name: Annotated[
+        str | None, typer.Argument(metavar="SCHEMA", help="Such as check/1; a command's name is its newest.")
+    ] = None,
+) -> None:
+    """Print a schema, or the names of all."""
+    if name is None:
+        emit("\n".join(names()))
+        return
+    emit(json.dumps(load_schema(name), indent=2))
+
+
+def names() -> list[str]:
+    """All schemas, such as `check/1`."""
+    return sorted(f"{path.stem}/1" for path in FOLDER.glob("*.json") if path.stem != "frame")
+
+
+def load_schema(name: str) -> dict[str, Any]:
+    """The schema of a whole document: the frame that all have, and the result of one command.
+
+    Raises:
+        UsageError: U101, there is no such schema.
+    """
+    wanted = name if "/" in name else f"{name}/1"
+    if wanted not in names():
+        near = closest(wanted, names())
+        advice = (f"did you mean `{near}`?",) if near else ("stlc schema  lists them",)
+        raise UsageError(Diagnostic("U101", f"there is no schema `{name}`", help=advice))
+    command = wanted.partition("/")[0]
+    frame = _read("frame")
+    properties = {**frame["properties"], "schema": {"const": wanted}}
+    result = _read(command)
+    shared = {"$defs": result.pop("$defs")} if "$defs" in result else {}
+    properties["result"] = {"anyOf": [result, {"type": "null"}]}
+    return {"$schema": _DIALECT, "title": wanted, **frame, "properties": properties, **shared}
+
+
+def _read(name: str) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
+    return found

@@ -1,0 +1,195 @@
+"""`stlc system`: look at a system file, try it out, list those there are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from stlc.cli.framework.options import JsonOption, SetOption, describe, only_help, parse_overrides
+from stlc.cli.framework.output import emit, emit_json, say, show_diagnostics, table
+from stlc.escape import visible
+
+if TYPE_CHECKING:
+    from stlc.diagnostics import Diagnostic
+    from stlc.dynamics.declaration.decl import SystemDecl
+    from stlc.dynamics.robots.crosscheck import Comparison
+
+_File = Annotated[
+    str, typer.Argument(metavar="SYSTEM", help="As given, in systems/, in examples/, or installed.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the program."""
+    group = typer.Typer(
+        name="system",
+        help=describe("Show, check and list system files.", "stlc system show car.yaml"),
+        invoke_without_command=True,
+        rich_markup_mode=None,
+    )
+    group.callback()(only_help)
+    group.command(
+        help=describe(
+            "Show what a system file declares, from states to scenarios.",
+            "stlc system show car.yaml",
+        )
+    )(show)
+    group.command(
+        help=describe(
+            "Validate a system file, draw initial states, and let it move.",
+            "stlc system check car.yaml",
+            "stlc system check examples/car.yaml --steps 64",
+            note="The file is read without torch; with --steps above 0 states are drawn and driven with "
+            "random controls: initial sets that reject nearly all and dynamics that explode are found. "
+            "Kinematics from a URDF are compared with pytorch-kinematics where that is installed.",
+        )
+    )(check)
+    group.command("list", help=describe("List the systems that are found by name.", "stlc system list"))(
+        list_
+    )
+    app.add_typer(group)
+
+
+def show(system: _File, set_: SetOption = None, as_json: JsonOption = False) -> None:
+    """Print `system` in a table."""
+    from stlc.dynamics.declaration.describe import describe as in_words
+
+    decl = _load(system, parse_overrides(set_))
+    if as_json:
+        emit_json("system/1", ok=True, exit_code=0, diagnostics=decl.warnings, result=_values(decl))
+        return
+    say(f"system {decl.path}")
+    show_diagnostics(decl.warnings)
+    emit(in_words(decl))
+
+
+def check(
+    system: _File,
+    steps: Annotated[int, typer.Option(min=0, help="How far to drive random starts; 0 reads only.")] = 32,
+    seed: Annotated[int, typer.Option(min=0, help="Of the states and controls.")] = 0,
+    set_: SetOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Validate `system`; findings are raised by what finds them."""
+    decl = _load(system, parse_overrides(set_))
+    warnings = [*decl.warnings, *(_drive(decl, steps, seed) if steps else ())]
+    looked = _kinematics(decl) if steps else []
+    if as_json:
+        robots = [
+            {"name": one.name, "distance_m": one.distance, "why_not": one.why or None} for one in looked
+        ]
+        result = {**_values(decl), "driven": {"steps": steps, "seed": seed}, "kinematics": robots}
+        emit_json("system/1", ok=True, exit_code=0, diagnostics=warnings, result=result)
+        return
+    show_diagnostics(warnings)
+    for one in looked:
+        if one.distance is None:
+            say(f"{one.name}: not compared; {one.why}")
+        else:
+            say(f"{one.name}: within {one.distance:.1e} m of pytorch-kinematics in 256 random positions")
+    moved = f", {_DRAWN} starts driven {steps} steps" if steps else ""
+    size = f"{_counted(len(decl.signature), 'state')}, {_counted(len(decl.controls), 'control')}"
+    emit(f"{visible(str(decl.path))} is valid: {size}{moved}")
+
+
+def list_(as_json: JsonOption = False) -> None:
+    """Print the systems in `examples/`, in `systems/` and among the installed ones."""
+    found = list(_all_systems())
+    if as_json:
+        rows = [{"name": name, "path": path, "doc": doc} for name, path, doc in found]
+        emit_json("system/1", ok=True, exit_code=0, result={"systems": rows})
+    elif found:
+        emit(table(found, header=("name", "file", "")))
+    else:
+        say("no system here; write one: stlc new system cart")
+
+
+_DRAWN = 256
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def _load(name: str, overrides: dict[str, str]) -> SystemDecl:
+    from stlc.dynamics.schema.schema import load_system_decl
+    from stlc.files import find_system
+
+    return load_system_decl(find_system(name), overrides)
+
+
+def _drive(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]:
+    """Draw states and drive them with random controls; what goes wrong is raised."""
+    import torch
+
+    from stlc.dynamics.model.system import System
+
+    system = System(decl)
+    warnings = system.probe(_DRAWN, seed=seed)
+    low, high = system.control_low, system.control_high
+    generator = torch.Generator().manual_seed(seed)
+    share = torch.rand((_DRAWN, steps, len(system.controls)), generator=generator)
+    with torch.no_grad():
+        system.require_finite(system.rollout(system.sample(_DRAWN, seed=seed), low + share * (high - low)))
+    return tuple(warnings)
+
+
+def _kinematics(decl: SystemDecl) -> list[Comparison]:
+    """Forward kinematics against another library's; what disagrees is raised."""
+    robots = [function for function in decl.functions if function.body is not None]
+    if not robots:
+        return []
+    from stlc.dynamics.robots.crosscheck import compared
+
+    return [compared(function) for function in robots]
+
+
+def _values(decl: SystemDecl) -> dict[str, Any]:
+    """What the file says, as values for JSON."""
+    flow = {assign.name: assign.text for assign in decl.flow}
+    return {
+        "name": decl.name,
+        "doc": decl.doc,
+        "path": str(decl.path),
+        "dt": float(decl.dt),
+        "horizon": {"seconds": float(decl.dt * decl.horizon), "steps": decl.horizon},
+        "states": [
+            {
+                **{"name": column.name, "kind": column.kind, "unit": str(column.unit), "role": column.role},
+                **{"low": column.low, "high": column.high, "labels": dict(column.labels)},
+                "flow": flow.get(column.name),
+            }
+            for column in decl.signature.columns
+        ],
+        "controls": [
+            {"name": control.name, "unit": str(control.unit), "low": control.low, "high": control.high}
+            for control in decl.controls
+        ],
+        "constants": {name: value for name, (value, _) in decl.constants.items()},
+        "jumps": [jump.name for jump in decl.jumps],
+        "situations": [situation.name for situation in decl.init.mixture],
+    }
+
+
+def _all_systems() -> Iterator[tuple[str, str, str]]:
+    """Name, path and first sentence of every system file in the places that are looked at."""
+    from stlc.diagnostics import StlcError
+    from stlc.dynamics.schema.schema import load_system_decl
+    from stlc.files import SYSTEMS
+
+    seen: set[str] = set()
+    for folder in (Path("systems"), Path("examples"), SYSTEMS):
+        for path in sorted([*folder.glob("*.yaml"), *folder.glob("*.yml")]):
+            if path.name in seen:
+                continue
+            seen.add(path.name)
+            try:
+                decl = load_system_decl(path)
+            except StlcError as error:
+                finding = error.diagnostics[0]
+                yield path.stem, str(path), f"invalid: {finding.code}, {finding.message}"
+            else:
+                yield decl.name, str(path), decl.doc

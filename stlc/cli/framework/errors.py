@@ -1,0 +1,161 @@
+"""The error boundary: whatever a command raises becomes a message and an exit code, here and nowhere else."""
+
+from __future__ import annotations
+
+import errno
+import sys
+import traceback
+from collections.abc import Sequence
+from datetime import datetime
+from itertools import pairwise
+from pathlib import Path
+
+import typer
+
+from stlc.cli.framework.output import emit_json, show_diagnostics
+from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError
+
+INTERNAL_ERROR = 70
+INTERRUPTED = 130
+TERMINATED = 143
+
+_NO_WRITING = frozenset(
+    {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG, errno.EIO, errno.EMFILE}
+)
+_NO_FILE = frozenset({errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP})
+_EXTRAS = {
+    **{"matplotlib": "plot", "PIL": "plot", "pybullet": "panda", "pytorch_kinematics": "panda"},
+    **{"pygls": "lsp", "lsprotocol": "lsp"},
+}
+
+
+class BugError(StlcError):
+    """Something that should not have happened; the crash report says what."""
+
+    exit_code = INTERNAL_ERROR
+
+
+def report(error: BaseException, argv: Sequence[str]) -> int:
+    """Tell the user about `error` and return the exit code it stands for."""
+    match error:
+        case SystemExit() if isinstance(error.__context__, BrokenPipeError):
+            return 0  # the reader has seen enough of a help text
+        case SystemExit(code=int() as code):
+            return _stopped(code, argv)
+        case SystemExit(code=code):
+            return 0 if code is None else 1
+        case KeyboardInterrupt():
+            return _stopped(INTERRUPTED, argv)
+        case typer.Abort() if not isinstance(error.__cause__, EOFError):
+            return _stopped(INTERRUPTED, argv)
+    known = _known(error) or _crash(error, argv)
+    if wants_json(argv):
+        emit_json(_schema(argv), ok=False, exit_code=known.exit_code, diagnostics=known.diagnostics)
+    else:
+        show_diagnostics(known.diagnostics)
+    return known.exit_code
+
+
+def _stopped(code: int, argv: Sequence[str]) -> int:
+    """Nothing is said about a command that was stopped, but a reader of JSON gets its document."""
+    if code in (INTERRUPTED, TERMINATED) and wants_json(argv):
+        emit_json(_schema(argv), ok=False, exit_code=code)
+    return code
+
+
+def wants_json(argv: Sequence[str]) -> bool:
+    """Whether the options ask for a JSON document: `--json`, `--format json`, `--ast json`."""
+    options = list(argv[: argv.index("--")] if "--" in argv else argv)
+    joined = {f"{option}={value}" for option, value in pairwise([*options, ""])}
+    return bool({"--json", "--format=json", "--ast=json"} & ({*options} | joined))
+
+
+def _schema(argv: Sequence[str]) -> str:
+    """That of the command, where it has one; `stlc/1` is the frame with no result."""
+    from stlc.cli.commands.schema import names
+
+    wanted = f"{argv[0]}/1" if argv else ""
+    return wanted if wanted in names() else "stlc/1"
+
+
+def _known(error: BaseException) -> StlcError | None:
+    """`error` in the user's terms, or None if it is a bug."""
+    match error:
+        case StlcError():
+            return error
+        case OSError():
+            return _from_system(error)
+        case MemoryError():
+            return MissingError(Diagnostic("R202", "there is not enough memory"))
+        case ModuleNotFoundError(name=str() as name) if name.partition(".")[0] in _EXTRAS:
+            return _missing_package(name.partition(".")[0])
+    if callable(getattr(error, "format_message", None)):
+        return UsageError(_usage(error))
+    return None
+
+
+def _from_system(error: OSError) -> StlcError | None:
+    reason = (error.strerror or type(error).__name__).lower()
+    place = f" `{error.filename}`" if error.filename is not None else ""
+    if error.errno in _NO_WRITING:
+        return MissingError(Diagnostic("R201", f"cannot use{place or ' a file'}: {reason}"))
+    if error.errno in _NO_FILE and place:
+        return UsageError(Diagnostic("U102", f"cannot open{place}: {reason}"))
+    return None
+
+
+def _missing_package(name: str) -> StlcError:
+    return MissingError(
+        Diagnostic(
+            "R301",
+            f"this needs the package `{name}`, which is not installed",
+            help=(f"pip install 'stlc[{_EXTRAS[name]}]'",),
+        )
+    )
+
+
+def _usage(error: BaseException) -> Diagnostic:
+    """What typer says about a command line. Its error classes are not public, their methods are."""
+    message = str(error.format_message()).strip().rstrip(".")  # type: ignore[attr-defined]
+    message = message.replace(": Value error, ", ": ")  # how pydantic introduces what an option said
+    context = getattr(error, "ctx", None)
+    command = getattr(context, "command_path", "stlc")
+    lowered = message[:1].lower() + message[1:] if message[1:2].islower() else message
+    return Diagnostic("U101", lowered, help=(f"{command} --help",))
+
+
+def _crash(error: BaseException, argv: Sequence[str]) -> StlcError:
+    headline = "".join(traceback.format_exception_only(error)).strip().splitlines()[-1]
+    path = _write_report(error, argv)
+    advice: tuple[str, ...]
+    if path is None:
+        note, advice = "no crash report could be written", ()
+    else:
+        note, advice = f"the crash report is {path}", ("report it with that file",)
+    return BugError(Diagnostic("B001", f"a bug in stlc: {headline}", note=(note,), help=advice))
+
+
+def _write_report(error: BaseException, argv: Sequence[str]) -> Path | None:
+    import tempfile
+
+    from stlc.provenance import hardware, versions
+
+    stamp = datetime.now().astimezone()
+    lines = [
+        f"time      {stamp.isoformat(timespec='seconds')}",
+        f"command   stlc {' '.join(argv)}",
+        f"folder    {Path.cwd()}",
+        f"python    {sys.version}",
+        f"versions  {versions()}",
+        f"hardware  {hardware()}",
+        "",
+        *(line.rstrip("\n") for line in traceback.format_exception(error)),
+    ]
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix=f"stlc-crash-{stamp:%Y%m%d-%H%M%S}-", suffix=".txt", delete=False, encoding="utf-8"
+        ) as file:
+            file.write("\n".join(lines) + "\n")
+    except OSError:
+        return None
+    return Path(file.name)

@@ -1,0 +1,182 @@
+"""What reaches the terminal: the result on the standard output, the talk on the standard error.
+
+A reader that goes away (`stlc … | head`) is no error: what is left is dropped and the exit code stays
+that of the work.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TYPE_CHECKING, Any, Literal, TextIO
+
+from stlc.diagnostics import Diagnostic, Notice
+from stlc.escape import screen, visible
+from stlc.jsontext import dumps, plain
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+ColorMode = Literal["auto", "always", "never"]
+
+WIDEST = 80
+"""Columns up to which a cell of a table makes room for itself in the others."""
+
+COLOR: ContextVar[ColorMode] = ContextVar("stlc_color", default="auto")
+
+
+def emit(text: str, *, styled: bool = False) -> None:
+    """Write `text` and a line break to the standard output.
+
+    Of what it holds only line breaks and tabs reach a terminal as such, and colours where it is `styled`;
+    what names hold of them is made `visible` by whoever puts the colours in.
+    """
+    _write(sys.stdout, screen(text, styled=styled))
+
+
+def say(text: str, *, styled: bool = False) -> None:
+    """Write a line to the standard error; what is `styled` may be several, with colours, as for `emit`."""
+    _write(sys.stderr, screen(text, styled=True) if styled else visible(text))
+
+
+def emit_json(
+    schema: str,
+    *,
+    ok: bool,
+    exit_code: int,
+    diagnostics: Iterable[Diagnostic] = (),
+    result: object = None,
+) -> None:
+    """Write the one JSON document of a command to the standard output.
+
+    Args:
+        schema: name and major number, such as "check/1".
+        ok: whether the answer is yes.
+        exit_code: the one that the command is about to exit with.
+        diagnostics: findings, warnings among them.
+        result: what was computed; numbers that are not finite become texts.
+    """
+    from stlc.cli.framework.render import to_json
+    from stlc.version import __version__
+
+    document = {
+        "stlc": __version__,
+        "schema": schema,
+        "ok": ok,
+        "exit_code": exit_code,
+        "diagnostics": [to_json(finding) for finding in diagnostics],
+        "result": plain(result),
+    }
+    emit(dumps(document, indent=2))
+
+
+def show_diagnostics(diagnostics: Sequence[Diagnostic]) -> None:
+    """Render findings on the standard error."""
+    from stlc.cli.framework.render import render_text
+
+    if diagnostics:
+        say(render_text(tuple(diagnostics), color=wants_color(sys.stderr)).rstrip("\n"), styled=True)
+
+
+@contextmanager
+def noticing() -> Iterator[None]:
+    """Show what is noticed about the machine (`stlc.diagnostics.notice`), each thing once."""
+    said: set[str] = set()
+    others = warnings.showwarning
+
+    def show(message: Warning | str, *rest: Any, **options: Any) -> None:
+        if not isinstance(message, Notice):
+            others(message, *rest, **options)
+        elif str(message) not in said:
+            said.add(str(message))
+            show_diagnostics([message.finding])
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", Notice)
+        warnings.showwarning = show
+        yield
+
+
+def wants_color(stream: TextIO) -> bool:
+    """Whether colour may be written to `stream`: by `--color`, then `NO_COLOR`, then being a terminal."""
+    mode = COLOR.get()
+    if mode != "auto":
+        return mode == "always"
+    if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
+        return False
+    return stream.isatty()
+
+
+def console(*, stderr: bool = False, width: int | None = None) -> Console:
+    """A rich console for the result (or, with `stderr`, for the talk). Never guesses at markup.
+
+    What is no terminal gets 120 columns, so that a piped table does not depend on the window.
+    """
+    from rich.console import Console
+
+    stream = sys.stderr if stderr else sys.stdout
+    colored = wants_color(stream)
+    if width is None and not stream.isatty():
+        width = 120
+    return Console(
+        file=stream,
+        force_terminal=colored or None,
+        no_color=not colored,
+        highlight=False,
+        markup=False,
+        width=width,
+        soft_wrap=not stream.isatty(),
+    )
+
+
+def table(rows: Sequence[Sequence[str]], *, header: Sequence[str] = (), indent: str = "  ") -> str:
+    """Columns of text, aligned by width, two blanks apart; numbers, and margins with a unit, stand right."""
+    lines = [tuple(map(visible, row)) for row in ([header, *rows] if header else rows)]
+    if not lines:
+        return ""
+    count = max(len(line) for line in lines)
+    widths = [
+        min(max((len(line[i]) for line in lines if i < len(line)), default=0), WIDEST) for i in range(count)
+    ]
+    return "\n".join(
+        (indent + "  ".join(_cell(cell, width) for cell, width in zip(line, widths, strict=False))).rstrip()
+        for line in lines
+    )
+
+
+def _cell(text: str, width: int) -> str:
+    number, _, unit = text.partition(" ") if text[:1] in ("+", "-") else (text, "", "")
+    digits = "" if " " in unit else number.lstrip("+-").replace(",", "").replace(".", "", 1)
+    return text.rjust(width) if digits.isdigit() else text.ljust(width)
+
+
+def _write(stream: TextIO | None, text: str) -> None:
+    if stream is None:  # closed by the caller: stlc … >&-
+        return
+    with tolerate_closed(stream):
+        try:
+            stream.write(text + "\n")
+        except UnicodeEncodeError:
+            encoding = stream.encoding or "ascii"
+            stream.write(text.encode(encoding, "replace").decode(encoding) + "\n")
+        stream.flush()
+
+
+@contextmanager
+def tolerate_closed(stream: TextIO) -> Iterator[None]:
+    """Let the reader of `stream` go away: from then on what is written to it goes nowhere."""
+    try:
+        yield
+    except BrokenPipeError:
+        silence(stream)
+
+
+def silence(stream: TextIO) -> None:
+    """Send what is still buffered, and what is written from now on, nowhere."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)

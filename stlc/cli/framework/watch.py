@@ -1,0 +1,42 @@
+"""Do it again whenever a file changes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from stlc.cli.framework.output import say
+
+PERIOD = 0.3
+
+
+def watch(files: Iterable[str], action: Callable[[], object], *, rounds: int | None = None) -> None:
+    """Call `action` now, and after each change of a file, until Ctrl-C.
+
+    Args:
+        files: to look at.
+        action: what to do; it reports its own errors.
+        rounds: stop after so many looks; None goes on.
+    """
+    paths = [Path(file) for file in files]
+    before = None
+    while rounds is None or rounds > 0:
+        now = [_stamp(path) for path in paths]
+        if now != before:
+            before = now
+            action()
+            say(f"watching {', '.join(map(str, paths))}; Ctrl-C stops")
+        if rounds is not None:
+            rounds -= 1
+        if rounds is None or rounds > 0:
+            time.sleep(PERIOD)
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    """What changes with a file; a file that is not there counts as empty."""
+    try:
+        status = path.stat()
+    except OSError:
+        return (0, 0)
+    return (status.st_mtime_ns, status.st_size)

@@ -1,0 +1,1 @@
+"""`stlc simulate`."""

@@ -1,0 +1,234 @@
+"""The live view of a deployment: margins as bars, agents, who decides for them; elsewhere ten lines."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.console import Console, Group
+from rich.live import Live
+from rich.text import Text
+
+from stlc.cli.check.text import percent, signed
+from stlc.cli.framework.output import table
+from stlc.compile.ir.traverse import margin_unit
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.guard.guard import SOURCES
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from stlc.controller.deployment.live import Oversight
+    from stlc.monitor.online.margins import Margin
+    from stlc.signature import Column
+
+REDRAWN = 0.5
+"""Seconds between pictures on a terminal."""
+LINES = 10
+"""How many lines there are elsewhere."""
+HALF = 10
+"""Half the width of a bar: what stands right of its middle is to spare."""
+NARROW = 4
+"""The same where there is little room."""
+FIRST = ("agent", "decided by", "plan", "least margin")
+"""What is said of every agent before its states."""
+
+
+class LiveView:
+    """Shows a deployment: in place on a terminal, ten lines elsewhere.
+
+    Args:
+        oversight: of the deployment.
+        title: what is deployed.
+        console: where; that of the talk.
+        clock: in seconds.
+    """
+
+    def __init__(
+        self,
+        oversight: Oversight,
+        title: str,
+        console: Console,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.oversight, self.title, self.console = oversight, title, console
+        self._clock = clock
+        self._drawn_at = -1e9
+        self._scales: dict[str, float] = {}
+        self._seconds = 0.0
+        terminal = console.is_terminal and not console.is_dumb_terminal
+        self._live = Live(console=console, auto_refresh=False) if terminal else None
+        self._unicode = "utf" in (console.encoding or "").lower()
+
+    def start(self) -> None:
+        """Open the view."""
+        if self._live is not None:
+            self._live.start()
+        else:
+            self.console.print(Text(self.title))
+
+    def stop(self) -> None:
+        """Close the view; what it showed last stays."""
+        if self._live is not None:
+            self._live.stop()
+
+    def tell(self) -> None:
+        """The overseen deployment has gone on by a step."""
+        moment = self.oversight.moment
+        assert moment is not None
+        if moment.planned:
+            self._seconds = moment.seconds
+        over = moment.decision is None
+        if self._live is None:
+            if over or moment.step * LINES // moment.steps > (moment.step - 1) * LINES // moment.steps:
+                self.console.print(Text(self.line()), soft_wrap=True)
+        elif over or self._clock() - self._drawn_at >= REDRAWN:
+            self._live.update(self.panel(), refresh=True)
+            self._drawn_at = self._clock()
+
+    # ------------------------------------------------------------------------- text
+
+    def line(self) -> str:
+        """The present moment on a line."""
+        worst = min(self.oversight.margins.items(), key=lambda each: float(each[1].high.min()))
+        name, agent = worst[0], int(worst[1].high.argmin())
+        violated = np.any([margin.violated > 0 for margin in self.oversight.margins.values()], axis=0)
+        parts = (
+            self._counter(),
+            f"guard acted in {self._acted()}",
+            f"least margin {name} {_signed(float(worst[1].high[agent]))} ({self._agent(agent)})",
+            f"violated by {int(violated.sum())} of {len(violated)}",
+        )
+        return "  " + "   ".join(parts)
+
+    def panel(self) -> Group:
+        """What the terminal shows at this moment."""
+        width, height = self.console.size
+        lines = [Text(self.title, style="bold"), Text(f"{self._counter()}   {self._decisions()}"), Text()]
+        lines += self._bars(width)
+        lines.append(Text())
+        lines += self._agents(width, max(height - len(lines) - 2, 3))
+        for line in lines:
+            line.no_wrap, line.overflow = True, "ellipsis"
+        return Group(*lines)
+
+    def _counter(self) -> str:
+        moment = self.oversight.moment
+        assert moment is not None
+        step = f"step {moment.step:,} / {moment.steps:,}   t = {self.oversight.time:.6g} s"
+        return f"{step}   all decided in {1e3 * self._seconds:.1f} ms"
+
+    def _decisions(self) -> str:
+        total = max(int(self.oversight.counts.sum()), 1)
+        shares = zip(SOURCES, self.oversight.counts.tolist(), strict=True)
+        return "   ".join(f"{name} {percent(count / total)}" for name, count in shares if count)
+
+    def _acted(self) -> str:
+        acted, total = int(self.oversight.counts[1:].sum()), int(self.oversight.counts.sum())
+        return f"{acted:,} of {total:,}"
+
+    def _agent(self, row: int) -> str:
+        seed, agent = divmod(row, self.oversight.setting.agents)
+        several = len(self.oversight.setting.seeds) > 1
+        return f"agent {agent}" + (f", seed {self.oversight.setting.seeds[seed]}" if several else "")
+
+    def _bars(self, width: int) -> list[Text]:
+        """A line for each requirement: what the worst agent can still have of it; bars give way to words."""
+        margins = self.oversight.margins
+        units = {rule.name: margin_unit(rule.typed.formula) for rule in self.oversight.task.rules}
+        told = {name: self._told(margin, units.get(name, "")) for name, margin in margins.items()}
+        wide = [max(len(parts[k]) for parts in told.values()) for k in range(3)]
+        label = max(map(len, margins))
+        room = width - label - sum(wide) - len("      │      ")
+        half = min(max(room // 2, NARROW), HALF)
+        found = []
+        for name, (value, agent, violated) in told.items():
+            high = float(margins[name].high.min())
+            text = Text(f"  {name:<{label}}  ")
+            text.append(self._bar(name, high, half), style="red" if high < -TOLERANCE else "green")
+            text.append(f"  {value:<{wide[0]}}  {agent:<{wide[1]}}")
+            text.append(f"  {violated}", style="red")
+            text.rstrip()
+            found.append(text)
+        return found
+
+    def _told(self, margin: Margin, unit: str) -> tuple[str, str, str]:
+        """Of one requirement: its least margin in its unit, whose that is, and how many have violated it."""
+        row = int(margin.high.argmin())
+        open_ = margin.low[row] < margin.high[row]
+        count = int((margin.violated > 0).sum())
+        value = f"{'at most ' if open_ else ''}{_signed(float(margin.high[row]))} {unit}".rstrip()
+        return value, self._agent(row), f"violated by {count} of {len(margin.high)}" if count else ""
+
+    def _bar(self, name: str, value: float, half: int = HALF) -> str:
+        """A margin left or right of the middle, by the largest one so far."""
+        full, empty, middle = ("█", "·", "│") if self._unicode else ("#", ".", "|")
+        finite = abs(value) if np.isfinite(value) else 0.0
+        scale = self._scales[name] = max(self._scales.get(name, 1e-9), finite)
+        length = half if not np.isfinite(value) else round(half * abs(value) / scale)
+        length = max(length, 1) if value else 0
+        filled = full * length, empty * (half - length)
+        if value < 0:
+            return filled[1] + filled[0] + middle + empty * half
+        return empty * half + middle + filled[0] + filled[1]
+
+    def _agents(self, width: int, most: int) -> list[Text]:
+        """A line for each agent of the first seed, the worst of them where there are more than fit."""
+        oversight, moment = self.oversight, self.oversight.moment
+        assert moment is not None
+        agents = range(oversight.setting.agents)
+        least = _least(oversight.margins)
+        rows = sorted(sorted(agents, key=lambda row: float(least[row]))[:most])
+        states = moment.x[: len(agents)].tolist()
+        names = oversight.task.system.signature.columns
+        decision = moment.decision
+        cells = []
+        for row in rows:
+            rho = "" if decision is None else _signed(float(decision.rho[row]))
+            name, margin = _worst(oversight.margins, row)
+            first = (str(row), oversight.decided(row) or "", rho, f"{name} {_signed(margin)}")
+            cells.append([*first, *map(_shown, names, states[row])])
+        units = (f"{column.name} {column.unit.text}".strip() for column in names)
+        lines = [Text(line) for line in _fitting(cells, [*FIRST, *units], width).splitlines()]
+        for line, row in zip(lines[1:], rows, strict=True):
+            line.stylize("red" if least[row] < -TOLERANCE else "")
+        return lines
+
+
+def _fitting(cells: list[list[str]], header: list[str], width: int) -> str:
+    """A table with as many whole columns as there is room for, and `…` where some are left out."""
+    for count in range(len(header), len(FIRST), -1):
+        more = ["…"] if count < len(header) else []
+        text = table([[*row[:count], *more] for row in cells], header=[*header[:count], *more])
+        if max(map(len, text.splitlines())) <= width:
+            return text
+    return table([row[: len(FIRST)] for row in cells], header=header[: len(FIRST)])
+
+
+def _shown(column: Column, value: float) -> str:
+    """A state as one reads it: the label of an enum, yes or no, a number."""
+    for label, number in column.labels:
+        if number == value:
+            return label
+    if column.kind == "bool":
+        return "yes" if value > 0.5 else "no"
+    return f"{value:.2f}"
+
+
+def _signed(value: float) -> str:
+    """A margin; rounding around zero is zero."""
+    return "0" if abs(value) <= TOLERANCE else signed(value)
+
+
+def _least(margins: Mapping[str, Margin]) -> NDArray[np.float64]:
+    """The least margin of each agent over all requirements."""
+    least: NDArray[np.float64] = np.min([margin.high for margin in margins.values()], axis=0)
+    return least
+
+
+def _worst(margins: Mapping[str, Margin], row: int) -> tuple[str, float]:
+    name = min(margins, key=lambda each: float(margins[each].high[row]))
+    return name, float(margins[name].high[row])

@@ -1,0 +1,262 @@
+"""What `stlc simulate` measured, as a person reads it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from stlc.escape import operand, shell, visible
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+Record: TypeAlias = "dict[str, Any]"
+
+MOST_LISTED = 12
+MOST_BROKEN = 6
+"""Drives that broke rules and are listed."""
+ERRORS = {
+    "actuator_gain": "wrong: gains of actuators",
+    "parameters": "wrong: numbers of the dynamics",
+    "actuator_noise": "noise: what actuators give",
+    "sensor_noise": "noise: what agents see",
+}
+"""Errors of a scenario, in words."""
+TITLES = {"none": "no guard", "paper": "paper's guard", "full": "full guard"}
+COMPARED = ("obeyed every rule", "plan accuracy")
+"""Columns by which scenarios are compared; drives that are lost are not counted."""
+
+ROWS = {
+    "plan accuracy": "plan_accuracy",
+    "  visited states that have one": "feasible",
+    "  share of these": "feasible_followed",
+    "plan safety": "plan_safety",
+    "policy's own plans": "policy_accuracy",
+    "executed, agents": "executed",
+    "  safely": "executed_safe",
+    "  safely, of the savable": "saved",
+    "executed, starts": "executed_starts",
+    "  safely ": "executed_safe_starts",
+    "  where foreseen": "foreseen_starts",
+    "  safely, where foreseen": "foreseen_safe_starts",
+}
+
+
+SAFETY = (
+    *("plan_safety", "executed_safe", "saved", "executed_safe_starts", "foreseen_safe_starts"),
+    "savable",
+)
+"""Of these, what says nothing where no requirement is tagged `@safety`."""
+
+
+def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
+    """The measured figures, as a person reads them: the drives first; with `windows` plans and starts, too.
+
+    Without a specification of drives these are shown as well: drives are judged as plans are then.
+    """
+    from stlc.cli.framework.output import table
+
+    windows = windows or document["judge"] is None
+    guards = document["guards"]
+    seeds, agents, steps = len(document["seeds"]), document["agents"], document["steps"]
+    size = f"{seeds} seed{'s' * (seeds > 1)} x {agents} agents x {steps} steps"
+    world = document["world"] or f"{document['system']} and its events"
+    scenario = [f"scenario {document['scenario']}"] if document["scenario"] else []
+    yield visible(" · ".join((document["spec"], f"run {document['run']}", f"world {world}", *scenario, size)))
+    yield from _starts(document)
+    yield from _wrong(document.get("errors", {}))
+    if document.get("margin"):
+        spared = ", ".join(f"{name} {margin:.3g}" for name, margin in document["margin"].items())
+        yield f"  the guard asks for a margin: {spared}"
+    yield ""
+    yield from _drives(document)
+    header = ("", *(TITLES[name] for name in guards))
+    shares = _shares(guards, safe=bool(document.get("safety", True))) if windows else ()
+    yield table([*_rules(document), *shares, *_progress(guards), *_times(guards)], header=header)
+    for name, guard in guards.items():
+        if name != "none":
+            yield f"  guard acted in {_acted(guard['decisions'])}"
+    last = list(guards.values())[-1]
+    yield from _broken(last["drives"])
+    if windows and document.get("safety", True):
+        yield f"  {_unsafe(last['unsafe'], seeds * agents)}"
+    if windows:
+        yield from _foreseen(last["metrics"].get("foreseen"))
+    if document.get("scenarios"):
+        yield from compared(document)
+
+
+def _starts(document: Record) -> Iterator[str]:
+    """A line on the starts that were taken, where not all were."""
+    known = {"savable": "a safe plan", "feasible": "a plan that satisfies everything"}.get(document["starts"])
+    if known:
+        yield f"  starts from which {known} is known; {document['redrawn']:,} others were drawn again"
+
+
+def _drives(document: Record) -> Iterator[str]:
+    """The verdict on what was driven, and who could not have been driven better."""
+    from stlc.view.words import obeyed_sentence, viable_sentence
+
+    yield f"  {obeyed_sentence(document)}"
+    lost = viable_sentence(document)
+    if lost:
+        yield f"  {lost}"
+    judge = document["judge"]
+    if judge is None:
+        yield f"  {document['system']} names no specification of drives (test: judge); plans' is taken"
+    else:
+        yield f"  judged by {judge['path']}"
+
+
+def _rules(document: Record) -> Iterator[tuple[str, ...]]:
+    """How many drives obeyed each rule, a column per guard."""
+    guards = [guard["drives"] for guard in document["guards"].values()]
+    for name in guards[-1]["rules"]:
+        yield (name, *(f"{each['rules'][name]['obeyed']} of {each['count']}" for each in guards))
+
+
+def _broken(drives: Record) -> Iterator[str]:
+    """`broken by seed 3, agent 7: full_stop (4.3 s)`, the first few: first those who could have obeyed."""
+    from stlc.view.words import cause_words
+
+    for each in sorted(drives["broken"], key=lambda each: each["lost"])[:MOST_BROKEN]:
+        rules = ", ".join(
+            name if time is None else f"{name} ({time:.3g} s)" for name, time in each["rules"].items()
+        )
+        cause = cause_words(each)
+        yield f"  broken by seed {each['seed']}, agent {each['agent']}: {rules}{cause and f'; {cause}'}"
+    more = len(drives["broken"]) - MOST_BROKEN
+    if more > 0:
+        yield f"  broken by {more} more: see eval/simulate.json"
+
+
+def _foreseen(foreseen: Record | None) -> Iterator[str]:
+    if foreseen and foreseen["mean"] > 0:
+        share = _part(foreseen["mean"])
+        beyond = "; others hold what no plan could know" if foreseen["mean"] < 1 else ""
+        yield f"  foreseen: the {share} of starts from which the world did as the model says{beyond}"
+
+
+def _wrong(errors: Mapping[str, Any]) -> Iterator[str]:
+    """What the truth has otherwise than the model, on a line for each kind."""
+    for name, what in ERRORS.items():
+        if name in errors:
+            numbers = errors.get("numbers", []) if name == "parameters" else []
+            which = f": {', '.join(numbers)}" if numbers else ""
+            if name != "parameters" or numbers:
+                yield f"  {what} by {100 * errors[name]:.3g} %{which}"
+
+
+def compared(document: Record) -> Iterator[str]:
+    """All scenarios in one table: who obeyed every rule, and of whom that could be had."""
+    from stlc.cli.framework.output import table
+
+    guards = list(document["guards"])
+    header = ("scenario", *(f"{TITLES[name]}: {label}" for name in guards for label in COMPARED))
+    rows = []
+    for name, each in {"as it is": document, **document["scenarios"]}.items():
+        cells: list[str] = []
+        for guard in guards:
+            found = each["guards"].get(guard)
+            cells += ["", ""] if found is None else _both(found)
+        rows.append((name, *cells))
+    yield ""
+    yield table(rows, header=header)
+
+
+def _both(guard: Record) -> list[str]:
+    """Plan accuracy, and the drives that obeyed of those that were not lost."""
+    drives = guard["drives"]
+    obeyed = f"{drives['obeyed']} of {drives['count'] - drives['lost']}"
+    return [obeyed, _number(guard["metrics"]["plan_accuracy"], "", 3)]
+
+
+def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: str | None) -> Iterator[str]:
+    """Where things are; the last line is the next command, with the system where judging needs it."""
+    from stlc.files import find_trace
+
+    yield ""
+    yield f"  trace      {visible(trace)}"
+    for what, path in drawn.items():
+        yield f"  {what:<10} {visible(path)}"
+    found = (
+        find_trace("trace.npz")
+        if Path("trace.npz").exists() or Path("runs/latest/trace.npz").exists()
+        else None
+    )
+    short = found is not None and found.resolve() == Path(trace).resolve()
+    judged = operand(str(record or ("trace.npz" if short else trace)))
+    needed = () if system is None else ("--system", system)
+    yield f"  next       {shell(('stlc', 'check', judged, *needed))}"
+
+
+def _shares(guards: Record, *, safe: bool) -> Iterator[tuple[str, ...]]:
+    """Shares of plans and starts; those of safety where any requirement is tagged `@safety`."""
+    for label, name in ROWS.items():
+        if not safe and name in SAFETY:
+            continue
+        found = [guard["metrics"].get(name) for guard in guards.values()]
+        if any(found):
+            yield (label, *("" if metric is None else _number(metric, "", 3) for metric in found))
+
+
+def _progress(guards: Record) -> Iterator[tuple[str, ...]]:
+    """What the world tells of itself: every metric that is not one of ours."""
+    from stlc.controller.evaluation.deployment import METRICS
+
+    first = next(iter(guards.values()))
+    for name in first["metrics"]:
+        if name not in METRICS and not name.startswith("holds."):
+            unit = first["units"].get(name, "")
+            cells = (_number(guard["metrics"][name], unit, 2) for guard in guards.values())
+            yield (name.replace("_", " "), *cells)
+
+
+def _times(guards: Record) -> Iterator[tuple[str, ...]]:
+    from stlc.view.words import seconds
+
+    for label, name in (("decision, median", "median"), ("decision, 99 %", "p99")):
+        yield (label, *(seconds(guard["latency"][name]) for guard in guards.values()))
+
+
+def _number(metric: Record, unit: str, digits: int) -> str:
+    """A mean and half its interval: `0.957 ± 0.012`, `4.10 ± 0.20 m/s`."""
+    mean, high = metric["mean"], metric["high"]
+    text = f"{mean:.{digits}f}" if high is None else f"{mean:.{digits}f} ± {high - mean:.{digits}f}"
+    return f"{text} {unit}".rstrip()
+
+
+def _unsafe(unsafe: Sequence[Record], agents: int) -> str:
+    """`not driven safely: 9 of 60 agents, of which 1 can be saved (seed 2: 7)`."""
+    if not unsafe:
+        return f"all {agents} agents were driven safely"
+    lost = [each for each in unsafe if each["savable"]]
+    ending = f"{len(lost)} can be saved ({_listed(lost)})" if lost else "none can be saved"
+    return f"not driven safely: {len(unsafe)} of {agents} agents, of which {ending}"
+
+
+def _listed(agents: Sequence[Record]) -> str:
+    """`seed 2: 7, 11; seed 5: 0`, the first few."""
+    shown = agents[:MOST_LISTED]
+    seeds = dict.fromkeys(each["seed"] for each in shown)
+    parts = (
+        f"seed {seed}: " + ", ".join(str(each["agent"]) for each in shown if each["seed"] == seed)
+        for seed in seeds
+    )
+    return "; ".join(parts) + ("; …" if len(agents) > MOST_LISTED else "")
+
+
+def _acted(decisions: Mapping[str, float]) -> str:
+    """`3.1 % of decisions (T0=1 71 %, T0=2 22 %, longest safe prefix 7 %)`."""
+    total = 1.0 - decisions["policy"]
+    if total <= 0.0:
+        return "0 % of decisions"
+    kinds = {name.removeprefix("backup "): share for name, share in decisions.items() if "T0=" in name}
+    kinds |= {"polished": decisions["polished"], "longest safe prefix": decisions["safest"]}
+    parts = ", ".join(f"{name} {_part(share / total)}" for name, share in kinds.items() if share)
+    return f"{100 * total:.1f} % of decisions ({parts})"
+
+
+def _part(share: float) -> str:
+    """Of a whole, in per cent; what is something never reads as nothing, nor as all."""
+    return "< 1 %" if share < 0.005 else "> 99 %" if 0.995 <= share < 1.0 else f"{100 * share:.0f} %"

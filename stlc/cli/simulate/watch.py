@@ -1,0 +1,127 @@
+"""What is told of a deployment while it runs: a progress bar, the live view, and margins as JSON lines."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, TextIO
+
+from stlc.diagnostics import Diagnostic, MissingError
+from stlc.escape import visible
+
+if TYPE_CHECKING:
+    from stlc.controller.deployment.live import Oversight
+    from stlc.controller.deployment.simulator import Moment, Setting, Watch
+    from stlc.controller.problem.task import Task
+
+STANDARD_OUTPUT = "-"
+
+
+@dataclass(frozen=True, slots=True)
+class Watching:
+    """How a deployment is watched.
+
+    Attributes:
+        title: what is deployed.
+        live: whether it is shown as it goes on.
+        margins: a file for the lines, or `-` for the standard output; None where nobody wants them.
+    """
+
+    title: str
+    live: bool = False
+    margins: str | None = None
+
+    @contextmanager
+    def of(self, task: Task, setting: Setting) -> Iterator[Watch]:
+        """What a deployment is to tell its steps to."""
+        if not self.live and self.margins is None:
+            with _bar(self.title) as watch:
+                yield watch
+            return
+        from stlc.controller.deployment.live import Oversight
+
+        oversight = Oversight(task, setting)
+        with ExitStack() as stack:
+            listeners: list[Callable[[], None]] = []
+            if self.margins is not None:
+                lines = stack.enter_context(_lines(self.margins))
+                listeners.append(lambda: _write(oversight, lines))
+            if self.live:
+                from stlc.cli.framework.output import console
+                from stlc.cli.simulate.live import LiveView
+
+                view = LiveView(oversight, self.title, console(stderr=True))
+                stack.callback(view.stop)
+                view.start()
+                listeners.append(view.tell)
+            else:
+                told = stack.enter_context(_bar(self.title))
+                listeners.append(lambda: told(_present(oversight)))
+
+            def watch(moment: Moment) -> None:
+                oversight.push(moment)
+                for listener in listeners:
+                    listener()
+
+            yield watch
+
+
+def _present(oversight: Oversight) -> Moment:
+    assert oversight.moment is not None
+    return oversight.moment
+
+
+def require_writable(where: str | None) -> None:
+    """Begin the file that lines will be written to. Raises MissingError (R201) where that cannot be."""
+    if where is not None and where != STANDARD_OUTPUT:
+        _opened(where).close()
+
+
+@contextmanager
+def _lines(where: str) -> Iterator[TextIO]:
+    """A file that lines are written to as they come."""
+    if where == STANDARD_OUTPUT:
+        yield sys.stdout
+        return
+    with _opened(where) as stream:
+        yield stream
+
+
+def _opened(where: str) -> TextIO:
+    try:
+        return Path(where).open("w", encoding="utf-8")
+    except OSError as error:
+        reason = (error.strerror or type(error).__name__).lower()
+        raise MissingError(Diagnostic("R201", f"cannot write `{where}`: {reason}")) from error
+
+
+def _write(oversight: Oversight, stream: TextIO) -> None:
+    """One object an agent, a line each."""
+    from stlc.cli.framework.output import tolerate_closed
+    from stlc.jsontext import dumps
+
+    with tolerate_closed(stream):
+        stream.writelines(dumps(record) + "\n" for record in oversight.records())
+        stream.flush()
+
+
+@contextmanager
+def _bar(title: str) -> Iterator[Watch]:
+    """A progress bar on the standard error, if that is a terminal."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from stlc.cli.framework.output import console
+
+    talk = console(stderr=True)
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=talk, transient=True, disable=not talk.is_terminal) as progress:
+        bar = progress.add_task(visible(title), total=None)
+        yield lambda moment: progress.update(bar, completed=moment.step, total=moment.steps)

@@ -1,0 +1,200 @@
+"""Training for several specifications and seeds: a run each, in a process of its own, and a table of all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import typer
+
+from stlc.cli.framework.output import emit, emit_json, say, table
+from stlc.escape import operand
+
+if TYPE_CHECKING:
+    from stlc.controller.parallel.jobs import Errand, Returned
+    from stlc.controller.training.config import TrainConfig
+    from stlc.controller.training.launch import Launch
+
+HEADER = ("seed", "accuracy", "95 % interval", "known feasible", "share", "worst requirement", "time", "run")
+ENDED = 70
+"""Exit code for a process that a signal ended."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One run of many.
+
+    Attributes:
+        spec: the specification's file.
+        seed: None for that of the system file.
+    """
+
+    spec: Path
+    seed: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Many:
+    """Runs that differ in their specifications and seeds alone.
+
+    Attributes:
+        specs: the specifications' files.
+        system: as given, or None; only of one specification.
+        config: what the runs have in common.
+        launch: where, and under which name.
+        seeds: one a run of each specification; None for that of its system file.
+        jobs: processes at a time.
+        cluster: address of a cluster that trains instead of this machine.
+        log: of `--log`.
+        pictures: whether reports are drawn.
+    """
+
+    specs: Sequence[Path]
+    system: str | None
+    config: TrainConfig
+    launch: Launch
+    seeds: Sequence[int | None]
+    jobs: int
+    cluster: str | None
+    log: str | None
+    pictures: bool
+
+    @property
+    def parts(self) -> list[Part]:
+        """The runs, in order."""
+        return [Part(spec, seed) for spec in self.specs for seed in self.seeds]
+
+    def name(self, part: Part) -> str:
+        """By which a run is told from the others."""
+        words = [] if len(self.specs) == 1 and part.seed is not None else [str(part.spec)]
+        return " ".join(words + ([] if part.seed is None else [f"seed {part.seed}"]))
+
+    def errand(self, part: Part) -> Errand:
+        """The command line of one run."""
+        from stlc.controller.parallel.jobs import Errand
+
+        config, launch = self.config, self.launch
+        threads = config.threads or (1 if self.jobs > 1 or self.cluster is not None else None)
+        seeded = "" if part.seed is None else f"-seed{part.seed}"
+        name = None if launch.name is None else f"{launch.name}{seeded}"
+        options: Mapping[str, object] = {
+            "--seed": part.seed,
+            "--system": self.system,
+            "--budget": None if config.budget is None else f"{config.budget!r}s",
+            "--clock": config.clock,
+            "--steps": config.steps,
+            "--method": config.method,
+            "--name": name,
+            "--device": config.device,
+            "--threads": threads,
+            "--plans": config.plans,
+            "--lr": config.lr,
+            "--batch": config.batch,
+            "--held-out": config.held_out,
+            "--drives": config.drives,
+            "--log": self.log,
+            "--runs": launch.root,
+        }
+        given = [word for key, value in options.items() if value is not None for word in (key, str(value))]
+        changed = [word for key, value in launch.overrides.items() for word in ("--set", f"{key}={value}")]
+        drawn = () if self.pictures else ("--no-pictures",)
+        arguments = (operand(str(part.spec)), *given, *changed, *drawn)
+        if self.cluster is None:
+            return Errand(self.name(part), arguments)
+        from stlc.controller.training.inputs import input_files
+
+        read = input_files(part.spec, self.system, launch.overrides)
+        return Errand(self.name(part), arguments, read, launch.root)
+
+
+def train_many(many: Many, *, json: bool) -> NoReturn:
+    """Train all, and print a table or the JSON document; raises `typer.Exit` with the exit code."""
+    found: dict[str, Returned] = {}
+    sent = "begins" if many.cluster is None else "is sent"
+    try:
+        for back in _backs(many, lambda errand: say(f"{errand.name} {sent}")):
+            found[back.errand.name] = back
+            for line in _line(back).splitlines():
+                say(line)
+    except (KeyboardInterrupt, SystemExit):
+        say(f"interrupted; runs that were going are saved: stlc runs list --runs {many.launch.root}")
+        raise
+    ordered = {part: found[many.name(part)] for part in many.parts}
+    code = max((back.code if back.code >= 0 else ENDED) for back in ordered.values())
+    if json:
+        result = {"runs": [_entry(part, back) for part, back in ordered.items()]}
+        emit_json("train/1", ok=code == 0, exit_code=code, result=result)
+    else:
+        emit(_table(many, ordered))
+    raise typer.Exit(code)
+
+
+def _backs(many: Many, begun: Callable[[Errand], None]) -> Iterator[Returned]:
+    """The runs as they end: of processes here, or of a cluster."""
+    errands = [many.errand(part) for part in many.parts]
+    if many.cluster is None:
+        from stlc.controller.parallel.jobs import side_by_side
+
+        return side_by_side(errands, jobs=many.jobs, begun=begun)
+    from stlc.controller.parallel.ray_cluster import Cluster, on_cluster
+
+    config = many.config
+    cluster = Cluster(many.cluster, config.threads or 1, gpus=int(config.device != "cpu"))
+    return on_cluster(errands, cluster, begun=begun)
+
+
+def _table(many: Many, ordered: Mapping[Part, Returned]) -> str:
+    """A line for every run, and one for the mean of each specification's."""
+    rows: list[tuple[str, ...]] = []
+    several = len(many.specs) > 1
+    for spec in many.specs:
+        own = {part: back for part, back in ordered.items() if part.spec == spec}
+        lines = [*(_cells(part, back) for part, back in own.items()), *_mean(list(own.values()))]
+        rows += [(str(spec), *line) if several else line for line in lines]
+    return table(rows, header=("specification", *HEADER) if several else HEADER, indent="")
+
+
+def _line(back: Returned) -> str:
+    """What is said as a run ends."""
+    accuracy = back.result.get("accuracy")
+    if accuracy is None:
+        return f"{back.errand.name} broke off with exit code {back.code}\n{back.why}".rstrip()
+    return f"{back.errand.name} done: accuracy {accuracy:.4f}  {back.result['run']}"
+
+
+def _cells(part: Part, back: Returned) -> tuple[str, ...]:
+    result, seed = back.result, "" if part.seed is None else str(part.seed)
+    if result.get("accuracy") is None:
+        return (seed, "", f"exit code {back.code}")
+    low, high = result["interval"]
+    shares = result["requirements"]
+    worst = min(shares, key=shares.__getitem__)
+    return (
+        *(seed, f"{result['accuracy']:.4f}", f"[{low:.4f}, {high:.4f}]", f"{result['feasible']:.4f}"),
+        *(_share(result), f"{worst} {shares[worst]:.4f}", f"{result['seconds']:.0f} s", result["run"]),
+    )
+
+
+def _share(result: Mapping[str, Any]) -> str:
+    return f"{100 * result['accuracy'] / result['feasible']:.1f} %" if result["feasible"] else ""
+
+
+def _mean(backs: Sequence[Returned]) -> list[tuple[str, ...]]:
+    """The last line, where there are several runs that ended well."""
+    results = [back.result for back in backs if back.result.get("accuracy") is not None]
+    if len(results) < 2:
+        return []
+    accuracies = [float(result["accuracy"]) for result in results]
+    spread = f"{min(accuracies):.4f} to {max(accuracies):.4f}"
+    feasible = fmean(float(result["feasible"]) for result in results)
+    mean = {"accuracy": fmean(accuracies), "feasible": feasible}
+    return [("mean", f"{mean['accuracy']:.4f}", spread, f"{feasible:.4f}", _share(mean))]
+
+
+def _entry(part: Part, back: Returned) -> dict[str, Any]:
+    seed = {} if part.seed is None else {"seed": part.seed}
+    why = {"why": back.why} if back.result.get("accuracy") is None else {}
+    return {"spec": str(part.spec), **seed, "exit_code": back.code, **why, **back.result}

@@ -1,0 +1,249 @@
+"""One sitting of training as a person sees it: the panel, Ctrl-C, pictures, the closing screen."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn, Self
+
+import typer
+
+from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
+from stlc.cli.framework.output import console, emit_json, say, show_diagnostics
+from stlc.cli.train.progress import Progress, RunInfo, Summary
+from stlc.controller.training.loop import Outcome, Watch
+from stlc.diagnostics import StlcError
+from stlc.rundir import LATEST, RUNS
+from stlc.stopping import age, leaving
+from stlc.view.learning import Commands, Learning, driven_lines, learning_of_run, recommended
+
+if TYPE_CHECKING:
+    from types import FrameType, TracebackType
+
+    from stlc.controller.training.tensorboard import Logbook, Opener
+    from stlc.rundir import RunDir
+
+BESIDE = 10.0
+"""Seconds that a command has beside its budget."""
+AFTER = 1.2
+"""Seconds for pictures and the end of a process, beside those before the training."""
+FAILURES = "failures.png"
+"""What the report draws of the starts that fail."""
+
+
+@dataclass(slots=True)
+class Sitting:
+    """Shows progress while it is open; Ctrl-C or SIGTERM saves and stops.
+
+    While steps are made it asks for that, and a second one stops at once, as the first does at other times.
+
+    Attributes:
+        folder: of the run.
+        outcome: what training gave, once it did.
+        progress: the panel.
+        logbook: how a log beside `train.jsonl` is opened, if one is wanted.
+        keeps: whether this process keeps the run's folder; of several ranks the first does.
+    """
+
+    folder: RunDir
+    outcome: Outcome | None = None
+    progress: Progress = field(default_factory=Progress)
+    logbook: Opener | None = None
+    keeps: bool = True
+    _log: Logbook | None = None
+    _asked: list[int] = field(default_factory=list)
+    _deferring: bool = False
+    _before_it: float = 0.0
+    _forced: ExitStack = field(default_factory=ExitStack)
+    _before: dict[int, Any] = field(default_factory=dict)
+
+    @property
+    def watch(self) -> Watch:
+        """What training reports to."""
+        stop = lambda: bool(self._asked)  # noqa: E731
+        return Watch(self._begun, self._row, stop, self._steps, self._late)
+
+    def _late(self, budget: float) -> float:
+        """By how much a slow machine would let the command end too late: imports foretell the pictures."""
+        return (1.0 + AFTER) * self._before_it - BESIDE - 0.1 * budget
+
+    @contextmanager
+    def _steps(self) -> Iterator[None]:
+        self._deferring = True
+        try:
+            yield
+        finally:
+            self._deferring = False
+
+    def _begun(self, chosen: dict[str, Any]) -> None:
+        self.progress.chosen(chosen)
+        if self._log is not None:
+            self._log.begun(chosen)
+
+    def _row(self, row: dict[str, Any]) -> None:
+        self.progress.update(row)
+        if self._log is not None:
+            self._log.row(row)
+
+    def __enter__(self) -> Self:
+        self._before_it = age()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._ask)
+        if self.keeps:
+            self._forced.enter_context(leaving(self._ended))
+            self._log = None if self.logbook is None else self.logbook(self.folder.path)
+            self.progress.start(_info(self.folder))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.progress.stop()
+        if self._log is not None:
+            self._log.close()
+        if error is not None and self.keeps:
+            if isinstance(error, KeyboardInterrupt | SystemExit):
+                self._ended()
+            else:
+                with suppress(StlcError):
+                    self.folder.finish("failed")
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._forced.close()
+
+    def _ended(self, _code: int = INTERRUPTED) -> None:
+        """The remains of a run that was ended on the spot: its last checkpoint."""
+        with suppress(StlcError):
+            self.folder.finish("interrupted")
+        self._say_interrupted()
+
+    def _say_interrupted(self) -> None:
+        ranks = 1 if self.outcome is None else self.outcome.ranks
+        say(f"interrupted, saved: {self.folder.shown}")
+        say(f"go on with: {_commands(self.folder, ranks).train_on}")
+
+    def _ask(self, number: int, _frame: FrameType | None) -> None:
+        at_once = bool(self._asked) or not self._deferring
+        self._asked.append(number)
+        if at_once:
+            raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(TERMINATED)
+
+    @property
+    def _signalled(self) -> int:
+        """The exit code of what asked to stop."""
+        return TERMINATED if signal.SIGTERM in self._asked else INTERRUPTED
+
+    def conclude(self, *, pictures: bool, json: bool) -> NoReturn:
+        """Pictures, then the closing screen or the JSON document; raises `typer.Exit` with the exit code."""
+        outcome = self.outcome
+        assert outcome is not None
+        if not self.keeps:
+            raise typer.Exit(self._signalled if outcome.interrupted else 0)
+        if outcome.score is None:
+            self._say_interrupted()
+            code = self._signalled
+            if json:
+                result = {"run": self.folder.shown, "seconds": outcome.seconds}
+                emit_json("train/1", ok=False, exit_code=code, result=result)
+            raise typer.Exit(code)
+        if pictures:
+            draw_report(self.folder)
+        why = () if outcome.why is None else (outcome.why,)
+        found = outcome.score.feasible > 0.0
+        code = 0 if found else 1
+        if json:
+            learning = _learning(outcome)
+            result = {"run": self.folder.shown, "seconds": outcome.seconds, **outcome.score.summary()}
+            result |= {} if outcome.driven is None else {"closed_loop": outcome.driven.summary()}
+            result |= {} if learning is None else {"verdict": learning.summary()}
+            result |= {key: self.folder.record().get(key) for key in ("steps", "schedule")}
+            emit_json("train/1", ok=found, exit_code=code, diagnostics=why, result=result)
+        else:
+            self.progress.finish(_summary(outcome, pictures=pictures), to=console())
+            show_diagnostics(why)
+        raise typer.Exit(code)
+
+
+def started(ranks: int) -> str:
+    """How so many processes are started that train together."""
+    return "stlc" if ranks == 1 else f"torchrun --nproc-per-node {ranks} -m stlc"
+
+
+def spoken(folder: RunDir) -> str:
+    """What other commands find the run by: its name in the usual place, its path elsewhere."""
+    usual = folder.path.resolve().parent.parent == RUNS.resolve()
+    return folder.name if usual else folder.shown
+
+
+def _commands(folder: RunDir, ranks: int = 1) -> Commands:
+    """The commands that a closing screen names; the run need not be named while it is the newest."""
+    newest = (RUNS / LATEST).resolve() == folder.path.resolve()
+    guard = recommended(folder.record())
+    return Commands.of(spoken(folder), newest=newest, start=started(ranks), guard=guard)
+
+
+def _learning(outcome: Outcome) -> Learning | None:
+    """The verdict on the training, as its record has it."""
+    return learning_of_run(outcome.run.dir, _commands(outcome.run.dir, outcome.ranks))
+
+
+def _info(folder: RunDir) -> RunInfo:
+    record = folder.record()
+    path = str(record.get("system_path"))
+    return RunInfo(
+        spec=str(record.get("spec")),
+        system=Path(path).name,
+        system_path=path,
+        run=folder.name,
+        seed=int(record.get("seed", 0)),
+        threads=int(record.get("threads", 1)),
+        device=str(record.get("device", "cpu")),
+        steps=record.get("steps"),
+    )
+
+
+def _summary(outcome: Outcome, *, pictures: bool) -> Summary:
+    from stlc.view.held_out import find_weakness, load_held_out, unsolved_text, weakness_text
+
+    learning = _learning(outcome)
+    score, folder = outcome.score, outcome.run.dir
+    assert score is not None
+    held = load_held_out(folder.path / "eval" / "held_out.npz")
+    weakness = find_weakness(held) if held is not None else None
+    where = unsolved = ""
+    if held is not None and weakness is not None:
+        where = weakness_text(weakness, held, outcome.run.task.system.signature)
+        unsolved = unsolved_text(held)
+    drawn = folder.path / FAILURES
+    return Summary(
+        accuracy=score.accuracy,
+        interval=score.interval,
+        held_out=score.states.shape[0],
+        requirements=score.requirements,
+        feasible=score.feasible,
+        seconds=outcome.seconds,
+        folder=folder.shown,
+        steps=outcome.steps,
+        searched=int(score.searched.sum()),
+        learning=learning,
+        driven=driven_lines({} if outcome.driven is None else {"closed_loop": outcome.driven.summary()}),
+        judged=score.endless,
+        where=where,
+        unsolved=unsolved,
+        picture=f"{folder.shown}/{FAILURES}" if pictures and weakness and drawn.is_file() else "",
+    )
+
+
+def draw_report(folder: RunDir) -> None:
+    """The report, where pictures can be drawn; nothing fails for their lack."""
+    from stlc.view import available
+
+    if not available():
+        say("no pictures: pip install 'stlc[plot]'")
+        return
+    from stlc.view.report import write_report
+
+    write_report(folder)

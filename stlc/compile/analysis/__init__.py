@@ -1,0 +1,1 @@
+"""What ranges say of a specification before it is used."""

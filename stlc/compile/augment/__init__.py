@@ -1,0 +1,1 @@
+"""States that a plan needs to know what was before it: timers, statuses, missions."""

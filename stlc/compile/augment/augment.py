@@ -1,0 +1,173 @@
+"""A requirement for training: what it asks of every plan, and the states that a plan needs for that."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+from stlc.compile.augment.lift import lifted
+from stlc.compile.augment.mission import (
+    Absolute,
+    Branch,
+    Goal,
+    Leaf,
+    Op,
+    last_step,
+    obligation,
+    possible,
+    update,
+)
+from stlc.compile.augment.nested import TooFarError, unnested
+from stlc.compile.augment.past import Past
+from stlc.compile.augment.timers import Ledger, Timer, tolerant
+from stlc.compile.frontend.bounds import report, to_window
+from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.traverse import absolute, at_hand, is_state_formula, looks_back, normal
+from stlc.compile.lowering.lower import lower
+from stlc.compile.lowering.simplify import simplify
+from stlc.diagnostics import Diagnostic
+from stlc.source import Span
+
+
+@dataclass(frozen=True, slots=True)
+class Augmented:
+    """A requirement for training.
+
+    Attributes:
+        formula: what every plan has to satisfy.
+        alive: whether the mission so far leaves a way to satisfy the requirement.
+        goal: its absolute formulas; None where it has none.
+    """
+
+    formula: typed.Formula
+    alive: typed.Formula
+    goal: Goal | None
+
+
+def augment(requirement: typed.Requirement, grid: Grid, ledger: Ledger, sink: list[Diagnostic]) -> Augmented:
+    """Rewrite the formula of a requirement; the states that it needs go to `ledger`.
+
+    Findings go to `sink`: E307 for an absolute interval that cannot be moved out of the operators around
+    it, E309 for a past operator without a timer, E310 for an absolute operator whose body looks ahead, E312
+    for one without a deadline, E311 without a horizon.
+    """
+    formula = requirement.formula
+    always = typed.Truth(formula.span, True)
+    if not absolute(formula) and not looks_back(formula):
+        return Augmented(formula, always, None)
+    past = Past(grid, ledger, sink, requirement.name)
+    if not absolute(formula):
+        return Augmented(past.rewrite(normal(formula)), always, None)
+    if grid.horizon is None:
+        report(sink, _without_horizon(formula.span))
+        return Augmented(always, always, None)
+    try:
+        flat = unnested(lifted(normal(formula), sink), grid, ledger, sink)
+    except TooFarError as problem:
+        report(sink, _looks_ahead(problem.span, str(problem)))
+        return Augmented(always, always, None)
+    plain = past.rewrite(flat)
+    goal = _Goals(grid, ledger, sink, requirement.name).of(plain)
+    return Augmented(obligation(goal, grid.horizon), possible(goal), goal)
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class _Goals:
+    """The absolute formulas of a requirement that is judged at the start of the mission."""
+
+    grid: Grid
+    ledger: Ledger
+    sink: list[Diagnostic]
+    name: str
+
+    def of(self, node: typed.Formula) -> Goal:
+        """The goals of a formula without operators of the past.
+
+        What is not absolute is asked of the start of the mission: there now and the mission clock agree.
+        """
+        if is_state_formula(node):
+            return self._leaf(node, ("always", ir.Window(0, 0)), (typed.Truth(node.span, True), node))
+        match node:
+            case typed.Logic(span, "and" | "or" as op, items):
+                return Branch(op, tuple(map(self.of, items)), span)
+            case typed.Temporal(_, "always" | "eventually" as op, interval, body):
+                window = to_window(interval, self.grid, self.sink, outward=op == "always")
+                return self._leaf(node, (op, window), (typed.Truth(node.span, True), body))
+            case typed.Until(_, "until" | "release" as op, interval, left, right):
+                window = to_window(interval, self.grid, self.sink, outward=op == "release")
+                return self._leaf(node, (op, window), (left, right))
+            case _:
+                report(self.sink, _looks_ahead(node.span))
+                return self.of(typed.Truth(node.span, True))
+
+    def _leaf(
+        self, node: typed.Formula, how: tuple[Op, ir.Window], operands: tuple[typed.Formula, typed.Formula]
+    ) -> Goal:
+        op, window = how
+        for body in operands:
+            if not is_state_formula(body):
+                report(self.sink, _looks_ahead(body.span))
+                return self.of(typed.Truth(node.span, True))
+        if window.hi is None and op in ("eventually", "until"):
+            report(self.sink, _without_deadline(node.span))
+        left, right = (simplify(lower(at_hand(body), self.grid, self.sink)) for body in operands)
+        formula = Absolute(op, window, node.span, *operands, tolerant(left), tolerant(right), right)
+        clock = self.ledger.clock(last_step(formula) + (self.grid.horizon or 0) + 1)
+        draft = Timer(self.name, "status", 0.0, ir.Lit(0.0), -1.0, 1.0, _about(formula))
+        return Leaf(formula, self.ledger.add(draft, update(formula, clock)), clock)
+
+
+_LATCHED: dict[Op, str] = {
+    "always": "false where {right} fails",
+    "eventually": "true where {right} holds",
+    "until": "true where {right} holds, false where {left} fails before",
+    "release": "true where {left} holds, false where {right} fails before",
+}
+
+
+def _about(formula: Absolute) -> str:
+    """`open | true | false`, and when it is latched."""
+    left, right = (f"`{' '.join(body.span.text.split())}`" for body in (formula.left, formula.right))
+    window = formula.window
+    if formula.right.span == formula.left.span:  # written otherwise
+        return f"open | true | false  what is known of {right}"
+    if window == ir.Window(0, 0):
+        return f"open | true | false  {right} at the start of the mission"
+    end = "end" if window.hi is None else window.hi
+    latched = _LATCHED[formula.op].format(left=left, right=right)
+    return f"open | true | false  {latched}, samples {window.lo}..{end} of the mission"
+
+
+def _looks_ahead(span: Span, why: str = "not about one instant of the mission") -> Diagnostic:
+    return Diagnostic(
+        "E310",
+        "an absolute operator over more of the future than states can hold",
+        span,
+        why,
+        help=(
+            "end the windows inside, and make those shorter that do not begin now",
+            "`stlc check` judges this one as it is",
+        ),
+    )
+
+
+def _without_deadline(span: Span) -> Diagnostic:
+    return Diagnostic(
+        "E312",
+        "an absolute promise without a deadline cannot be trained for",
+        span,
+        "no finite mission can break it",
+        help=("give its interval an end, such as `eventually@[0 s, 60 s]`",),
+    )
+
+
+def _without_horizon(span: Span) -> Diagnostic:
+    return Diagnostic(
+        "E311",
+        "an absolute interval is planned for window by window, and no planning horizon is known here",
+        span,
+        help=('name the system (`system "…"` in the file, or --system), or give dt and the horizon',),
+    )

@@ -1,0 +1,106 @@
+"""Absolute intervals are moved out of the operators around them: their truth does not depend on now.
+
+`always[0, T] (q -> always@[a, b] p)` is `eventually[0, T] q -> always@[a, b] p`. What cannot is E307 in
+training; on recorded traces every one is judged where it stands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal, assert_never
+
+from stlc.compile.frontend.bounds import report
+from stlc.compile.ir import typed
+from stlc.compile.ir.traverse import absolute, from_now, nodes, on_clock
+from stlc.diagnostics import Diagnostic
+from stlc.source import Span
+
+
+def lifted(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
+    """A formula in negation normal form with no absolute interval under another temporal operator."""
+    if not absolute(formula):
+        return formula
+    match formula:
+        case typed.Truth() | typed.Pred() | typed.Recalled():
+            return formula
+        case typed.Logic(_, "and" | "or", items):
+            return replace(formula, items=tuple(lifted(item, sink) for item in items))
+        case typed.Temporal(_, _, interval, body) if absolute(body):
+            if not _reaches_now(interval, formula):
+                return _stuck(formula, sink)
+            return _out_of(formula, lifted(body, sink), sink)
+        case typed.Temporal():
+            return formula
+        case typed.Until(_, _, _, left, right) if not absolute(left) and not absolute(right):
+            return formula
+        case typed.Until() | typed.Shift() | typed.Edge() | typed.Not() | typed.Logic() | typed.Freeze():
+            return _stuck(formula, sink)
+        case _:
+            assert_never(formula)
+
+
+def _reaches_now(interval: typed.Interval, node: typed.Temporal) -> bool:
+    """A window of the past that does not start now may be empty; what is constant in it is not the whole."""
+    return node.op in ("always", "eventually") or (interval.lo == typed.Time() and not interval.lo_open)
+
+
+def _out_of(node: typed.Temporal, body: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
+    """`op body` with what is constant in `body` beside the operator."""
+    if _constant(body):
+        return body
+    if isinstance(body, typed.Logic) and body.op in ("and", "or"):
+        fixed = [item for item in body.items if _constant(item)]
+        moving = [item for item in body.items if not _constant(item)]
+        if fixed and not any(map(absolute, moving)):
+            rest = moving[0] if len(moving) == 1 else replace(body, items=tuple(moving))
+            op: Literal["and", "or"] = body.op
+            return typed.Logic(node.span, op, (*fixed, replace(node, body=rest)))
+    return _stuck(replace(node, body=body), sink)
+
+
+def _constant(formula: typed.Formula) -> bool:
+    """Whether the truth of `formula` is the same at every instant."""
+    match formula:
+        case typed.Truth():
+            return True
+        case typed.Logic(_, _, items):
+            return all(map(_constant, items))
+        case typed.Not(_, body):
+            return _constant(body)
+        case _:
+            return on_clock(formula)
+
+
+def _stuck(outer: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
+    """E307 for the first absolute interval below `outer`."""
+    inner = next(node for node in nodes(outer) if on_clock(node) and node is not outer)
+    report(sink, _nested(inner.span, outer.span))
+    return typed.Truth(outer.span, True)
+
+
+def _nested(span: Span, outer: Span) -> Diagnostic:
+    return Diagnostic(
+        "E307",
+        "an absolute interval under another temporal operator",
+        span,
+        help=("its truth does not depend on now: move it out of the operator around it",),
+    ).with_note(f"the operator around it starts at line {outer.line}, column {outer.column}")
+
+
+def recorded(formula: typed.Formula) -> typed.Formula:
+    """The formula of a requirement for a recorded trace that is judged at its first sample alone.
+
+    There the mission clock and the time from now agree, so absolute intervals become relative ones. Those
+    under another temporal operator stay: they are judged at the first sample, whenever they are asked for.
+    """
+    match formula:
+        case typed.Truth() | typed.Pred() | typed.Shift() | typed.Edge() | typed.Recalled():
+            return formula
+        case typed.Not() | typed.Freeze():
+            return replace(formula, body=recorded(formula.body))
+        case typed.Logic():
+            return replace(formula, items=tuple(map(recorded, formula.items)))
+        case typed.Temporal() | typed.Until():
+            return from_now(formula)
+        case _:
+            assert_never(formula)

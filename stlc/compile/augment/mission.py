@@ -1,0 +1,210 @@
+"""Absolute formulas, each with a status: what the mission so far says, and what is left to plans.
+
+A status is open, true or false, latched by the clock and the state. A plan satisfies an absolute formula
+unless what is known by its end falsifies it: an open one is judged by its remainder within the horizon, and
+what lies beyond is taken to go well. Whatever `and`, `or`, `not` and `->` stand above, requiring that of
+every plan of an executed trace is requiring the formula of the trace.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Literal, TypeAlias, assert_never
+
+from stlc.compile.augment.timers import FALSE, OPEN, TRUE, at_least, both, choose, denied, guard
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.source import Span
+
+Op: TypeAlias = Literal["always", "eventually", "until", "release"]
+
+_OPEN, _TRUE, _FALSE = ir.Lit(OPEN), ir.Lit(TRUE), ir.Lit(FALSE)
+_KNOWN = ir.Lit(0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Absolute:
+    """An absolute operator over state formulas, in negation normal form.
+
+    Attributes:
+        op: the operator.
+        window: samples of the mission.
+        span: where it was written.
+        left: left operand of `until` and `release`, as typed; a constant for the other two.
+        right: the other operand, or the only one.
+        left_now: `left` as a condition on the state, ties counted.
+        right_now: the same of `right`.
+        margin: `right` as a formula of the IR.
+    """
+
+    op: Op
+    window: ir.Window
+    span: Span
+    left: typed.Formula
+    right: typed.Formula
+    left_now: ir.Formula
+    right_now: ir.Formula
+    margin: ir.Formula
+
+
+@dataclass(frozen=True, slots=True)
+class Leaf:
+    """An absolute formula with its columns."""
+
+    formula: Absolute
+    status: ir.Col
+    clock: ir.Col
+
+
+@dataclass(frozen=True, slots=True)
+class Branch:
+    """`and` or `or` of goals."""
+
+    op: Literal["and", "or"]
+    items: tuple[Goal, ...]
+    span: Span
+
+
+Goal: TypeAlias = Leaf | Branch
+"""The Boolean structure of a requirement above its absolute formulas."""
+
+
+def last_step(formula: Absolute) -> int:
+    """The last step of the mission of which this speaks by name."""
+    return formula.window.lo if formula.window.hi is None else formula.window.hi
+
+
+def mission_steps(goal: Goal) -> int:
+    """The last step of which any of its formulas speaks by name."""
+    if isinstance(goal, Leaf):
+        return last_step(goal.formula)
+    return max(map(mission_steps, goal.items))
+
+
+def endless(goal: Goal) -> bool:
+    """Whether a mission is never over: one of its formulas has no end."""
+    if isinstance(goal, Leaf):
+        return goal.formula.window.hi is None
+    return any(map(endless, goal.items))
+
+
+# ----------------------------------------------------------------------------- the latch
+
+
+def update(formula: Absolute, clock: ir.Col) -> Callable[[ir.Col], ir.Num]:
+    """The status one step later, from its own column: once it is known it stays."""
+    later = _decided(formula, clock)
+    return lambda own: choose(at_least(_KNOWN, ir.Op("abs", (own,))), later, own)
+
+
+def _decided(formula: Absolute, clock: ir.Col) -> ir.Num:
+    """What an open status becomes after the sample at hand."""
+    inside, left, right = _inside(formula.window, clock), formula.left_now, formula.right_now
+    over = _passed(formula.window, clock)
+    match formula.op:
+        case "always":
+            return choose(both(inside, denied(right)), _FALSE, choose(over, _TRUE, _OPEN))
+        case "eventually":
+            return choose(both(inside, right), _TRUE, choose(denied(over), _OPEN, _FALSE))
+        case "until":
+            met = choose(both(inside, right), _TRUE, choose(denied(over), _OPEN, _FALSE))
+            return choose(denied(left), _FALSE, met)
+        case "release":
+            failed = choose(both(inside, denied(right)), _FALSE, choose(over, _TRUE, _OPEN))
+            return choose(left, _TRUE, failed)
+        case _:
+            assert_never(formula.op)
+
+
+def _inside(window: ir.Window, clock: ir.Col) -> ir.Formula:
+    begun = at_least(clock, ir.Lit(float(window.lo)))
+    if window.hi is None:
+        return begun
+    not_over = at_least(ir.Lit(float(window.hi)), clock)
+    return not_over if window.lo == 0 else both(begun, not_over)
+
+
+def _passed(window: ir.Window, clock: ir.Col) -> ir.Formula:
+    """Whether the sample at hand is the last one of the window."""
+    return ir.Truth(False) if window.hi is None else at_least(clock, ir.Lit(float(window.hi)))
+
+
+# ------------------------------------------------------------------------- what plans do
+
+
+def obligation(goal: Goal, horizon: int) -> typed.Formula:
+    """What a plan has to satisfy, from where it starts: true unless falsified by its end."""
+    match goal:
+        case Branch(op, items, span):
+            return typed.Logic(span, op, tuple(obligation(item, horizon) for item in items))
+        case Leaf(formula):
+            return _remainder(goal, formula, horizon)
+        case _:
+            assert_never(goal)
+
+
+def _remainder(leaf: Leaf, formula: Absolute, horizon: int) -> typed.Formula:
+    span, left, right = formula.span, formula.left, formula.right
+    known = guard(leaf.status, _KNOWN, span)
+    alive = possible(leaf)
+    inside = typed_inside(formula.window, leaf.clock, span)
+    asked = typed.Logic(span, "->", (inside, right))
+    met = typed.Logic(span, "and", (inside, right))
+    far = _beyond(formula, leaf.clock, horizon)
+    match formula.op:
+        case "always":
+            held = asked if formula.window.hi == 0 else _all_along(asked)
+            return typed.Logic(span, "and", (alive, held))
+        case "eventually":
+            soon = typed.Temporal(span, "eventually", _plan(span), met)
+            return typed.Logic(span, "or", (known, far, soon))
+        case "until":
+            later = typed.Logic(span, "and", (far, _all_along(left)))
+            soon_or_later = typed.Logic(
+                span, "or", (later, typed.Until(span, "until", _plan(span), left, met))
+            )
+            return typed.Logic(span, "or", (known, typed.Logic(span, "and", (alive, soon_or_later))))
+        case "release":
+            freed = typed.Until(span, "release", _plan(span), left, asked)
+            return typed.Logic(span, "or", (known, typed.Logic(span, "and", (alive, freed))))
+        case _:
+            assert_never(formula.op)
+
+
+def possible(goal: Goal) -> typed.Formula:
+    """Whether the mission so far leaves a way to satisfy it; a guard on the state at hand."""
+    match goal:
+        case Branch(op, items, span):
+            return typed.Logic(span, op, tuple(map(possible, items)))
+        case Leaf(formula):
+            return guard(goal.status, ir.Lit(-0.5), formula.span)
+        case _:
+            assert_never(goal)
+
+
+def typed_inside(window: ir.Window, clock: ir.Col, span: Span) -> typed.Formula:
+    """Whether the sample at hand is in a window of the mission."""
+    begun = guard(clock, ir.Lit(float(window.lo)), span)
+    if window.hi is None:
+        return begun
+    not_over = guard(ir.Lit(float(window.hi)), clock, span)
+    return not_over if window.lo == 0 else typed.Logic(span, "and", (begun, not_over))
+
+
+def _beyond(formula: Absolute, clock: ir.Col, horizon: int) -> typed.Formula:
+    """Whether the end of the window lies beyond the end of the plan."""
+    hi = formula.window.hi
+    if hi is None or hi - horizon < 1:
+        return typed.Truth(formula.span, hi is None)
+    return guard(ir.Lit(float(hi - horizon - 1)), clock, formula.span)
+
+
+def _all_along(body: typed.Formula) -> typed.Formula:
+    return typed.Temporal(body.span, "always", _plan(body.span), body)
+
+
+def _plan(span: Span) -> typed.Interval:
+    """The whole planning window."""
+    return typed.Interval(typed.Time(), typed.Time(horizons=Fraction(1), span=span), span=span)

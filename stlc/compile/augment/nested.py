@@ -1,0 +1,362 @@
+"""Absolute operators over formulas that look ahead, as absolute operators over the past.
+
+`eventually@[a, b] always[0, c] p` says that at some sample from a + c to b + c p has held for c. All of it is
+said of the moment at which it is known, so that what is not known yet needs no memory but that of the past:
+a timer a window. Where parts are known at different moments the earlier ones wait in a register.
+
+A promise that begins at b at the latest is lost as soon as p fails later than that: `left until@ right` says
+so at once, and not when its last moment has passed. (Past for future: Maler, Nickovic and Pnueli 2005.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+from typing import Literal, TypeAlias, final
+
+from stlc.compile.augment.mission import typed_inside
+from stlc.compile.augment.past import REGISTER
+from stlc.compile.augment.timers import Ledger, guard
+from stlc.compile.frontend.bounds import to_window
+from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.traverse import nodes, normal
+from stlc.diagnostics import Diagnostic
+from stlc.source import Span
+
+_MOST_TURNS = 32
+"""Samples of an `until` below other operators: it is written out."""
+
+_Wide: TypeAlias = Literal["always", "eventually", "once", "historically"]
+Formulas: TypeAlias = tuple[typed.Formula, ...]
+
+
+class TooFarError(Exception):
+    """A formula looks ahead without end, or in a way that no state holds; the message says how."""
+
+    def __init__(self, span: Span, why: str) -> None:
+        super().__init__(why)
+        self.span = span
+
+
+def looks_ahead(formula: typed.Formula) -> bool:
+    """Whether `formula` has an operator of the future."""
+    return any(map(_forwards, nodes(formula)))
+
+
+def _forwards(node: typed.Formula) -> bool:
+    match node:
+        case typed.Temporal(_, op):
+            return op in ("always", "eventually")
+        case typed.Until(_, op):
+            return op != "since"
+        case typed.Shift(_, steps):
+            return steps > 0
+        case _:
+            return False
+
+
+def unnested(formula: typed.Formula, grid: Grid, ledger: Ledger, sink: list[Diagnostic]) -> typed.Formula:
+    """A formula in negation normal form, judged at the start of the mission, of operators that look back.
+
+    Args:
+        formula: absolute operators, and others that begin at the start, under `and` and `or`.
+        grid: of time.
+        ledger: takes the mission clock where latest moments are asked for.
+        sink: takes findings about bounds.
+
+    Raises:
+        TooFarError: what stands below an operator looks ahead without end, or is not understood.
+    """
+    match formula:
+        case typed.Logic(_, _, items):
+            return replace(formula, items=tuple(unnested(item, grid, ledger, sink) for item in items))
+        case typed.Temporal(_, "always" | "eventually" as op, interval, body) if looks_ahead(body):
+            window = to_window(interval, grid, sink, outward=op == "always")
+            body = _on_grid(body, grid, sink)
+            writer = _Writer(ledger, formula.span, soon=op == "eventually")
+            if op == "eventually":
+                return writer.met(window, (), body)
+            return normal(writer.met(window, (), normal(body, -1)), -1)
+        case typed.Until(_, "until" | "release" as op, interval, left, right) if looks_ahead(
+            left
+        ) or looks_ahead(right):
+            window = to_window(interval, grid, sink, outward=op == "release")
+            left, right = _on_grid(left, grid, sink), _on_grid(right, grid, sink)
+            writer = _Writer(ledger, formula.span, soon=op == "until")
+            if op == "until":
+                return writer.until(window, left, right)
+            return normal(writer.until(window, normal(left, -1), normal(right, -1)), -1)
+        case _:
+            return formula
+
+
+# ------------------------------------------------------------------- windows in samples
+
+
+def _on_grid(
+    formula: typed.Formula, grid: Grid, sink: list[Diagnostic], *, denied: bool = False
+) -> typed.Formula:
+    """The formula with bounds in whole samples, rounded for the operator that was written."""
+    match formula:
+        case typed.Logic(_, _, items):
+            return replace(formula, items=tuple(_on_grid(item, grid, sink) for item in items))
+        case typed.Shift(span, 1, body):
+            return _next(span, _on_grid(normal(body), grid, sink))
+        case typed.Not(_, typed.Shift(span, 1, body)):
+            return _next(span, _on_grid(normal(body, -1), grid, sink))
+        case typed.Not(_, body):
+            return replace(formula, body=_on_grid(body, grid, sink, denied=True))
+        case typed.Temporal(_, op, interval, body):
+            window = to_window(interval, grid, sink, outward=op in ("always", "historically"))
+            return replace(formula, interval=_steps(window, formula.span), body=_on_grid(body, grid, sink))
+        case typed.Until(_, op, interval, left, right):
+            window = to_window(interval, grid, sink, outward=op == "release" or denied)
+            left, right = (_on_grid(part, grid, sink) for part in (left, right))
+            return replace(formula, interval=_steps(window, formula.span), left=left, right=right)
+        case _:
+            return formula
+
+
+def _next(span: Span, body: typed.Formula) -> typed.Formula:
+    """`next(p)`: a mission has a next sample."""
+    return typed.Temporal(span, "always", _steps(ir.Window(1, 1), span), body)
+
+
+def _steps(window: ir.Window, span: Span, clock: Literal["now", "start"] = "now") -> typed.Interval:
+    hi = None if window.hi is None else typed.Time(steps=Fraction(window.hi), span=span)
+    lo = typed.Time(steps=Fraction(window.lo), span=span)
+    return typed.Interval(lo, hi, clock=clock, span=span)
+
+
+def _window(node: typed.Temporal | typed.Until) -> ir.Window:
+    """The window of an operator whose bounds are whole samples."""
+    lo, hi = node.interval.lo, node.interval.hi
+    return ir.Window(int(lo.steps), None if hi is None else int(hi.steps))
+
+
+def _sum(window: ir.Window, lo: int, hi: int | None) -> ir.Window:
+    return ir.Window(window.lo + lo, None if window.hi is None or hi is None else window.hi + hi)
+
+
+def _ahead(formula: typed.Formula) -> int:
+    """How many samples a formula looks ahead. Raises TooFarError where it has no end."""
+    match formula:
+        case typed.Truth() | typed.Pred() | typed.Edge() | typed.Shift() | typed.Freeze() | typed.Recalled():
+            return 0
+        case typed.Logic(_, _, items):
+            return max(map(_ahead, items))
+        case typed.Not(_, body):
+            return _ahead(body)
+        case typed.Temporal(_, op, _, body):
+            return _ahead(body) + (_end(formula) if op in ("always", "eventually") else 0)
+        case typed.Until(_, op, _, left, right):
+            return max(_ahead(left), _ahead(right)) + (0 if op == "since" else _end(formula))
+
+
+def _end(node: typed.Temporal | typed.Until) -> int:
+    hi = _window(node).hi
+    if hi is None:
+        raise TooFarError(node.span, "a window to the end of the trace")
+    return hi
+
+
+# ------------------------------------------------------------------------ the rewriting
+
+
+@final
+class _Writer:
+    """Writes what is known of a promise in terms of the past.
+
+    Args:
+        ledger: takes the mission clock.
+        span: of the absolute operator.
+        soon: whether it is worth a state to know at once that the promise is lost.
+    """
+
+    def __init__(self, ledger: Ledger, span: Span, *, soon: bool) -> None:
+        self._ledger, self._span, self._soon = ledger, span, soon
+
+    def met(self, window: ir.Window, when: Formulas, what: typed.Formula) -> typed.Formula:
+        """At some sample of `window` there is all of `when`, which looks back, and from it on `what`."""
+        if not looks_ahead(what):
+            return self._on_clock("eventually", window, self._and(*when, what))
+        match what:
+            case typed.Logic(_, "or", items):
+                return self._or(*(self.met(window, when, item) for item in items))
+            case typed.Logic(_, "and", items):
+                return self._all(window, when, items)
+            case typed.Temporal(_, "eventually", _, body):
+                inner = _window(what)
+                later = _sum(window, inner.lo, inner.hi)
+                return self.met(later, (self._once(inner, self._begun(window, when)),) if when else (), body)
+            case typed.Temporal(_, "always", _, body):
+                _end(what)
+                return self._kept(window, when, (_window(what), body))
+            case typed.Until(_, "until", _, left, right):
+                return self._reached(window, when, (_window(what), left, right))
+            case typed.Until(_, "release", _, left, right):
+                return self.met(window, when, self._freed(what, left, right))
+            case _:
+                raise TooFarError(what.span, "not something that the past can tell")
+
+    def until(self, window: ir.Window, left: typed.Formula, right: typed.Formula) -> typed.Formula:
+        """`left until@ right`, said when both are known."""
+        late = max(_ahead(left), _ahead(right))
+        known = self._or(self._until_step(late - 1), self.delayed(left, late))
+        return self._on_clock_until(_sum(window, late, late), known, self.delayed(right, late))
+
+    def _all(self, window: ir.Window, when: Formulas, items: Formulas) -> typed.Formula:
+        """Conditions that are known at once, and the others."""
+        later = [item for item in items if looks_ahead(item)]
+        known = (*when, *(item for item in items if not looks_ahead(item)))
+        if len(later) == 1:
+            return self.met(window, known, later[0])
+        whole = self._and(*known, *later)
+        late = _ahead(whole)
+        return self._on_clock("eventually", _sum(window, late, late), self.delayed(whole, late))
+
+    def _kept(
+        self, window: ir.Window, when: Formulas, what: tuple[ir.Window, typed.Formula]
+    ) -> typed.Formula:
+        """`always[l, u] body` from a sample of `window` on."""
+        (lo, hi), body = (what[0].lo, what[0].hi or 0), what[1]
+        late = _ahead(body)
+        body = self.delayed(body, late)
+        lo, hi = lo + late, hi + late
+        there = _sum(window, hi, hi)
+        if not when:
+            held = self._past("historically", ir.Window(0, hi - lo), body)
+            if not self._soon:
+                return self._on_clock("eventually", there, held)
+            latest = self._until_step(None if window.hi is None else window.hi + lo - 1)
+            return self._on_clock_until(there, self._or(latest, body), held)
+        begun = self._ago(self._begun(window, when), lo)
+        lasting = self._since(ir.Window(hi - lo, None), body, begun)
+        if not self._soon:
+            return self._on_clock("eventually", there, lasting)
+        latest = self._until_step(None if window.hi is None else window.hi + lo)
+        pending = self._since(ir.Window(0, None), body, begun)
+        return self._on_clock_until(there, self._or(latest, pending), lasting)
+
+    def _reached(
+        self, window: ir.Window, when: Formulas, what: tuple[ir.Window, typed.Formula, typed.Formula]
+    ) -> typed.Formula:
+        """`left until[l, u] right` from a sample of `window` on."""
+        inner, left, right = what
+        late = max(_ahead(left), _ahead(right))
+        left, right = self.delayed(left, late), self.delayed(right, late)
+        begun = self._ago(self._begun(window, when), late) if when else None
+        window = _sum(window, late, late)
+        there = _sum(window, inner.lo, inner.hi)
+        if begun is None:
+            met = self._and(right, self._past("historically", ir.Window(0, inner.lo), left))
+            latest = self._until_step(None if window.hi is None else window.hi - 1)
+            return self._on_clock_until(there, self._or(latest, left), met)
+        met = self._and(right, self._since(inner, left, begun))
+        if not self._soon:
+            return self._on_clock("eventually", there, met)
+        latest = self._until_step(window.hi)
+        pending = self._since(ir.Window(0, inner.hi), left, begun)
+        return self._on_clock_until(there, self._or(latest, pending), met)
+
+    def _freed(self, node: typed.Until, left: typed.Formula, right: typed.Formula) -> typed.Formula:
+        """`left release[l, u] right`: right throughout, left before the window, or right until left in it."""
+        window, span = _window(node), node.span
+        hi = _end(node)
+        always = typed.Temporal(span, "always", node.interval, right)
+        before = typed.Temporal(span, "eventually", _steps(ir.Window(0, window.lo), span), left)
+        inside = typed.Until(
+            span, "until", _steps(ir.Window(0, hi - window.lo), span), self._or(left, right), left
+        )
+        at = _steps(ir.Window(window.lo, window.lo), span)
+        return self._or(always, before, typed.Temporal(span, "eventually", at, inside))
+
+    # ---------------------------------------------------------------- later, by a fixed time
+
+    def delayed(self, formula: typed.Formula, steps: int) -> typed.Formula:
+        """What a formula said `steps` samples ago, by when it is known."""
+        if not looks_ahead(formula):
+            return self._ago(formula, steps)
+        match formula:
+            case typed.Logic(_, _, items):
+                return replace(formula, items=tuple(self.delayed(item, steps) for item in items))
+            case typed.Temporal(_, "always" | "eventually" as op, _, body):
+                window, late, end = _window(formula), _ahead(body), _end(formula)
+                back: _Wide = "historically" if op == "always" else "once"
+                seen = self._past(back, ir.Window(0, end - window.lo), self.delayed(body, late))
+                return self._ago(seen, steps - end - late)
+            case typed.Until(_, "until" | "release", _, left, right):
+                return self._written_out(formula, left, right, steps)
+            case _:
+                raise TooFarError(formula.span, "not something that the past can tell")
+
+    def _written_out(
+        self, node: typed.Until, left: typed.Formula, right: typed.Formula, steps: int
+    ) -> typed.Formula:
+        """`left until[l, u] right`, or `release`, turn by turn."""
+        window, end, strong = _window(node), _end(node), node.op == "until"
+        if end > _MOST_TURNS:
+            raise TooFarError(
+                node.span, f"an `{node.op}` of more than {_MOST_TURNS} samples below other operators"
+            )
+        one, two = (self._and, self._or) if strong else (self._or, self._and)
+        whole = one(self.delayed(left, steps - end), self.delayed(right, steps - end))
+        for turn in range(end - 1, -1, -1):
+            ago = steps - turn
+            met = two(self.delayed(right, ago), whole) if turn >= window.lo else whole
+            whole = one(self.delayed(left, ago), met)
+        return whole
+
+    # ------------------------------------------------------------------------ small words
+
+    def _and(self, *items: typed.Formula) -> typed.Formula:
+        return items[0] if len(items) == 1 else typed.Logic(self._span, "and", items)
+
+    def _or(self, *items: typed.Formula) -> typed.Formula:
+        kept = tuple(item for item in items if not (isinstance(item, typed.Truth) and not item.value))
+        return kept[0] if len(kept) == 1 else typed.Logic(self._span, "or", kept)
+
+    def _begun(self, window: ir.Window, when: Formulas) -> typed.Formula:
+        """All of `when`, at a sample of `window`."""
+        if window == ir.Window(0, None):
+            return self._and(*when)
+        clock = self._ledger.clock((window.lo if window.hi is None else window.hi) + 1)
+        return self._and(*when, typed_inside(window, clock, self._span))
+
+    def _until_step(self, step: int | None) -> typed.Formula:
+        """Whether the mission is at most so many samples old; always where None is said."""
+        if step is None or step < 0:
+            return typed.Truth(self._span, step is None)
+        return guard(ir.Lit(float(step)), self._ledger.clock(step + 1), self._span)
+
+    def _on_clock(self, op: _Wide, window: ir.Window, body: typed.Formula) -> typed.Formula:
+        return typed.Temporal(self._span, op, _steps(window, self._span, "start"), body)
+
+    def _on_clock_until(self, window: ir.Window, left: typed.Formula, right: typed.Formula) -> typed.Formula:
+        if isinstance(left, typed.Logic) and any(isinstance(item, typed.Truth) for item in left.items):
+            return self._on_clock("eventually", window, right)
+        return typed.Until(self._span, "until", _steps(window, self._span, "start"), left, right)
+
+    def _past(self, op: _Wide, window: ir.Window, body: typed.Formula) -> typed.Formula:
+        if window == ir.Window(0, 0):
+            return body
+        self._require_memory(window.lo)
+        return typed.Temporal(self._span, op, _steps(window, self._span), body)
+
+    def _once(self, window: ir.Window, body: typed.Formula) -> typed.Formula:
+        return self._past("once", window, body)
+
+    def _ago(self, body: typed.Formula, steps: int) -> typed.Formula:
+        return self._once(ir.Window(steps, steps), body)
+
+    def _since(self, window: ir.Window, left: typed.Formula, right: typed.Formula) -> typed.Formula:
+        if window.hi is not None:
+            self._require_memory(window.lo)
+        return typed.Until(self._span, "since", _steps(window, self._span), left, right)
+
+    def _require_memory(self, steps: int) -> None:
+        if steps > REGISTER:
+            why = f"a part is kept for {steps} samples until the rest is known: at most {REGISTER}"
+            raise TooFarError(self._span, why)

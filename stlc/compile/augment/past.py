@@ -1,0 +1,383 @@
+"""Operators of the past become timers, so that a plan knows what was before it.
+
+A timer holds the time up to the sample before: `historically[0, c] p` is `p and held >= c`, `once[0, c] p` is
+`p or since_p <= c`. At the start of a mission nothing was before: windows of the past are cut there.
+
+That decides at an instant, and has no slope. Along a plan the samples since its start are looked at as they
+were written about, and only what was before the start is left to the timer: after k steps it lacks the
+`c - held - k` steps that it lacked of c when the plan began.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Literal, TypeAlias, final
+
+from stlc.compile.augment.timers import (
+    MISSING,
+    Kind,
+    Ledger,
+    Timer,
+    at_least,
+    choose,
+    denied,
+    guard,
+    recalled,
+    tolerant,
+)
+from stlc.compile.frontend.bounds import report, to_window
+from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.traverse import Sign, at_hand, flip, is_state_formula, looks_back, normal
+from stlc.compile.lowering.lower import lower
+from stlc.compile.lowering.simplify import simplify
+from stlc.diagnostics import Diagnostic
+from stlc.source import Span
+
+REGISTER = 64
+"""Samples ago up to which states hold what a formula said then, one a sample."""
+
+_ZERO, _ONE = ir.Lit(0.0), ir.Lit(1.0)
+_Op: TypeAlias = Literal["and", "or"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Test:
+    """`left >= right`, where one is a timer and the other a number.
+
+    Attributes:
+        left: the greater one.
+        right: the other one.
+        span: of the operator.
+        later: how much a timer has gone on one step later, if nothing else happened.
+    """
+
+    left: ir.Num
+    right: ir.Num
+    span: Span
+    later: int = 0
+
+    def decides(self) -> typed.Recalled:
+        """As one of several ways: it decides, or has no say."""
+        return typed.Recalled(
+            self.span, guard(self.left, self.right, self.span), guard(*self._then, self.span)
+        )
+
+    def lacks(self) -> typed.Recalled:
+        """As one of several conditions: what is missing counts."""
+        return typed.Recalled(
+            self.span, guard(self.left, self.right, self.span), recalled(*self._then, self.span)
+        )
+
+    @property
+    def _then(self) -> tuple[ir.Num, ir.Num]:
+        """Both sides some samples after the timer was read at the first one."""
+        return self._since_first(self.left), self._since_first(self.right)
+
+    def _since_first(self, side: ir.Num) -> ir.Num:
+        if not isinstance(side, ir.Col):
+            return side
+        first = ir.at_first(side)
+        return ir.Op("add", (first, ir.Col(ir.ELAPSED))) if self.later else first
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class Past:
+    """Rewrites operators of the past for one requirement.
+
+    Attributes:
+        grid: of time.
+        ledger: takes the timers.
+        sink: takes the findings, E309 for what no timer can hold.
+        name: of the requirement; timers are named after it.
+    """
+
+    grid: Grid
+    ledger: Ledger
+    sink: list[Diagnostic]
+    name: str
+
+    def rewrite(self, formula: typed.Formula) -> typed.Formula:
+        """A formula in negation normal form without operators of the past."""
+        if not looks_back(formula):
+            return formula
+        match formula:
+            case typed.Logic(_, _, items):
+                return replace(formula, items=tuple(map(self.rewrite, items)))
+            case typed.Temporal(_, "once" | "historically"):
+                return self._window(formula)
+            case typed.Temporal():
+                return replace(formula, body=self.rewrite(formula.body))
+            case typed.Until(_, "since"):
+                return self._since(formula, positive=True)
+            case typed.Not(_, typed.Until(_, "since") as since):
+                return self._since(since, positive=False)
+            case typed.Until():
+                return replace(formula, left=self.rewrite(formula.left), right=self.rewrite(formula.right))
+            case typed.Edge():
+                return self._edge(formula, positive=True)
+            case typed.Not(_, typed.Edge() as edge):
+                return self._edge(edge, positive=False)
+            case _:
+                return self._refused(formula.span, "under `prev` or `next`")
+
+    # ---------------------------------------------------------------- once, historically
+
+    def _window(self, node: typed.Temporal) -> typed.Formula:
+        once = node.op == "once"
+        body = self._body(node.body)
+        if body is None:
+            return typed.Truth(node.span, True)
+        window = to_window(node.interval, self.grid, self.sink, outward=not once)
+        if window.lo:
+            recent = ir.Window(0, None if window.hi is None else window.hi - window.lo)
+            inner = self._window(replace(node, interval=_back(recent, node.span)))
+            return self._delayed(node, inner, (window.lo, not once))
+        if window.hi == 0:
+            return body
+        memory = self._seen(node, body, window.hi) if once else self._held(node, body, window.hi)
+        inside = replace(node, interval=_back(window, node.span), body=body)
+        op: _Op = "or" if once else "and"
+        return typed.Recalled(
+            node.span,
+            now=typed.Logic(node.span, op, (body, memory.now)),
+            along=typed.Logic(node.span, op, (inside, memory.along)),
+        )
+
+    def _seen(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
+        """Whether `body` held at one of the `most` samples before."""
+        condition = self._condition(body)
+        if most is None:
+            draft = self._draft("latch", "seen", 0.0, 1.0, f"whether {_short(node.body)} ever held")
+            seen = self.ledger.add(draft, lambda own: choose(condition, _ONE, own))
+            return _Test(seen, _ONE, node.span).decides()
+        about = f"steps since {_short(node.body)} last held, up to {most}"
+        draft = self._draft("timer", "since", most + 1.0, most + 1.0, about)
+        since = self.ledger.add(draft, lambda own: choose(condition, _ONE, _counted(own, most + 1)))
+        return _Test(ir.Lit(float(most)), since, node.span, later=1).decides()
+
+    def _held(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
+        """Whether `body` held at all of the `most` samples before."""
+        condition = self._condition(body)
+        if most is None:
+            draft = self._draft("latch", "kept", 1.0, 1.0, f"whether {_short(node.body)} always held")
+            kept = self.ledger.add(draft, lambda own: choose(condition, own, _ZERO))
+            return _Test(kept, _ONE, node.span).lacks()
+        about = f"steps for which {_short(node.body)} has held, up to {most}"
+        draft = self._draft("timer", "held", float(most), float(most), about)
+        held = self.ledger.add(draft, lambda own: choose(condition, _counted(own, most), _ZERO))
+        return _Test(held, ir.Lit(float(most)), node.span, later=1).lacks()
+
+    # ------------------------------------------------------------------------------ since
+
+    def _since(self, node: typed.Until, *, positive: bool) -> typed.Formula:
+        """`p since[0, c] q`: p now, and q now or so lately that p has held from there on; or its dual."""
+        sign: Sign = 1 if positive else -1
+        left, right = self._body(normal(node.left, sign)), self._body(normal(node.right, sign))
+        if left is None or right is None:
+            return typed.Truth(node.span, True)
+        window = to_window(node.interval, self.grid, self.sink, outward=not positive)
+        if window.lo and window.hi is None:
+            return self._lasting(node, left, right, (window.lo, positive))
+        if window.lo and window.hi is not None:
+            return self._since_before(node, window, positive=positive)
+        ops: tuple[_Op, _Op] = ("and", "or") if positive else ("or", "and")
+        if window.hi == 0:
+            return typed.Logic(node.span, ops[0], (left, right))
+        recent = self._recent(node, self._condition(left), self._condition(right), (window.hi, positive))
+        met = typed.Logic(node.span, ops[1], (right, recent.now))
+        whole = typed.Temporal(
+            node.span, "historically" if positive else "once", _back(ir.Window(0, None), node.span), left
+        )
+        before = typed.Logic(node.span, ops[0], (whole, recent.along))
+        return typed.Recalled(
+            node.span,
+            now=typed.Logic(node.span, ops[0], (left, met)),
+            along=typed.Logic(
+                node.span, ops[1], (_since_inside(node, left, right, window, positive=positive), before)
+            ),
+        )
+
+    def _recent(
+        self, node: typed.Until, left: ir.Formula, right: ir.Formula, how: tuple[int | None, bool]
+    ) -> typed.Recalled:
+        """Whether q held at one of the samples before, and p from there on up to now; or its contrary."""
+        most, positive = how
+        held, met = (left, right) if positive else (denied(left), denied(right))
+        about = f"{_short(node.right)}, and {_short(node.left)} from there on"
+        if most is None:
+            draft = self._draft("latch", "since", 0.0, 1.0, f"whether there was {about}")
+            begun = self.ledger.add(draft, lambda own: choose(held, choose(met, _ONE, own), _ZERO))
+            test = _Test(begun, _ONE, node.span) if positive else _Test(_ZERO, begun, node.span)
+            return test.decides()
+        far = ir.Lit(most + 1.0)
+        draft = self._draft("timer", "since", far.value, far.value, f"steps since {about}, up to {most}")
+        since = self.ledger.add(
+            draft, lambda own: choose(held, choose(met, _ONE, _counted(own, most + 1)), far)
+        )
+        if positive:
+            return _Test(ir.Lit(float(most)), since, node.span, later=1).decides()
+        return _Test(since, far, node.span, later=1).decides()
+
+    # ------------------------------------------------------------------------- rise, fall
+
+    def _edge(self, node: typed.Edge, *, positive: bool) -> typed.Formula:
+        """`rise`: now and not before; false at the first sample."""
+        now: Sign = 1 if (node.op == "rise") is positive else -1
+        body, before = self._body(normal(node.body, now)), self._body(normal(node.body, flip(now)))
+        if body is None or before is None:
+            return typed.Truth(node.span, True)
+        op: _Op = "and" if positive else "or"
+        return typed.Logic(node.span, op, (body, self._delayed(node, before, (1, not positive))))
+
+    # --------------------------------------------------------------------- some time ago
+
+    def _delayed(
+        self, node: typed.Temporal | typed.Until | typed.Edge, body: typed.Formula, how: tuple[int, bool]
+    ) -> typed.Formula:
+        """What `body` said so many samples ago, in a register; second: what it said before the start."""
+        steps, before = how
+        if steps > REGISTER:
+            return self._refused(node.span, f"that asks what was more than {REGISTER} samples ago")
+        condition = self._condition(body)
+        initial = float(before)
+        known = _short(node.body if not isinstance(node, typed.Until) else node)
+        about = f"whether {known} held at the sample before"
+        draft = self._draft("latch", "before", initial, 1.0, about)
+        latch = self.ledger.add(draft, lambda _own: choose(condition, _ONE, _ZERO))
+        for ago in range(2, steps + 1):
+            about = f"whether {known} held {ago} samples before"
+            draft = self._draft("latch", "before", initial, 1.0, about)
+            latch = self.ledger.add(draft, lambda _own, last=latch: last)  # type: ignore[misc]
+        begun = guard(ir.Col(ir.ELAPSED), ir.Lit(float(steps)), node.span)
+        first = typed.Logic(node.span, "or", (begun, recalled(latch, _ONE, node.span)))
+        inside = typed.Shift(node.span, -steps, body, outside=True)
+        return typed.Recalled(
+            node.span,
+            now=guard(latch, _ONE, node.span),
+            along=typed.Logic(node.span, "and", (inside, first)),
+        )
+
+    def _since_before(self, node: typed.Until, window: ir.Window, *, positive: bool) -> typed.Formula:
+        """`p since[a, b] q`: p for the last a, and a ago `p since[0, b - a] q`; or its dual."""
+        lo, hi = window.lo, window.hi or 0
+        recent = replace(node, interval=_back(ir.Window(0, hi - lo), node.span))
+        ago = self._delayed(node, self._since(recent, positive=positive), (lo, not positive))
+        held = typed.Temporal(
+            node.span,
+            "historically" if positive else "once",
+            _back(ir.Window(0, lo), node.span),
+            normal(node.left, 1 if positive else -1),
+        )
+        return typed.Logic(node.span, "and" if positive else "or", (self._window(held), ago))
+
+    def _lasting(
+        self, node: typed.Until, left: typed.Formula, right: typed.Formula, how: tuple[int, bool]
+    ) -> typed.Formula:
+        """`p since[a, end] q`: how long ago the first q was from which on p has held; or its dual."""
+        least, positive = how
+        p, q = self._condition(left), self._condition(right)
+        held, met = (p, q) if positive else (denied(p), denied(q))
+        from_there = f"{_short(node.right)} with {_short(node.left)} from there on"
+        about = f"steps since the first {from_there}, up to {least}"
+        draft = self._draft("timer", "lasting", 0.0, float(least), about)
+
+        def update(own: ir.Col) -> ir.Num:
+            running = ir.Where(at_least(own, _ONE), _counted(own, least), choose(met, _ONE, _ZERO))
+            return choose(held, running, _ZERO)
+
+        age = self.ledger.add(draft, update)
+        span, bound = node.span, ir.Lit(float(least))
+        first, elapsed = ir.at_first(age), ir.Col(ir.ELAPSED)
+        after = ir.Op("add", (first, elapsed))
+        whole = _back(ir.Window(0, None), span)
+        inside = _since_inside(node, left, right, ir.Window(least, None), positive=positive)
+        if not positive:
+            none = typed.Logic(
+                span,
+                "or",
+                (
+                    typed.Temporal(span, "once", whole, left),
+                    guard(_ZERO, first, span),
+                    guard(ir.Lit(least - 1.0), after, span),
+                ),
+            )
+            now = typed.Logic(span, "or", (left, guard(ir.Lit(least - 1.0), age, span)))
+            return typed.Recalled(span, now=now, along=typed.Logic(span, "and", (inside, none)))
+        memory = typed.Logic(
+            span,
+            "and",
+            (
+                typed.Temporal(span, "historically", whole, left),
+                guard(first, _ONE, span),
+                guard(after, bound, span),
+            ),
+        )
+        missing = ir.Op("min", (ir.Op("sub", (elapsed, bound)), ir.Lit(-1.0)))
+        lacks = typed.Pred(span, ir.Op("mul", (missing, ir.Lit(MISSING))), strict=False)
+        return typed.Recalled(
+            span,
+            now=typed.Logic(span, "and", (left, guard(age, bound, span))),
+            along=typed.Logic(span, "or", (inside, memory, lacks)),
+        )
+
+    # -------------------------------------------------------------------------- in common
+
+    def _draft(self, kind: Kind, what: str, initial: float, high: float, about: str) -> Timer:
+        return Timer(f"{self.name}_{what}", kind, initial, _ZERO, 0.0, high, about)
+
+    def _condition(self, body: typed.Formula) -> ir.Formula:
+        return tolerant(simplify(lower(at_hand(body), self.grid, self.sink)))
+
+    def _body(self, body: typed.Formula) -> typed.Formula | None:
+        """A body without operators of the past, if it is about one instant alone by then."""
+        rewritten = self.rewrite(body)
+        if is_state_formula(rewritten):
+            return rewritten
+        self._refused(body.span, "over a formula that looks ahead")
+        return None
+
+    def _refused(self, span: Span, why: str) -> typed.Formula:
+        finding = Diagnostic(
+            "E309",
+            "this past operator would need the policy to remember more than a timer can hold",
+            span,
+            f"a past operator {why}",
+            help=(
+                f"windows that end now, or up to {REGISTER} samples ago, train: `once[0, 3 s] p` is a timer",
+                "`stlc check` can judge this one on recorded traces",
+            ),
+        )
+        report(self.sink, finding)
+        return typed.Truth(span, True)
+
+
+def _counted(own: ir.Num, most: int) -> ir.Num:
+    """One more, up to `most`."""
+    return ir.Op("min", (ir.Op("add", (own, _ONE)), ir.Lit(float(most))))
+
+
+def _short(formula: typed.Formula) -> str:
+    """A formula as it was written, cut where it is long."""
+    text = " ".join(formula.span.text.split())
+    return f"`{text}`" if len(text) <= 40 else f"`{text[:37]}...`"
+
+
+def _back(window: ir.Window, span: Span) -> typed.Interval:
+    """A window of the past."""
+    hi = None if window.hi is None else typed.Time(steps=Fraction(window.hi), span=span)
+    return typed.Interval(typed.Time(steps=Fraction(window.lo), span=span), hi, span=span)
+
+
+def _since_inside(
+    node: typed.Until, left: typed.Formula, right: typed.Formula, window: ir.Window, *, positive: bool
+) -> typed.Formula:
+    """`since` or its dual over the samples since the first one; the operands of the dual are negated."""
+    interval = _back(window, node.span)
+    if positive:
+        return replace(node, interval=interval, left=left, right=right)
+    denied_ = tuple(typed.Not(part.span, part) for part in (left, right))
+    return typed.Not(node.span, replace(node, interval=interval, left=denied_[0], right=denied_[1]))

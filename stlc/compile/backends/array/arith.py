@@ -1,0 +1,321 @@
+"""Numbers -> arrays: `ir.Num` as a program over any array library.
+
+A program is built once and called often. For each switch it keeps a tape
+(`stlc.compile.backends.array.tape`) bound to the array library; a call fills registers from top to bottom.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial, reduce
+from typing import Any, TypeAlias, assert_never
+
+from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.backends.array.tape import Instr, Operand, Tape
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.samples import key_of, leaves
+from stlc.compile.semantics.switch import Hard, Switch
+
+ExternFunction: TypeAlias = Callable[..., Sequence[Array]]
+"""A function that the system provides: arrays in, its components out."""
+
+
+_TAKES_FLOATS = frozenset({"pow"})
+"""Kernels that want a constant as the float it is."""
+
+
+class Program:
+    """Several numbers computed together from one environment.
+
+    Args:
+        outputs: what to compute, by name.
+        constants: columns whose value is known when the program is built (`dt`, constants of a system).
+        externs: functions of the system that `ir.Extern` names.
+
+    Calling it takes an environment of arrays that broadcast against each other, each of the columns in
+    `columns` (those of another sample under the keys of `shifted`), and returns one array for every output;
+    an output that is a constant takes the shape of the first array of the environment. Common
+    sub-expressions are computed once.
+    """
+
+    def __init__(
+        self,
+        outputs: Mapping[str, ir.Num],
+        *,
+        constants: Mapping[str, float] | None = None,
+        externs: Mapping[str, ExternFunction] | None = None,
+    ) -> None:
+        self._outputs = dict(outputs)
+        self._constants = {name: float(value) for name, value in (constants or {}).items()}
+        self._externs = dict(externs or {})
+        self._tapes: dict[bool, tuple[Tape, dict[str, Operand]]] = {}
+        self._bound: dict[tuple[str, Switch, Hashable], _Bound] = {}
+        tape, _ = self._tape(exact=True)
+        self.columns = frozenset(str(i.params[0]) for i in tape.code if i.kernel == "input")
+        shifted = (leaf for num in outputs.values() for leaf in leaves(num) if isinstance(leaf, ir.At))
+        self.shifted = {key_of(leaf): leaf for leaf in shifted}
+
+    def __call__(self, env: Mapping[str, Array], ops: Ops, switch: Switch | None = None) -> dict[str, Array]:
+        """All outputs. `switch` says how conditions become numbers; None is `Hard()`."""
+        switch = switch or Hard()
+        like = _first(env)
+        key = (ops.name, switch, ops.kind(like))
+        bound = self._bound.get(key)
+        if bound is None:
+            bound = self._bound[key] = self._bind(ops, switch, like)
+        with ops.quiet():
+            return bound.run(env, ops)
+
+    def operations(self, *, exact: bool = True) -> int:
+        """How many array operations one call takes, with exact or with soft conditions."""
+        tape, outputs = self._tape(exact=exact)
+        free = ("input", "pick")
+        return sum(tape.code[i].kernel not in free for i in _needed(tape, outputs.values()))
+
+    def _tape(self, *, exact: bool) -> tuple[Tape, dict[str, Operand]]:
+        if exact not in self._tapes:
+            writer = _Writer(self._constants, exact=exact)
+            outputs = {name: writer.number(num) for name, num in self._outputs.items()}
+            self._tapes[exact] = writer.tape, outputs
+        return self._tapes[exact]
+
+    def _bind(self, ops: Ops, switch: Switch, like: Array) -> _Bound:
+        tape, outputs = self._tape(exact=switch.exact)
+        registers: list[Any] = [None] * len(tape.code)
+
+        def place(value: object) -> int:
+            registers.append(value)
+            return len(registers) - 1
+
+        inputs, code = [], []
+        for register in _needed(tape, outputs.values()):
+            instr = tape.code[register]
+            if instr.kernel == "input":
+                inputs.append((str(instr.params[0]), register))
+                continue
+            literal = instr.kernel in _TAKES_FLOATS
+            args = [
+                arg if isinstance(arg, int) else place(arg if literal else ops.constant(arg, like))
+                for arg in instr.args
+            ]
+            args += [place(param) for param in instr.params]
+            code.append((self._kernel(instr, ops, switch), tuple(args), register))
+        numbers = {name: value for name, value in outputs.items() if isinstance(value, float)}
+        arrays = {name: value for name, value in outputs.items() if isinstance(value, int)}
+        return _Bound(inputs, code, registers, arrays, numbers)
+
+    def _kernel(self, instr: Instr, ops: Ops, switch: Switch) -> Callable[..., Any]:
+        match instr.kernel:
+            case "indicator":
+                return partial(switch.indicator, ops=ops)
+            case "blend":
+                return partial(switch.blend, ops=ops)
+            case "settle":
+                return partial(switch.settle, ops=ops)
+            case "extern":
+                (given,) = instr.params
+                function: Any = self._externs[given] if isinstance(given, str) else given
+                return lambda *args: function(*args[:-1])
+            case "pick":
+                return operator.getitem
+            case name:
+                return getattr(ops, name)  # type: ignore[no-any-return]
+
+
+@dataclass(frozen=True, slots=True)
+class _Bound:
+    """A tape whose kernels are functions: fill `registers` from top to bottom."""
+
+    inputs: list[tuple[str, int]]
+    code: list[tuple[Callable[..., Any], tuple[int, ...], int]]
+    registers: list[Any]
+    arrays: dict[str, int]
+    numbers: dict[str, float]
+
+    def run(self, env: Mapping[str, Array], ops: Ops) -> dict[str, Array]:
+        registers = self.registers.copy()
+        for name, register in self.inputs:
+            value = env[name]
+            registers[register] = _array(value, env, ops) if isinstance(value, (int, float)) else value
+        for kernel, args, register in self.code:
+            registers[register] = kernel(*[registers[arg] for arg in args])
+        out = {name: registers[register] for name, register in self.arrays.items()}
+        for name, number in self.numbers.items():
+            like = _first(env)
+            out[name] = ops.full(tuple(like.shape), number, like)
+        return out
+
+
+def _first(env: Mapping[str, Array]) -> Array:
+    return next(value for value in env.values() if not isinstance(value, (int, float)))
+
+
+def _array(value: float, env: Mapping[str, Array], ops: Ops) -> Array:
+    return ops.full((), float(value), _first(env))
+
+
+def _needed(tape: Tape, outputs: Any) -> list[int]:
+    """Registers that the outputs depend on, in order."""
+    wanted: set[int] = set()
+    stack = [value for value in outputs if isinstance(value, int)]
+    while stack:
+        register = stack.pop()
+        if register not in wanted:
+            wanted.add(register)
+            stack.extend(arg for arg in tape.code[register].args if isinstance(arg, int))
+    return sorted(wanted)
+
+
+class _Writer:
+    """Writes numbers and state formulas on a tape.
+
+    With `exact` conditions are masks; otherwise they are margins handed to the switch.
+    """
+
+    def __init__(self, constants: Mapping[str, float], *, exact: bool, tape: Tape | None = None) -> None:
+        self.tape = Tape() if tape is None else tape
+        self.bound: dict[str, Operand] = {}
+        self._constants = constants
+        self._exact = exact
+        self._seen: dict[int, Operand] = {}
+
+    def number(self, num: ir.Num) -> Operand:
+        """The operand that holds `num`."""
+        operand = self._seen.get(id(num))
+        if operand is None:
+            operand = self._seen[id(num)] = self._number(num)
+        return operand
+
+    def _number(self, num: ir.Num) -> Operand:
+        match num:
+            case ir.Lit(value):
+                return float(value)
+            case ir.Col(name):
+                known = self.bound.get(name, self._constants.get(name))
+                return self.tape.emit("input", params=(name,)) if known is None else known
+            case ir.At() | ir.Held():
+                return self.tape.emit("input", params=(key_of(num),))
+            case ir.Op(name, args):
+                return self._op(name, [self.number(arg) for arg in args])
+            case ir.Ind(cond, sharpness):
+                return self._indicator(cond, sharpness)
+            case ir.Where(cond, yes, no):
+                return self._where(cond, self.number(yes), self.number(no))
+            case ir.Extern(_, args, output, ir.Body() as body):
+                return self._inlined(body, [self.number(arg) for arg in args], output)
+            case ir.Extern(name, args, output, function):
+                whole = self.tape.emit("extern", *map(self.number, args), params=(function or name,))
+                return self.tape.emit("pick", whole, params=(output,))
+            case _:
+                assert_never(num)
+
+    def _inlined(self, body: ir.Body, args: list[Operand], output: int) -> Operand:
+        """A function of which only numbers are known: its lines on the same tape, which knows them again."""
+        inner = _Writer(self._constants, exact=self._exact, tape=self.tape)
+        inner.bound.update(zip(body.formals, args, strict=True))
+        for name, num in body.lets:
+            inner.bound[name] = inner.number(num)
+        return inner.number(body.outputs[output])
+
+    def _op(self, name: str, args: list[Operand]) -> Operand:
+        tape = self.tape
+        match name:
+            case "add" | "sub" | "mul" | "div" | "pow" | "neg":
+                method: Callable[..., Operand] = getattr(tape, name)
+                return method(*args)
+            case "min":
+                return reduce(tape.least, args)
+            case "max":
+                return reduce(tape.greatest, args)
+            case "relu":
+                return tape.greatest(args[0], 0.0)
+            case "clip":
+                return tape.least(tape.greatest(args[0], args[1]), args[2])
+            case "norm":
+                return tape.norm(*args)
+            case "norm1":
+                return reduce(tape.add, [tape.call("abs", arg) for arg in args])
+            case "norminf":
+                return reduce(tape.greatest, [tape.call("abs", arg) for arg in args])
+            case _:
+                return tape.call(name, *args)
+
+    # ------------------------------------------------------------- conditions
+
+    def _indicator(self, cond: ir.Formula, sharpness: float | None) -> Operand:
+        if self._exact:
+            mask = self._truth(cond)
+            return float(mask) if isinstance(mask, bool) else self.tape.number(mask)
+        return self._weight(cond, sharpness)
+
+    def _where(self, cond: ir.Formula, yes: Operand, no: Operand) -> Operand:
+        if type(yes) is type(no) and yes == no:
+            return yes
+        if isinstance(yes, float) and isinstance(no, float):
+            return self.tape.add(self.tape.mul(self._indicator(cond, None), yes - no), no)
+        choice = self._truth(cond) if self._exact else self._weight(cond, None)
+        if isinstance(choice, (bool, float)):
+            return yes if choice else no
+        return self.tape.emit("where" if self._exact else "blend", choice, yes, no)
+
+    def _truth(self, cond: ir.Formula) -> int | bool:
+        """The mask of a state formula, every atom with its own strictness."""
+        match cond:
+            case ir.Truth(value):
+                return value
+            case ir.Atom(num, sign, strict):
+                margin = self.number(num)
+                return self.tape.compare(margin if sign > 0 else self.tape.neg(margin), strict)
+            case ir.Join(op, items):
+                return self._combine(op, [self._truth(item) for item in items])
+            case _:
+                raise TypeError(f"not a state formula: {type(cond).__name__}")
+
+    def _combine(self, op: str, masks: Sequence[int | bool]) -> int | bool:
+        absorbing = op == "or"
+        if any(mask is absorbing for mask in masks):
+            return absorbing
+        registers = [mask for mask in masks if not isinstance(mask, bool)]
+        if not registers:
+            return not absorbing
+        kernel = "either" if op == "or" else "both"
+        return reduce(lambda a, b: a if a == b else self.tape.emit(kernel, a, b), registers)
+
+    def _weight(self, cond: ir.Formula, sharpness: float | None) -> Operand:
+        """The soft indicator of a state formula: of its margin, settled where atoms differ in strictness."""
+        kinds = _strictness(cond)
+        margin = self.margin(cond)
+        truth = self._truth(cond) if len(kinds) > 1 else None
+        if isinstance(margin, float):
+            known = truth if isinstance(truth, bool) else (margin > 0 if True in kinds else margin >= 0)
+            return float(known)
+        weight = self.tape.emit("indicator", margin, params=(True in kinds, sharpness))
+        if truth is None:
+            return weight
+        return self.tape.emit("settle", weight, float(truth) if isinstance(truth, bool) else truth)
+
+    def margin(self, cond: ir.Formula) -> Operand:
+        """The exact robustness of a state formula."""
+        match cond:
+            case ir.Truth(value):
+                return float("inf") if value else float("-inf")
+            case ir.Atom(num, sign):
+                margin = self.number(num)
+                return margin if sign > 0 else self.tape.neg(margin)
+            case ir.Join(op, items):
+                pick = self.tape.least if op == "and" else self.tape.greatest
+                return reduce(pick, [self.margin(item) for item in items])
+            case _:
+                raise TypeError(f"not a state formula: {type(cond).__name__}")
+
+
+def _strictness(cond: ir.Formula) -> set[bool]:
+    match cond:
+        case ir.Atom(_, _, strict):
+            return {strict}
+        case ir.Join(_, items):
+            return set().union(*map(_strictness, items))
+        case _:
+            return set()

@@ -1,0 +1,314 @@
+"""Formulas -> arrays: robustness at the instants that are asked for, on any array library.
+
+Columns are `(time, batch)`. A schedule (`stlc.compile.schedule.schedule`) says what to compute,
+`stlc.compile.schedule.machine` how.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache, partial
+from typing import Protocol
+
+import numpy as np
+
+from stlc.compile.backends.array.inputs import inputs
+from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.array.windows import Windows
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.defined import defined
+from stlc.compile.schedule.frozen import Freezer
+from stlc.compile.schedule.machine import Machine
+from stlc.compile.schedule.schedule import End, Extent, Run, Runner, Schedule, schedule
+from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
+from stlc.diagnostics import Diagnostic, TraceError
+from stlc.signature import Signature
+
+MAX_BEYOND = 1 << 24
+"""Instants beyond the last sample at which bounds are computed, over all parts of a formula."""
+
+MAX_VALUES = 1 << 27
+"""The same over all traces: a gigabyte."""
+
+
+def evaluate(
+    formulas: Sequence[ir.Formula],
+    env: Mapping[str, Array],
+    *,
+    ops: Ops,
+    semantics: Semantics | None = None,
+    start: int = 0,
+    count: int = 1,
+    end: End = "strict",
+    stop: int | None = None,
+) -> list[Array]:
+    """Robustness of several formulas; common parts are computed once.
+
+    Args:
+        formulas: in negation normal form.
+        env: columns, `(time, batch)`.
+        ops: the array library of `env`.
+        semantics: of min and max; None is `Exact()`.
+        start: the first instant that is asked for.
+        count: how many instants from there on.
+        end: what stands beyond the last sample.
+        stop: how many samples there will be where `end` is "lower" or "upper"; None: windows to the end of
+            the trace end with the last one that is known.
+
+    Returns:
+        For each formula an array `(count, batch)`.
+
+    Raises:
+        ValueError: a window leaves the trace, and `end` is "strict".
+        TraceError: E306, bounds over all continuations of the trace look too far beyond it.
+    """
+    windows = Windows(semantics or Exact(), ops)
+    extent = _extent(env, end, windows, stop)
+    return execute(planned(tuple(formulas), Run(start, count), extent), env, windows)
+
+
+def evaluate_parts(
+    formula: ir.Formula,
+    env: Mapping[str, Array],
+    instants: range,
+    *,
+    ops: Ops,
+    end: End,
+    stop: int | None = None,
+) -> Iterator[tuple[ir.Formula, range, Array]]:
+    """Exact robustness of a formula at consecutive instants, and of its parts where it needs them.
+
+    Where `end` is "lower" or "upper", instants may lie beyond the last sample; `stop` as in `evaluate`.
+
+    Yields:
+        Formulas, instants and values `(instants, batch)`, parts first; not what stands in a `Freeze`.
+    """
+    windows = Windows(Exact(), ops)
+    plan = planned((formula,), Run(instants.start, len(instants)), _extent(env, end, windows, stop))
+    for step, values in zip(plan.steps, _all_values(plan, env, windows), strict=True):
+        yield step.node, range(step.run.start, step.run.last + 1), values
+
+
+def _extent(env: Mapping[str, Array], end: End, windows: Windows, stop: int | None = None) -> Extent:
+    samples = len(next(iter(env.values())))
+    return Extent(samples, end, stop, counted=not windows.semantics.idempotent)
+
+
+@lru_cache(maxsize=512)
+def planned(formulas: tuple[ir.Formula, ...], run: Run, extent: Extent) -> Schedule:
+    """The schedule for a trace, remembered. Raises ValueError as `evaluate` does."""
+    samples = extent.samples
+    if run.start < 0 or (run.last >= samples and not extent.open):
+        raise ValueError(f"instants {run.start}..{run.last} of a trace with {samples} samples")
+    if extent.end == "strict":
+        for formula in formulas:
+            if not defined(formula, samples)[run.start : run.last + 1].all():
+                raise ValueError(f"the formula looks beyond the end of a trace of {samples} samples")
+    return schedule(formulas, run, extent)
+
+
+def robustness_signal(
+    formula: ir.Formula,
+    env: Mapping[str, Array],
+    *,
+    ops: Ops,
+    semantics: Semantics | None = None,
+    end: End = "strict",
+) -> Array:
+    """Robustness at every sample, `(time, batch)`; NaN where `end` "strict" leaves it undefined."""
+    windows = Windows(semantics or Exact(), ops)
+    extent = _extent(env, "truncate" if end == "strict" else end, windows)
+    samples = extent.samples
+    (signal,) = execute(planned((formula,), Run(0, samples), extent), env, windows)
+    if end != "strict":
+        return signal
+    return ops.rows(defined(formula, samples), signal, math.nan)
+
+
+def execute(plan: Schedule, env: Mapping[str, Array], windows: Windows) -> list[Array]:
+    """The values of the roots of a schedule, each `(count, batch)`.
+
+    Raises:
+        TraceError: E306, bounds over all continuations of the trace look too far beyond it.
+    """
+    values = _all_values(plan, env, windows)
+    return [values[root] for root in plan.roots]
+
+
+def _all_values(plan: Schedule, env: Mapping[str, Array], windows: Windows) -> list[Array]:
+    """The values of all steps."""
+    ops, like = windows.ops, next(iter(env.values()))
+    if plan.beyond > MAX_BEYOND or (plan.beyond and plan.beyond * math.prod(like.shape[1:]) > MAX_VALUES):
+        raise TraceError(_too_far(plan))
+    runners = plan.runners.get(windows)
+    if runners is None:
+        machine = Machine(plan.extent, windows)
+        runners = tuple(_runner(plan, index, machine) for index in range(len(plan.steps)))
+        plan.runners[windows] = runners
+    outputs = [batch.program(inputs(batch.program, env, batch.run, ops), ops) for batch in plan.batches]
+    values: list[Array] = []
+    for runner in runners:
+        values.append(runner(values, outputs, env, like))
+    return values
+
+
+def _too_far(plan: Schedule) -> Diagnostic:
+    """E306 for a formula whose parts would be needed at too many instants beyond the trace."""
+    step = max(plan.steps, key=lambda step: step.run.last)
+    return Diagnostic(
+        "E306",
+        f"this looks {step.run.last - plan.extent.samples + 1:,} samples beyond the last one",
+        step.node.span,
+        help=(
+            "record more, or shorten the intervals: a trace that ends so early says nothing certain here",
+            "`--end truncate` evaluates on what there is",
+        ),
+    )
+
+
+def _runner(plan: Schedule, index: int, machine: Machine) -> Runner:
+    """What computes a step from those before it, the outputs of the programs, and the columns."""
+    step = plan.steps[index]
+    if isinstance(step.node, ir.Freeze):
+        return _frozen(step.node, step.run, plan.extent, machine.windows)
+    if isinstance(step.node, ir.Atom):
+        return _predicate(plan, index, machine)
+    kernel, parts = machine.bind(step), [part for part in step.parts if part is not None]
+    if len(parts) == 1:
+        (only,) = parts
+        return lambda values, _, __, like: kernel((values[only],), like)
+    return lambda values, _, __, like: kernel([values[part] for part in parts], like)
+
+
+def _predicate(plan: Schedule, index: int, machine: Machine) -> Runner:
+    """Its rows come from a program, or are those of a column."""
+    step, place = plan.steps[index], plan.atoms.get(index)
+    assert isinstance(step.node, ir.Atom)
+    if place is None:
+        kernel = machine.atom(step.node, step.run, Run(step.run.start, 0))
+        return lambda _, __, ___, like: kernel((), like)
+    number, name, inside = place
+    kernel = machine.atom(step.node, step.run, inside)
+    if number is None:
+        if inside.count == plan.extent.samples:
+            return lambda _, __, env, like: kernel((env[name],), like)
+        first, stop = inside.start, inside.start + inside.count
+        return lambda _, __, env, like: kernel((env[name][first:stop],), like)
+    offset = inside.start - plan.batches[number].run.start
+    if offset == 0 and plan.batches[number].run.count == inside.count:
+        return lambda _, outputs, __, like: kernel((outputs[number][name],), like)
+    rows = slice(offset, offset + inside.count)
+    return lambda _, outputs, __, like: kernel((outputs[number][name][rows],), like)
+
+
+def _frozen(node: ir.Freeze, run: Run, extent: Extent, windows: Windows) -> Runner:
+    judge = partial(_judge, windows=windows)
+    return lambda _, __, env, ___: Freezer(extent, env, windows.ops, judge).values(node, run)
+
+
+def _judge(
+    formula: ir.Formula, env: Mapping[str, Array], run: Run, extent: Extent, *, windows: Windows
+) -> Array:
+    """One formula at consecutive instants, on the trace or beyond it: `(count, batch)`."""
+    return execute(_scheduled(formula, run, extent), env, windows)[0]
+
+
+@lru_cache(maxsize=512)
+def _scheduled(formula: ir.Formula, run: Run, extent: Extent) -> Schedule:
+    return schedule((formula,), run, extent)
+
+
+class Weighed(Protocol):
+    """What the graph asks of a requirement; `stlc.compile.pipeline.Rule` has it."""
+
+    def under(self, semantics: Semantics) -> ir.Formula:
+        """In steps, with what laws of the semantics allow left out."""
+
+    @property
+    def weight(self) -> float:
+        """Factor of its robustness in the whole."""
+
+    @property
+    def scale(self) -> float:
+        """Divisor of its robustness in the whole."""
+
+
+class RobustnessGraph:
+    """Robustness of requirements over trajectories, differentiable, at the first sample.
+
+    Args:
+        rules: the requirements.
+        signature: the columns of a state, in order.
+        semantics: of min and max, or its name in `stlc.compile.semantics.semantics.SEMANTICS`.
+
+    Trajectories are `(batch, time, dim)`, torch or NumPy, float32 or float64; results keep dtype and device.
+    `smoothing` is the scale k of log-sum-exp, for one call; None is the semantics of the graph.
+
+    Raises:
+        UsageError: U101, an unknown semantics, or `smoothing` for one that has no such scale.
+    """
+
+    def __init__(
+        self, rules: Sequence[Weighed], signature: Signature, semantics: str | Semantics = "exact"
+    ) -> None:
+        self.rules = tuple(rules)
+        self.signature = signature
+        self.semantics = semantics_of(semantics)
+        self._formulas: dict[tuple[bool, bool], list[ir.Formula]] = {}
+
+    def robustness(self, x: Array, smoothing: float | None = None) -> Array:
+        """Of the whole: min over requirements of `weight * rho / scale`, `(batch,)`."""
+        env, ops = self._columns(x)
+        return self.columns(env, ops=ops, smoothing=smoothing)
+
+    def per_requirement(self, x: Array, smoothing: float | None = None) -> Array:
+        """Of each requirement before weight and scale, `(batch, rules)`."""
+        env, ops = self._columns(x)
+        return self.per_requirement_columns(env, ops=ops, smoothing=smoothing)
+
+    def columns(self, env: Mapping[str, Array], *, ops: Ops, smoothing: float | None = None) -> Array:
+        """`robustness` on columns `(time, batch)`; only those that the requirements read are needed."""
+        return self.overall(self.per_requirement_columns(env, ops=ops, smoothing=smoothing), smoothing)
+
+    def overall(self, each: Array, smoothing: float | None = None) -> Array:
+        """`robustness` from what `per_requirement` gave: (batch, rules) -> (batch,); +inf without rules."""
+        ops, rows = ops_of(each), each.T
+        if not self.rules:
+            return ops.full((each.shape[0],), math.inf, each)
+        weighed = [
+            rows[i : i + 1] if rule.weight == rule.scale else rows[i : i + 1] * (rule.weight / rule.scale)
+            for i, rule in enumerate(self.rules)
+        ]
+        return semantics_of(self.semantics, smoothing).join(weighed, "min", ops)[0]
+
+    def per_requirement_columns(
+        self, env: Mapping[str, Array], *, ops: Ops, smoothing: float | None = None
+    ) -> Array:
+        """`per_requirement` on columns `(time, batch)`."""
+        rows = self._rows(env, ops, semantics_of(self.semantics, smoothing))
+        if not rows:
+            like = next(iter(env.values()))
+            return ops.full((*like.shape[1:], 0), math.inf, like)
+        return ops.cat(rows).T
+
+    def _rows(self, env: Mapping[str, Array], ops: Ops, semantics: Semantics) -> list[Array]:
+        laws = semantics.associative, semantics.idempotent
+        if laws not in self._formulas:
+            self._formulas[laws] = [rule.under(semantics) for rule in self.rules]
+        return evaluate(self._formulas[laws], env, ops=ops, semantics=semantics)
+
+    def _columns(self, x: Array) -> tuple[dict[str, Array], Ops]:
+        if x.shape[-1] != len(self.signature):
+            raise ValueError(f"{x.shape[-1]} columns where {len(self.signature)} are expected")
+        ops = ops_of(x)
+        return dict(zip(self.signature.names, ops.columns(x), strict=True)), ops
+
+
+def ops_of(x: Array) -> Ops:
+    """The array library of `x`. Torch is imported only when `x` comes from it."""
+    if isinstance(x, np.ndarray):
+        return NUMPY
+    return importlib.import_module("stlc.compile.backends.torch.ops").TORCH  # type: ignore[no-any-return]

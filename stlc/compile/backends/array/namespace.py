@@ -1,0 +1,187 @@
+"""The array namespace: everything that the evaluators ask of an array library, and nothing else.
+
+`stlc.compile.backends.array.numpy_ops` and `stlc.compile.backends.torch.ops` write it once per library.
+Operands named `x`, `a`, `b` are arrays; where a method says so a plain float may stand for one. Operators
+(`a + b`, `a * 2.0`) are used as they are, because both libraries agree on them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from contextlib import AbstractContextManager
+from typing import Any, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.backends.array.extremum import Pick, Sliding
+
+Array: TypeAlias = Any
+"""A NumPy array or a torch tensor."""
+
+Mask: TypeAlias = Any
+"""An array of booleans."""
+
+
+class Ops(Protocol):
+    """An array library. Reductions and scans run along axis 0, which is time."""
+
+    name: str
+
+    # arithmetic: one array operation each
+    add: Callable[[Array, Array], Array]
+    sub: Callable[[Array, Array], Array]
+    mul: Callable[[Array, Array], Array]
+    div: Callable[[Array, Array], Array]
+    abs: Callable[[Array], Array]
+    exp: Callable[[Array], Array]
+    expm1: Callable[[Array], Array]
+    log: Callable[[Array], Array]
+    log1p: Callable[[Array], Array]
+    sin: Callable[[Array], Array]
+    cos: Callable[[Array], Array]
+    tan: Callable[[Array], Array]
+    asin: Callable[[Array], Array]
+    acos: Callable[[Array], Array]
+    atan: Callable[[Array], Array]
+    sigmoid: Callable[[Array], Array]
+    sign: Callable[[Array], Array]
+    floor: Callable[[Array], Array]
+    ceil: Callable[[Array], Array]
+    round: Callable[[Array], Array]
+    square: Callable[[Array], Array]
+    minimum: Callable[..., Array]
+    """Of two arrays; `out=` takes the result without a gradient."""
+    maximum: Callable[..., Array]
+
+    def sqrt(self, x: Array) -> Array:
+        """Square root; its gradient at 0 is 0, so that a distance of 0 does no harm."""
+
+    def pow(self, a: Array | float, b: Array | float) -> Array:
+        """`a ^ b`."""
+
+    def mod(self, a: Array | float, b: Array | float) -> Array:
+        """Floored modulo: the sign of `b`; gradient 1 in `a`."""
+
+    def atan2(self, a: Array | float, b: Array | float) -> Array:
+        """Angle of the point (b, a)."""
+
+    def axpy(self, a: Array, b: Array, factor: float) -> Array:
+        """`a + factor * b`; `a` may be a float."""
+
+    def addcmul(self, a: Array, b: Array, c: Array, factor: float) -> Array:
+        """`a + factor * b * c`; `a` may be a float."""
+
+    def clamp(self, x: Array, low: float | None, high: float | None) -> Array:
+        """`x` cut to [low, high]; None leaves a side open."""
+
+    def norm(self, *components: Array | float) -> Array:
+        """Euclidean length; its gradient at 0 is 0."""
+
+    # truth
+    def gt(self, a: Array | float, b: Array | float) -> Mask:
+        """`a > b`."""
+
+    def ge(self, a: Array | float, b: Array | float) -> Mask:
+        """`a >= b`."""
+
+    def both(self, a: Mask, b: Mask) -> Mask:
+        """Conjunction."""
+
+    def either(self, a: Mask, b: Mask) -> Mask:
+        """Disjunction."""
+
+    def settled(self, weight: Array, mask: Mask) -> Array:
+        """1 where `mask`, else 0, with the gradient of `weight`."""
+
+    def number(self, mask: Mask, like: Array) -> Array:
+        """1 where `mask`, else 0, in the dtype of `like`."""
+
+    def where(self, mask: Mask, yes: Array | float, no: Array | float) -> Array:
+        """`yes` where `mask`, else `no`; one of them may be a float."""
+
+    def lerp(self, no: Array | float, yes: Array | float, weight: Array) -> Array:
+        """`no + weight (yes - no)`, exact where `weight` is 0 or 1; one of the ends may be a float."""
+
+    def infinite(self, mask: Mask, like: Array) -> Array:
+        """+inf where `mask`, else -inf, in the dtype of `like`, without gradient."""
+
+    def straight_through(self, rho: Array, strict: bool, slope: float) -> Array:
+        """1 where `rho` > 0 (>= 0 unless `strict`), else 0; gradient of `(1 + tanh(slope rho)) / 2`."""
+
+    # along time
+    def amin(self, x: Array) -> Array:
+        """Minimum over axis 0, which stays with length 1."""
+
+    def amax(self, x: Array) -> Array:
+        """Maximum over axis 0, which stays with length 1."""
+
+    def sum(self, x: Array) -> Array:
+        """Sum over axis 0, which stays with length 1."""
+
+    def cummin(self, x: Array) -> Array:
+        """Running minimum along axis 0."""
+
+    def cummax(self, x: Array) -> Array:
+        """Running maximum along axis 0."""
+
+    def softmax(self, x: Array, k: float) -> Array:
+        """`log(sum(exp(k x))) / k` over axis 0, which stays with length 1; stable, also with infinities.
+
+        A smooth maximum for `k` > 0, a smooth minimum for `k` < 0.
+        """
+
+    def softmax2(self, a: Array, b: Array, k: float) -> Array:
+        """`log(exp(k a) + exp(k b)) / k`: `softmax` of two arrays of one shape."""
+
+    def join(self, items: Sequence[Array], pick: Pick) -> Array:
+        """Exact extremum of one or more arrays, elementwise."""
+
+    def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
+        """Exact extrema of sliding windows: `(time, batch)` -> `(count, batch)`.
+
+        None where other methods of the library do it faster.
+        """
+
+    def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array | None:
+        """Exact `until` ("max") and `release` ("min"): two of `(time, batch)` -> `(count, batch)`.
+
+        None where other methods of the library do it faster.
+        """
+
+    # constants and shapes
+    def kind(self, like: Array) -> Hashable:
+        """What a constant depends on: arrays of one kind may share it."""
+
+    def constant(self, value: float, like: Array) -> Array | float:
+        """A number in the form that is fastest beside `like`."""
+
+    def full(self, shape: tuple[int, ...], value: float, like: Array) -> Array:
+        """A constant array with dtype and device of `like`."""
+
+    def counted(self, first: int, count: int, like: Array) -> Array:
+        """`first`, `first + 1`, … along time: (count, batch) with batch, dtype and device of `like`."""
+
+    def empty(self, shape: tuple[int, ...], like: Array) -> Array:
+        """Memory with dtype and device of `like`, to be written to."""
+
+    def unbind(self, x: Array, axis: int) -> Sequence[Array]:
+        """Views of the slices along an axis."""
+
+    def cat(self, parts: Sequence[Array]) -> Array:
+        """Joined along axis 0."""
+
+    def stack(self, parts: Sequence[Array]) -> Array:
+        """A new axis 0 in front."""
+
+    def flip(self, x: Array) -> Array:
+        """Reversed along axis 0."""
+
+    def rows(self, keep: NDArray[np.bool_], x: Array, value: float) -> Array:
+        """`x` with `value` in the rows (along axis 0) that are not kept."""
+
+    def columns(self, x: Array) -> Sequence[Array]:
+        """`(batch, time, dim)` -> for every column an array `(time, batch)`."""
+
+    def quiet(self) -> AbstractContextManager[object]:
+        """Within it, division by zero and the like give inf and NaN without a warning."""

@@ -1,0 +1,213 @@
+"""The array namespace over NumPy: for recorded traces, and wherever torch must not be imported."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Hashable, Sequence
+from contextlib import AbstractContextManager
+from functools import reduce
+from typing import Any, cast, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.backends.array import sliding
+from stlc.compile.backends.array.extremum import Pick, Sliding
+from stlc.compile.backends.array.namespace import Array, Mask, Ops
+
+_WIDE = 8
+"""From so many columns on sliding windows beat putting pairs together,"""
+
+_LONG = 20_000
+"""and for `until` also from so many rows of a window on."""
+
+
+@final
+class NumpyOps:
+    """`backends.array.namespace.Ops` over NumPy arrays. There are no gradients: straight-through is hard."""
+
+    name = "numpy"
+
+    add = staticmethod(operator.add)
+    sub = staticmethod(operator.sub)
+    mul = staticmethod(operator.mul)
+    div = staticmethod(np.true_divide)
+    abs = staticmethod(np.abs)
+    exp = staticmethod(np.exp)
+    expm1 = staticmethod(np.expm1)
+    log = staticmethod(np.log)
+    log1p = staticmethod(np.log1p)
+    sin = staticmethod(np.sin)
+    cos = staticmethod(np.cos)
+    tan = staticmethod(np.tan)
+    asin = staticmethod(np.arcsin)
+    acos = staticmethod(np.arccos)
+    atan = staticmethod(np.arctan)
+    sign = staticmethod(np.sign)
+    floor = staticmethod(np.floor)
+    ceil = staticmethod(np.ceil)
+    round = staticmethod(np.rint)
+    square = staticmethod(np.square)
+    minimum = staticmethod(np.minimum)
+    maximum = staticmethod(np.maximum)
+    sqrt = staticmethod(np.sqrt)
+    pow = staticmethod(np.power)
+    mod = staticmethod(np.mod)
+    atan2 = staticmethod(np.arctan2)
+    gt = staticmethod(operator.gt)
+    ge = staticmethod(operator.ge)
+    both = staticmethod(operator.and_)
+    either = staticmethod(operator.or_)
+    where = staticmethod(np.where)
+    cat = staticmethod(np.concatenate)
+    stack = staticmethod(np.stack)
+
+    def axpy(self, a: Array, b: Array, factor: float) -> Array:
+        """`a + factor * b`."""
+        return a + factor * b
+
+    def addcmul(self, a: Array, b: Array, c: Array, factor: float) -> Array:
+        """`a + factor * b * c`."""
+        product = b * c
+        return a + (product if factor == 1.0 else factor * product)
+
+    def clamp(self, x: Array, low: float | None, high: float | None) -> Array:
+        """`x` cut to [low, high]."""
+        return np.clip(x, low, high)
+
+    def norm(self, *components: Array | float) -> Array:
+        """Euclidean length."""
+        return np.sqrt(reduce(operator.add, (np.square(part) for part in components)))
+
+    def settled(self, weight: Array, mask: Mask) -> Array:
+        """1 where `mask`, else 0."""
+        return np.broadcast_to(np.asarray(mask, dtype=weight.dtype), weight.shape)
+
+    def number(self, mask: Mask, like: Array) -> Array:
+        """1 where `mask`, else 0."""
+        return mask.astype(like.dtype)
+
+    def lerp(self, no: Array | float, yes: Array | float, weight: Array) -> Array:
+        """`no + weight (yes - no)`, exact at both ends."""
+        span = yes - no
+        return np.where(weight < 0.5, no + weight * span, yes - span * (1.0 - weight))
+
+    def infinite(self, mask: Mask, like: Array) -> Array:
+        """+inf where `mask`, else -inf."""
+        return np.where(mask, np.inf, -np.inf).astype(like.dtype)
+
+    def straight_through(self, rho: Array, strict: bool, slope: float) -> Array:  # noqa: ARG002
+        """1 where `rho` > 0 (>= 0 unless `strict`), else 0."""
+        return self.number(rho > 0 if strict else rho >= 0, rho)
+
+    def amin(self, x: Array) -> Array:
+        """Minimum over axis 0, kept."""
+        return x.min(axis=0, keepdims=True)
+
+    def amax(self, x: Array) -> Array:
+        """Maximum over axis 0, kept."""
+        return x.max(axis=0, keepdims=True)
+
+    def sum(self, x: Array) -> Array:
+        """Sum over axis 0, kept."""
+        return x.sum(axis=0, keepdims=True)
+
+    def cummin(self, x: Array) -> Array:
+        """Running minimum along axis 0."""
+        return np.minimum.accumulate(x, axis=0)
+
+    def cummax(self, x: Array) -> Array:
+        """Running maximum along axis 0."""
+        return np.maximum.accumulate(x, axis=0)
+
+    def join(self, items: Sequence[Array], pick: Pick) -> Array:
+        """Exact extremum of one or more arrays."""
+        return reduce(np.minimum if pick == "min" else np.maximum, items)
+
+    def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
+        """Exact extrema of sliding windows; None for narrow rows of which the last windows are cut."""
+        if x.ndim != 2 or x.shape[1] < _WIDE:
+            whole = window.rows >= window.count + window.width - 1
+            return _doubling(x, np.minimum if pick == "min" else np.maximum, window) if whole else None
+        return sliding.extrema(x, sliding.Asked(pick, window, NUMPY))
+
+    def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array | None:
+        """Exact `until` and `release`, for rows or windows that are long enough."""
+        if left.ndim != 2 or (left.shape[1] < _WIDE and window.width < _LONG):
+            return None
+        return sliding.until(left, right, sliding.Asked(pick, window, NUMPY))
+
+    def softmax(self, x: Array, k: float) -> Array:
+        """Smooth extremum over axis 0, kept."""
+        top = self.amax(x) if k > 0 else self.amin(x)
+        finite = np.where(np.isfinite(top), top, 0.0)
+        with self.quiet():
+            total = np.exp(np.minimum(k * (x - finite), 0.0)).sum(axis=0, keepdims=True)
+            return top + np.log(total) / k
+
+    def softmax2(self, a: Array, b: Array, k: float) -> Array:
+        """Smooth extremum of two."""
+        top = np.maximum(a, b) if k > 0 else np.minimum(a, b)
+        with self.quiet():
+            gap = np.where(np.isfinite(top), np.abs(a - b), np.inf)
+            return top + np.log1p(np.exp(-abs(k) * gap)) / k
+
+    def sigmoid(self, x: Array) -> Array:
+        """`1 / (1 + exp(-x))`."""
+        return 0.5 + 0.5 * np.tanh(0.5 * x)
+
+    def kind(self, like: Array) -> Hashable:  # noqa: ARG002
+        """Floats take the dtype of what stands beside them."""
+        return None
+
+    def constant(self, value: float, like: Array) -> Array | float:  # noqa: ARG002
+        """The float itself."""
+        return value
+
+    def full(self, shape: tuple[int, ...], value: float, like: Array) -> Array:
+        """A constant array."""
+        return np.full(shape, value, dtype=like.dtype)
+
+    def counted(self, first: int, count: int, like: Array) -> Array:
+        """Whole numbers along time."""
+        numbers = np.arange(first, first + count, dtype=like.dtype)
+        return np.broadcast_to(numbers.reshape(-1, *(1,) * (like.ndim - 1)), (count, *like.shape[1:]))
+
+    def empty(self, shape: tuple[int, ...], like: Array) -> Array:
+        """Memory to be written to."""
+        return np.empty(shape, dtype=like.dtype)
+
+    def unbind(self, x: Array, axis: int) -> Sequence[Array]:
+        """Views of the slices along an axis."""
+        return list(np.moveaxis(x, axis, 0))
+
+    def flip(self, x: Array) -> Array:
+        """Reversed along axis 0."""
+        return x[::-1]
+
+    def rows(self, keep: NDArray[np.bool_], x: Array, value: float) -> Array:
+        """`x` with `value` in the rows that are not kept."""
+        return np.where(keep.reshape(-1, *(1,) * (x.ndim - 1)), x, np.asarray(value, dtype=x.dtype))
+
+    def columns(self, x: Array) -> Sequence[Array]:
+        """One `(time, batch)` array for every column of `(batch, time, dim)`."""
+        return list(np.ascontiguousarray(x.transpose(2, 1, 0)))
+
+    def quiet(self) -> AbstractContextManager[object]:
+        """Numerical exceptions give inf and NaN."""
+        context: Any = np.errstate(all="ignore")
+        return context  # type: ignore[no-any-return]
+
+
+def _doubling(x: Array, pair: np.ufunc, window: Sliding) -> Array:
+    """Pieces of 1, 2, 4, … rows are put together."""
+    size, width = 1, window.width
+    while 2 * size <= width:
+        x = pair(x[:-size], x[size:])
+        size *= 2
+    rest = width - size
+    x = pair(x[:-rest], x[rest:]) if rest else x
+    return x[: window.count]
+
+
+NUMPY: Ops = cast("Ops", NumpyOps())

@@ -1,0 +1,237 @@
+"""Numbers -> a straight line of array operations: common parts once, constants folded, few operations.
+
+In training an array operation costs microseconds before it touches a number, so the aim here is their count:
+`a * 0.1 + b` is one `axpy`, a product that is added is one `addcmul`, `min` and `max` with literals are one
+`clamp`, an indicator that multiplies is one `where`. Every rule returns the same number, up to rounding.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from stlc.compile.backends.array.numpy_ops import NUMPY
+
+Operand: TypeAlias = int | float
+"""An int is the register that an instruction writes; a float is a constant."""
+
+
+@dataclass(frozen=True, slots=True)
+class Instr:
+    """One operation.
+
+    Attributes:
+        kernel: a method of `Ops` or of the switch, or `input`, `extern`, `pick`.
+        args: operands.
+        params: what else the kernel takes, after the operands.
+    """
+
+    kernel: str
+    args: tuple[Operand, ...] = ()
+    params: tuple[object, ...] = ()
+
+
+class Tape:
+    """A growing list of instructions; asking for one that is there already returns its register."""
+
+    def __init__(self) -> None:
+        self.code: list[Instr] = []
+        self._known: dict[tuple[object, ...], int] = {}
+
+    def emit(self, kernel: str, *args: Operand, params: tuple[object, ...] = ()) -> int:
+        """The register of that instruction."""
+        key = (kernel, params, *((type(arg), arg) for arg in args))
+        register = self._known.get(key)
+        if register is None:
+            register = self._known[key] = len(self.code)
+            self.code.append(Instr(kernel, args, params))
+        return register
+
+    def parts(self, operand: Operand, kernel: str) -> tuple[Operand, ...] | None:
+        """Operands of the instruction behind `operand` if that is a `kernel`."""
+        if isinstance(operand, float) or self.code[operand].kernel != kernel:
+            return None
+        return self.code[operand].args
+
+    # ------------------------------------------------------------ arithmetic
+
+    def add(self, a: Operand, b: Operand) -> Operand:
+        """`a + b`."""
+        a, b = _constant_last(a, b)
+        if isinstance(a, float):
+            return a + float(b)
+        if isinstance(b, float):
+            return a if b == 0.0 else self.emit("add", a, b)
+        for whole, part in ((a, b), (b, a)):
+            fused = self._plus_product(whole, part, 1.0)
+            if fused is not None:
+                return fused
+        return self.emit("add", a, b)
+
+    def sub(self, a: Operand, b: Operand) -> Operand:
+        """`a - b`."""
+        if isinstance(a, float) and isinstance(b, float):
+            return a - b
+        if isinstance(b, float):
+            return a if b == 0.0 else self.emit("sub", a, b)
+        if isinstance(a, int):
+            fused = self._plus_product(a, b, -1.0)
+            if fused is not None:
+                return fused
+        return self.emit("sub", a, b)
+
+    def _plus_product(self, whole: int, part: int, sign: float) -> int | None:
+        """`whole + sign * part` in one operation if `part` is a product."""
+        factors = self.parts(part, "mul")
+        if factors is None:
+            return None
+        left, right = factors
+        if not isinstance(right, float):
+            return self.emit("addcmul", whole, left, right, params=(sign,))
+        inner = self.parts(left, "mul")
+        if inner is not None and not isinstance(inner[1], float):
+            return self.emit("addcmul", whole, *inner, params=(sign * right,))
+        if right == -1.0:
+            return self.emit("sub" if sign > 0 else "add", whole, left)
+        return self.emit("axpy", whole, left, params=(sign * right,))
+
+    def mul(self, a: Operand, b: Operand) -> Operand:
+        """`a * b`."""
+        a, b = _constant_last(a, b)
+        if isinstance(a, float):
+            return a * float(b)
+        if isinstance(b, float):
+            return self._scaled(a, b)
+        for one, other in ((a, b), (b, a)):
+            scaled = self.parts(one, "mul")
+            if scaled is not None and isinstance(scaled[1], float):
+                return self.mul(self.mul(scaled[0], other), scaled[1])
+            gate = self.parts(one, "number")
+            if gate is not None:
+                return self.emit("where", gate[0], other, 0.0)
+        return self.emit("square", a) if a == b else self.emit("mul", a, b)
+
+    def _scaled(self, a: int, factor: float) -> Operand:
+        if factor == 0.0:
+            return 0.0
+        if factor == 1.0:
+            return a
+        inner = self.parts(a, "mul")
+        if inner is not None and isinstance(inner[1], float):
+            return self.mul(inner[0], inner[1] * factor)
+        if factor == -1.0:
+            difference = self.parts(a, "sub")
+            if difference is not None:
+                return self.sub(difference[1], difference[0])
+        return self.emit("mul", a, factor)
+
+    def neg(self, a: Operand) -> Operand:
+        """`-a`."""
+        return self.mul(a, -1.0)
+
+    def div(self, a: Operand, b: Operand) -> Operand:
+        """`a / b`."""
+        if b == 1.0 and isinstance(b, float):
+            return a
+        return self.call("div", a, b)
+
+    def pow(self, a: Operand, b: Operand) -> Operand:
+        """`a ^ b`; small powers without a logarithm."""
+        if isinstance(b, int):
+            return self.call("pow", a, b)
+        match b:
+            case 0.0:
+                return 1.0
+            case 0.5:
+                return self.call("sqrt", a)
+            case 1.0:
+                return a
+            case 2.0:
+                return self.call("square", a)
+            case 3.0 if isinstance(a, int):
+                return self.emit("mul", self.emit("square", a), a)
+            case -1.0:
+                return self.div(1.0, a)
+            case _:
+                return self.call("pow", a, b)
+
+    def call(self, kernel: str, *args: Operand) -> Operand:
+        """Any kernel; folded where all operands are constants."""
+        if all(isinstance(arg, float) for arg in args):
+            with NUMPY.quiet():
+                return float(getattr(NUMPY, kernel)(*(np.float64(arg) for arg in args)))
+        return self.emit(kernel, *args)
+
+    def least(self, a: Operand, b: Operand) -> Operand:
+        """`min(a, b)`."""
+        return self._bounded(a, b, "minimum")
+
+    def greatest(self, a: Operand, b: Operand) -> Operand:
+        """`max(a, b)`."""
+        return self._bounded(a, b, "maximum")
+
+    def _bounded(self, a: Operand, b: Operand, kernel: str) -> Operand:
+        a, b = _constant_last(a, b)
+        pick = min if kernel == "minimum" else max
+        if isinstance(a, float):
+            return pick(a, float(b))
+        if isinstance(b, int):
+            return a if a == b else self.emit(kernel, *sorted((a, b)))
+        low, high, inner = -math.inf, math.inf, a
+        if self.code[a].kernel == "clamp":
+            low, high = _bounds(self.code[a])
+            inner = int(self.code[a].args[0])
+        return self._clamp(inner, pick(low, b), pick(high, b))
+
+    def _clamp(self, x: int, low: float, high: float) -> Operand:
+        if low == high:
+            return low
+        bounds = (None if low == -math.inf else low, None if high == math.inf else high)
+        return self.emit("clamp", x, params=bounds)
+
+    def norm(self, *parts: Operand) -> Operand:
+        """Euclidean length."""
+        return self.call("abs", parts[0]) if len(parts) == 1 else self.call("norm", *parts)
+
+    # ---------------------------------------------------------------- choice
+
+    def compare(self, margin: Operand, strict: bool) -> int | bool:
+        """The mask `margin > 0` (`strict`) or `margin >= 0`; a difference is not computed for it."""
+        if isinstance(margin, float):
+            return margin > 0 if strict else margin >= 0
+        kernel = "gt" if strict else "ge"
+        difference = self.parts(margin, "sub")
+        if difference is not None:
+            return self.emit(kernel, *difference)
+        total = self.parts(margin, "add")
+        if total is not None and isinstance(total[1], float):
+            return self.emit(kernel, total[0], -total[1])
+        return self.emit(kernel, margin, 0.0)
+
+    def number(self, mask: int) -> int:
+        """1 where `mask`, else 0, in the dtype of what the mask compares."""
+        return self.emit("number", mask, self._compared(mask))
+
+    def _compared(self, mask: int) -> int:
+        args = self.code[mask].args
+        if self.code[mask].kernel in ("both", "either"):
+            return self._compared(int(args[0]))
+        return next(arg for arg in args if isinstance(arg, int))
+
+
+def _constant_last(a: Operand, b: Operand) -> tuple[Operand, Operand]:
+    """Operands of a commutative operation in one order: registers first, in order."""
+    if isinstance(a, float):
+        return (a, b) if isinstance(b, float) else (b, a)
+    return (b, a) if isinstance(b, int) and b < a else (a, b)
+
+
+def _bounds(clamp: Instr) -> tuple[float, float]:
+    low, high = clamp.params
+    return (
+        low if isinstance(low, float) else -math.inf,
+        high if isinstance(high, float) else math.inf,
+    )

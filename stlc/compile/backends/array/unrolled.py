@@ -1,0 +1,91 @@
+"""Robustness as a graph: formulas over symbolic columns, `freeze` instant by instant."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import assert_never
+
+from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.inputs import inputs
+from stlc.compile.backends.c.numbers import Untranslatable
+from stlc.compile.backends.onnx.ops import ONNX
+from stlc.compile.backends.onnx.sheet import Value
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.defined import defined
+from stlc.compile.ir.horizon import numbers
+from stlc.compile.ir.samples import everything
+from stlc.compile.schedule.schedule import Run
+
+Columns = dict[str, Value]
+
+
+def written(formulas: Sequence[ir.Formula], columns: Mapping[str, Value], *, count: int = 1) -> list[Value]:
+    """Exact robustness at the first samples.
+
+    Args:
+        formulas: in negation normal form.
+        columns: `(samples, batch)` each.
+        count: at how many samples from the first on.
+
+    Returns:
+        For each formula a value (count, batch), or of one trajectory where it is a constant.
+
+    Raises:
+        Untranslatable: a formula looks beyond the samples, or calls a function of Python.
+    """
+    env = dict(columns)
+    samples = len(next(iter(env.values())))
+    for formula in formulas:
+        require_numbers(numbers(formula))
+        if not defined(formula, samples)[:count].all():
+            raise Untranslatable("a sample outside of the plan")
+    thawed = [_thawed(formula, env) for formula in formulas]
+    found: list[Value] = evaluate(thawed, env, ops=ONNX, count=count)
+    return found
+
+
+def require_numbers(nums: Iterator[ir.Num] | Sequence[ir.Num]) -> None:
+    """Raise Untranslatable where a number calls a function of which only Python knows what it computes."""
+    for num in nums:
+        for part in everything(num):
+            if isinstance(part, ir.Extern) and not isinstance(part.function, ir.Body):
+                raise Untranslatable(f"the function `{part.name}`")
+
+
+def _thawed(formula: ir.Formula, env: Columns) -> ir.Formula:
+    """The formula with a new column of `env` in the place of every `freeze`."""
+    match formula:
+        case ir.Truth() | ir.Atom():
+            return formula
+        case ir.Join():
+            return replace(formula, items=tuple(_thawed(item, env) for item in formula.items))
+        case ir.Over() | ir.Past() | ir.Shift() | ir.AtStart():
+            return replace(formula, body=_thawed(formula.body, env))
+        case ir.Until() | ir.Since():
+            return replace(formula, left=_thawed(formula.left, env), right=_thawed(formula.right, env))
+        case ir.Freeze():
+            name = f"#frozen{len(env)}"
+            env[name] = _frozen(formula, env)
+            return ir.Atom(ir.Col(name))
+        case _:
+            assert_never(formula)
+
+
+def _frozen(node: ir.Freeze, env: Columns) -> Value:
+    """The values of a `freeze` at all samples, `(samples, batch)`; NaN where it has none."""
+    like = next(iter(env.values()))
+    program, samples = Program(dict(node.bindings)), len(like)
+    rows = []
+    for instant, known in enumerate(defined(node, samples)):
+        if not known:
+            rows.append(ONNX.full((1, 1), math.nan, like))
+            continue
+        held = program(inputs(program, env, Run(instant, 1), ONNX), ONNX)
+        inner = env | {name: value.spread(samples, value.shape[1]) for name, value in held.items()}
+        body = _thawed(node.body, inner)
+        rows += evaluate([body], inner, ops=ONNX, start=instant, count=1)
+    column: Value = ONNX.cat(rows)
+    return column

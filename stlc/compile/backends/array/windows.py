@@ -1,0 +1,228 @@
+"""Extrema over windows of time, the algorithms: reductions, running extrema, sliding, doubling, scans.
+
+All arrays are `(time, batch)`. Window `j` of `count` starts at row `j` and has `width` rows; rows beyond the
+array are absent, and a window without rows has the neutral value (+inf for a minimum, -inf for a maximum).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import final
+
+from stlc.compile.backends.array.extremum import Pick, Sliding, dual, neutral
+from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.semantics.protocol import Parts, Semantics
+
+__all__ = ["Windows", "dual", "neutral"]
+
+_SCAN_BATCH = 64
+"""From this batch size on a sequential scan beats the log-depth one."""
+
+_TILE = 1 << 17
+"""Numbers of a long trace that are dealt with at a time: what is made of them stays near the processor."""
+
+_OVERLAP = 8
+"""How many times as long as a window such a stretch is at least."""
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class Windows:
+    """Windowed extrema under one semantics, on one array library."""
+
+    semantics: Semantics
+    ops: Ops
+
+    def padded(self, x: Array, rows: int, value: float) -> Array:
+        """The first `rows` rows of `x`, with rows of `value` behind it where it is shorter."""
+        if x.shape[0] >= rows:
+            return x[:rows] if x.shape[0] > rows else x
+        missing = self.ops.full((rows - x.shape[0], *x.shape[1:]), value, x)
+        return self.ops.cat([x, missing]) if x.shape[0] else missing
+
+    def extrema(self, x: Array, pick: Pick, *, count: int, width: int) -> Array:
+        """`count` windows of `width` rows: `(time, batch)` -> `(count, batch)`."""
+        rows = x.shape[0]
+        width = min(width, max(rows, 1))
+        if tiles := self._tiles(x, count, width):
+            out = self.ops.empty((count, *x.shape[1:]), x)
+            for asked, seen in tiles:
+                out[asked] = self.extrema(x[seen], pick, count=asked.stop - asked.start, width=width)
+            return out
+        if count == 1 and rows:
+            return self.semantics.reduce(self.padded(x, width, neutral(pick)), pick, self.ops)
+        if self.semantics.exact and rows:
+            found = self.ops.extrema(x, pick, Sliding(rows, min(count, rows), width))
+            if found is not None:
+                return self.padded(found, count, neutral(pick))
+        if width >= rows > 1 and self.semantics.idempotent:
+            return self.padded(self._to_end(x, pick), count, neutral(pick))
+        return self._doubling(self.padded(x, count + width - 1, neutral(pick)), pick, width)
+
+    def _tiles(self, x: Array, count: int, width: int) -> list[tuple[slice, slice]]:
+        """Windows of a long recorded trace that are computed together, and the rows that they see.
+
+        Nothing where all of them are.
+        """
+        if self.ops.name != "numpy" or not self.semantics.exact:
+            return []
+        size = max(_TILE // max(math.prod(x.shape[1:]), 1), _OVERLAP * width)
+        if count < 2 * size:
+            return []
+        asked = [slice(first, min(first + size, count)) for first in range(0, count, size)]
+        return [(some, slice(some.start, some.stop + width - 1)) for some in asked]
+
+    def _to_end(self, x: Array, pick: Pick) -> Array:
+        """Every window reaches the last row: a running extremum from behind."""
+        running = self.ops.cummin if pick == "min" else self.ops.cummax
+        return self.ops.flip(running(self.ops.flip(x)))
+
+    def _doubling(self, x: Array, pick: Pick, width: int) -> Array:
+        """Full windows only, in about log2(width) operations: pieces of 1, 2, 4, … rows are put together."""
+        if width == 1:
+            return x
+        piece, size, done = self.semantics.lift(x, pick, self.ops), 1, 0
+        total: Parts | None = None
+        while True:
+            if self.semantics.idempotent and 2 * size > width:
+                total = self._merged(piece, piece, width - size, pick) if width > size else piece
+                break
+            if width & size:
+                total = piece if total is None else self._merged(total, piece, done, pick)
+                done += size
+                if done == width:
+                    break
+            piece = self._merged(piece, piece, size, pick)
+            size *= 2
+        return self.semantics.finish(total, pick, self.ops)
+
+    def _merged(self, a: Parts, b: Parts, shift: int, pick: Pick) -> Parts:
+        """The pieces that start at a row, and `shift` rows later."""
+        rows = min(a[0].shape[0], b[0].shape[0] - shift)
+        return self.semantics.merge(
+            tuple(part[:rows] for part in a), tuple(part[shift : shift + rows] for part in b), pick, self.ops
+        )
+
+    def until(self, left: Array, right: Array, pick: Pick, *, count: int, width: int, lo: int = 0) -> Array:
+        """`until` for `pick` "max", its dual `release` for "min".
+
+        Row `j` is the extremum over rows `t` of window `j` of the dual extremum of `right[t]` and of
+        `left[j..lo + t]`.
+
+        Args:
+            left: what must hold up to and including `t`; `(time, batch)`.
+            right: what must hold at `t`, from `lo` rows later on.
+            pick: "max" or "min".
+            count: number of windows.
+            width: rows of a window.
+            lo: rows of `left` before the window.
+
+        Returns:
+            `(count, batch)`
+        """
+        rows = right.shape[0]
+        width = min(width, max(rows, 1))
+        if not self.semantics.exact:
+            return self._until_by_definition(left, right, pick, (count, width, lo))
+        if lo:
+            reached = self.until(left[lo:], right, pick, count=count, width=width)
+            held = self.extrema(left, dual(pick), count=count, width=lo)
+            return self.semantics.pair(held, reached, dual(pick), self.ops)
+        if tiles := self._tiles(left, count, width):
+            out = self.ops.empty((count, *left.shape[1:]), left)
+            for asked, seen in tiles:
+                many = asked.stop - asked.start
+                out[asked] = self.until(left[seen], right[seen], pick, count=many, width=width)
+            return out
+        if count == 1 and rows:
+            return self._until_once(left[:width], right[:width], pick)
+        if rows:
+            found = self.ops.until(left, right, pick, Sliding(rows, min(count, rows), width))
+            if found is not None:
+                return self.padded(found, count, neutral(pick))
+        if width >= rows > 0 and (rows <= _SCAN_BATCH or left[0].shape[0] >= _SCAN_BATCH):
+            return self.padded(self._until_to_end(left, right, pick, min(rows, count)), count, neutral(pick))
+        left = self.padded(left, count + width - 1, neutral(dual(pick)))
+        right = self.padded(right, count + width - 1, neutral(pick))
+        return self._until_doubling(left, self.semantics.pair(left, right, dual(pick), self.ops), pick, width)
+
+    def _until_once(self, left: Array, right: Array, pick: Pick) -> Array:
+        pair, other = self.semantics.pair, dual(pick)
+        held = (self.ops.cummin if pick == "max" else self.ops.cummax)(left)
+        return self.semantics.reduce(pair(held, right, other, self.ops), pick, self.ops)
+
+    def _until_by_definition(
+        self, left: Array, right: Array, pick: Pick, sizes: tuple[int, int, int]
+    ) -> Array:
+        """One distance of `t` after the other: `lo + width` operations on `count` rows.
+
+        Minima do not distribute over maxima unless both are exact, so there is no shorter way for many rows.
+        """
+        semantics, ops, other = self.semantics, self.ops, dual(pick)
+        count, width, lo = sizes
+        left = self.padded(left, count + lo + width - 1, neutral(other))
+        right = self.padded(right, count + width - 1, neutral(pick))
+        if count == 1 and semantics.associative:
+            held_so_far = self._from_first(left, other)[lo:]
+            return semantics.reduce(semantics.pair(held_so_far, right, other, ops), pick, ops)
+        held, found = semantics.lift(left[:count], other, ops), None
+        for ahead in range(lo + width):
+            if ahead:
+                held = semantics.merge(
+                    held, semantics.lift(left[ahead : ahead + count], other, ops), other, ops
+                )
+            if ahead < lo:
+                continue
+            here = right[ahead - lo : ahead - lo + count]
+            met = semantics.lift(
+                semantics.pair(semantics.finish(held, other, ops), here, other, ops), pick, ops
+            )
+            found = met if found is None else semantics.merge(found, met, pick, ops)
+        assert found is not None
+        return semantics.finish(found, pick, ops)
+
+    def _from_first(self, x: Array, pick: Pick) -> Array:
+        """The extremum of all rows up to each one, in about log2(rows) operations."""
+        size = 1
+        while size < x.shape[0]:
+            later = self.semantics.pair(x[size:], x[:-size], pick, self.ops)
+            x, size = self.ops.cat([x[:size], later]), 2 * size
+        return x
+
+    def _until_to_end(self, left: Array, right: Array, pick: Pick, count: int) -> Array:
+        """The recursion `u(t) = min(left(t), max(right(t), u(t + 1)))`, from behind."""
+        pair, other = self.semantics.pair, dual(pick)
+        row = pair(left[-1:], right[-1:], other, self.ops)
+        out = [row]
+        for t in range(left.shape[0] - 2, -1, -1):
+            reached = pair(right[t : t + 1], row, pick, self.ops)
+            row = pair(left[t : t + 1], reached, other, self.ops)
+            out.append(row)
+        rows = out[: -count - 1 : -1]
+        return rows[0] if count == 1 else self.ops.cat(rows)
+
+    def _until_doubling(self, held: Array, met: Array, pick: Pick, width: int) -> Array:
+        """Full windows, in about log2(width) compositions of (`left` holds throughout, met within).
+
+        `total` covers the first `done` rows of every window, `met` the `size` rows from every row on.
+        """
+        size, done = 1, 0
+        total: tuple[Array, Array] | None = None
+        while True:
+            if width & size:
+                part = (held[done:], met[done:])
+                total = part if total is None else self._composed(total, part, pick)
+                done += size
+                if done == width:
+                    return total[1]
+            held, met = self._composed((held, met), (held[size:], met[size:]), pick)
+            size *= 2
+
+    def _composed(self, a: tuple[Array, Array], b: tuple[Array, Array], pick: Pick) -> tuple[Array, Array]:
+        """First window `a`, then window `b`: `left` holds through both, or it is met in one of them."""
+        rows = min(a[0].shape[0], b[0].shape[0])
+        pair, other = self.semantics.pair, dual(pick)
+        later = pair(a[0][:rows], b[1][:rows], other, self.ops)
+        met = pair(a[1][:rows], later, pick, self.ops)
+        return pair(a[0][:rows], b[0][:rows], other, self.ops), met

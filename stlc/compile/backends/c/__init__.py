@@ -1,0 +1,1 @@
+"""Dynamics and requirements as C, forwards and backwards."""

@@ -1,0 +1,218 @@
+"""Dynamics and requirements -> one C translation unit: rollout, exact robustness, performance.
+
+The same IR as the torch graph, exact switching, double precision, `LANES` trajectories at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from stlc.compile.backends.c.climb import CLIMB
+from stlc.compile.backends.c.formulas import Forward
+from stlc.compile.backends.c.numbers import Leaf, NumberWriter
+from stlc.compile.backends.c.parts import Frame, declared, in_parts
+from stlc.compile.backends.c.plan import plan_of
+from stlc.compile.backends.c.steps import Place, Plan
+from stlc.compile.ir import nodes as ir
+
+LANES = 16
+
+HEAD = f"""
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+/* The vector forms of the GNU C library, where the build links them. */
+#if defined(VECTOR_MATH) && defined(__GNUC__) && !defined(__clang__)
+#define VECTOR(f) __attribute__((simd("notinbranch"), const)) double f(double);
+VECTOR(sin) VECTOR(cos) VECTOR(exp) VECTOR(log)
+#endif
+
+#define LANES {LANES}
+#define LANE for (int j = 0; j < LANES; ++j)
+#define MIN(a, b) ((b) < (a) ? (b) : (a)) /* a where it is NaN */
+#define MAX(a, b) ((b) > (a) ? (b) : (a))
+#if defined(__GNUC__)
+#define APART __attribute__((noinline))
+#else
+#define APART
+#endif
+#define LATER(a, b) ((a) > (b) ? (a) : (b))
+#define LEAST(a, b) (MIN(a, b) + ((b) != (b) ? (b) : 0.0)) /* NaN where either is; loops vectorise */
+#define MOST(a, b) (MAX(a, b) + ((b) != (b) ? (b) : 0.0))
+#define NAN_IN(a) ((double)((a) != (a)))
+
+static inline double floored_mod(double a, double b) {{
+  const double r = a - b * floor(a / b);
+  return r;
+}}
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """One step of a system, straight-line code that reads states, controls and earlier assignments.
+
+    Attributes:
+        states: names of the state columns, in order.
+        controls: names of the inputs, in order.
+        lets: (name, number), in order.
+        next: name of a state that moves -> what it is one step later.
+        steps: of a plan.
+        dt: seconds of a step.
+    """
+
+    states: tuple[str, ...]
+    controls: tuple[str, ...]
+    lets: tuple[tuple[str, ir.Num], ...]
+    next: Mapping[str, ir.Num]
+    steps: int
+    dt: float
+
+
+def emit(motion: Motion, formulas: Sequence[ir.Formula]) -> str:
+    """The C text of `judge` and `climb`; see `stlc.native` for their signatures.
+
+    Raises:
+        Untranslatable: the IR holds something that has no C form.
+    """
+    plan = plan_of(formulas, motion.steps + 1)
+    states, rules, steps = len(motion.states), len(formulas), motion.steps
+    return "\n".join(
+        [
+            HEAD,
+            *passes(motion, plan),
+            (_DRIVER + CLIMB).format(
+                states=states,
+                controls=len(motion.controls),
+                steps=steps,
+                rules=rules,
+                room=max(plan.size, 1),
+            ),
+        ]
+    )
+
+
+def state_index(motion: Motion) -> dict[str, int]:
+    """The place of each state among the columns."""
+    return {name: i for i, name in enumerate(motion.states)}
+
+
+def passes(motion: Motion, plan: Plan) -> list[str]:
+    """The two passes forward: `roll` fills the states, `check` gives the robustness of each requirement."""
+    forward = Forward(plan, state_index(motion))
+    blocks = [forward.lines([step]) for step in plan.steps]
+    blocks.append(roots_out(plan))
+    return [
+        "typedef double lane[LANES];",
+        f"typedef double lanes[{motion.steps + 1}][LANES];",
+        f"typedef double inputs[{motion.steps}][LANES];",
+        "static void roll(lanes *restrict x, const inputs *restrict u, double *restrict bad) {",
+        f"  for (int k = 0; k < {motion.steps}; ++k) LANE {{",
+        *(f"    {line}" for line in _step(motion)),
+        "  }",
+        "}",
+        *in_parts(CHECK, blocks, declared(plan)),
+    ]
+
+
+def roots_out(plan: Plan) -> list[str]:
+    """What the requirements come to, in their order."""
+    return [_along(i, root, rows, "LANE out[{i}][j] = {value};") for i, root, rows in _side_by_side(plan)]
+
+
+def roots_in(plan: Plan) -> list[str]:
+    """The gradients by them, in their order."""
+    return [_along(i, root, rows, "LANE g{value} += g[{i}][j];") for i, root, rows in _side_by_side(plan)]
+
+
+def _side_by_side(plan: Plan) -> list[tuple[int, Place, int]]:
+    """Requirements whose values follow each other: number of the first, where it stands, how many."""
+    runs: list[tuple[int, Place, int]] = []
+    for i, root in enumerate(plan.roots):
+        if runs and root == Place(runs[-1][1].buffer, runs[-1][1].row + runs[-1][2]):
+            runs[-1] = (*runs[-1][:2], runs[-1][2] + 1)
+        else:
+            runs.append((i, root, 1))
+    return runs
+
+
+def _along(first: int, root: Place, rows: int, form: str) -> str:
+    if rows == 1:
+        return form.format(i=first, value=root.buffer[str(root.row)])
+    text = form.format(i=f"{first} + i", value=root.buffer[f"{root.row} + i"])
+    return f"for (int i = 0; i < {rows}; ++i) {text}"
+
+
+CHECK = Frame(
+    "check",
+    (
+        "const lanes *restrict x",
+        "double *restrict room",
+        "double *restrict bad",
+        "lane *restrict out",
+    ),
+)
+
+
+def place_in_step(motion: Motion) -> Callable[[Leaf], str | None]:
+    """Where states and inputs stand in a step, of lane `j`."""
+    index = state_index(motion)
+
+    def place(leaf: Leaf) -> str | None:
+        if not isinstance(leaf, ir.Col):
+            return None
+        if leaf.name in index:
+            return f"x[{index[leaf.name]}][k][j]"
+        return f"u[{motion.controls.index(leaf.name)}][k][j]"
+
+    return place
+
+
+def _step(motion: Motion) -> list[str]:
+    """The body of a step: sample k to sample k + 1 of one lane."""
+    index = state_index(motion)
+    writer = NumberWriter(place_in_step(motion))
+    for name, num in motion.lets:
+        writer.assign(name, writer.number(num))
+    after = {name: writer.number(num) for name, num in motion.next.items()}
+    moved = [
+        f"x[{index[name]}][k + 1][j] = {value}; bad[j] += NAN_IN({value});" for name, value in after.items()
+    ]
+    still = [f"x[{i}][k + 1][j] = x[{i}][k][j];" for name, i in index.items() if name not in after]
+    return [*writer.lines, *moved, *still]
+
+
+_DRIVER = """
+/* x0 (batch, {states}), u (batch, {steps}, {controls}) -> rho (batch, {rules}); columns
+   ({states}, {steps} + 1, batch) where asked for. Rows from `first` up to `last`. 1: no memory. */
+int judge(int64_t batch, int64_t first, int64_t last, const double *x0, const double *u, double *rho,
+          double *columns) {{
+  enum {{ N = {states}, M = {controls}, T = {steps}, R = {rules} }};
+  lanes *x = malloc(sizeof(lanes) * N);
+  inputs *v = malloc(sizeof(double) * M * T * LANES);
+  double *room = malloc(sizeof(double) * {room} * LANES);
+  lane *out = malloc(sizeof(double) * (R + 1) * LANES);
+  if (!x || !v || !room || !out) {{ free(x); free(v); free(room); free(out); return 1; }}
+  for (int64_t at = first; at < last; at += LANES) {{
+    const int here = last - at < LANES ? (int)(last - at) : LANES;
+    for (int j = 0; j < LANES; ++j) {{
+      const int64_t row = at + (j < here ? j : 0);
+      for (int i = 0; i < N; ++i) x[i][0][j] = x0[row * N + i];
+      for (int k = 0; k < T; ++k) for (int i = 0; i < M; ++i) v[i][k][j] = u[(row * T + k) * M + i];
+    }}
+    double bad[LANES] = {{0}};
+    roll(x, (const inputs *)v, bad);
+    check(x, room, bad, out);
+    for (int j = 0; j < here; ++j) for (int i = 0; i < R; ++i)
+      rho[(at + j) * R + i] = bad[j] > 0.0 ? NAN : out[i][j];
+    if (columns)
+      for (int i = 0; i < N; ++i) for (int k = 0; k <= T; ++k) for (int j = 0; j < here; ++j)
+        columns[((int64_t)i * (T + 1) + k) * batch + at + j] = x[i][k][j];
+  }}
+  free(x); free(v); free(room); free(out);
+  return 0;
+}}
+"""

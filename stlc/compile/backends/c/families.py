@@ -1,0 +1,155 @@
+"""Formulas of equal shape -> one shape and a table of what they differ in: obstacles are data.
+
+A hundred boxes are one loop over a hundred rows of numbers, not a hundred times the same text. Constants and
+the columns that are read may differ; operators, windows and calls of functions are the shape.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias, assert_never
+
+from stlc.compile.backends.c.numbers import LISTED
+from stlc.compile.ir import nodes as ir
+
+LEAST = 8
+"""Formulas from which on a loop over a table takes the place of their text."""
+
+Entry: TypeAlias = ir.Lit | ir.Col | ir.At
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Constants and columns of each row that has a shape.
+
+    Attributes:
+        rows: how many there are.
+        constants: C name -> the number in each row.
+        columns: C name -> the column in each row.
+    """
+
+    rows: int
+    constants: Mapping[str, tuple[float, ...]]
+    columns: Mapping[str, tuple[str, ...]]
+
+    @property
+    def names(self) -> frozenset[str]:
+        """What stands in the shape for its entries, as names of frozen values and of columns."""
+        return frozenset(f"{LISTED}{name}" for name in (*self.constants, *self.columns))
+
+
+@dataclass(frozen=True, slots=True)
+class Family:
+    """Formulas that differ in constants and columns.
+
+    Attributes:
+        members: their places among the formulas that were looked at.
+        shape: one of them, names of the table in the place of what differs.
+        table: what stands for these names in each of them.
+    """
+
+    members: tuple[int, ...]
+    shape: ir.Formula
+    table: Table
+
+
+def families(formulas: Sequence[ir.Formula], first: int) -> list[Family]:
+    """The families of at least `LEAST` among some formulas.
+
+    Args:
+        formulas: to look at.
+        first: number of the first table, part of the names in it; the others follow.
+    """
+    if len(formulas) < LEAST:
+        return []
+    alike: dict[ir.Formula, list[int]] = {}
+    for place, formula in enumerate(formulas):
+        alike.setdefault(_changed(formula, _blank), []).append(place)
+    groups = [group for group in alike.values() if len(group) >= LEAST]
+    return [_family(formulas, group, first + i) for i, group in enumerate(groups)]
+
+
+def _blank(leaf: Entry) -> ir.Num:
+    return ir.Lit(0.0) if isinstance(leaf, ir.Lit) else replace(leaf, name="")
+
+
+def _family(formulas: Sequence[ir.Formula], members: Sequence[int], number: int) -> Family:
+    constants: dict[tuple[str, ...], str] = {}
+    columns: dict[tuple[str, ...], str] = {}
+    values: dict[str, tuple[float, ...]] = {}
+    stands: list[ir.Num] = []
+    entries = zip(*(_entries(formulas[member]) for member in members), strict=True)
+    for rows in entries:
+        first = rows[0]
+        if isinstance(first, ir.Lit):
+            numbers = tuple(row.value for row in rows if isinstance(row, ir.Lit))
+            key = tuple(value.hex() for value in numbers)
+            if len(set(key)) > 1:
+                name = constants.setdefault(key, f"t{number}_{len(constants)}")
+                values[name] = numbers
+                stands.append(ir.Held(f"{LISTED}{name}"))
+                continue
+        else:
+            key = tuple(row.name for row in rows if not isinstance(row, ir.Lit))
+            if len(set(key)) > 1:
+                name = columns.setdefault(key, f"c{number}_{len(columns)}")
+                stands.append(replace(first, name=f"{LISTED}{name}"))
+                continue
+        stands.append(first)
+    left = iter(stands)
+    shape = _changed(formulas[members[0]], lambda _: next(left))
+    table = Table(len(members), values, {name: key for key, name in columns.items()})
+    return Family(tuple(members), shape, table)
+
+
+def _entries(formula: ir.Formula) -> list[Entry]:
+    """What may differ among formulas of one shape, in the order of `_changed`."""
+    found: list[Entry] = []
+
+    def note(leaf: Entry) -> ir.Num:
+        found.append(leaf)
+        return leaf
+
+    _changed(formula, note)
+    return found
+
+
+def _changed(formula: ir.Formula, change: Callable[[Entry], ir.Num]) -> ir.Formula:
+    """The formula with everything changed that may differ."""
+    match formula:
+        case ir.Truth() | ir.Freeze():  # frozen values have names of their own: no other has this shape
+            return formula
+        case ir.Atom(num):
+            return replace(formula, num=_number(num, change))
+        case ir.Join(_, items):
+            return replace(formula, items=tuple(_changed(item, change) for item in items))
+        case ir.Over(_, _, body) | ir.Past(_, _, body) | ir.Shift(_, body) | ir.AtStart(body):
+            return replace(formula, body=_changed(body, change))
+        case ir.Until(_, _, left, right) | ir.Since(_, _, left, right):
+            return replace(formula, left=_changed(left, change), right=_changed(right, change))
+        case _:
+            assert_never(formula)
+
+
+def _number(num: ir.Num, change: Callable[[Entry], ir.Num]) -> ir.Num:
+    match num:
+        case ir.Col(name) | ir.At(name) if name.startswith(LISTED):  # an entry of the table around
+            return num
+        case ir.Col(ir.ELAPSED):
+            return num
+        case ir.Lit() | ir.Col() | ir.At():
+            return change(num)
+        case ir.Held() | ir.Extern():  # a call is computed once, for the columns that it names
+            return num
+        case ir.Op("pow", (base, exponent)):  # compilers know some exponents, and round otherwise for them
+            return ir.Op("pow", (_number(base, change), exponent))
+        case ir.Op(_, args):
+            return replace(num, args=tuple(_number(arg, change) for arg in args))
+        case ir.Ind(cond):
+            return replace(num, cond=_changed(cond, change))
+        case ir.Where(cond, yes, no):
+            cond = _changed(cond, change)
+            return ir.Where(cond, _number(yes, change), _number(no, change))
+        case _:
+            assert_never(num)

@@ -1,0 +1,182 @@
+"""Numbers and state formulas of the IR as C expressions, common parts once.
+
+A writer turns `ir.Num` into statements `const double r7 = …;` on scalars, free of branches, so that a
+compiler can run a loop over trajectories around them as vector code.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import reduce
+from typing import TypeAlias, assert_never
+
+from stlc.compile.ir import nodes as ir
+
+UNARY = {
+    "neg": "(-{0})",
+    "abs": "fabs({0})",
+    "square": "({0} * {0})",
+    "relu": "MAX({0}, 0.0)",
+    "sign": "(double)(({0} > 0.0) - ({0} < 0.0))",
+    "floor": "floor({0})",
+    "ceil": "ceil({0})",
+    "round": "rint({0})",
+    "sqrt": "sqrt({0})",
+    "exp": "exp({0})",
+    "log": "log({0})",
+    "sin": "sin({0})",
+    "cos": "cos({0})",
+    "tan": "tan({0})",
+    "asin": "asin({0})",
+    "acos": "acos({0})",
+    "atan": "atan({0})",
+}
+BINARY = {
+    "add": "({0} + {1})",
+    "sub": "({0} - {1})",
+    "mul": "({0} * {1})",
+    "div": "({0} / {1})",
+    "mod": "floored_mod({0}, {1})",
+    "pow": "pow({0}, {1})",
+    "atan2": "atan2({0}, {1})",
+    "min": "LEAST({0}, {1})",
+    "max": "MOST({0}, {1})",
+}
+CLIP = "LEAST(MOST({0}, {1}), {2})"
+LISTED = "\0"
+"""How names of frozen values and columns begin that are entries of a table; their C names follow."""
+
+
+class Untranslatable(Exception):  # noqa: N818 - not an error: another back end takes over
+    """The IR holds something that a back end has no form for, such as a function that the system provides."""
+
+
+Leaf: TypeAlias = ir.Col | ir.At | ir.Held | ir.Extern
+
+
+class NumberWriter:
+    """Writes numbers as C statements; equal numbers get one register.
+
+    Args:
+        place: C expression of where a column, a frozen value or a function's result stands already; None for
+            a function that is to be written out.
+    """
+
+    def __init__(self, place: Callable[[Leaf], str | None]) -> None:
+        self.lines: list[str] = []
+        self._place = place
+        self._known: dict[ir.Num, str] = {}
+        self._texts: dict[str, str] = {}
+        self._calls: dict[tuple[str, ...], list[str]] = {}
+
+    def number(self, num: ir.Num) -> str:
+        """The C name of a number, its statements written."""
+        known = self._known.get(num)
+        if known is None:
+            known = self._known[num] = self._number(num)
+        return known
+
+    def assign(self, name: str, value: str) -> None:
+        """From now on the environment entry `name` is the C expression `value`."""
+        self._known[ir.Col(name)] = value
+
+    def truth(self, cond: ir.Formula) -> str:
+        """A C condition, 0 or 1: exact, every atom with its own strictness."""
+        match cond:
+            case ir.Truth(value):
+                return "1" if value else "0"
+            case ir.Atom(num, sign, strict):
+                op = (">" if sign > 0 else "<") + ("" if strict else "=")
+                return f"({self.number(num)} {op} 0.0)"
+            case ir.Join(op, items):
+                return "(" + (" & " if op == "and" else " | ").join(map(self.truth, items)) + ")"
+            case _:
+                raise Untranslatable(type(cond).__name__)
+
+    def _number(self, num: ir.Num) -> str:
+        match num:
+            case ir.Lit(value):
+                return literal(value)
+            case ir.Op(name, args):
+                return self._op(name, [self.number(arg) for arg in args])
+            case ir.Ind(cond):
+                return self._indicator(cond)
+            case ir.Where(cond, yes, no):
+                return self._choice(cond, self.number(yes), self.number(no))
+            case ir.Held(name) if name.startswith(LISTED):
+                return name.removeprefix(LISTED)
+            case ir.Col() | ir.At() | ir.Held() | ir.Extern():
+                place = self._place(num)
+                return self._written_out(num) if place is None else self._load(place)
+            case _:
+                assert_never(num)
+
+    def _load(self, place: str) -> str:
+        return self._register(place)
+
+    def _written_out(self, num: Leaf) -> str:
+        if not isinstance(num, ir.Extern) or not isinstance(num.function, ir.Body):
+            raise Untranslatable(f"the function `{num.name}`")
+        args = [self.number(arg) for arg in num.args]
+        return self._inlined(num.name, num.function, args)[num.output]
+
+    def _indicator(self, cond: ir.Formula) -> str:
+        return self._register(f"(double){self.truth(cond)}")
+
+    def _choice(self, cond: ir.Formula, yes: str, no: str) -> str:
+        return self._register(f"{self.truth(cond)} ? {yes} : {no}")
+
+    def _inlined(self, name: str, body: ir.Body, args: list[str]) -> list[str]:
+        """The components of a function that is known as numbers, its statements written."""
+        outputs = self._calls.get((name, *args))
+        if outputs is None:
+            inner = self._inside()
+            for formal, arg in zip(body.formals, args, strict=True):
+                inner.assign(formal, arg)
+            for let, num in body.lets:
+                inner.assign(let, inner.number(num))
+            outputs = self._calls[name, *args] = [inner.number(output) for output in body.outputs]
+        return outputs
+
+    def _inside(self) -> NumberWriter:
+        """A writer with names of its own into the same registers."""
+        inner = NumberWriter(self._place)
+        inner.lines, inner._texts = self.lines, self._texts
+        return inner
+
+    def _op(self, name: str, args: list[str]) -> str:
+        if name in ("min", "max") and len(args) == 1:
+            return args[0]
+        if name in BINARY:
+            return reduce(lambda a, b: self._apply(name, [a, b]), args)
+        if name in ("norm1", "norminf"):
+            sizes = [self._apply("abs", [arg]) for arg in args]
+            pick = "add" if name == "norm1" else "max"
+            return reduce(lambda a, b: self._apply(pick, [a, b]), sizes)
+        return self._apply(name, args)
+
+    def _apply(self, name: str, args: list[str]) -> str:
+        """One function of the tables, or `clip` or `norm`, in a register."""
+        if name == "norm":
+            return self._register("sqrt(" + " + ".join(f"{arg} * {arg}" for arg in args) + ")")
+        form = CLIP if name == "clip" else UNARY.get(name) or BINARY.get(name)
+        if form is None:
+            raise Untranslatable(name)
+        return self._register(form.format(*args))
+
+    def _register(self, text: str) -> str:
+        known = self._texts.get(text)
+        if known is None:
+            known = self._texts[text] = f"r{len(self._texts)}"
+            self.lines.append(f"const double {known} = {text};")
+        return known
+
+
+def literal(value: float) -> str:
+    """A double as C reads it back, bit for bit."""
+    if math.isnan(value):
+        return "NAN"
+    if math.isinf(value):
+        return "INFINITY" if value > 0 else "(-INFINITY)"
+    return f"({value.hex()})"

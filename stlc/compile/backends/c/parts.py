@@ -1,0 +1,70 @@
+"""Blocks of statements -> C functions of a moderate size: a compiler takes long over long ones."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from stlc.compile.backends.c.steps import Plan
+
+LONG = 4_000
+"""Characters from which on a function ends with the block that it has."""
+
+_NAME = re.compile(r"\bg?b\d+\b")
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A function that is written in parts.
+
+    Attributes:
+        name: of the function; its parts are numbered.
+        formals: C declarations of its arguments.
+        locals: statements that every part begins with.
+    """
+
+    name: str
+    formals: tuple[str, ...]
+    locals: tuple[str, ...] = ()
+
+
+def in_parts(frame: Frame, blocks: Sequence[Sequence[str]], buffers: Mapping[str, str]) -> list[str]:
+    """The function that runs all blocks, and its parts before it.
+
+    Args:
+        frame: of the function.
+        blocks: statements that stay together.
+        buffers: C name of a buffer -> its declaration; those that a part reads or writes are declared in it.
+    """
+    lines, calls = [], []
+    names = [formal.rpartition(" ")[2] for formal in frame.formals]
+    for number, part in enumerate(_parts(blocks)):
+        used = dict.fromkeys(name for line in part for name in _NAME.findall(line))
+        lines += [
+            f"APART static void {frame.name}_{number}({', '.join(frame.formals)}) {{",
+            *(f"  {line}" for line in (*frame.locals, *(buffers[name] for name in used), *part)),
+            "}",
+        ]
+        calls.append(f"  {frame.name}_{number}({', '.join(names)});")
+    return [*lines, f"static void {frame.name}({', '.join(frame.formals)}) {{", *calls, "}"]
+
+
+def _parts(blocks: Sequence[Sequence[str]]) -> Iterator[list[str]]:
+    part: list[str] = []
+    for block in blocks:
+        part += block
+        if sum(map(len, part)) > LONG:
+            yield part
+            part = []
+    if part:
+        yield part
+
+
+def declared(plan: Plan, *, room: str = "room", prefix: str = "") -> dict[str, str]:
+    """The buffers of a plan, as C names with their declarations."""
+    return {
+        f"{prefix}{buffer.name}": f"double (*restrict {prefix}{buffer.name})[LANES] ="
+        f" (double (*)[LANES])({room} + {buffer.place} * LANES);"
+        for buffer in plan.buffers
+    }

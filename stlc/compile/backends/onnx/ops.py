@@ -1,0 +1,301 @@
+"""The array namespace over the values of a sheet: what is computed becomes an ONNX graph.
+
+It holds what exact switching and exact robustness ask for; gradients and smooth extrema have no use there.
+Numbers are float64 throughout. Where the runtime has a function for float32 alone (`atan`) one step of
+Newton's method makes it exact.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import TypeAlias, cast, final
+
+from stlc.compile.backends.array.extremum import Pick, Sliding
+from stlc.compile.backends.array.namespace import Ops
+from stlc.compile.backends.onnx.sheet import BATCH, Kind, Value, joined
+
+Number: TypeAlias = Value | float
+
+
+@final
+class OnnxOps:
+    """`stlc.compile.backends.array.namespace.Ops` over symbolic values. Extrema keep NaN, as elsewhere."""
+
+    name = "onnx"
+
+    # ----------------------------------------------------------------- arithmetic
+
+    def add(self, a: Number, b: Number) -> Value:
+        """`a + b`."""
+        return _two("Add", a, b)
+
+    def sub(self, a: Number, b: Number) -> Value:
+        """`a - b`."""
+        return _two("Sub", a, b)
+
+    def mul(self, a: Number, b: Number) -> Value:
+        """`a * b`."""
+        return _two("Mul", a, b)
+
+    def div(self, a: Number, b: Number) -> Value:
+        """`a / b`."""
+        return _two("Div", a, b)
+
+    def axpy(self, a: Number, b: Value, factor: float) -> Value:
+        """`a + factor * b`."""
+        return _two("Add", a, b * factor)
+
+    def addcmul(self, a: Number, b: Value, c: Value, factor: float) -> Value:
+        """`a + factor * b * c`."""
+        product = b * c
+        return _two("Add", a, product if factor == 1.0 else product * factor)
+
+    def square(self, x: Value) -> Value:
+        """`x * x`."""
+        return x * x
+
+    def pow(self, a: Number, b: Number) -> Value:
+        """`a ^ b`."""
+        return _two("Pow", a, b)
+
+    def mod(self, a: Number, b: Number) -> Value:
+        """Floored modulo: the sign of `b`."""
+        like = _like(a, b)
+        divisor = like.beside(b)
+        (rest,) = like.sheet.emit(
+            "Mod", (like.beside(a), divisor), [_shape(like, a, b)], like.kind, {"fmod": 1}
+        )
+        other = (rest * divisor).apply("Less", 0.0, kind="bool")
+        return self.where(other, rest + divisor, rest)
+
+    def abs(self, x: Value) -> Value:
+        """Size."""
+        return x.apply("Abs")
+
+    def sign(self, x: Value) -> Value:
+        """-1, 0 or 1."""
+        return x.apply("Sign")
+
+    def floor(self, x: Value) -> Value:
+        """The next whole number below."""
+        return x.apply("Floor")
+
+    def ceil(self, x: Value) -> Value:
+        """The next whole number above."""
+        return x.apply("Ceil")
+
+    def round(self, x: Value) -> Value:
+        """The nearest whole number, halves to the even one."""
+        return x.apply("Round")
+
+    def sqrt(self, x: Value) -> Value:
+        """Square root."""
+        return x.apply("Sqrt")
+
+    def exp(self, x: Value) -> Value:
+        """Exponential."""
+        return x.apply("Exp")
+
+    def log(self, x: Value) -> Value:
+        """Natural logarithm."""
+        return x.apply("Log")
+
+    def norm(self, *components: Number) -> Value:
+        """Euclidean length."""
+        first, *rest = components
+        total = self.mul(first, first) if isinstance(first, Value) else first * first
+        for part in rest:
+            total = self.add(total, part * part) if isinstance(total, Value) else part * part + total
+        assert isinstance(total, Value)
+        return total.apply("Sqrt")
+
+    # ------------------------------------------------------------------ angles
+
+    def sin(self, x: Value) -> Value:
+        """Sine."""
+        return x.apply("Sin")
+
+    def cos(self, x: Value) -> Value:
+        """Cosine."""
+        return x.apply("Cos")
+
+    def tan(self, x: Value) -> Value:
+        """Tangent."""
+        return x.apply("Sin") / x.apply("Cos")
+
+    def atan(self, x: Value) -> Value:
+        """The angle of a slope."""
+        return self.atan2(x, 1.0)
+
+    def asin(self, x: Value) -> Value:
+        """The angle of a sine; NaN beyond 1."""
+        return self.atan2(x, ((1.0 - x) * (1.0 + x)).apply("Sqrt"))
+
+    def acos(self, x: Value) -> Value:
+        """The angle of a cosine; NaN beyond 1."""
+        return self.atan2(((1.0 - x) * (1.0 + x)).apply("Sqrt"), x)
+
+    def atan2(self, a: Number, b: Number) -> Value:
+        """Angle of the point (b, a), from the slope of the flatter of its two coordinates."""
+        like = _like(a, b)
+        y, x = like.beside(a), like.beside(b)
+        tall, wide = y.apply("Abs"), x.apply("Abs")
+        longer = tall.apply("Max", wide)
+        none = longer.apply("Equal", 0.0, kind="bool")
+        slope = tall.apply("Min", wide) / self.where(none, 1.0, longer)
+        angle = _flat(slope)
+        angle = self.where(self.gt(tall, wide), math.pi / 2 - angle, angle)
+        angle = self.where(_negative(x), math.pi - angle, angle)
+        return self.where(_negative(y), -angle, angle)
+
+    # ------------------------------------------------------------------- truth
+
+    def gt(self, a: Number, b: Number) -> Value:
+        """`a > b`."""
+        return _two("Greater", a, b, truth=True)
+
+    def ge(self, a: Number, b: Number) -> Value:
+        """`a >= b`."""
+        return _two("GreaterOrEqual", a, b, truth=True)
+
+    def both(self, a: Value, b: Value) -> Value:
+        """Conjunction."""
+        return a.apply("And", b)
+
+    def either(self, a: Value, b: Value) -> Value:
+        """Disjunction."""
+        return a.apply("Or", b)
+
+    def number(self, mask: Value, like: Value) -> Value:
+        """1 where `mask`, else 0."""
+        return mask.cast(like.kind)
+
+    def where(self, mask: Value, yes: Number, no: Number) -> Value:
+        """`yes` where `mask`, else `no`."""
+        kind: Kind = next((each.kind for each in (yes, no) if isinstance(each, Value)), "float64")
+        parts = [each if isinstance(each, Value) else mask.sheet.constant(each, kind) for each in (yes, no)]
+        return mask.apply("Where", *parts, kind=kind)
+
+    def infinite(self, mask: Value, like: Value) -> Value:  # noqa: ARG002
+        """+inf where `mask`, else -inf."""
+        return self.where(mask, math.inf, -math.inf)
+
+    def clamp(self, x: Value, low: float | None, high: float | None) -> Value:
+        """`x` cut to [low, high]."""
+        if low is not None and high is not None:
+            return x.apply("Clip", low, high)
+        x = x if low is None else x.apply("Max", low)
+        return x if high is None else x.apply("Min", high)
+
+    # -------------------------------------------------------------- along time
+
+    def minimum(self, a: Number, b: Number) -> Value:
+        """The lesser one."""
+        return _two("Min", a, b)
+
+    def maximum(self, a: Number, b: Number) -> Value:
+        """The greater one."""
+        return _two("Max", a, b)
+
+    def join(self, items: Sequence[Value], pick: Pick) -> Value:
+        """Exact extremum of one or more arrays."""
+        first, *rest = items
+        return first.apply("Min" if pick == "min" else "Max", *rest) if rest else first
+
+    def amin(self, x: Value) -> Value:
+        """Minimum over axis 0, kept."""
+        return self.join(x.rows(), "min")
+
+    def amax(self, x: Value) -> Value:
+        """Maximum over axis 0, kept."""
+        return self.join(x.rows(), "max")
+
+    def cummin(self, x: Value) -> Value:
+        """Running minimum along axis 0."""
+        return _running(x, "Min")
+
+    def cummax(self, x: Value) -> Value:
+        """Running maximum along axis 0."""
+        return _running(x, "Max")
+
+    def extrema(self, x: Value, pick: Pick, window: Sliding) -> None:
+        """Windows are put together from pairs."""
+
+    def until(self, left: Value, right: Value, pick: Pick, window: Sliding) -> None:
+        """The same for `until`."""
+
+    # ------------------------------------------------------ constants and shapes
+
+    def kind(self, like: Value) -> Hashable:
+        """Floats become constants of the sheet where they are used."""
+        return like.kind
+
+    def constant(self, value: float, like: Value) -> float:  # noqa: ARG002
+        """The float itself."""
+        return value
+
+    def full(self, shape: tuple[int, ...], value: float, like: Value) -> Value:
+        """A constant array, of one trajectory where their number is not known: it broadcasts."""
+        known = like.sheet.constant(value, like.kind)
+        return known.spread(*(1 if length == BATCH else length for length in shape))
+
+    def counted(self, first: int, count: int, like: Value) -> Value:
+        """Whole numbers along time, of one trajectory where their number is not known."""
+        numbers = like.sheet.constant([[float(k)] for k in range(first, first + count)], like.kind)
+        return numbers.spread(count, *(1 if length == BATCH else length for length in like.shape[1:]))
+
+    def cat(self, parts: Sequence[Value]) -> Value:
+        """Joined along axis 0."""
+        widest = max(parts, key=lambda part: part.shape[-1])
+        return joined([part.spread(part.shape[0], *widest.shape[1:], like=widest) for part in parts])
+
+    def flip(self, x: Value) -> Value:
+        """Reversed along axis 0."""
+        return x[::-1] if x.shape[0] > 1 else x
+
+    def quiet(self) -> AbstractContextManager[object]:
+        """Nothing is computed here."""
+        return nullcontext()
+
+
+def _like(*numbers: Number) -> Value:
+    return next(number for number in numbers if isinstance(number, Value))
+
+
+def _shape(like: Value, *numbers: Number) -> tuple[int, ...]:
+    first, *rest = (like.beside(number) for number in numbers)
+    return first.broadcast(*rest)
+
+
+def _two(op: str, a: Number, b: Number, *, truth: bool = False) -> Value:
+    like = _like(a, b)
+    return like.beside(a).apply(op, b, kind="bool" if truth else None)
+
+
+def _negative(x: Value) -> Value:
+    """Where a number has a minus, -0 too."""
+    return ONNX_OPS.where(x.apply("Equal", 0.0, kind="bool"), 1.0 / x, x).apply("Less", 0.0, kind="bool")
+
+
+def _flat(slope: Value) -> Value:
+    """The arc tangent of a slope in [0, 1]: that of float32, and one step of Newton's method."""
+    near = slope.cast("float32").apply("Atan").cast(slope.kind)
+    if slope.kind == "float32":
+        return near
+    sine, cosine = near.apply("Sin"), near.apply("Cos")
+    return near + (slope * cosine - sine) / (cosine + slope * sine)
+
+
+def _running(x: Value, op: str) -> Value:
+    """The extremum of everything up to each row, in about log2(rows) operations."""
+    size = 1
+    while size < x.shape[0]:
+        x = joined([x[:size], x[size:].apply(op, x[:-size])])
+        size *= 2
+    return x
+
+
+ONNX_OPS = OnnxOps()
+ONNX: Ops = cast("Ops", ONNX_OPS)

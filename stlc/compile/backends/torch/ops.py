@@ -1,0 +1,347 @@
+"""The array namespace over torch: gradients, batches, any device. Every method is one or two operations."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Hashable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from functools import lru_cache, reduce
+from itertools import pairwise
+from typing import Any, cast, final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from stlc.compile.backends.array.extremum import Pick, Sliding
+from stlc.compile.backends.array.namespace import Mask, Ops
+from stlc.compile.backends.array.sliding import Asked
+from stlc.compile.backends.torch.choice import choice, reduction
+from stlc.compile.backends.torch.kernel import by_kernel
+from stlc.compile.backends.torch.small import block_extrema, is_small, small_extrema, small_until
+from stlc.compile.backends.torch.windows import SlidingExtremum, SlidingUntil
+
+_LARGE, _LARGE_FEW, _LARGE_BLOCK, _LARGE_UNTIL = 1 << 13, 1 << 17, 1 << 16, 1 << 12
+"""From so many numbers on, on a processor, scans in place beat what torch's own operations can do: for
+windows, for windows of a few traces, for windows that all reach the last row, and for `until`."""
+
+_LARGE_KERNEL = 1 << 11
+"""From so many numbers on a kernel is worth building."""
+
+_FEW = 16
+"""So many traces are a few."""
+
+
+class _SafeSqrt(torch.autograd.Function):
+    """Square root whose gradient at 0 is 0."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        root = torch.sqrt(x)
+        ctx.save_for_backward(root)
+        return root
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (root,) = ctx.saved_tensors
+        return torch.where(root > 0, grad / (2.0 * root), 0.0)
+
+
+class _Kept(torch.autograd.Function):
+    """Some rows as they are, in the others a constant."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, keep: NDArray[np.bool_], value: float) -> Tensor:
+        edges = (0, *(np.flatnonzero(np.diff(keep)) + 1).tolist(), len(keep))
+        ctx.runs = [(slice(a, b), bool(keep[a])) for a, b in pairwise(edges)]
+        return _kept(x, ctx.runs, value)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        return _kept(grad, ctx.runs, 0.0), None, None
+
+
+def _kept(x: Tensor, runs: list[tuple[slice, bool]], value: float) -> Tensor:
+    out = torch.empty_like(x)
+    for rows, stay in runs:
+        out[rows] = x[rows] if stay else value
+    return out
+
+
+class _SmoothMax(torch.autograd.Function):
+    """`log(sum(exp(k x))) / k` over axis 0; infinite values carry no gradient and make no NaN."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, k: float) -> Tensor:
+        top = x.amax(dim=0, keepdim=True) if k > 0 else x.amin(dim=0, keepdim=True)
+        unbounded = torch.isinf(top)
+        shares = ((x - top.masked_fill(unbounded, 0.0)) * k).clamp_max_(0.0).exp_()
+        total = shares.sum(dim=0, keepdim=True)
+        ctx.save_for_backward(shares.div_(total.masked_fill(unbounded, torch.inf)))
+        return top + total.log_() / k
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        (shares,) = ctx.saved_tensors
+        return grad * shares, None
+
+
+class _SmoothMax2(torch.autograd.Function):
+    """`log(exp(k a) + exp(k b)) / k` for operands of one shape."""
+
+    @staticmethod
+    def forward(ctx: Any, a: Tensor, b: Tensor, k: float) -> Tensor:
+        top = torch.maximum(a, b) if k > 0 else torch.minimum(a, b)
+        unbounded = torch.isinf(top)
+        gap = (a - b).masked_fill_(unbounded, torch.inf)
+        share = torch.sigmoid(gap * k)
+        ctx.save_for_backward(share.masked_fill(unbounded, 0.0), (1.0 - share).masked_fill_(unbounded, 0.0))
+        return top + torch.log1p(torch.exp(gap.abs_() * -abs(k))) / k
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+        left, right = ctx.saved_tensors
+        return grad * left, grad * right, None
+
+
+@lru_cache(maxsize=4096)
+def _constant(value: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.tensor(value, dtype=dtype, device=device)
+
+
+def _pair(a: Tensor | float, b: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Both as tensors, where torch wants two of them."""
+    if isinstance(a, Tensor):
+        return a, b if isinstance(b, Tensor) else _constant(b, a.dtype, a.device)
+    assert isinstance(b, Tensor)
+    return _constant(a, b.dtype, b.device), b
+
+
+@final
+class TorchOps:
+    """`stlc.compile.backends.array.namespace.Ops` over torch tensors; dtype and device follow the operands.
+
+    Operands are `(time, batch)`, or of any shapes that broadcast; what runs over axis 0 runs over time, and a
+    reduction over it gives `(1, batch)`.
+    """
+
+    name = "torch"
+
+    add = staticmethod(operator.add)
+    sub = staticmethod(operator.sub)
+    mul = staticmethod(operator.mul)
+    div = staticmethod(operator.truediv)
+    pow = staticmethod(operator.pow)
+    abs = staticmethod(torch.abs)
+    exp = staticmethod(torch.exp)
+    expm1 = staticmethod(torch.expm1)
+    log = staticmethod(torch.log)
+    log1p = staticmethod(torch.log1p)
+    sin = staticmethod(torch.sin)
+    cos = staticmethod(torch.cos)
+    tan = staticmethod(torch.tan)
+    asin = staticmethod(torch.asin)
+    acos = staticmethod(torch.acos)
+    atan = staticmethod(torch.atan)
+    sigmoid = staticmethod(torch.sigmoid)
+    sign = staticmethod(torch.sign)
+    floor = staticmethod(torch.floor)
+    ceil = staticmethod(torch.ceil)
+    round = staticmethod(torch.round)
+    square = staticmethod(torch.square)
+    mod = staticmethod(torch.remainder)
+    minimum = staticmethod(torch.minimum)
+    maximum = staticmethod(torch.maximum)
+    gt = staticmethod(operator.gt)
+    ge = staticmethod(operator.ge)
+    both = staticmethod(operator.and_)
+    either = staticmethod(operator.or_)
+    where = staticmethod(torch.where)
+
+    def sqrt(self, x: Tensor) -> Tensor:
+        """Square root; gradient 0 at 0."""
+        root: Tensor = _SafeSqrt.apply(x)  # type: ignore[no-untyped-call]
+        return root
+
+    def atan2(self, a: Tensor | float, b: Tensor | float) -> Tensor:
+        """Angle of the point (b, a)."""
+        return torch.atan2(*_pair(a, b))
+
+    def axpy(self, a: Tensor | float, b: Tensor, factor: float) -> Tensor:
+        """`a + factor * b`."""
+        return torch.add(a, b, alpha=factor) if isinstance(a, Tensor) else b * factor + a
+
+    def addcmul(self, a: Tensor | float, b: Tensor, c: Tensor, factor: float) -> Tensor:
+        """`a + factor * b * c`."""
+        return torch.addcmul(_pair(a, b)[0], b, c, value=factor)
+
+    def clamp(self, x: Tensor, low: float | None, high: float | None) -> Tensor:
+        """`x` cut to [low, high]; the gradient at a bound is 1."""
+        return torch.clamp(x, low, high)
+
+    def norm(self, *components: Tensor | float) -> Tensor:
+        """Euclidean length; gradient 0 at 0."""
+        like = next(part for part in components if isinstance(part, Tensor))
+        first, *others = (_pair(part, like)[0] for part in components)
+        total = first * first
+        for part in others:
+            total = torch.addcmul(total, part, part)
+        if not total.requires_grad:
+            return total.sqrt()
+        positive = total > 0.0
+        return torch.where(positive, torch.where(positive, total, 1.0).sqrt(), total)
+
+    def settled(self, weight: Tensor, mask: Mask) -> Tensor:
+        """1 where `mask`, else 0, with the gradient of `weight`."""
+        return weight + (self.number(mask, weight) - weight.detach())
+
+    def number(self, mask: Mask, like: Tensor) -> Tensor:
+        """1 where `mask`, else 0."""
+        out: Tensor = mask.to(like.dtype)
+        return out
+
+    def lerp(self, no: Tensor | float, yes: Tensor | float, weight: Tensor) -> Tensor:
+        """`no + weight (yes - no)`, exact at both ends."""
+        return torch.lerp(*_pair(no, yes), weight)
+
+    def infinite(self, mask: Mask, like: Tensor) -> Tensor:
+        """+inf where `mask`, else -inf, without gradient."""
+        return torch.where(mask, self.constant(torch.inf, like), self.constant(-torch.inf, like))
+
+    def straight_through(self, rho: Tensor, strict: bool, slope: float) -> Tensor:
+        """Hard forward, the slope of a tanh backward; `soft + (1 - soft)` is exactly 1 for `soft` >= 1/2."""
+        hard = torch.heaviside(rho.detach(), self.constant(0.0 if strict else 1.0, rho))
+        if not rho.requires_grad:
+            return hard
+        soft = torch.sigmoid(rho * self.constant(2.0 * slope, rho))
+        return soft + (hard - soft.detach())
+
+    def amin(self, x: Tensor) -> Tensor:
+        """Minimum over axis 0, kept; ties share the gradient."""
+        return reduction(x, "min")
+
+    def amax(self, x: Tensor) -> Tensor:
+        """Maximum over axis 0, kept; ties share the gradient."""
+        return reduction(x, "max")
+
+    def sum(self, x: Tensor) -> Tensor:
+        """Sum over axis 0, kept."""
+        return x.sum(dim=0, keepdim=True)
+
+    def cummin(self, x: Tensor) -> Tensor:
+        """Running minimum along axis 0."""
+        return torch.cummin(x, dim=0).values
+
+    def cummax(self, x: Tensor) -> Tensor:
+        """Running maximum along axis 0."""
+        return torch.cummax(x, dim=0).values
+
+    def join(self, items: Sequence[Tensor], pick: Pick) -> Tensor:
+        """Exact extremum of one or more arrays; one of several equal operands may get all of the gradient."""
+        if torch.compiler.is_exporting():  # it must not depend on the batch
+            return reduce(torch.minimum if pick == "min" else torch.maximum, items)
+        return choice(items, pick)
+
+    def extrema(self, x: Tensor, pick: Pick, window: Sliding) -> Tensor | None:
+        """Exact extrema of sliding windows; one of several equal operands may get all of the gradient."""
+        if x.ndim != 2 or torch.compiler.is_exporting():
+            return None
+        if is_small(x, window):
+            return small_extrema(x, pick, window)
+        if x.numel() >= _LARGE_KERNEL and (found := by_kernel((x,), pick, window)) is not None:
+            return found
+        if x.is_cuda or (window.to_end and x.numel() < _LARGE_BLOCK):
+            return None
+        if not window.to_end and x.numel() < (_LARGE_FEW if x.shape[1] <= _FEW else _LARGE):
+            return block_extrema(x, pick, window)
+        out: Tensor = SlidingExtremum.apply(x, Asked(pick, window, TORCH))  # type: ignore[no-untyped-call]
+        return out
+
+    def until(self, left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Tensor | None:
+        """Exact `until` and `release`; one of several equal operands may get all of the gradient."""
+        if left.ndim != 2 or left.is_cuda or torch.compiler.is_exporting():
+            return None
+        if is_small(left, window):
+            return small_until(left, right, pick, window)
+        if left.numel() >= _LARGE_KERNEL and (found := by_kernel((left, right), pick, window)) is not None:
+            return found
+        if left.numel() < _LARGE_UNTIL and not window.to_end:
+            return None
+        out: Tensor = SlidingUntil.apply(left, right, Asked(pick, window, TORCH))  # type: ignore[no-untyped-call]
+        return out
+
+    def softmax(self, x: Tensor, k: float) -> Tensor:
+        """Smooth extremum over axis 0, kept."""
+        out: Tensor = _SmoothMax.apply(x, k)  # type: ignore[no-untyped-call]
+        return out
+
+    def softmax2(self, a: Tensor, b: Tensor, k: float) -> Tensor:
+        """Smooth extremum of two of one shape."""
+        out: Tensor = _SmoothMax2.apply(a, b, k)  # type: ignore[no-untyped-call]
+        return out
+
+    def kind(self, like: Tensor) -> Hashable:
+        """The dtype and the device."""
+        return like.dtype, like.device
+
+    def constant(self, value: float, like: Tensor) -> Tensor:
+        """A tensor without dimensions: torch converts a Python number anew in every operation."""
+        return _constant(value, like.dtype, like.device)
+
+    def full(self, shape: tuple[int, ...], value: float, like: Tensor) -> Tensor:
+        """A constant array; infinite where the dtype cannot hold the value."""
+        return self.constant(value, like).expand(shape).clone()
+
+    def cat(self, parts: Sequence[Tensor]) -> Tensor:
+        """Joined along axis 0."""
+        return torch.cat(list(parts))
+
+    def stack(self, parts: Sequence[Tensor]) -> Tensor:
+        """A new axis 0 in front."""
+        return torch.stack(list(parts))
+
+    def counted(self, first: int, count: int, like: Tensor) -> Tensor:
+        """Whole numbers along time."""
+        numbers = torch.arange(first, first + count, dtype=like.dtype, device=like.device)
+        return numbers.view(-1, *(1,) * (like.ndim - 1)).expand(count, *like.shape[1:])
+
+    def empty(self, shape: tuple[int, ...], like: Tensor) -> Tensor:
+        """Memory to be written to, also outside of inference mode."""
+        with torch.inference_mode(False):
+            return like.new_empty(shape)
+
+    def unbind(self, x: Tensor, axis: int) -> Sequence[Tensor]:
+        """Views of the slices along an axis."""
+        return x.unbind(axis)
+
+    def flip(self, x: Tensor) -> Tensor:
+        """Reversed along axis 0."""
+        return x.flip(0)
+
+    def rows(self, keep: NDArray[np.bool_], x: Tensor, value: float) -> Tensor:
+        """`x` with `value` in the rows that are not kept."""
+        if keep.all():
+            return x
+        if torch.compiler.is_exporting():
+            mask = torch.from_numpy(keep).view(-1, *(1,) * (x.ndim - 1))
+            return torch.where(mask, x, value)
+        out: Tensor = _Kept.apply(x, keep, value)  # type: ignore[no-untyped-call]
+        return out
+
+    def columns(self, x: Tensor) -> Sequence[Tensor]:
+        """One `(time, batch)` tensor for every column of `(batch, time, dim)`: a copy, and views of it."""
+        return x.permute(2, 1, 0).contiguous().unbind(0)
+
+    def quiet(self) -> AbstractContextManager[object]:
+        """Torch does not warn."""
+        return nullcontext()
+
+
+TORCH: Ops = cast("Ops", TorchOps())

@@ -1,0 +1,574 @@
+"""Functions applied to numbers: units agree, constants fold.
+
+A number in a unit with a zero of its own (`degC`) is a point. Points are compared, chosen from and
+subtracted, which gives a difference in kelvin; a point and kelvin are a point; `abs` and its like refuse
+points, and any other function takes them in kelvin.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
+from typing import Literal
+
+from stlc.compile.analysis.ranges import bounds
+from stlc.compile.frontend.scope import Scope
+from stlc.compile.frontend.values import Number, literal, unit_text
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.functions import FUNCTIONS, Function
+from stlc.diagnostics import Diagnostic, Label
+from stlc.signature import Kind
+from stlc.source import Span
+from stlc.units import DIMENSIONLESS, SYMBOLS, Unit, nearest, same_dims
+
+_MAX_BITS = 512
+_QUANTITY = re.compile(r"(-? *[\d.]+(?:[eE][+-]?\d+)?) *(?:[^\W\d]|°)\S*")
+"""A number with its unit, as written."""
+_OF_POINTS = ("min", "max", "clip", "choice", "uniform")
+"""Functions that choose from points, or draw between them."""
+
+_LENGTHS = ("abs", "norm", "norm1", "norminf")
+_TEMPERATURE = (0, 0, 0, 0, 1)
+_MISSING = {
+    (1, 0, 0, 0, 0): ("length", "m"),
+    (0, 1, 0, 0, 0): ("mass", "kg"),
+    (0, 0, 1, 0, 0): ("time", "s"),
+}
+
+
+def apply(name: str, args: Sequence[Number], span: Span, scope: Scope) -> Number:
+    """`name(args)`, checked and folded.
+
+    Args:
+        name: of an entry of `FUNCTIONS`.
+        args: as many as the function takes.
+        span: of the whole, for findings.
+        scope: where findings go.
+
+    Raises:
+        Failed: units do not agree (E203), a division by zero (E401), or a value that does not exist (E205).
+    """
+    function = FUNCTIONS[name]
+    for arg in args:
+        _refuse_enum(function, arg, span, scope)
+    typed_args, shell = _units(function, args, span, scope)
+    if name in ("div", "mod"):
+        _check_divisor(function, typed_args[1], span, scope)
+    if function.fold is not None and all(arg.constant is not None for arg in typed_args):
+        return _fold(function, typed_args, shell, scope)
+    kind: Kind = "bool" if name == "bernoulli" else "int" if _whole(function, typed_args, shell) else "real"
+    if name == "choice" and len({(arg.kind, arg.labels) for arg in typed_args}) == 1:
+        return replace(shell, num=_op(name, typed_args), kind=typed_args[0].kind, labels=typed_args[0].labels)
+    return replace(shell, num=_op(name, typed_args), kind=kind)
+
+
+def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[tuple[Number, ...], Number]:
+    """The arguments with bare numbers in the unit that is needed, and a blank of that unit.
+
+    Args:
+        args: numbers that must have one unit.
+        what: the headline's verb: "compare", "add", or `norm`.
+        span: of the finding.
+        scope: where findings go.
+    """
+    rigid = [arg for arg in args if not arg.flexible]
+    for other in rigid[1:]:
+        if not same_dims(rigid[0].unit, other.unit):
+            scope.fail(_mismatch(rigid[0], other, what, span))
+    if any(arg.unit.offset for arg in args):
+        return _on_one_scale(args, what, span, scope)
+    known = rigid or [arg for arg in args if not arg.bare]
+    if not known:
+        return tuple(args), Number(ir.Lit(0.0), DIMENSIONLESS, True, True, span=span)
+    unit, sense = known[0].unit, _sense(args)
+    bare = next((arg for arg in args if arg.bare), None)
+    if bare is not None and sense == "open":
+        scope.fail(_which(bare, SYMBOLS["degC"], span))
+    blank = Number(ir.Lit(0.0), unit, not rigid, sense=sense, span=span)
+    return tuple(in_unit(arg, unit, scope) if arg.bare else arg for arg in args), blank
+
+
+def gap(left: Number, right: Number, span: Span, scope: Scope) -> Number:
+    """`left - right` of what is compared: two points, or two numbers. Raises Failed (E203)."""
+    if not (left.unit.offset or right.unit.offset):
+        return apply("sub", (left, right), span, scope)
+    sides, _ = agree((left, right), "subtract", span, scope)
+    plain = [replace(side, unit=side.unit.interval, sense="") for side in sides]
+    return replace(apply("sub", plain, span, scope), sense="difference")
+
+
+def rebased(number: Number, unit: Unit) -> Number:
+    """The same number, counted from the zero of `unit`, which it takes."""
+    shift = number.unit.offset - unit.offset
+    if not shift:
+        return replace(number, unit=unit)
+    value, amount = number.constant, float(shift)
+    exact = None if number.exact is None else number.exact + shift
+    num: ir.Num
+    match number.num:
+        case ir.Lit():
+            assert value is not None
+            num = ir.Lit(nearest(exact) if exact is not None else value + amount)
+        case ir.Op("add" | "sub" as name, (inner, ir.Lit(before))) if before == (
+            -amount if name == "add" else amount
+        ):
+            num = inner
+        case inner:
+            num = ir.Op("add" if amount > 0 else "sub", (inner, ir.Lit(abs(amount))))
+    return replace(number, num=num, unit=unit, exact=exact, kind="real", sense="")
+
+
+def absolute(number: Number) -> Number:
+    """The number in SI units from their zero: 20 degC is 293.15 K."""
+    return rebased(number, number.unit.interval)
+
+
+def on_scale(number: Number, unit: Unit, place: Span | None, scope: Scope) -> Number:
+    """A number of the dimensions of `unit` as one in it. Raises Failed (E203): a difference is no point."""
+    if unit.offset and number.sense == "difference":
+        scope.fail(difference_for_point(number, unit, place))
+    return rebased(number, unit)
+
+
+def difference_for_point(number: Number, unit: Unit, place: Span | None) -> Diagnostic:
+    """E203: a difference where a point of a scale is needed."""
+    message = f"a difference of temperatures, in [{unit.interval}], is no temperature in [{unit}]"
+    help_ = (f"declare it in [{unit.interval}], or add it to a temperature: `20 {unit} + …`",)
+    return Diagnostic("E203", message, number.span or place, "a difference", help=help_)
+
+
+def too_large(span: Span | None) -> Diagnostic:
+    """E005: a number that no double holds."""
+    return Diagnostic(
+        "E005",
+        "this number is beyond double precision",
+        span,
+        note=("in SI units the largest is about 1.8e308",),
+    )
+
+
+def in_unit(number: Number, unit: Unit, scope: Scope) -> Number:
+    """A bare number read in `unit`: 30 becomes 30 deg. Raises Failed (E005 beyond double precision)."""
+    if unit.ratio == 1:
+        return replace(number, unit=unit, bare=False, flexible=False)
+    exact = None if number.exact is None else number.exact * unit.ratio
+    value = number.constant
+    num: ir.Num = ir.Op("mul", (number.num, ir.Lit(unit.scale)))
+    if value is not None:
+        stored = nearest(exact) if exact is not None else value * unit.scale
+        if not math.isfinite(stored):
+            scope.fail(too_large(number.span))
+        num = ir.Lit(stored)
+    return replace(number, num=num, unit=unit, exact=exact, kind="real", bare=False, flexible=False)
+
+
+def _refuse_enum(function: Function, arg: Number, span: Span, scope: Scope) -> None:
+    if arg.kind != "enum" or function.name == "choice":
+        return
+    name = function.symbol or function.name
+    help_ = "compare it with one of its members: " + ", ".join(f"`{label}`" for label, _ in arg.labels)
+    scope.fail(Diagnostic("E205", f"`{name}` does not apply to an enum", arg.span or span, help=(help_,)))
+
+
+def _units(
+    function: Function, args: Sequence[Number], span: Span, scope: Scope
+) -> tuple[tuple[Number, ...], Number]:
+    """The arguments in the units that the rule asks for, and a blank with the result's unit."""
+    flexible, bare = any(arg.flexible for arg in args), all(arg.bare for arg in args)
+    if function.rule == "same":
+        return _alike(function, args, span, scope)
+    scaled = _scaled_point(function, args)
+    args = _in_kelvin(function, args, span, scope)
+    match function.rule:
+        case "ratio":
+            return agree(args, _verb(function), span, scope)[0], Number(ir.Lit(0.0), span=span)
+        case "mul":
+            unit = args[0].unit * args[1].unit
+        case "div":
+            unit = args[0].unit / args[1].unit
+        case "square":
+            unit = args[0].unit ** 2
+        case "sqrt":
+            unit = _root(args[0], span, scope)
+        case "pow":
+            unit = _power(args[0], args[1], span, scope)
+            flexible, bare = args[0].flexible, args[0].bare
+        case "plain" | "sign":
+            if function.rule == "plain":
+                _check_plain(function, args, scope)
+            unit, flexible = DIMENSIONLESS, bare
+    sense: Sense = "difference" if _length_or_multiple(function, args, unit) else "open" if scaled else ""
+    return tuple(args), Number(ir.Lit(0.0), unit, flexible, bare, sense=sense, span=span)
+
+
+# ---------------------------------------------------------------------- points of a scale
+
+Sense = Literal["", "difference", "open"]
+Agreed = tuple[tuple[Number, ...], Number]
+
+
+def _alike(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> Agreed:
+    """Arguments of one unit."""
+    name, verb = function.name, _verb(function)
+    if name in ("normal", "truncnorm"):
+        return _spread(function, args, span, scope)
+    if name in ("add", "sub") and any(arg.unit.offset for arg in args):
+        return _sum(function, (args[0], args[1]), span, scope)
+    if name not in ("add", "sub", *_OF_POINTS):
+        args = [_length(function, arg, span, scope) for arg in args]
+    found, blank = agree(args, verb, span, scope)
+    if name in _LENGTHS and blank.unit.dims == _TEMPERATURE:
+        blank = replace(blank, sense="difference")
+    elif blank.sense == "difference" and any(not arg.sense and arg.constant is None for arg in args):
+        blank = replace(blank, sense="")
+    return found, blank
+
+
+def _in_kelvin(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> list[Number]:
+    if function.rule == "sign":
+        args = [_length(function, arg, span, scope) for arg in args]
+    return [absolute(arg) for arg in args]
+
+
+def _sense(args: Sequence[Number]) -> Sense:
+    senses = [arg.sense for arg in args]
+    return "open" if "open" in senses else "difference" if "difference" in senses else ""
+
+
+def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) -> bool:
+    """Whether this is a plain number times a difference, or the root of squares: differences again."""
+    if function.rule in ("sqrt", "pow"):
+        return unit.dims == _TEMPERATURE != args[0].unit.dims
+    if function.rule not in ("mul", "div"):
+        return False
+    first, second = args
+    if second.sense == "difference" and function.rule == "mul":
+        first, second = second, first
+    return first.sense == "difference" and not second.sense and second.unit.dimensionless
+
+
+def _scaled_point(function: Function, args: Sequence[Number]) -> bool:
+    """Whether this is a plain number times a point: a part of a mean, or of a conversion to another scale."""
+    told = [arg for arg in args if arg.unit.offset or arg.sense == "open"]
+    rest = [arg for arg in args if arg not in told]
+    plain = all(arg.bare or (arg.unit.dimensionless and not arg.flexible) for arg in rest)
+    first = function.rule == "mul" or (function.rule == "div" and told[:1] == [args[0]])
+    return first and len(told) == 1 and plain
+
+
+def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -> Agreed:
+    """Numbers, some of them points, from one zero: that of a point that varies, if there is one."""
+    points = [arg for arg in args if arg.unit.offset]
+    told = [arg for arg in args if not arg.bare]
+    bare = next((arg for arg in args if arg.bare), None)
+    difference = next((arg for arg in told if arg.sense == "difference"), None)
+    undecided = all(arg.sense == "open" for arg in points)
+    if difference is not None:
+        if not undecided:
+            fixed = next(arg for arg in points if arg.sense != "open")
+            scope.fail(_compared_with_point(difference, fixed, what, span))
+        unit = points[0].unit.interval
+    else:
+        varying = [arg for arg in told if arg.constant is None]
+        moved = next((arg for arg in varying if arg.unit.offset), None) or next(iter(varying), points[0])
+        unit = moved.unit if moved.unit.offset else points[0].unit.interval
+        if bare is not None and (undecided or not unit.offset):
+            scope.fail(_which(bare, points[0].unit, span))
+    sense: Sense = "difference" if difference is not None else "open" if undecided and unit.offset else ""
+    blank = Number(ir.Lit(0.0), unit, sense=sense, span=span)
+    return tuple(in_unit(arg, unit, scope) if arg.bare else rebased(arg, unit) for arg in args), blank
+
+
+def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Scope) -> Agreed:
+    """A sum or difference with a point in it."""
+    left, right = args
+    first = left.unit.offset and (not right.unit.offset or left.sense != "open")
+    point, other = (left, right) if first else (right, left)
+    if not other.flexible and not same_dims(point.unit, other.unit):
+        scope.fail(_mismatch(left, right, _verb(function), span))
+    if function.name == "sub" and right.unit.offset:
+        return _less_point(left, right, span, scope)
+    if other.sense == "open":
+        other = absolute(other)
+    elif other.unit.offset:
+        scope.fail(_sum_of_points(left, right, span))
+    if other.bare and function.name == "sub":
+        scope.fail(_which(other, point.unit, span))
+    if other.bare:
+        other = in_unit(other, point.unit.interval, scope)
+    drops = function.name == "sub" and other.constant is None and other.sense != "difference"
+    blank = Number(ir.Lit(0.0), point.unit, sense="open" if drops else point.sense, span=span)
+    return (point, other) if first else (other, point), blank
+
+
+def _less_point(left: Number, right: Number, span: Span, scope: Scope) -> Agreed:
+    """`left - right` of a point: a difference of two; undecided where the point is."""
+    if right.sense == "open" and not left.bare and left.sense != "difference":
+        sense: Sense = "open" if left.unit.offset else ""
+        return (left, absolute(right)), Number(ir.Lit(0.0), left.unit, left.flexible, sense=sense, span=span)
+    found, _ = agree((left, right), "subtract", span, scope)
+    return found, Number(ir.Lit(0.0), right.unit.interval, sense="difference", span=span)
+
+
+def _spread(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> Agreed:
+    """A middle, a deviation, and perhaps ends: the deviation is a difference."""
+    middle, deviation, *ends = args
+    places = [middle, *ends]
+    if deviation.unit.offset:
+        scope.fail(point_for_amount(f"the deviation of `{function.name}`", deviation, span))
+    point = next((place for place in places if place.unit.offset), None)
+    if point is None:
+        found, blank = agree(args, _verb(function), span, scope)
+        told = not deviation.bare and deviation.unit.dims == _TEMPERATURE
+        around = told and all(place.bare for place in places)
+        return found, replace(blank, sense="difference" if around else blank.sense)
+    if not deviation.flexible and not same_dims(point.unit, deviation.unit):
+        scope.fail(_mismatch(middle, deviation, _verb(function), span))
+    (middle, *ends), blank = agree(places, _verb(function), span, scope)
+    if deviation.bare:
+        deviation = in_unit(deviation, blank.unit.interval, scope)
+    return (middle, deviation, *ends), blank
+
+
+def _length(function: Function, arg: Number, span: Span, scope: Scope) -> Number:
+    """The argument of `abs` and its like, which take no point: an undecided one is a difference to them."""
+    if not arg.unit.offset:
+        return arg
+    if arg.sense == "open":
+        return replace(absolute(arg), sense="difference")
+    name = function.symbol or function.name
+    return scope.fail(point_for_amount(f"`{name}`", arg, span))
+
+
+def refuse_point(what: str, number: Number, span: Span, scope: Scope) -> None:
+    """Fail (E203) for a point where an amount is needed: `what` names the place."""
+    if number.unit.offset:
+        scope.fail(point_for_amount(what, number, span))
+
+
+def point_for_amount(what: str, number: Number, span: Span) -> Diagnostic:
+    """E203: a point of a scale where an amount is needed; `what` names the place."""
+    unit = number.unit
+    text = (number.span or span).text
+    written = _QUANTITY.fullmatch(text)
+    help_ = (
+        f"write the amount in [{unit.interval}]: `{written[1]} {unit.interval}`"
+        if written is not None
+        else f"subtract another one first: `{text} - 20 {unit}` is a difference in [{unit.interval}]"
+    )
+    message = f"{what} takes no temperature in [{unit}], which counts from 0 {unit}"
+    return Diagnostic("E203", message, number.span or span, f"[{unit}]", help=(help_,))
+
+
+def _compared_with_point(difference: Number, point: Number, what: str, span: Span) -> Diagnostic:
+    """E203: `abs(temp - 21 degC) <= 0.5 degC`."""
+    unit = point.unit
+    text = (point.span or span).text
+    if point.constant is not None:
+        label = f"{float(point.constant + unit.offset):g} {unit.interval}"
+        help_ = f"write the difference in kelvin: `{point.constant / unit.scale:g} {unit.interval}`"
+    else:
+        label = f"[{unit}]"
+        help_ = f"make it a difference too: `{text} - 0 {unit}`"
+    labels: tuple[Label, ...] = ()
+    if difference.span is not None and point.span is not None and difference.span != span:
+        labels = (Label(difference.span, f"a difference, in [{unit.interval}]"),)
+    verb = what if what.startswith("`") else f"cannot {what}"
+    message = f"{verb} a difference of temperatures with a temperature"
+    return Diagnostic("E203", message, point.span or span, label, labels, help=(help_,))
+
+
+def _sum_of_points(left: Number, right: Number, span: Span) -> Diagnostic:
+    unit = right.unit
+    first, second = ((side.span or span).text for side in (left, right))
+    written = _QUANTITY.fullmatch(second)
+    labels = tuple(
+        Label(side.span, f"[{side.unit}]")
+        for side in (left, right)
+        if side.span is not None and side.span != span
+    )
+    help_ = (
+        f"a difference is in kelvin: `{first} + {written[1]} {unit.interval}`"
+        if written is not None
+        else f"a mean of both: `{first} + ({second} - {first}) / 2`"
+    )
+    return Diagnostic("E203", "cannot add two temperatures", span, labels=labels, help=(help_,))
+
+
+def _which(bare: Number, unit: Unit, span: Span) -> Diagnostic:
+    """E203: a bare number that may count from the zero of a scale, or be in SI units."""
+    text, kelvin = (bare.span or span).text, unit.interval
+    help_ = (f"`{text} {unit}` is a temperature, `{text} {kelvin}` a difference or a temperature in kelvin",)
+    message = f"`{text}` may be in [{unit}] or in [{kelvin}] here"
+    return Diagnostic("E203", message, bare.span or span, "no unit", help=help_)
+
+
+# ---------------------------------------------------------------------- rules
+
+
+def _root(arg: Number, span: Span, scope: Scope) -> Unit:
+    try:
+        return arg.unit ** Fraction(1, 2)
+    except ValueError:
+        if arg.flexible:
+            return DIMENSIONLESS
+    return scope.fail(
+        Diagnostic("E203", f"the square root of {unit_text(arg)} has no unit", arg.span or span)
+    )
+
+
+def _power(base: Number, exponent: Number, span: Span, scope: Scope) -> Unit:
+    if not exponent.flexible and not exponent.unit.dimensionless:
+        message = f"an exponent has no unit, this is {unit_text(exponent)}"
+        scope.fail(Diagnostic("E203", message, exponent.span or span))
+    if base.unit.dimensionless:
+        return DIMENSIONLESS
+    if exponent.constant is None:
+        message = f"{unit_text(base)} to a power that varies has no unit"
+        scope.fail(Diagnostic("E203", message, span, help=("use a constant exponent",)))
+    try:
+        return base.unit ** (exponent.exact if exponent.exact is not None else Fraction(exponent.constant))
+    except ValueError as error:
+        if base.flexible:
+            return DIMENSIONLESS
+        return scope.fail(Diagnostic("E203", str(error), span))
+
+
+def _check_plain(function: Function, args: Sequence[Number], scope: Scope) -> None:
+    angle = function.name in ("sin", "cos", "tan")
+    wants = "an angle or a plain number" if angle else "a plain number"
+    for arg in args:
+        if not arg.flexible and not arg.unit.dimensionless:
+            message = f"`{function.name}` takes {wants}, this is {unit_text(arg)}"
+            help_ = (f"divide by a reference first: `{function.name}(… / 1 {arg.unit})`",)
+            scope.fail(Diagnostic("E203", message, arg.span, help=help_))
+
+
+def _check_divisor(function: Function, divisor: Number, span: Span, scope: Scope) -> None:
+    what = "modulo" if function.name == "mod" else "division"
+    place = divisor.span or span
+    if divisor.constant == 0:
+        origin = divisor.origin
+        labels = () if origin is None or origin.span is None else (Label(origin.span, "from here"),)
+        amount = "0" if divisor.unit.dimensionless else f"0 {divisor.unit}"
+        scope.fail(Diagnostic("E401", f"{what} by zero", place, f"is {amount}", labels))
+    reach = bounds(divisor.num, scope.facts)
+    if divisor.constant is None and reach is not None and reach[0] <= 0 <= reach[1]:
+        low, high = (f"{end / divisor.unit.scale:g}" for end in reach)
+        unit = "" if divisor.unit.dimensionless and not divisor.unit.text else f" {divisor.unit}"
+        text = f"between {low} and {high}{unit}"
+        help_ = ("multiply by it instead, when its sign is known",)
+        scope.report(Diagnostic("W402", "the divisor's range contains 0", place, text, help=help_))
+
+
+def _op(name: str, args: Sequence[Number]) -> ir.Num:
+    """The node, with neutral elements left out."""
+    nums = tuple(arg.num for arg in args)
+    match name, nums:
+        case ("add", (num, ir.Lit(0.0))) | ("add", (ir.Lit(0.0), num)) | ("sub", (num, ir.Lit(0.0))):
+            return num
+        case ("mul", (num, ir.Lit(1.0))) | ("mul", (ir.Lit(1.0), num)) | ("div", (num, ir.Lit(1.0))):
+            return num
+        case ("min" | "max" | "choice", (num,)):
+            return num
+        case "pow", (base, ir.Lit(exponent)) if exponent in (0.5, 1.0, 2.0):
+            return base if exponent == 1.0 else ir.Op("sqrt" if exponent == 0.5 else "square", (base,))
+        case _:
+            return ir.Op(name, nums)
+
+
+def _fold(function: Function, args: Sequence[Number], shell: Number, scope: Scope) -> Number:
+    """The value of a function of constants; exact where all of them are and the function allows it."""
+    assert function.fold is not None
+    exacts = [arg.exact for arg in args]
+    rational = function.exact and all(exact is not None for exact in exacts)
+    try:
+        result = function.fold(*(exacts if rational else [arg.constant for arg in args]))
+        value = float(result)
+        if isinstance(result, complex) or not math.isfinite(value):
+            raise ValueError("no finite value")
+    except (ValueError, TypeError, OverflowError, ZeroDivisionError):
+        written = ", ".join(f"{arg.constant:g}" for arg in args)
+        name = function.symbol or function.name
+        return scope.fail(Diagnostic("E205", f"`{name}` has no value for {written}", shell.span))
+    exact = Fraction(result) if isinstance(result, Fraction | int) else None
+    if exact is not None and max(exact.numerator.bit_length(), exact.denominator.bit_length()) > _MAX_BITS:
+        exact = None
+    return replace(
+        shell, num=ir.Lit(value), exact=exact, kind="int" if _whole(function, args, shell) else "real"
+    )
+
+
+def _whole(function: Function, args: Sequence[Number], shell: Number) -> bool:
+    """Whether the result is a whole number, whatever the arguments are at the moment.
+
+    `floor` and its like make whole numbers of SI units: in kilometres these need not be whole.
+    """
+    if function.integral:
+        return shell.unit.ratio == 1
+    if function.name == "pow":
+        exponent = args[1].exact
+        return args[0].kind == "int" and exponent is not None and exponent.denominator == 1 and exponent >= 0
+    return function.whole and all(arg.kind == "int" for arg in args)
+
+
+def _verb(function: Function) -> str:
+    verbs = {"add": "add", "sub": "subtract", "mod": "take the modulo of"}
+    return verbs.get(function.name, f"`{function.name}`")
+
+
+def _mismatch(left: Number, right: Number, what: str, span: Span) -> Diagnostic:
+    """E203, with both places and what would make the units agree."""
+    preposition = {"add": "and", "subtract": "and", "take the modulo of": "and"}.get(what, "with")
+    verb = f"cannot {what}" if not what.startswith("`") else f"{what} cannot combine"
+    labels = tuple(
+        Label(side.span, _sided(side))
+        for side in (left, right)
+        if side.span is not None and side.span != span
+    )
+    headline = f"{verb} [{left.unit}] {preposition} [{right.unit}]"
+    return Diagnostic("E203", headline, span, labels=labels, help=_repair(left, right, span))
+
+
+def _sided(side: Number) -> str:
+    declared = f", {side.origin.text}" if side.origin is not None else ""
+    return f"[{side.unit}]{declared}"
+
+
+def _repair(left: Number, right: Number, span: Span) -> tuple[str, ...]:
+    drop = "drop the units from the declarations"
+    if left.span is None or right.span is None:
+        return (drop,)
+    sign = span.text.strip()
+    for number, other in ((left, right), (right, left)):
+        written = _QUANTITY.fullmatch(number.span.text if number.span else "")
+        if written and number.constant is not None:
+            sides = [side.span.text for side in (left, right) if side.span is not None]
+            bare = f" {sign} ".join(written[1] if side == written[0] else side for side in sides)
+            return (f"a number without a unit takes the one that is needed, [{other.unit}]: `{bare}`",)
+    for numerator, denominator, factor_right in ((left, right, True), (right, left, False)):
+        quotient = (numerator.unit.si / denominator.unit.si).dims
+        if quotient in _MISSING and sign in ("<", "<=", ">", ">=", "==", "!=", "+", "-"):
+            noun, symbol = _MISSING[quotient]
+            first, second = left.span.text, right.span.text
+            first, second = (
+                (first, f"{second} * 1 {symbol}") if factor_right else (f"{first} * 1 {symbol}", second)
+            )
+            return (f"a {noun} is missing: `{first} {sign} {second}`, or {drop}",)
+    return (drop,)
+
+
+def negated(number: Number, span: Span) -> Number:
+    """The number with its sign flipped."""
+    value = number.constant
+    num: ir.Num = ir.Lit(-value) if value is not None else ir.Op("neg", (number.num,))
+    exact = None if number.exact is None else -number.exact
+    return replace(number, num=num, exact=exact, span=span, origin=None)
+
+
+def half(span: Span) -> Number:
+    """The margin of a truth value: 1/2."""
+    return literal(Fraction(1, 2), span)

@@ -1,0 +1,152 @@
+"""Bounds in seconds -> windows in steps.
+
+An interval covers the samples inside it. A bound that falls between two samples is rounded so that what holds
+on the samples holds as written: `always` and `release` take the neighbour outside as well, `eventually` and
+`until` do not. After negation normal form the operator itself says which; every such bound is W304.
+"""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.diagnostics import Diagnostic, tell
+from stlc.source import Span
+from stlc.units import nearest
+
+MAX_STEPS = 10**12
+"""Bounds beyond are longer than any trace, and sums of them would not fit into 64 bits."""
+
+_EMPTY = ir.Window(0, 0)
+"""Stands for a window that could not be made; an error was reported."""
+
+
+def to_window(interval: typed.Interval, grid: Grid, sink: list[Diagnostic], *, outward: bool) -> ir.Window:
+    """The window of an interval, in steps.
+
+    Args:
+        interval: in seconds, steps and horizons.
+        grid: of time.
+        sink: takes E005, E301, E302, E305, E311 and W304. After an error the window is a stand-in.
+        outward: round a bound off the grid away from the interval.
+    """
+    lo = in_steps(interval.lo, grid, sink, interval.span)
+    if lo is None:
+        return _EMPTY
+    hi = None if interval.hi is None else in_steps(interval.hi, grid, sink, interval.span)
+    if hi is None and interval.hi is not None:
+        return _EMPTY
+    if _reversed(interval, lo, hi, sink) or _endless(interval, lo, hi, sink):
+        return _EMPTY
+    first = _first(lo, outward=outward, excluded=interval.lo_open)
+    _note_rounding(interval.lo, lo, first, grid, sink)
+    if hi is None or interval.hi is None:
+        return ir.Window(first, None)
+    last = _last(hi, outward=outward, excluded=interval.hi_open)
+    _note_rounding(interval.hi, hi, last, grid, sink)
+    if last < first:
+        report(sink, _without_sample(interval, grid))
+        return _EMPTY
+    return ir.Window(first, last)
+
+
+def in_steps(time: typed.Time, grid: Grid, sink: list[Diagnostic], span: Span | None) -> Fraction | None:
+    """A bound in steps, or None (and E311) where the grid does not say what it needs."""
+    if time.horizons and grid.horizon is None:
+        report(sink, _needs_grid("`T` is the planning horizon of a system", time.span or span))
+        return None
+    if time.seconds and grid.dt is None:
+        report(sink, _needs_grid("seconds become samples with the step `dt` of a system", time.span or span))
+        return None
+    seconds = time.seconds / grid.dt if grid.dt is not None else Fraction(0)
+    return seconds + time.steps + time.horizons * (grid.horizon or 0)
+
+
+def _first(lo: Fraction, *, outward: bool, excluded: bool) -> int:
+    if lo.denominator != 1:
+        return math.floor(lo) if outward else math.ceil(lo)
+    return int(lo) + 1 if excluded else int(lo)
+
+
+def _last(hi: Fraction, *, outward: bool, excluded: bool) -> int:
+    if hi.denominator != 1:
+        return math.ceil(hi) if outward else math.floor(hi)
+    return int(hi) - 1 if excluded else int(hi)
+
+
+def report(sink: list[Diagnostic], finding: Diagnostic) -> None:
+    """Append a finding that is not there yet: a formula and its negation may both be lowered."""
+    tell(sink, finding)
+
+
+def _reversed(interval: typed.Interval, lo: Fraction, hi: Fraction | None, sink: list[Diagnostic]) -> bool:
+    if lo < 0:
+        text = "an interval starts before now"
+        report(
+            sink, Diagnostic("E302", text, interval.lo.span or interval.span, label=f"{nearest(lo):g} steps")
+        )
+        return True
+    if hi is not None and hi < lo:
+        text = "the interval ends before it starts"
+        label = f"from {nearest(lo):g} to {nearest(hi):g} steps"
+        report(sink, Diagnostic("E301", text, interval.span, label=label))
+        return True
+    return False
+
+
+def _endless(interval: typed.Interval, lo: Fraction, hi: Fraction | None, sink: list[Diagnostic]) -> bool:
+    if max(lo, hi or 0) <= MAX_STEPS:
+        return False
+    text = f"an interval of more than {MAX_STEPS:,} steps"
+    report(sink, Diagnostic("E005", text, interval.span, help=("`inf` means to the end of the trace",)))
+    return True
+
+
+def _note_rounding(time: typed.Time, exact: Fraction, taken: int, grid: Grid, sink: list[Diagnostic]) -> None:
+    if exact.denominator == 1:
+        return
+    below, above = math.floor(exact), math.ceil(exact)
+    finding = Diagnostic(
+        "W304",
+        f"{in_words(exact, grid)} is not a whole number of {_step(grid)}",
+        time.span,
+        label=f"taken as {in_words(Fraction(taken), grid)} here",
+        help=(
+            f"use {in_words(Fraction(below), grid)} or {in_words(Fraction(above), grid)}, or a dt that fits",
+        ),
+        note=("`always` and `release` also take the sample outside, `eventually` and `until` do not",),
+    )
+    tell(sink, finding)
+
+
+def in_words(steps: Fraction, grid: Grid) -> str:
+    """A time as people write it: in seconds where the step is known."""
+    if grid.dt is None:
+        return f"{nearest(steps):g} steps"
+    return f"{nearest(steps * grid.dt):g} s"
+
+
+def _step(grid: Grid) -> str:
+    return "steps" if grid.dt is None else f"{float(grid.dt):g} s steps"
+
+
+def _without_sample(interval: typed.Interval, grid: Grid) -> Diagnostic:
+    return Diagnostic(
+        "E305",
+        "no sample lies in this interval",
+        interval.span,
+        label=f"samples are {_step(grid)} apart".replace(" steps apart", " apart"),
+        help=("make it longer, or close its ends",),
+    )
+
+
+def _needs_grid(text: str, span: Span | None) -> Diagnostic:
+    return Diagnostic(
+        "E311",
+        f"{text}, and none is known here",
+        span,
+        help=('name the system (`system "…"` in the file, or --system), or give dt and the horizon',),
+    )

@@ -1,0 +1,260 @@
+"""Comparisons and membership: from numbers to predicates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from stlc.compile.frontend.algebra import agree, apply, gap, half, in_unit
+from stlc.compile.frontend.regions import signed_distance
+from stlc.compile.frontend.scope import Scope
+from stlc.compile.frontend.sorts import Need, as_formula, as_number, loose_number
+from stlc.compile.frontend.sweep import swept_distance
+from stlc.compile.frontend.values import (
+    REGION_TYPES,
+    Box,
+    Complement,
+    Number,
+    Region,
+    Swept,
+    Value,
+    Vector,
+    is_formula,
+    noun,
+)
+from stlc.compile.frontend.values import Label as Member
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.diagnostics import Diagnostic
+from stlc.grammar import ast
+from stlc.source import Span
+from stlc.units import Unit
+
+
+def comparison(expr: ast.Compare, values: Sequence[Value], scope: Scope) -> typed.Formula:
+    """A chain `a <= b < c`: the conjunction of its neighbours."""
+    pairs = []
+    for index, op in enumerate(expr.ops):
+        left, right = expr.operands[index], expr.operands[index + 1]
+        whole = expr.span if len(expr.ops) == 1 else left.span.to(right.span)
+        place = sign_span(op, left.span, right.span)
+        pairs.append(_pair(op, (left, values[index]), (right, values[index + 1]), (whole, place), scope))
+    return pairs[0] if len(pairs) == 1 else typed.Logic(expr.span, "and", tuple(pairs))
+
+
+def sign_span(sign: str, left: Span, right: Span) -> Span:
+    """Where an operator stands between its operands."""
+    gap = left.source.text[left.end : right.start]
+    at = gap.find(sign)
+    if at < 0:
+        return left.to(right)
+    return left.source.span(left.end + at, left.end + at + len(sign))
+
+
+def _pair(
+    op: str,
+    left: tuple[ast.Expr, Value],
+    right: tuple[ast.Expr, Value],
+    spans: tuple[Span, Span],
+    scope: Scope,
+) -> typed.Formula:
+    whole, place = spans
+    if op in ("==", "!="):
+        equal = _equality(left, right, spans, scope)
+        return equal if op == "==" else typed.Not(whole, equal)
+    _refuse_vectors(left, right, op, scope)
+    need = f"`{op}` compares numbers"
+    a = as_number(left[1], left[0], Need(need, "the left side"), scope)
+    b = as_number(right[1], right[0], Need(need, "the right side"), scope)
+    if "enum" in (a.kind, b.kind):
+        help_ = ("use `==`, `!=` or `in {…}`",)
+        scope.fail(
+            Diagnostic(
+                "E205",
+                f"the members of an enum have no order, so `{op}` cannot compare them",
+                place,
+                help=help_,
+            )
+        )
+    (a, b), _ = agree((a, b), "compare", place, scope)
+    big, small = (a, b) if op in (">", ">=") else (b, a)
+    return _above(big, small, op in ("<", ">"), whole, scope)
+
+
+def _above(big: Number, small: Number, strict: bool, span: Span, scope: Scope) -> typed.Pred:
+    """`big > small` (`strict`) or `big >= small`; between whole numbers with half a step of margin.
+
+    Whole numbers differ by one step or not at all: halfway, no rounding and no tie decides, and the margin is
+    that of `==`.
+    """
+    written = _compared(big, small)
+    if (big.kind, small.kind) == ("int", "int"):
+        step = half(span)
+        step = in_unit(step, big.unit.interval, scope) if big.unit.offset else step
+        big = apply("sub" if strict else "add", (big, step), span, scope)
+    return _pred(span, gap(big, small, span, scope), strict=strict, written=written)
+
+
+def _pred(span: Span, margin: Number, *, strict: bool = False, written: Unit | None = None) -> typed.Pred:
+    unit = (margin.unit if written is None else written).interval
+    return typed.Pred(span, margin.num, strict, unit=unit.si, written=unit)
+
+
+def _compared(*sides: Number) -> Unit:
+    """The unit of what is compared: that of what varies, which constants are measured against."""
+    told = [side for side in sides if side.unit.text] or list(sides)
+    return next((side.unit for side in told if side.constant is None), told[0].unit)
+
+
+def _refuse_vectors(
+    left: tuple[ast.Expr, Value], right: tuple[ast.Expr, Value], op: str, scope: Scope
+) -> None:
+    for expr, value in (left, right):
+        if isinstance(value, Vector):
+            help_ = (f"`norm({expr.span.text})`, one component, or `in` with a region",)
+            scope.fail(
+                Diagnostic("E205", f"`{op}` does not compare vectors", expr.span, noun(value)[2:], help=help_)
+            )
+
+
+def _equality(
+    left: tuple[ast.Expr, Value], right: tuple[ast.Expr, Value], spans: tuple[Span, Span], scope: Scope
+) -> typed.Formula:
+    """`==` on whole numbers, truth values and enums; its margin is 1/2 - |a - b|."""
+    whole, place = spans
+    _refuse_vectors(left, right, "==", scope)
+    if any(is_formula(value) for _, value in (left, right)):
+        need = Need("`==` between truth values", "the other side")
+        sides = [as_formula(value, expr, need, scope) for expr, value in (left, right)]
+        return typed.Logic(whole, "<->", (sides[0], sides[1]))
+    a, b = _meet(left, right, scope), _meet(right, left, scope)
+    if a.kind == "real" or b.kind == "real":
+        scope.fail(_real_equality(a, b, left[0], right[0], place))
+    _check_labels(a, b, place, scope)
+    plain = [replace(side, kind="real", labels=()) for side in (a, b)]
+    apart = apply("abs", (gap(plain[0], plain[1], whole, scope),), whole, scope)
+    return typed.Pred(whole, apply("sub", (half(whole), apart), whole, scope).num, strict=False)
+
+
+def _meet(side: tuple[ast.Expr, Value], other: tuple[ast.Expr, Value], scope: Scope) -> Number:
+    """A side as a number; a member of an enum is read in the enum of the other side."""
+    expr, value = side
+    labels = other[1].labels if isinstance(other[1], Number) else ()
+    if isinstance(value, Member) and labels:
+        if value.name not in dict(labels):
+            names = ", ".join(f"`{name}`" for name, _ in labels)
+            message = f"`{value.name}` is not a member of the enum of `{other[0].span.text}`"
+            scope.fail(Diagnostic("E205", message, expr.span, help=(f"its members are {names}",)))
+        return Number(ir.Lit(dict(labels)[value.name]), kind="enum", labels=labels, span=expr.span)
+    return loose_number(value, expr, Need("`==` compares numbers", "one side"), scope)
+
+
+def _real_equality(a: Number, b: Number, left: ast.Expr, right: ast.Expr, place: Span) -> Diagnostic:
+    first, second = left.span.text, right.span.text
+    unit = next((n.unit for n in (a, b) if not n.unit.dimensionless), None)
+    if unit is not None and unit.offset:
+        first, second = (f"{n} {unit}" if m.bare else n for n, m in ((first, a), (second, b)))
+    apart = f"{first} - {second}"
+    away = first if b.constant == 0 and (unit is None or not unit.offset) else apart
+    tolerance = "0.05" if unit is None else f"0.05 {unit.interval}"
+    label = f"its robustness is -|{apart}|: at best 0, so it can never hold with a margin"
+    return Diagnostic(
+        "E204",
+        "`==` between reals is never robustly true",
+        place,
+        label,
+        help=(f"abs({away}) <= {tolerance}",),
+        note=("`==` is exact and allowed on whole numbers, truth values and enums",),
+    )
+
+
+def _check_labels(a: Number, b: Number, place: Span, scope: Scope) -> None:
+    """Enums meet their own kind, or a number that one of their members has."""
+    if a.labels and b.labels:
+        if a.labels != b.labels:
+            scope.fail(Diagnostic("E205", "these are members of different enums", place))
+        return
+    for side, other in ((a, b), (b, a)):
+        if not side.labels or other.constant in [value for _, value in side.labels]:
+            continue
+        names = ", ".join(f"`{name}` ({value:g})" for name, value in side.labels)
+        help_ = (f"its members are {names}",)
+        scope.fail(
+            Diagnostic(
+                "E205", "an enum is compared with something that is none of its members", place, help=help_
+            )
+        )
+
+
+def in_set(
+    item: tuple[ast.Expr, Value], members: Sequence[tuple[ast.Expr, Value]], span: Span, scope: Scope
+) -> typed.Formula:
+    """`s in {1, 2}`: equal to one of them."""
+    equals = tuple(_equality(item, member, (span, span), scope) for member in members)
+    return equals[0] if len(equals) == 1 else typed.Logic(span, "or", equals)
+
+
+def in_range(
+    item: tuple[ast.Expr, Value], ends: Sequence[tuple[ast.Expr, Value]], span: Span, scope: Scope
+) -> typed.Formula:
+    """`x in [lo, hi]`: min(x - lo, hi - x), or under `@product` the paper's (x - lo) (hi - x)."""
+    need = "`in [lo, hi]` compares numbers"
+    x = as_number(item[1], item[0], Need(need, "the left side"), scope)
+    low, high = (as_number(value, expr, Need(need, "a bound"), scope) for expr, value in ends)
+    (x, low, high), _ = agree((x, low, high), "compare", span, scope)
+    if low.constant is not None and high.constant is not None and low.constant > high.constant:
+        scope.fail(
+            Diagnostic(
+                "E205",
+                "this range is empty: its lower end is above its upper end",
+                ends[0][0].span.to(ends[1][0].span),
+            )
+        )
+    if scope.product and x.kind != "int":
+        sides = gap(x, low, span, scope), gap(high, x, span, scope)
+        return _pred(span, apply("mul", sides, span, scope))
+    above = _above(x, low, False, span, scope)
+    below = _above(high, x, False, span, scope)
+    return typed.Logic(span, "and", (above, below))
+
+
+def sweeps(
+    expr: ast.Member, segment: Swept, region: Sequence[tuple[ast.Expr, Value]], scope: Scope
+) -> typed.Formula:
+    """`sweep(p) in R`: all of the segment; `not in`: none of it, which is no negation."""
+    if isinstance(expr.region, ast.SetLiteral):
+        help_ = ("write a range `[lo, hi]`, or a region like `circle(center, radius)`",)
+        scope.fail(
+            Diagnostic("E205", "a segment lies in a region, not in a set", expr.region.span, help=help_)
+        )
+    if len(region) == 2:
+        ends = [
+            as_number(value, end, Need("`in [lo, hi]` compares numbers", "a bound"), scope)
+            for end, value in region
+        ]
+        place: Region = Box(Vector((ends[0],)), Vector((ends[1],)), expr.region.span)
+    elif isinstance(region[0][1], REGION_TYPES):
+        place = region[0][1]
+    else:
+        message = f"`in` needs a region, this is {noun(region[0][1])}"
+        scope.fail(Diagnostic("E205", message, region[0][0].span))
+    place = Complement(place) if expr.negated else place
+    return _pred(expr.span, swept_distance(segment.point, place, expr.span, scope))
+
+
+def in_region(
+    item: tuple[ast.Expr, Value], region: tuple[ast.Expr, Value], span: Span, scope: Scope
+) -> typed.Formula:
+    """`p in R`: the signed distance is not negative."""
+    (point_expr, point), (region_expr, place) = item, region
+    if not isinstance(place, REGION_TYPES):
+        help_ = ("write a range `[lo, hi]`, a set `{a, b}`, or a region like `circle(center, radius)`",)
+        scope.fail(
+            Diagnostic("E205", f"`in` needs a region, this is {noun(place)}", region_expr.span, help=help_)
+        )
+    if not isinstance(point, Vector):
+        message = f"`in` asks where a point is, this is {noun(point)}"
+        scope.fail(
+            Diagnostic("E205", message, point_expr.span, help=("write the point as a vector: `[x, y]`",))
+        )
+    return _pred(span, signed_distance(point, place, span, scope))

@@ -1,0 +1,233 @@
+"""Times and intervals: `2 s`, `3 steps`, `T - 1 s`, `end`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
+
+from stlc.compile.frontend.scope import Scope
+from stlc.compile.frontend.values import Moment, Number, Value, noun
+from stlc.compile.ir import typed
+from stlc.diagnostics import Diagnostic, Fix, Label
+from stlc.grammar import ast
+from stlc.source import Span
+from stlc.units import SYMBOLS, parse_unit
+
+_SECOND = SYMBOLS["s"]
+_PAST = ("once", "historically", "since")
+_MIRROR = {"always": "historically", "eventually": "once"}
+
+
+def time_word(name: str, span: Span) -> Moment:
+    """`T`, `dt` or `end`."""
+    match name:
+        case "T":
+            return Moment(horizons=Fraction(1), span=span)
+        case "dt":
+            return Moment(steps=Fraction(1), span=span)
+        case _:
+            return Moment(end=True, span=span)
+
+
+def combine(
+    op: str, left: tuple[ast.Expr, Value], right: tuple[ast.Expr, Value], span: Span, scope: Scope
+) -> Moment:
+    """Arithmetic where at least one side is a time on the grid: sums, and multiples by plain numbers."""
+    if op in ("+", "-"):
+        a, b = moment(*left, scope), moment(*right, scope)
+        sign = 1 if op == "+" else -1
+        if not (a.end or b.end):
+            return Moment(
+                a.seconds + sign * b.seconds,
+                a.steps + sign * b.steps,
+                a.horizons + sign * b.horizons,
+                span=span,
+            )
+    times, factor = (left, right) if isinstance(left[1], Moment) else (right, left)
+    if isinstance(factor[1], Number) and factor[1].constant is None:
+        scope.fail(out_of_place(times[0].span))
+    if (
+        op in ("*", "/")
+        and isinstance(times[1], Moment)
+        and not times[1].end
+        and not (op == "/" and times is right)
+    ):
+        share = _factor(*factor, scope)
+        if op == "/" and share == 0:
+            scope.fail(Diagnostic("E401", "division by zero", factor[0].span, "is 0"))
+        return _scaled(times[1], 1 / share if op == "/" else share, span)
+    help_ = ("a bound is a sum of times, each times a plain number: `T / 2 - 1 s`",)
+    return scope.fail(Diagnostic("E205", f"`{op}` does not apply to these times", span, help=help_))
+
+
+def out_of_place(span: Span) -> Diagnostic:
+    """E311: `T`, `dt` or a number of steps among other numbers."""
+    message = f"`{span.text}` is only known inside the interval of a temporal operator"
+    return Diagnostic("E311", message, span, help=("name the time: `const tau = 2 s`",))
+
+
+def negative(value: Moment, span: Span, scope: Scope) -> Moment:
+    """`-value`."""
+    if value.end:
+        scope.fail(Diagnostic("E205", "`end` has no sign", span))
+    return _scaled(value, Fraction(-1), span)
+
+
+def _scaled(value: Moment, factor: Fraction, span: Span) -> Moment:
+    return Moment(value.seconds * factor, value.steps * factor, value.horizons * factor, span=span)
+
+
+def _factor(expr: ast.Expr, value: Value, scope: Scope) -> Fraction:
+    if isinstance(value, Number) and value.constant is not None and value.unit.dimensionless:
+        return value.exact if value.exact is not None else Fraction(repr(value.constant))
+    return scope.fail(
+        Diagnostic("E205", f"a time is multiplied by a plain number, this is {noun(value)}", expr.span)
+    )
+
+
+def moment(expr: ast.Expr, value: Value, scope: Scope) -> Moment:
+    """A value as a time. Raises Failed (E303 not constant, E203 not a time)."""
+    if isinstance(value, Moment):
+        return value
+    if not isinstance(value, Number) or value.kind in ("bool", "enum"):
+        scope.fail(Diagnostic("E205", f"an interval bound is a time, this is {noun(value)}", expr.span))
+    if value.constant is None:
+        scope.fail(_not_constant(expr, value, scope))
+    exact = value.exact if value.exact is not None else Fraction(repr(value.constant))
+    if value.bare:
+        return _bare(exact, expr, scope)
+    if value.unit.dims != _SECOND.dims and not value.flexible:
+        scope.fail(Diagnostic("E203", f"an interval bound is a time, this is [{value.unit}]", expr.span))
+    return Moment(exact, span=expr.span)
+
+
+def _bare(value: Fraction, expr: ast.Expr, scope: Scope) -> Moment:
+    """A bare number in the unit of the pragma; in seconds, with a warning, where there is none."""
+    if scope.time_unit in ("step", "steps"):
+        return Moment(steps=value, span=expr.span)
+    if not scope.time_unit and value != 0:
+        fix = Fix(((expr.span, f"{expr.span.text} s"),), f"{expr.span.text} s")
+        help_ = ("say the unit, or set it for the whole file: `time s`",)
+        scope.report(
+            Diagnostic(
+                "W101",
+                "a bare number as an interval bound",
+                expr.span,
+                "taken as seconds",
+                help=help_,
+                fix=fix,
+            )
+        )
+    ratio = parse_unit(scope.time_unit).ratio if scope.time_unit else Fraction(1)
+    return Moment(value * ratio, span=expr.span)
+
+
+def _not_constant(expr: ast.Expr, value: Number, scope: Scope) -> Diagnostic:
+    entry = scope.entries.get(expr.name) if isinstance(expr, ast.Name) else None
+    sampled = entry is not None and entry.about.startswith("param")
+    label = "a parameter that is sampled per trajectory" if sampled else "changes along the trajectory"
+    text = expr.span.text
+    labels = (
+        ()
+        if value.origin is None or value.origin.span is None
+        else (Label(value.origin.span, "declared here"),)
+    )
+    return Diagnostic(
+        "E303",
+        "an interval bound must be known at compile time",
+        expr.span,
+        label,
+        labels,
+        help=(
+            f"use a timer state instead:  always[0, T] (near or tau <= 0)   with tau := {text} at the start",
+            f"or fix it:  const {text} = 2 s",
+        ),
+    )
+
+
+def interval(
+    node: ast.Interval | None,
+    bounds: Sequence[Value],
+    operator: tuple[str, Span],
+    body: ast.Expr,
+    scope: Scope,
+) -> typed.Interval:
+    """The bounds of a temporal operator, checked as far as they are known without a grid.
+
+    Args:
+        node: as written; None where nothing is written: from now to the end.
+        bounds: values of its two bounds.
+        operator: its name, and where it stands.
+        body: what it applies to, for the help.
+        scope: where findings go.
+
+    Raises:
+        Failed: E301 reversed, E302 negative, E303 not constant, E203 not a time.
+    """
+    name, place = operator
+    if node is None:
+        return typed.Interval(typed.Time(), None, span=place)
+    low, high = moment(node.lo, bounds[0], scope), moment(node.hi, bounds[1], scope)
+    if low.end:
+        scope.fail(Diagnostic("E303", "an interval cannot start at the end of the trace", node.lo.span))
+    if _sign(low) < 0 or (not high.end and _sign(high) < 0):
+        scope.fail(_negative(name, node, (low, high), body))
+    if not high.end and _sign(_difference(high, low)) < 0:
+        scope.fail(_reversed(node))
+    lo, hi = _time(low), None if high.end else _time(high)
+    return typed.Interval(lo, hi, node.lo_open, node.hi_open, node.clock, node.span)
+
+
+def _time(value: Moment) -> typed.Time:
+    return typed.Time(value.seconds, value.steps, value.horizons, value.span)
+
+
+def _difference(left: Moment, right: Moment) -> Moment:
+    return replace(
+        left,
+        seconds=left.seconds - right.seconds,
+        steps=left.steps - right.steps,
+        horizons=left.horizons - right.horizons,
+    )
+
+
+def _sign(value: Moment) -> int:
+    """-1 where the time is negative whatever the grid, else 0 or 1."""
+    parts = (value.seconds, value.steps, value.horizons)
+    if all(part <= 0 for part in parts):
+        return -1 if any(parts) else 0
+    return 1
+
+
+def _reversed(node: ast.Interval) -> Diagnostic:
+    low, high = node.lo.span, node.hi.span
+    edits = ((low, high.text), (high, low.text))
+    label = f"{low.text} > {high.text}"
+    fix = Fix(edits, f"[{high.text}, {low.text}]")
+    return Diagnostic("E301", "the interval ends before it starts", low.to(high), label, fix=fix)
+
+
+def _negative(name: str, node: ast.Interval, ends: tuple[Moment, Moment], body: ast.Expr) -> Diagnostic:
+    low, high = ends
+    bound = node.lo if _sign(low) < 0 else node.hi
+    if name in _PAST:
+        help_ = (f"bounds of `{name}` count backwards already: write them without the sign",)
+        return Diagnostic(
+            "E302", "a bound of a past operator is a length of time, never negative", bound.span, help=help_
+        )
+    mirror = _MIRROR.get(name, "since" if name == "until" else "")
+    plain = all(not end.end and _sign(end) <= 0 for end in ends)
+    hints: tuple[str, ...] = ()
+    if mirror and plain and name != "until":
+        near, far = _shown(high, node.hi), _shown(low, node.lo)
+        hints = (f"{mirror}[{near}, {far}] {body.span.text}   looks back",)
+    elif mirror:
+        hints = (f"`{mirror}` looks back",)
+    return Diagnostic("E302", "a future operator cannot look into the past", bound.span, help=hints)
+
+
+def _shown(value: Moment, expr: ast.Expr) -> str:
+    """A bound as written, without its sign."""
+    text = expr.span.text.strip()
+    return text.removeprefix("-").strip() if _sign(value) < 0 else text

@@ -1,0 +1,161 @@
+"""`import`: other specifications, read where they lie, or from the texts that a run or a trace keeps of them.
+
+A file is known by its path from the folder of the importing specification, the library by `@std`. The same
+keys name the kept texts, so that a specification means the same wherever it is read again.
+"""
+
+from __future__ import annotations
+
+import posixpath
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from stlc.diagnostics import Diagnostic, SpecError, UsageError
+from stlc.files import read_source
+from stlc.grammar import ast
+from stlc.grammar.parse.parser import parse
+from stlc.jsontext import dumps
+from stlc.provenance import sha256
+from stlc.source import Source
+
+STD = "@std"
+_STD_FILE = Path(__file__).with_name("std.stl")
+_MOST = 100
+"""How many files one specification may import, directly or not; one that is imported twice counts twice."""
+
+
+@dataclass(frozen=True, slots=True)
+class Module:
+    """An imported specification.
+
+    Attributes:
+        key: its path from the folder of the specification that is read first, or `@std`.
+        alias: by which name the importing file knows it.
+        written: the import.
+        spec: as parsed.
+        imports: what it imports itself.
+    """
+
+    key: str
+    alias: str
+    written: ast.Import
+    spec: ast.Spec
+    imports: tuple[Module, ...]
+
+
+def load_modules(spec: ast.Spec) -> tuple[Module, ...]:
+    """Everything that `spec` imports, with what those import.
+
+    Raises:
+        SpecError: E106, a file that cannot be read or that imports itself; whatever is wrong with its syntax.
+    """
+    return _Loader(spec).imports(spec, "", ())
+
+
+def library_of(spec: ast.Spec) -> dict[str, str]:
+    """The texts of all imported files by key: what makes `spec` independent of where it lies."""
+    found: dict[str, str] = {}
+    for module in _every(load_modules(spec)):
+        found[module.key] = module.spec.source.text
+    return dict(sorted(found.items()))
+
+
+def spec_sha256(text: str, library: Mapping[str, str]) -> str:
+    """SHA-256 of a specification and of what it imports, hexadecimal."""
+    return sha256(text + dumps(dict(sorted(library.items())))) if library else sha256(text)
+
+
+def file_of(key: str) -> str:
+    """A relative path below one folder for the text of a key."""
+    return "/".join("__" if part == ".." else part for part in key.split("/") if part) + (
+        ".stl" if key == STD else ""
+    )
+
+
+def _every(modules: tuple[Module, ...]) -> Iterator[Module]:
+    for module in modules:
+        yield module
+        yield from _every(module.imports)
+
+
+class _Loader:
+    """Reads files, each once."""
+
+    def __init__(self, spec: ast.Spec) -> None:
+        self.library = spec.library
+        self.home = Path(spec.source.name).parent
+        self.specs: dict[str, ast.Spec] = {}
+        self.sizes: dict[str, int] = {}
+        self.found: dict[str, tuple[Module, ...] | SpecError] = {}
+
+    def imports(self, spec: ast.Spec, key: str, around: tuple[str, ...]) -> tuple[Module, ...]:
+        """The modules of one file; `around` are the keys of the files that import it."""
+        if key not in self.found:
+            try:
+                self.found[key] = self._imports(spec, key, around)
+            except SpecError as error:
+                self.found[key] = error
+        found = self.found[key]
+        if isinstance(found, SpecError):
+            raise found
+        return found
+
+    def _imports(self, spec: ast.Spec, key: str, around: tuple[str, ...]) -> tuple[Module, ...]:
+        found: list[Module] = []
+        faults: list[Diagnostic] = []
+        for written in spec.imports:
+            try:
+                found.append(self._module(written, key, (*around, key)))
+            except SpecError as error:
+                faults += error.diagnostics
+            if sum(self.sizes[module.key] for module in found) > _MOST:
+                faults += _refused(written, f"more than {_MOST} files are imported").diagnostics
+                break
+        if faults:
+            raise SpecError(*dict.fromkeys(faults))
+        self.sizes[key] = 1 + sum(self.sizes[module.key] for module in found)
+        return tuple(found)
+
+    def _module(self, written: ast.Import, importer: str, around: tuple[str, ...]) -> Module:
+        key = self._key(written, importer)
+        if key in around:
+            chain = " -> ".join(name or self.home.name for name in (*around[around.index(key) :], key))
+            raise _refused(written, f"`{written.target}` imports itself", note=chain)
+        alias = written.alias or _stem(written)
+        if key not in self.specs:
+            if max(len(self.specs), len(around)) >= _MOST:
+                raise _refused(written, f"more than {_MOST} files are imported")
+            self.specs[key] = parse(self._source(written, key))
+        spec = self.specs[key]
+        return Module(key, alias, written, spec, self.imports(spec, key, around))
+
+    def _key(self, written: ast.Import, importer: str) -> str:
+        if written.is_file:
+            return posixpath.normpath(posixpath.join(posixpath.dirname(importer), written.target))
+        if written.target != "std":
+            help_ = f'`import std`, or a file: `import "{written.target}.stl" as {written.target}`'
+            raise _refused(written, f"there is no library `{written.target}`", help_)
+        return STD
+
+    def _source(self, written: ast.Import, key: str) -> Source:
+        if self.library is not None and key in self.library:
+            return Source(f"lib/{file_of(key)}", self.library[key])
+        if key == STD:
+            return read_source(_STD_FILE)
+        try:
+            return read_source(self.home / key)
+        except UsageError as error:
+            first = error.diagnostics[0]
+            raise _refused(written, first.message, *first.help) from None
+
+
+def _stem(written: ast.Import) -> str:
+    name = Path(written.target).stem
+    if name.isidentifier():
+        return name
+    raise _refused(written, f"`{name}` cannot be a name", f'import "{written.target}" as m')
+
+
+def _refused(written: ast.Import, message: str, *help_: str, note: str = "") -> SpecError:
+    return SpecError(Diagnostic("E106", message, written.span, help=help_, note=(note,) if note else ()))

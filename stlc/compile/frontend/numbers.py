@@ -1,0 +1,124 @@
+"""Expressions as numbers: what system files and declarations need."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from stlc.compile.frontend.algebra import difference_for_point, in_unit, rebased
+from stlc.compile.frontend.expressions import evaluate
+from stlc.compile.frontend.scope import Failed, Scope
+from stlc.compile.frontend.sorts import Need, loose_number
+from stlc.compile.frontend.values import Label, Number, Value, Vector, noun
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.conditions import condition, is_state
+from stlc.diagnostics import Diagnostic
+from stlc.grammar import ast
+from stlc.signature import Column
+from stlc.units import Unit, nearest, same_dims
+
+__all__ = ["Number", "resolve_number", "resolve_numbers", "stored"]
+
+
+def resolve_number(
+    expr: ast.Expr, scope: Scope, *, expected: Column | None = None, what: str = "a value"
+) -> Number:
+    """The expression as one number, in SI units from the zero of its unit.
+
+    Args:
+        expr: as parsed.
+        scope: what names mean; findings are appended to its sink.
+        expected: the column that the number is for: its enum members are names, `true` is 1, a formula is
+            1 where it holds, a bare number takes its unit, another unit is E203.
+        what: what the number is, for messages: "the flow of `x`".
+
+    Raises:
+        StlcError: `scope.error`, with what was found.
+    """
+    numbers = resolve_numbers(expr, scope, expected=expected, what=what)
+    if len(numbers) == 1:
+        return numbers[0]
+    finding = Diagnostic(_code(scope), f"{what} is one number, this is a vector of {len(numbers)}", expr.span)
+    scope.report(finding)
+    raise scope.error(finding)
+
+
+def resolve_numbers(
+    expr: ast.Expr, scope: Scope, *, expected: Column | None = None, what: str = "a value"
+) -> tuple[Number, ...]:
+    """The expression as the components of a vector; a number is a vector of one. See `resolve_number`."""
+    before = len(scope.sink)
+    try:
+        with scope.meter.fresh():
+            value = evaluate(expr, scope)
+            items: tuple[Value, ...] = value.items if isinstance(value, Vector) else (value,)
+            return tuple(_expected(item, expr, expected, what, scope) for item in items)
+    except Failed:
+        raise scope.error(*(f for f in scope.sink[before:] if f.severity == "error")) from None
+
+
+def stored(number: Number, unit: Unit) -> ir.Num:
+    """The number as a column of `unit` stores it: SI from the zero of the unit, divided by its scale."""
+    number = rebased(number, unit)
+    if unit.ratio == 1:
+        return number.num
+    value = number.constant
+    if value is None:
+        return ir.Op("div", (number.num, ir.Lit(unit.scale)))
+    return ir.Lit(nearest(number.exact / unit.ratio) if number.exact is not None else value / unit.scale)
+
+
+def _code(scope: Scope) -> str:
+    return "E205" if scope.in_spec else "S203"
+
+
+def _expected(value: Value, expr: ast.Expr, column: Column | None, what: str, scope: Scope) -> Number:
+    """A value as the number that a column stores."""
+    if column is not None and column.kind == "bool" and isinstance(value, typed.Node) and is_state(value):
+        cond = condition(value)
+        truth = ir.Lit(float(cond.value)) if isinstance(cond, ir.Truth) else ir.Ind(cond)
+        return Number(truth, kind="bool", span=expr.span)
+    if column is not None and column.labels and isinstance(value, Label):
+        return _member(value, expr, column, scope)
+    if isinstance(value, typed.Node) and not isinstance(value, typed.Truth) and not scope.in_spec:
+        help_ = (f"`ind({expr.span.text})` is 1 where it holds and 0 elsewhere",) if is_state(value) else ()
+        scope.fail(
+            Diagnostic(
+                "S203", f"{what} must be a number, this is a formula", expr.span, "formula", help=help_
+            )
+        )
+    number = loose_number(value, expr, Need(f"{what} is a number"), scope)
+    return number if column is None else _fitted(number, expr, column, scope)
+
+
+def _member(value: Label, expr: ast.Expr, column: Column, scope: Scope) -> Number:
+    known = dict(column.labels)
+    if value.name not in known:
+        names = ", ".join(f"`{name}`" for name in known)
+        message = f"`{value.name}` is not a member of the enum of `{column.name}`"
+        scope.fail(Diagnostic("E205", message, expr.span, help=(f"its members are {names}",)))
+    return Number(ir.Lit(known[value.name]), kind="enum", labels=column.labels, span=expr.span)
+
+
+def _fitted(number: Number, expr: ast.Expr, column: Column, scope: Scope) -> Number:
+    """Kind and unit agree with the column; a bare number takes its unit."""
+    values = [value for _, value in column.labels] if column.labels else [0.0, 1.0]
+    if column.kind in ("bool", "enum"):
+        fits = (number.kind == column.kind and number.labels == column.labels) or number.constant in values
+        if not fits and number.kind != "int":
+            names = ", ".join(f"`{name}`" for name, _ in column.labels) or "`true` and `false`"
+            message = f"`{column.name}` is one of {names}, this is {noun(number)}"
+            scope.fail(Diagnostic(_code(scope), message, expr.span))
+        return replace(number, kind=column.kind, labels=column.labels)
+    if number.kind == "enum":
+        scope.fail(
+            Diagnostic(_code(scope), f"`{column.name}` is a number, this is an enum member", expr.span)
+        )
+    if number.bare:
+        return in_unit(number, column.unit, scope)
+    if not number.flexible and column.unit.text and not same_dims(number.unit, column.unit):
+        message = f"`{column.name}` is in [{column.unit}], this is in [{number.unit}]"
+        scope.fail(Diagnostic("E203", message, expr.span, f"[{number.unit}]"))
+    if column.unit.offset and number.sense == "difference":
+        scope.fail(difference_for_point(number, column.unit, expr.span))
+    return number

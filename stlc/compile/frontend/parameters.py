@@ -1,0 +1,178 @@
+"""`param`: values that every trajectory has for itself, and how they are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from stlc.compile.analysis.spread import spread
+from stlc.compile.frontend.algebra import in_unit, on_scale
+from stlc.compile.frontend.expressions import evaluate
+from stlc.compile.frontend.interface import Interface
+from stlc.compile.frontend.numbers import resolve_numbers, stored
+from stlc.compile.frontend.scope import Scope
+from stlc.compile.frontend.signals import ends_of
+from stlc.compile.frontend.sorts import Need, loose_number
+from stlc.compile.frontend.values import Number, Vector
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.samples import columns_of
+from stlc.diagnostics import Diagnostic, Label, SpecError, UsageError
+from stlc.grammar import ast
+from stlc.grammar.parse.parser import parse_expr
+from stlc.signature import Column
+from stlc.source import Source
+from stlc.units import Unit, same_dims
+
+
+def parameters(
+    decl: ast.Param, columns: Sequence[Column], unit: Unit, interface: Interface | None, scope: Scope
+) -> tuple[typed.Parameter, ...]:
+    """The components of a `param`.
+
+    Args:
+        decl: as written.
+        columns: of its components, with their ranges.
+        unit: that was declared; bare numbers are in it.
+        interface: of the system, which may carry the parameter as a state.
+        scope: what names mean; findings go there.
+
+    Raises:
+        Failed: E205 or E203, its distribution cannot be drawn from; E104, the system has another one.
+    """
+    carried = interface is not None and columns[0].name in interface.signature
+    if carried and interface is not None:
+        _agree(decl, columns, interface, scope)
+    domain = decl.domain
+    if isinstance(domain, tuple | ast.SetLiteral):
+        draws = _even(decl, list(ends_of(domain, (columns[0], unit), scope)), columns, scope)
+    else:
+        draws = distribution(domain, columns, unit, scope)
+    found = []
+    for column, draw in zip(columns, draws, strict=True):
+        ends = spread(draw) if column.low is None else None
+        known = column if ends is None else replace(column, low=ends[0], high=ends[1])
+        found.append(typed.Parameter(decl.name_span, known, draw, _text(decl), carried))
+    return tuple(found)
+
+
+def _text(decl: ast.Param) -> str:
+    """How it is drawn, as written."""
+    match decl.domain:
+        case (low, high):
+            return f"in [{low.span.text}, {high.span.text}]"
+        case ast.SetLiteral(items=items):
+            return f"in {{{', '.join(item.span.text for item in items)}}}"
+        case expr:
+            return f"~ {expr.span.text}"
+
+
+def _even(
+    decl: ast.Param, values: Sequence[float | None], columns: Sequence[Column], scope: Scope
+) -> tuple[ir.Num, ...]:
+    """Every value of the range, or every member of the set, equally often."""
+    if any(value is None for value in values):
+        message = f"`{decl.name}` is drawn for every trajectory: its range must have both ends"
+        help_ = ("give it a finite range, or a distribution: `param r ~ normal(1, 0.1)`",)
+        scope.fail(Diagnostic("E205", message, decl.name_span, help=help_))
+    numbers = tuple(ir.Lit(value) for value in values if value is not None)
+    if isinstance(decl.domain, ast.SetLiteral):
+        return tuple(ir.Op("choice", numbers) for _ in columns)
+    sampler = "randint" if columns[0].kind == "int" else "uniform"
+    return tuple(ir.Op(sampler, numbers) for _ in columns)
+
+
+def distribution(expr: ast.Expr, columns: Sequence[Column], unit: Unit, scope: Scope) -> tuple[ir.Num, ...]:
+    """What a distribution gives to each column, in its unit; one number stands for every component.
+
+    Raises Failed: E203 for another unit, E205 where it reads what is not known before a trajectory begins.
+    """
+    here = scope.extended({}, samplers=True)
+    values = [evaluate(expr, here) for _ in columns]
+    first = values[0]
+    if isinstance(first, Vector):
+        if len(first.items) != len(columns):
+            message = f"this has {len(first.items)} components, not {len(columns)}"
+            scope.fail(Diagnostic("E205", message, expr.span))
+        values = list(first.items)
+    need = Need("a parameter is a number")
+    numbers = [loose_number(value, expr, need, scope) for value in values]
+    return tuple(
+        _in_column(number, expr, (column, unit), scope)
+        for number, column in zip(numbers, columns, strict=True)
+    )
+
+
+def _in_column(number: Number, expr: ast.Expr, target: tuple[Column, Unit], scope: Scope) -> ir.Num:
+    """A drawn number as its column stores it."""
+    column, unit = target
+    if columns_of(number.num):
+        message = "a parameter is drawn before anything moves: its distribution reads constants alone"
+        scope.fail(Diagnostic("E205", message, expr.span))
+    if number.bare:
+        wanted = unit if unit.text else column.unit
+        if wanted.offset != column.unit.offset:
+            return stored(in_unit(number, wanted, scope), column.unit)
+        factor = wanted.scale / column.unit.scale
+        return number.num if factor == 1 else ir.Op("mul", (number.num, ir.Lit(factor)))
+    if not number.flexible and column.unit.text and not same_dims(number.unit, column.unit):
+        message = f"`{column.name}` is in [{column.unit}], this is in [{number.unit}]"
+        scope.fail(Diagnostic("E203", message, expr.span, f"[{number.unit}]"))
+    return stored(on_scale(number, column.unit, expr.span, scope), column.unit)
+
+
+def _agree(decl: ast.Param, columns: Sequence[Column], interface: Interface, scope: Scope) -> None:
+    """E104: the system carries the parameter, with other values."""
+    place = interface.places.get(columns[0].name)
+    labels = () if place is None else (Label(place, "declared here"),)
+    if not isinstance(decl.domain, tuple | ast.SetLiteral):
+        message = f"{interface.where} says how `{decl.name}` is drawn, and so does this"
+        help_ = (f"say it once: here `env signal {decl.name}`, or take it out of {interface.where}",)
+        scope.fail(Diagnostic("E104", message, decl.name_span, labels=labels, help=help_))
+    for column in columns:
+        own = interface.signature[column.name]
+        if None in (own.low, own.high) or (own.low, own.high) == (column.low, column.high):
+            continue
+        here, there = (f"[{c.low:g}, {c.high:g}]" for c in (column, own))
+        message = f"`{column.name}` is in {here} here and in {there} in {interface.where}"
+        scope.fail(Diagnostic("E104", message, decl.name_span, here, labels))
+
+
+def fixed(parameters: Sequence[typed.Parameter], values: Mapping[str, str]) -> tuple[typed.Parameter, ...]:
+    """The parameters, those in `values` with one value for all trajectories, inside of their range or not.
+
+    Args:
+        parameters: components.
+        values: name -> its value as text, `0.8 m`; of a vector `[1 m, 2 m]`.
+
+    Raises:
+        UsageError: U101, a value cannot be read, or does not fit.
+    """
+    groups: dict[str, list[typed.Parameter]] = {}
+    for each in parameters:
+        groups.setdefault(each.column.name.partition("[")[0], []).append(each)
+    found = []
+    for name, group in groups.items():
+        found.extend(_given(name, group, values[name]) if name in values else group)
+    return tuple(found)
+
+
+def _given(name: str, group: Sequence[typed.Parameter], text: str) -> list[typed.Parameter]:
+    """The components of one parameter with the value that `text` says."""
+    what = f"`{name}`"
+    column = group[0].column
+    try:
+        expr = parse_expr(Source(f"--set {name}", text))
+        numbers = resolve_numbers(expr, Scope(), expected=column, what=what)
+    except SpecError as error:
+        raise _unfit(name, text, error.diagnostics[0].message) from None
+    if len(numbers) != len(group) or any(number.constant is None for number in numbers):
+        raise _unfit(name, text, f"{what} takes {len(group)} constant value{'s' if len(group) > 1 else ''}")
+    return [
+        replace(each, draw=stored(number, each.column.unit), text=f"= {text}")
+        for each, number in zip(group, numbers, strict=True)
+    ]
+
+
+def _unfit(name: str, text: str, reason: str) -> UsageError:
+    return UsageError(Diagnostic("U101", f"`--set {name}={text}`: {reason}"))

@@ -1,0 +1,265 @@
+"""From syntax to a typed specification: names bound, sorts and units checked, all findings at once.
+
+    ast.Spec --declare--> entries --evaluate--> typed.Spec
+
+Formulas keep their negations, implications and places; times stay in seconds, steps and horizons.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import PurePath
+from typing import TypeVar
+
+from stlc.compile.analysis.contradiction import contradictions
+from stlc.compile.analysis.ranges import Facts
+from stlc.compile.analysis.vacuity import toothless, vacuous
+from stlc.compile.frontend.algebra import absolute
+from stlc.compile.frontend.declare import Declared
+from stlc.compile.frontend.expressions import evaluate
+from stlc.compile.frontend.formulas import resolve_formula
+from stlc.compile.frontend.imported import File, declared, signature_of, with_facts
+from stlc.compile.frontend.interface import Grid, Interface
+from stlc.compile.frontend.modules import load_modules
+from stlc.compile.frontend.names import check_names
+from stlc.compile.frontend.overrides import read_overrides
+from stlc.compile.frontend.scales import nominal, reach_of_formula, reach_of_number
+from stlc.compile.frontend.scope import Definition, Failed, Scope, enforced
+from stlc.compile.frontend.tags import Tags, read_tags
+from stlc.compile.frontend.values import Number, Value, Vector
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.diagnostics import Diagnostic, Findings, Label, SpecError
+from stlc.grammar import ast
+from stlc.grammar.parse.parser import MAX_ERRORS
+from stlc.signature import Signature
+from stlc.units import same_dims
+
+Item = TypeVar("Item")
+
+
+def resolve(
+    spec: ast.Spec,
+    *,
+    interface: Interface | None = None,
+    overrides: Mapping[str, str] | None = None,
+    grid: Grid | None = None,
+    sink: list[Diagnostic],
+) -> typed.Spec:
+    """Bind names, check sorts and units, expand macros.
+
+    Args:
+        spec: as parsed.
+        interface: what the system offers; signals and constants are matched with it.
+        overrides: constant -> expression that replaces its value (`--set`).
+        grid: of time, as far as it is known; None where what comes out is not compiled further, so that
+            times among samples (`shift(x, 0.1 s)`) need not be whole numbers of steps.
+        sink: warnings are appended here.
+
+    Raises:
+        SpecError: with every independent error of the file, in source order, at most `MAX_ERRORS`.
+        UsageError: an override of a constant that does not exist.
+    """
+    values = read_overrides(overrides or {}, spec, interface)
+    findings = Findings()
+    elsewhere = _elsewhere(interface)
+    scope = Scope(sink=findings, temporal=True, time_unit=spec.time_unit, elsewhere=elsewhere, grid=grid)
+    file = declared(spec, load_modules(spec), interface, values, scope)
+    _adopt_units(spec, values, file.found, file.scope)
+    signature, parameters = signature_of(file, interface)
+    file = with_facts(file, enforced(signature.columns))
+    scope = file.scope
+    constants = _constants(spec, interface, scope)
+    _check_definitions(file)
+    ranges = nominal(signature.columns)
+    requirements = _requirements(spec, ast.Require, scope, ranges)
+    assumptions = _requirements(spec, ast.Assume, scope, ranges)
+    _finish(findings, spec, sink)
+    for requirement, item in zip(requirements, _items(spec, ast.Require), strict=True):
+        sink.extend(_warnings(requirement, item, signature, scope))
+    name = spec.name or PurePath(spec.source.name).stem
+    return typed.Spec(name, signature, constants, requirements, assumptions, spec, parameters)
+
+
+def _finish(findings: Sequence[Diagnostic], spec: ast.Spec, sink: list[Diagnostic]) -> None:
+    """Warnings to the sink; errors raised together, in the order of the text."""
+
+    def place(finding: Diagnostic) -> tuple[bool, int]:
+        span = finding.span
+        return (span is not None and span.source == spec.source, 0 if span is None else span.start)
+
+    ordered = sorted(findings, key=place)
+    sink.extend(finding for finding in ordered if finding.severity == "warning")
+    errors = [finding for finding in ordered if finding.severity == "error"]
+    if len(errors) > MAX_ERRORS:
+        more = f"{len(errors) - MAX_ERRORS} more errors are not shown"
+        errors = [*errors[: MAX_ERRORS - 1], errors[MAX_ERRORS - 1].with_note(more)]
+    if errors:
+        raise SpecError(*errors)
+
+
+# ----------------------------------------------------------------- declarations
+
+
+def _elsewhere(interface: Interface | None) -> dict[str, str]:
+    """What to write for a name that only the system knows."""
+    if interface is None:
+        return {}
+    found = {}
+    sizes = Counter(column.name.partition("[")[0] for column in interface.signature.columns)
+    for column in interface.signature.columns:
+        unit = f" [{column.unit}]" if column.unit.text else ""
+        name = column.name.partition("[")[0]
+        sort = "" if name == column.name else f": real[{sizes[name]}]"
+        found[name] = f"{interface.where} has it; declare it here too: `signal {name}{sort}{unit}`"
+    for name, (value, unit_) in interface.constants.items():
+        amount = _amount(unit_.of_si(value), unit_.text)
+        found[name] = f"{interface.where} has it; declare it here too: `const {name} = {amount}`"
+    return found
+
+
+def _adopt_units(spec: ast.Spec, overrides: Mapping[str, ast.Expr], found: Declared, scope: Scope) -> None:
+    """An override without a unit takes the unit of the value that it replaces."""
+    for item in spec.items:
+        entry = found.entries.get(item.name)
+        if not isinstance(item, ast.Const) or item.name not in overrides or not isinstance(entry, Definition):
+            continue
+        if entry.unit is None:
+            try:
+                original = evaluate(item.value, replace(scope, sink=[], cache=dict(scope.cache)))
+            except Failed:
+                continue
+            if isinstance(original, Number) and not original.flexible:
+                found.entries[item.name] = replace(entry, unit=original.unit)
+
+
+def _constants(spec: ast.Spec, interface: Interface | None, scope: Scope) -> tuple[tuple[str, float], ...]:
+    """Every constant in SI units, vectors by component; compared with those of the system (E104)."""
+    values: list[tuple[str, float]] = []
+    for item in _items(spec, ast.Const):
+        try:
+            with scope.meter.fresh():
+                value = evaluate(ast.Name(item.name_span, item.name, quoted=True), scope)
+        except Failed:
+            continue
+        values.extend(_scalars(item.name, value))
+        if interface is not None and isinstance(value, Number):
+            _compare(item, value, interface, scope)
+    return tuple(values)
+
+
+def _scalars(name: str, value: Value) -> list[tuple[str, float]]:
+    match value:
+        case Number() if value.constant is not None:
+            return [(name, absolute(value).constant or 0.0)]
+        case Vector(items):
+            return [(f"{name}[{i}]", absolute(item).constant or 0.0) for i, item in enumerate(items)]
+        case typed.Truth(_, truth):
+            return [(name, float(truth))]
+        case _:
+            return []
+
+
+def _compare(item: ast.Const, value: Number, interface: Interface, scope: Scope) -> None:
+    """E104: one constant, two values."""
+    if item.name not in interface.constants or value.constant is None:
+        return
+    theirs, unit = interface.constants[item.name]
+    free = value.flexible or not unit.text
+    ours = absolute(value).constant or 0.0
+    if math.isclose(ours, theirs, rel_tol=1e-9) and (free or same_dims(value.unit, unit)):
+        return
+    place = interface.places.get(item.name)
+    labels = () if place is None else (Label(place, "declared here"),)
+    here = _amount(value.constant / value.unit.scale, str(value.unit) if value.unit.text else "")
+    there = _amount(unit.of_si(theirs), unit.text)
+    message = f"`{item.name}` is {here} here and {there} in {interface.where}"
+    both = f"make them agree, or change both at once: `--set {item.name}={here.replace(' ', '')}`"
+    help_ = (both,) if free or same_dims(value.unit, unit) else ()
+    if value.bare and unit.offset:
+        help_ = (f"say its unit: `const {item.name} = {here} {unit}`",)
+    scope.report(Diagnostic("E104", message, item.name_span, here, labels, help=help_))
+
+
+def _amount(value: float, unit: str) -> str:
+    return f"{value:.12g} {unit}".rstrip()
+
+
+def _check_definitions(file: File) -> None:
+    """Look at every definition, used or not, of every file."""
+    for part in file.files:
+        _check_definitions(part)
+    scope = file.scope
+    for item in file.spec.items:
+        entry = scope.entries.get(item.name)
+        if not isinstance(item, ast.Def | ast.Region) or not isinstance(entry, Definition):
+            continue
+        if entry.formals:
+            check_names(entry, scope)
+            continue
+        try:
+            with scope.meter.fresh():
+                evaluate(ast.Name(item.name_span, item.name, quoted=True), scope)
+        except Failed:
+            continue
+
+
+# ----------------------------------------------------------------- requirements
+
+
+def _items(spec: ast.Spec, kind: type[Item]) -> list[Item]:
+    return [item for item in spec.items if isinstance(item, kind)]
+
+
+def _requirements(
+    spec: ast.Spec, kind: type[ast.Require | ast.Assume], scope: Scope, ranges: Facts
+) -> tuple[typed.Requirement, ...]:
+    """The requirements (or assumptions) that can be typed."""
+    found: list[typed.Requirement] = []
+    for item in _items(spec, kind):
+        tags = read_tags(item.tags, scope)
+        what = f"`{'require' if kind is ast.Require else 'assume'} {item.name}`"
+        here = scope.as_products() if tags.product else scope
+        try:
+            formula = resolve_formula(item.formula, here, what=what)
+            scale = _scale(tags, formula, ranges, scope)
+        except Failed:
+            continue
+        found.append(
+            typed.Requirement(
+                name=item.name,
+                doc=item.doc,
+                tags=tags.marks,
+                weight=tags.weight,
+                scale=scale,
+                id=tags.id,
+                group=tags.group,
+                formula=formula,
+                written=item.formula,
+                span=item.span,
+            )
+        )
+    return tuple(found)
+
+
+def _scale(tags: Tags, formula: typed.Formula, ranges: Facts, scope: Scope) -> float:
+    """What the robustness is divided by. Raises Failed (E205) where a range is not known."""
+    if isinstance(tags.scale, ir.Lit):
+        return tags.scale.value
+    place = tags.scale_span or formula.span
+    if tags.scale is None:
+        return reach_of_formula(formula, ranges, place, scope)
+    return reach_of_number(tags.scale, ranges, place, scope)
+
+
+def _warnings(
+    requirement: typed.Requirement, item: ast.Require, signature: Signature, scope: Scope
+) -> list[Diagnostic]:
+    """W502, W503 and W505."""
+    tag = next((tag for tag in item.tags if tag.name == "safety"), None)
+    found = [*vacuous(requirement.formula, signature, scope.facts), *contradictions(requirement.formula)]
+    weak = toothless(requirement, tag)
+    return found if weak is None else [*found, weak]

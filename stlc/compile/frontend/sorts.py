@@ -1,0 +1,145 @@
+"""From values to what a place needs: a number, a formula, a vector, a region."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from stlc.compile.frontend.algebra import apply, half
+from stlc.compile.frontend.intervals import out_of_place
+from stlc.compile.frontend.scope import Scope
+from stlc.compile.frontend.values import Label as Member
+from stlc.compile.frontend.values import Moment, Number, Value, Vector, describe, noun
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.conditions import condition, is_state
+from stlc.diagnostics import Diagnostic, Label
+from stlc.grammar import ast
+from stlc.source import Span
+
+
+@dataclass(frozen=True, slots=True)
+class Need:
+    """Who wants a value, for messages.
+
+    Attributes:
+        who: the operator or function, with its verb: "`+` adds numbers", "`always` needs a formula".
+        which: what the value is to it: "the right side", "argument 2"; "" for "this".
+        span: of the operator, where a second label says what it wants.
+    """
+
+    who: str
+    which: str = "this"
+    span: Span | None = None
+
+
+def as_number(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> Number:
+    """The value as a real or whole number or an enum. Raises Failed (E202, E205)."""
+    match value:
+        case Number(kind="bool"):
+            help_ = (f"`ind({expr.span.text})` is 1 where it holds and 0 elsewhere",)
+            message = f"{need.who}; {need.which} is true or false"
+            return scope.fail(Diagnostic("E202", message, expr.span, "bool", help=help_))
+        case Number():
+            return value
+        case Member():
+            return member_number(value, expr.span, scope)
+        case typed.Node():
+            return scope.fail(_formula_for_number(value, expr, need))
+        case Moment():
+            return scope.fail(_moment_for_number(value, expr))
+        case _:
+            message = f"{need.who}; {need.which} is {noun(value)}"
+            return scope.fail(Diagnostic("E205", message, expr.span, describe(value)))
+
+
+def loose_number(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> Number:
+    """Like `as_number`, but a bool stands for its 0 or 1: where a value is stored or compared."""
+    match value:
+        case Number():
+            return value
+        case typed.Truth(_, truth):
+            return Number(ir.Lit(float(truth)), kind="bool", span=expr.span)
+        case _:
+            return as_number(value, expr, need, scope)
+
+
+def as_formula(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> typed.Formula:
+    """The value as a formula; a bool signal holds where it is above 1/2. Raises Failed (E201)."""
+    match value:
+        case Number(formula=formula) if formula is not None:
+            return formula
+        case Number(kind="bool") as number:
+            margin = apply("sub", (replace(number, kind="real"), half(expr.span)), expr.span, scope)
+            return typed.Pred(expr.span, margin.num, strict=False)
+        case typed.Node():
+            return value
+        case _:
+            return scope.fail(_number_for_formula(value, expr, need))
+
+
+def as_state_formula(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> ir.Formula:
+    """The value as a formula over one instant, in negation normal form. Raises Failed (E201, E202)."""
+    formula = as_formula(value, expr, need, scope)
+    if not is_state(formula):
+        message = f"{need.who}, but this looks at other times"
+        note = ("a temporal operator has no numeric form in a predicate",)
+        scope.fail(Diagnostic("E202", message, expr.span, "temporal", note=note))
+    return condition(formula)
+
+
+def as_vector(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> Vector:
+    """The value as a vector of numbers. Raises Failed (E205)."""
+    if isinstance(value, Vector):
+        return value
+    message = f"{need.who}; {need.which} is {noun(value)}"
+    return scope.fail(Diagnostic("E205", message, expr.span, describe(value)))
+
+
+def member_number(member: Member, span: Span, scope: Scope) -> Number:
+    """A member of an enum as its number, where all enums that have it agree."""
+    values = {dict(labels)[member.name] for labels in member.options}
+    if len(values) > 1:
+        message = f"`{member.name}` is a member of several enums, with different values"
+        scope.fail(Diagnostic("E101", message, span, help=("compare it with a signal of the enum you mean",)))
+    labels = member.options[0]
+    return Number(ir.Lit(float(values.pop())), kind="enum", labels=labels, span=span)
+
+
+def _number_for_formula(value: Value, expr: ast.Expr, need: Need) -> Diagnostic:
+    labels = () if need.span is None else (Label(need.span, "wants something that is true or false"),)
+    message = f"{need.who} needs a formula, {need.which} is {noun(value)}"
+    return Diagnostic("E201", message, expr.span, describe(value), labels, help=_as_comparison(value, expr))
+
+
+def _as_comparison(value: Value, expr: ast.Expr) -> tuple[str, ...]:
+    text = expr.span.text
+    match value, expr:
+        case Number(kind="enum", labels=labels), _:
+            return (f"did you mean `{text} == {labels[0][0]}`?",)
+        case Number(), ast.Binary(op="-", left=left, right=right):
+            return (f"did you mean `{text} > 0` or `{left.span.text} > {right.span.text}`?",)
+        case Number(), _:
+            return (f"did you mean `{text} > 0`?",)
+        case Vector(), _:
+            return ("compare one component, its `norm`, or use `in` with a region",)
+        case _:
+            return ()
+
+
+def _formula_for_number(value: typed.Formula, expr: ast.Expr, need: Need) -> Diagnostic:
+    message = f"{need.who}; {need.which} is a formula"
+    if is_state(value):
+        help_ = (f"`ind({expr.span.text})` is 1 where it holds and 0 elsewhere",)
+    else:
+        help_ = (
+            "`ind(phi)` is 1 where phi holds and 0 otherwise;"
+            " a temporal operator has no numeric form in a predicate",
+        )
+    return Diagnostic("E202", message, expr.span, "formula", help=help_)
+
+
+def _moment_for_number(value: Moment, expr: ast.Expr) -> Diagnostic:
+    text = expr.span.text
+    if value.end:
+        return Diagnostic("E205", f"`{text}` is only known as the end of an interval", expr.span)
+    return out_of_place(expr.span)

@@ -1,0 +1,131 @@
+"""Tags of requirements: `@safety`, `@weight(2)`, `@id("R1")`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from stlc.compile.frontend.algebra import refuse_point
+from stlc.compile.frontend.expressions import evaluate
+from stlc.compile.frontend.scope import Failed, Scope
+from stlc.compile.frontend.sorts import Need, as_number
+from stlc.compile.ir import nodes as ir
+from stlc.diagnostics import Diagnostic
+from stlc.grammar import ast
+from stlc.registry import closest
+from stlc.source import Span
+
+MARKS = ("safety", "liveness")
+_SHOWN = '@safety @liveness @weight(x) @id("…") @group(name) @scale(x) @scale(auto) @product'
+_KNOWN = (*MARKS, "weight", "id", "group", "scale", "product")
+
+
+@dataclass(frozen=True, slots=True)
+class Tags:
+    """What the tags of one requirement say; see `typed.Requirement`.
+
+    Attributes:
+        marks: bare tag names.
+        weight: factor of the robustness.
+        scale: its divisor; a number that varies stands for the reach of its range, None for that of the
+            predicates (`@scale(auto)`).
+        scale_span: where that is written.
+        product: `x in [lo, hi]` is `(x - lo) (hi - x)`.
+        id: of `@id("…")`.
+        group: of `@group(name)`.
+    """
+
+    marks: frozenset[str] = frozenset()
+    weight: float = 1.0
+    scale: ir.Num | None = ir.Lit(1.0)  # noqa: RUF009 - frozen
+    scale_span: Span | None = None
+    product: bool = False
+    id: str = ""
+    group: str = ""
+
+
+def read_tags(tags: Sequence[ast.Tag], scope: Scope) -> Tags:
+    """The tags of a requirement. Findings (E501, E205) go to the scope; a bad tag says nothing."""
+    found = Tags()
+    seen: set[str] = set()
+    for tag in tags:
+        try:
+            if tag.name in seen:
+                scope.fail(Diagnostic("E501", f"`@{tag.name}` is given twice", tag.span))
+            seen.add(tag.name)
+            found = _with(found, tag, scope)
+        except Failed:
+            continue
+    return found
+
+
+def refuse_tags(tags: Sequence[ast.Tag], what: str, scope: Scope) -> None:
+    """Tags on a declaration that takes none (E501)."""
+    for tag in tags:
+        message = f"`@{tag.name}` says nothing about {what}"
+        scope.report(Diagnostic("E501", message, tag.span, help=("tags stand before `require`",)))
+
+
+def _with(found: Tags, tag: ast.Tag, scope: Scope) -> Tags:
+    match tag.name:
+        case "safety" | "liveness":
+            if tag.args:
+                scope.fail(Diagnostic("E501", f"`@{tag.name}` takes no argument", tag.span))
+            return replace(found, marks=found.marks | {tag.name})
+        case "weight":
+            return replace(found, weight=_positive(tag, scope))
+        case "scale":
+            scale = None if _word(tag) == "auto" else _number(tag, scope)
+            return replace(found, scale=scale, scale_span=tag.span)
+        case "id":
+            return replace(found, id=_text(tag, scope))
+        case "group":
+            return replace(found, group=_word(tag) or _text(tag, scope))
+        case "product":
+            if tag.args:
+                scope.fail(Diagnostic("E501", "`@product` takes no argument", tag.span))
+            return replace(found, product=True)
+        case _:
+            return scope.fail(_unknown(tag))
+
+
+def _unknown(tag: ast.Tag) -> Diagnostic:
+    near = closest(tag.name, _KNOWN)
+    asks = f"did you mean `@{near}`?  " if near is not None else ""
+    return Diagnostic("E501", f"unknown tag `@{tag.name}`", tag.span, help=(f"{asks}tags: {_SHOWN}",))
+
+
+def _only(tag: ast.Tag) -> ast.Expr | None:
+    """Its one argument, if that is what it has."""
+    return tag.args[0].value if len(tag.args) == 1 and tag.args[0].name is None else None
+
+
+def _word(tag: ast.Tag) -> str:
+    value = _only(tag)
+    return value.name if isinstance(value, ast.Name) else ""
+
+
+def _text(tag: ast.Tag, scope: Scope) -> str:
+    value = _only(tag)
+    if isinstance(value, ast.String):
+        return value.value
+    return scope.fail(Diagnostic("E501", f'`@{tag.name}` takes one text: `@{tag.name}("…")`', tag.span))
+
+
+def _positive(tag: ast.Tag, scope: Scope) -> float:
+    num = _number(tag, scope)
+    if not isinstance(num, ir.Lit):
+        scope.fail(Diagnostic("E205", f"`@{tag.name}` takes a positive constant", tag.args[0].span))
+    return num.value
+
+
+def _number(tag: ast.Tag, scope: Scope) -> ir.Num:
+    """The one number that a tag is given, positive where it is a constant."""
+    expr = _only(tag)
+    if expr is None:
+        scope.fail(Diagnostic("E501", f"`@{tag.name}` takes one number: `@{tag.name}(2)`", tag.span))
+    number = as_number(evaluate(expr, scope), expr, Need(f"`@{tag.name}` takes a number"), scope)
+    refuse_point(f"`@{tag.name}`", number, expr.span, scope)
+    if number.constant is not None and number.constant <= 0:
+        scope.fail(Diagnostic("E205", f"`@{tag.name}` takes a positive constant", expr.span))
+    return number.num

@@ -1,0 +1,1 @@
+"""Typed formulas, the intermediate representation, and what follows from them alone."""

@@ -1,0 +1,1 @@
+"""From typed formulas to the intermediate representation, time in steps."""

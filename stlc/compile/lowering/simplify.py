@@ -1,0 +1,120 @@
+"""Local laws on the IR. Each preserves the robustness of a semantics wherever both sides are defined.
+
+Under every semantics windows of the present alone vanish, `G[a,a] G[c,d] p` is `G[a+c, a+d] p`,
+`true until q` is `eventually q`, and constants are folded, so that no infinity reaches a gradient. Nested
+`and`s become one where the semantics is associative, without repetitions where it is idempotent; where it is
+both, `G[a,b] G[c,d] p` is `G[a+c, b+d] p`, and so for `F`, `H` and `O`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import assert_never
+
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.horizon import numbers
+from stlc.compile.ir.samples import held_by, thawed
+from stlc.compile.semantics.semantics import Exact, Semantics
+
+_EXACT = Exact()
+_NOW = ir.Window(0, 0)
+
+
+def simplify(formula: ir.Formula, semantics: Semantics = _EXACT) -> ir.Formula:
+    """An equivalent formula with fewer nodes; simplifying again changes nothing.
+
+    Args:
+        formula: in negation normal form.
+        semantics: under which it has the same robustness; the exact one allows all laws.
+    """
+
+    def inner(part: ir.Formula) -> ir.Formula:
+        return simplify(part, semantics)
+
+    match formula:
+        case ir.Truth() | ir.Atom():
+            return formula
+        case ir.Join(_, items):
+            return _join(formula, [inner(item) for item in items], semantics)
+        case ir.Over() | ir.Past():
+            return _window(replace(formula, body=inner(formula.body)), semantics)
+        case ir.Until() | ir.Since():
+            return _binary(replace(formula, left=inner(formula.left), right=inner(formula.right)), semantics)
+        case ir.Shift():
+            body = inner(formula.body)
+            return body if formula.steps == 0 else replace(formula, body=body)
+        case ir.Freeze():
+            return _freeze(replace(formula, body=inner(formula.body)))
+        case ir.AtStart():
+            body = inner(formula.body)
+            return body if isinstance(body, ir.Truth) else replace(formula, body=body)
+        case _:
+            assert_never(formula)
+
+
+def _join(whole: ir.Join, items: list[ir.Formula], semantics: Semantics) -> ir.Formula:
+    flat: list[ir.Formula] = []
+    for item in items:
+        nested = semantics.associative and isinstance(item, ir.Join) and item.op == whole.op
+        flat += item.items if nested and isinstance(item, ir.Join) else (item,)
+    if semantics.idempotent:
+        flat = list(dict.fromkeys(flat))
+    absorbing = whole.op == "or"
+    kept = [item for item in flat if not isinstance(item, ir.Truth)]
+    if any(isinstance(item, ir.Truth) and item.value is absorbing for item in flat):
+        return ir.Truth(absorbing, whole.span)
+    if not kept:
+        return ir.Truth(not absorbing, whole.span)
+    return kept[0] if len(kept) == 1 else replace(whole, items=tuple(kept))
+
+
+def _window(node: ir.Over | ir.Past, semantics: Semantics) -> ir.Formula:
+    body, window = node.body, node.window
+    every = node.op in ("always", "historically")
+    if isinstance(body, ir.Truth) and (body.value is every or window.lo == 0):
+        return replace(body, span=node.span)
+    if window == _NOW:
+        return body
+    if isinstance(body, (ir.Over, ir.Past)) and body.op == node.op:
+        together = _sum(window, body.window, semantics)
+        if together is not None:
+            return replace(node, window=together, body=body.body)
+    return node
+
+
+def _freeze(node: ir.Freeze) -> ir.Formula:
+    """Without what nobody reads; a predicate of this very instant reads the number itself."""
+    read = frozenset().union(*map(held_by, numbers(node.body)))
+    kept = tuple((name, num) for name, num in node.bindings if name in read)
+    if not kept:
+        return node.body
+    if not isinstance(node.body, ir.Atom):
+        return replace(node, bindings=kept)
+    return replace(node.body, num=thawed(node.body.num, dict(kept)))
+
+
+def _sum(outer: ir.Window, inner: ir.Window, semantics: Semantics) -> ir.Window | None:
+    """The window of both, one after the other, if it asks for no less of the trace than they did.
+
+    It counts a sample once that they may count several times, and has one extremum where they have two.
+    """
+    lattice = semantics.associative and semantics.idempotent
+    if outer.hi is not None and inner.hi is not None:
+        single = outer.lo == outer.hi or inner.lo == inner.hi
+        return ir.Window(outer.lo + inner.lo, outer.hi + inner.hi) if lattice or single else None
+    if outer.hi is None and inner == ir.Window(0, None) and lattice:
+        return outer
+    return None
+
+
+def _binary(node: ir.Until | ir.Since, semantics: Semantics) -> ir.Formula:
+    """`true until q` is `eventually q`, and the like for the other three."""
+    strong = node.op in ("until", "since")
+    if not (isinstance(node.left, ir.Truth) and node.left.value is strong):
+        return node
+    if isinstance(node, ir.Until):
+        later = ir.Over("eventually" if strong else "always", node.window, node.right, node.span)
+        return simplify(later, semantics)
+    return simplify(
+        ir.Past("once" if strong else "historically", node.window, node.right, node.span), semantics
+    )

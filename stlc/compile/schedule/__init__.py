@@ -1,0 +1,1 @@
+"""Which value of a formula is needed at which instant."""

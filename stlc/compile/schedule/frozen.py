@@ -1,0 +1,197 @@
+"""`freeze`: a formula about the values of one instant, judged at many.
+
+Every instant binds values of its own, so they become an axis of their own: columns `(time, batch)` are laid
+out as `(time, instants * batch)`. Where the body looks at a bounded neighbourhood only that is laid out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
+from typing import TypeAlias, assert_never, final
+
+import numpy as np
+
+from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.inputs import inputs
+from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.horizon import columns, nodes, numbers, reach, uses_end
+from stlc.compile.ir.samples import Reach, held_by, looks_at_ends
+from stlc.compile.schedule.schedule import Extent, Run, reads, upto, within
+
+Env: TypeAlias = Mapping[str, Array]
+Judge: TypeAlias = Callable[[ir.Formula, Env, Run, Extent], Array]
+"""Values `(count, batch)` of a formula on columns `(time, batch)` at the instants of a run."""
+
+_MOST = 1 << 22
+"""Numbers of one column that are laid out at a time."""
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class Freezer:
+    """Judges `Freeze` nodes on one trace.
+
+    Attributes:
+        extent: of the trace.
+        env: its columns, and what is frozen around.
+        ops: the array library.
+        judge: the evaluator.
+    """
+
+    extent: Extent
+    env: Env
+    ops: Ops
+    judge: Judge
+
+    def values(self, node: ir.Freeze, run: Run) -> Array:
+        """The node at the instants `run`, `(count, batch)`."""
+        bound = within(_together(node, self.extent), run, self.extent)
+        if bound.count <= 0:
+            parts = list(self._unbound(node, run))
+        else:
+            parts = [
+                *self._unbound(node, upto(run.start, bound.start - 1)),
+                *self._bound(node, bound),
+                *self._unbound(node, upto(bound.last + 1, run.last)),
+            ]
+        return self.ops.cat(parts) if len(parts) > 1 else parts[0]
+
+    def _unbound(self, node: ir.Freeze, run: Run) -> Iterator[Array]:
+        """Where a value to freeze does not exist, what reads it is unknown, or false on a cut trace."""
+        for missing, instants in groupby(range(run.start, run.start + run.count), partial(self._lost, node)):
+            first, *more = instants
+            kept = tuple((name, num) for name, num in node.bindings if name not in missing)
+            body = without(node.body, missing, self.extent)
+            if kept:
+                yield from self._bound(replace(node, bindings=kept, body=body), Run(first, 1 + len(more)))
+            else:
+                yield self.judge(body, self.env, Run(first, 1 + len(more)), self.extent)
+
+    def _lost(self, node: ir.Freeze, instant: int) -> frozenset[str]:
+        """Names of the values that do not exist at an instant."""
+        extent, run = self.extent, Run(instant, 1)
+        return frozenset(
+            name for name, num in node.bindings if within(reads(num, extent), run, extent).count <= 0
+        )
+
+    def _bound(self, node: ir.Freeze, run: Run) -> Iterator[Array]:
+        back, ahead = _neighbourhood(node.body)
+        if run.count == 1 or math.isinf(back + ahead):
+            yield from self._whole(node, run, back, ahead)
+            return
+        first = min(max(run.start, int(back)), run.last + 1)
+        last = max(min(run.last, self.extent.samples - 1 - int(ahead)), first - 1)
+        if first > run.start:
+            yield from self._whole(node, upto(run.start, first - 1), back, ahead)
+        yield from self._near(node, upto(first, last), int(back), int(ahead))
+        if last < run.last:
+            yield from self._whole(node, upto(last + 1, run.last), back, ahead)
+
+    def _near(self, node: ir.Freeze, run: Run, back: int, ahead: int) -> Iterator[Array]:
+        """Instants whose neighbourhood lies within the trace: it is all that is laid out."""
+        length = back + ahead + 1
+        extent = replace(self.extent, samples=length, stop=None)
+        for chunk in _chunks(run, max(_MOST // (length * self._batch), 1)):
+            chosen = np.arange(chunk.start, chunk.last + 1)
+            rows = np.arange(-back, ahead + 1)[:, None] + chosen
+            env = {n: x[rows].reshape(length, -1) for n, x in self._read(node).items()}
+            env |= self._held(node, chunk, length)
+            yield self.judge(node.body, env, Run(back, 1), extent).reshape(chunk.count, -1)
+
+    def _whole(self, node: ir.Freeze, run: Run, back: float, ahead: float) -> Iterator[Array]:
+        """Any instants: the trace around them is repeated for each, and each judged in its own copy."""
+        ops, batch = self.ops, self._batch
+        for chunk in _chunks(run, _edge(_MOST // batch, back + ahead, self.extent.samples)):
+            start = max(chunk.start - back, 0)
+            stop = min(chunk.last + ahead + 1, self.extent.samples)
+            begin, length = int(start), int(stop) - int(start)
+            blank = ops.full((1, chunk.count, 1), 0.0, self._like)
+            env = {
+                name: (x[begin : begin + length][:, None] + blank).reshape(length, -1)
+                for name, x in self._read(node).items()
+            }
+            env |= self._held(node, chunk, length)
+            ends = self.extent.stop
+            extent = replace(self.extent, samples=length, stop=None if ends is None else ends - begin)
+            there = self.judge(node.body, env, Run(chunk.start - begin, chunk.count), extent)
+            each = np.arange(chunk.count)
+            yield there.reshape(chunk.count, chunk.count, batch)[each, each]
+
+    def _held(self, node: ir.Freeze, run: Run, length: int) -> dict[str, Array]:
+        """The frozen values of every instant of `run`, the same at all times: `(length, count * batch)`."""
+        program = Program(dict(node.bindings))
+        found = program(inputs(program, self.env, run, self.ops), self.ops)
+        blank = self.ops.full((length, run.count * self._batch), 0.0, self._like)
+        rows = self.ops.full((run.count, self._batch), 0.0, self._like)
+        return {name: blank + (value + rows).reshape(1, -1) for name, value in found.items()}
+
+    def _read(self, node: ir.Freeze) -> dict[str, Array]:
+        """The columns that the body reads, and what is frozen around; at least one."""
+        own = {name for name, _ in node.bindings}
+        names = set(columns(node.body)).union(*map(held_by, numbers(node.body))) - own
+        return {name: self.env[name] for name in names & self.env.keys() or list(self.env)[:1]}
+
+    @property
+    def _like(self) -> Array:
+        return next(iter(self.env.values()))
+
+    @property
+    def _batch(self) -> int:
+        return int(self._like.shape[1])
+
+
+def _together(node: ir.Freeze, extent: Extent) -> Reach:
+    reaches = [reads(num, extent) for _, num in node.bindings]
+    return Reach(max(r.past for r in reaches), max(r.future for r in reaches))
+
+
+def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
+    """How many samples before and after its instant a formula reads where they exist; inf: all."""
+    past, future = reach(body)
+    on_clock = any(isinstance(node, ir.AtStart) for node in nodes(body))
+    if on_clock or any(map(looks_at_ends, numbers(body))):
+        return math.inf, math.inf
+    back = any(isinstance(node, (ir.Past, ir.Since)) and node.window.hi is None for node in nodes(body))
+    return math.inf if back else past, math.inf if uses_end(body) else future
+
+
+def _edge(most: int, width: float, samples: int) -> int:
+    """The largest c, at least 1, with c (c + width) or c * samples numbers below `most`."""
+    if math.isinf(width):
+        return max(most // samples, 1)
+    return max(int((math.sqrt(width * width + 4.0 * most) - width) / 2.0), 1)
+
+
+def _chunks(run: Run, size: int) -> Iterator[Run]:
+    for start in range(run.start, run.start + run.count, size):
+        yield upto(start, min(start + size - 1, run.last))
+
+
+def without(body: ir.Formula, names: frozenset[str], extent: Extent) -> ir.Formula:
+    """The formula where nothing is known of the frozen values `names`."""
+    match body:
+        case ir.Truth():
+            return body
+        case ir.Atom(num, sign):
+            if not held_by(num) & names:
+                return body
+            return ir.Truth(extent.end == "upper" if extent.open else sign < 0, body.span)
+        case ir.Join(_, items):
+            return replace(body, items=tuple(without(item, names, extent) for item in items))
+        case ir.Over() | ir.Past() | ir.Shift() | ir.AtStart():
+            return replace(body, body=without(body.body, names, extent))
+        case ir.Until() | ir.Since():
+            left, right = without(body.left, names, extent), without(body.right, names, extent)
+            return replace(body, left=left, right=right)
+        case ir.Freeze(bindings, inner):
+            lost = {name for name, num in bindings if held_by(num) & names}
+            inner = without(inner, names - {name for name, _ in bindings} | lost, extent)
+            kept = tuple((name, num) for name, num in bindings if name not in lost)
+            return replace(body, bindings=kept, body=inner) if kept else inner
+        case _:
+            assert_never(body)

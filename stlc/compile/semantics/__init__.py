@@ -1,0 +1,1 @@
+"""What the extremum of values means: exact, smooth, means."""

@@ -1,0 +1,63 @@
+"""What "max" means: exactly, or smoothly enough for a gradient to see more than one operand.
+
+A semantics says how a maximum and a minimum of robustness values are taken; everything else about formulas
+is the same for all of them (`stlc.compile.backends.array.graph`). Verdicts do not depend on it: whether a
+formula holds is decided by the truth of its predicates, and the exact robustness has that sign.
+
+| name     | class                     | is a positive value satisfied, a negative one violated?       |
+|----------|---------------------------|---------------------------------------------------------------|
+| `exact`  | `Exact`                   | yes                                                           |
+| `smooth` | `LogSumExp`               | not near 0: every operator may be off by log(n) / k           |
+| `agm`    | `ArithmeticGeometricMean` | yes                                                           |
+| `dgmsr`  | `GeneralizedMean`         | yes                                                           |
+"""
+
+from __future__ import annotations
+
+from stlc.compile.backends.array.extremum import Pick
+from stlc.compile.semantics.extrema import Exact, LogSumExp
+from stlc.compile.semantics.means import ArithmeticGeometricMean, GeneralizedMean
+from stlc.compile.semantics.protocol import Parts, Semantics
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.registry import Registry
+
+__all__ = [
+    "SEMANTICS",
+    "TOLERANCE",
+    "ArithmeticGeometricMean",
+    "Exact",
+    "GeneralizedMean",
+    "LogSumExp",
+    "Parts",
+    "Pick",
+    "Semantics",
+    "semantics_of",
+]
+
+TOLERANCE = 1e-6
+"""A robustness of at least minus this, in float64, is satisfied (time and start states lie on grids)."""
+
+SEMANTICS: Registry[type[Semantics]] = Registry("semantics")
+SEMANTICS.register("exact")(Exact)
+SEMANTICS.register("smooth")(LogSumExp)
+SEMANTICS.register("agm")(ArithmeticGeometricMean)
+SEMANTICS.register("dgmsr")(GeneralizedMean)
+
+
+def semantics_of(asked: str | Semantics = "exact", smoothing: float | None = None) -> Semantics:
+    """The semantics that somebody asks for.
+
+    Args:
+        asked: a semantics, or the name of one in `SEMANTICS`.
+        smoothing: the scale k of log-sum-exp, which it asks for by itself.
+
+    Raises:
+        UsageError: U101, there is no semantics of this name, or it has no such scale.
+    """
+    chosen = SEMANTICS.get(asked)() if isinstance(asked, str) else asked
+    if smoothing is None:
+        return chosen
+    if not isinstance(chosen, Exact | LogSumExp):
+        message = f"`{type(chosen).__name__}` has no `smoothing`"
+        raise UsageError(Diagnostic("U101", message, help=("`smoothing` is the scale of log-sum-exp",)))
+    return LogSumExp(float(smoothing))

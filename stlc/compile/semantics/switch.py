@@ -1,0 +1,117 @@
+"""How a condition becomes a number, and a choice a blend (Eq. 6 of the paper).
+
+A system flows where a condition fails and jumps where it holds. `Hard` is that rule; `Tanh` is the paper's
+smooth stand-in; `StraightThrough` steps hard and differentiates as if it were smooth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, final
+
+from stlc.compile.backends.array.namespace import Array, Ops
+
+
+class Switch(Protocol):
+    """What a program does with conditions.
+
+    `exact` says that only the truth of a condition matters, never its margin; such a switch is evaluated with
+    comparisons and masks, and every atom keeps its own strictness.
+    """
+
+    @property
+    def exact(self) -> bool:
+        """Whether only truth matters."""
+
+    def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:
+        """A number in 0..1: does a condition of margin `rho` hold?
+
+        Args:
+            rho: margin; true iff > 0 (`strict`) or >= 0.
+            strict: which of the two.
+            sharpness: what the indicator itself asks for; None takes the default of the switch.
+            ops: the array library.
+        """
+
+    def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
+        """The indicator `weight` of a condition whose atoms differ in strictness; `truth` is its mask."""
+
+    def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
+        """`yes` where the indicator `weight` is 1, `no` where it is 0."""
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class Hard:
+    """Exact switching: 0 or 1, without gradient and without tolerance."""
+
+    @property
+    def exact(self) -> bool:
+        """Only truth matters."""
+        return True
+
+    def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
+        """1 where the condition holds, else 0."""
+        return ops.number(ops.gt(rho, 0.0) if strict else ops.ge(rho, 0.0), rho)
+
+    def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
+        """The mask as a number."""
+        return ops.number(truth, weight)
+
+    def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
+        """The value of the branch that is taken, bit for bit."""
+        return ops.where(ops.gt(weight, 0.5), yes, no)
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class Tanh:
+    """The paper's Eq. 6: `(1 + tanh(w rho)) / 2`, that is `sigmoid(2 w rho)`, and a blend of branches."""
+
+    sharpness: float = 500.0
+
+    @property
+    def exact(self) -> bool:
+        """Margins matter."""
+        return False
+
+    def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
+        """`(1 + tanh(w rho)) / 2` with the indicator's own sharpness where it has one."""
+        width = self.sharpness if sharpness is None else sharpness
+        return ops.sigmoid(rho * ops.constant(2.0 * width, rho))
+
+    def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:  # noqa: ARG002
+        """The smooth number: at the edge it is a half whichever atom is strict."""
+        return weight
+
+    def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
+        """`no + weight (yes - no)`."""
+        return ops.lerp(no, yes, weight)
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class StraightThrough:
+    """Hard forward; backward the slope of `(1 + tanh(slope rho)) / 2`, whatever sharpness was asked for.
+
+    A choice has the value of the branch that is taken, its gradient, and the gradient of the condition.
+    """
+
+    slope: float = 10.0
+
+    @property
+    def exact(self) -> bool:
+        """Margins matter, for the gradient."""
+        return False
+
+    def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
+        """0 or 1, with a gradient."""
+        return ops.straight_through(rho, strict, self.slope)
+
+    def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
+        """0 or 1 as the mask says, with the gradient of `weight`."""
+        return ops.settled(weight, truth)
+
+    def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
+        """`no + weight (yes - no)`."""
+        return ops.lerp(no, yes, weight)

@@ -1,0 +1,1 @@
+"""Closed loop: worlds, disturbances, events, and the agents in them."""

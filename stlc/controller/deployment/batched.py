@@ -1,0 +1,237 @@
+"""The worlds of all seeds of a deployment, as one; what they do wrong is told, and where."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stlc.controller.deployment.disturbance import Disturbance
+from stlc.controller.deployment.world import Charting, Choosing, Redrawing
+from stlc.controller.deployment.world_errors import blamed, require_numbers, scene_of, states_of, wrong
+from stlc.controller.guard.feasibility import savable, solvable
+from stlc.controller.guard.tightened import Spare
+from stlc.diagnostics import Diagnostic, RunError, SystemFileError
+
+if TYPE_CHECKING:
+    from stlc.controller.deployment.world import WorldType
+    from stlc.controller.problem.task import Task
+    from stlc.dynamics.declaration.deployment import Starts, TestDecl
+
+
+REDRAWN = 50
+"""How often the start of an agent is drawn again, at most."""
+
+SURPRISE = 1e-6
+"""What moves a state further than this is no rounding."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A deployment: which seeds, how many agents each, how long, and how often they plan anew.
+
+    An agent that the world tells something new (a signal of role `env` has changed) plans at once.
+
+    `limit`: seconds that a decision of the full guard may take per agent; None: as long as it takes.
+    `paper_limit`: the same of the paper's guard.
+    `ceiling`: visited states, of all seeds, that are searched for a plan where the followed one fails.
+    `margin`: what a guard asks plans to spare of safety requirements, by their names.
+    """
+
+    seeds: tuple[int, ...]
+    agents: int
+    steps: int
+    replan: int = 1
+    limit: float | None = 0.1
+    ceiling: int = 0
+    margin: Spare = field(default_factory=dict)
+    paper_limit: float | None = None
+
+
+class Worlds:
+    """The worlds of all seeds, as one.
+
+    Raises SystemFileError, pointing into the world's file, where one fails: S207, or S302 for states that
+    are no numbers. Worlds get states and actions of their own: what they write into them is nobody else's.
+    """
+
+    def __init__(self, task: Task, make: WorldType, setting: Setting) -> None:
+        self.task, self.system, self.names = task, task.system, task.plain.names
+        self.size = (setting.agents, len(self.names))
+        self.seeds = setting.seeds
+        self.parts = [setting.agents] * len(setting.seeds)
+        self.generators = [torch.Generator().manual_seed(seed) for seed in setting.seeds]
+        self.disturbance = Disturbance(task.plain, self.generators, setting.agents)
+        self.truths = self.disturbance.truths(task.plain.truth)
+        self.quiet = torch.ones(setting.agents * len(setting.seeds), dtype=torch.bool)
+        with blamed(make, "__init__", "be made"):
+            pairs = zip(self.truths, self.generators, strict=True)
+            self.worlds = [make(real, setting.agents, generator) for real, generator in pairs]
+        self._scene: dict[str, NDArray[Any]] | None = None
+
+    def reset(self) -> Tensor:
+        """The first states, (rows, n); parameters are drawn, timers as at the start of a mission.
+
+        Where the system takes only starts from which a plan is known (`test: {starts: …}`), the others are
+        drawn again, `redrawn` of them in all.
+
+        Raises:
+            SystemFileError: S211, a world cannot draw the start of an agent again.
+            RunError: R405, no start that it draws has a known plan.
+        """
+        given = []
+        for world in self.worlds:
+            with blamed(world, "reset", "begin"):
+                given.append(world.reset())
+        parts = zip(torch.split(self._checked("reset", given, 0), self.parts), self.generators, strict=True)
+        begun = [self.system.begun(x, generator) for x, generator in parts]
+        self.redrawn = 0
+        if self.task.system.decl.test.starts == "any":
+            return torch.cat(begun)
+        return torch.cat(
+            [self._with_plans(*each) for each in zip(self.worlds, self.seeds, begun, strict=True)]
+        )
+
+    def _with_plans(self, world: object, seed: int, x: Tensor) -> Tensor:
+        """The first states of a seed, (agents, n), drawn again wherever no plan is known from them."""
+        known = savable if self.task.system.decl.test.starts == "savable" else solvable
+        good = known(self.task, x)
+        for _ in range(REDRAWN):
+            if bool(good.all()):
+                return x
+            if not isinstance(world, Redrawing):
+                raise _cannot_redraw(world, self.task.system.decl.test)
+            left = torch.nonzero(~good).squeeze(1)
+            self.redrawn += len(left)
+            with blamed(world, "redraw", "draw starts again"):
+                given = states_of(world, "redraw", world.redraw(left), self.size)
+            require_numbers(world, "redraw", given, (self.names, f"at step 0 (seed {seed})"))
+            again = torch.cat((given, x[:, self.size[1] :]), 1)
+            good &= (again == x).all(1)
+            x, left = again, torch.nonzero(~good).squeeze(1)
+            good[left] = known(self.task, x[left])
+        raise _hopeless(self.task.system.decl.test.starts, seed, int((~good).sum()))
+
+    def advance(self, x: Tensor, action: Tensor, step: int) -> Tensor:
+        """(rows, n), (rows, m) -> the (rows, n) states after step number `step`.
+
+        Worlds know neither parameters nor timers: those stay, these follow from the true states. Who is
+        `quiet` met nothing: its world did what the truth of its dynamics alone does.
+        """
+        known = x[:, : self.size[1]]
+        before, given = torch.split(known.clone(), self.parts), []
+        acted = self.disturbance.acted(self.system.commanded(x, action).clone())
+        acts = torch.split(self.system.planned(x, acted), self.parts)
+        alone = [truth.step(state, act) for truth, state, act in zip(self.truths, before, acts, strict=True)]
+        for world, state, act in zip(self.worlds, before, acts, strict=True):
+            with blamed(world, "advance", f"take step {step}"):
+                given.append(world.advance(state, act))
+        reached = self._checked("advance", given, step)
+        self.quiet = ((reached - torch.cat(alone)).abs() <= SURPRISE).all(1)
+        moved = self.disturbance.pushed(reached, known, step)
+        return torch.cat((moved, self.system.added_later(x)), 1)
+
+    def options(self, x: Tensor) -> Tensor | None:
+        """States under every choice that there is, (rows, k, n); None where the worlds leave none."""
+        given = []
+        for world in self.worlds:
+            if isinstance(world, Choosing):
+                with blamed(world, "options", "give options"):
+                    given.append(self._optional(world, world.options()))
+        if not given:
+            return None
+        options = torch.cat(given)
+        later = x[:, None, self.size[1] :].expand(-1, options.shape[1], -1)
+        return torch.cat((options, later), 2)
+
+    def _optional(self, world: object, given: object) -> Tensor:
+        agents, states = self.size
+        shape = tuple(given.shape) if isinstance(given, Tensor) else ()
+        if not isinstance(given, Tensor) or len(shape) != 3 or (shape[0], shape[2]) != self.size:
+            raise wrong(world, "options", f"gives no tensor of shape ({agents}, k, {states})")
+        return given.detach().to(torch.float64)
+
+    def choose(self, pick: Tensor, x: Tensor) -> Tensor:
+        """The (rows, n) states when every agent has taken an option, (rows,)."""
+        given = []
+        for world, part in zip(self.worlds, torch.split(pick, self.parts), strict=True):
+            if isinstance(world, Choosing):
+                with blamed(world, "choose", "take a choice"):
+                    given.append(world.choose(part))
+        return torch.cat((self._checked("choose", given, None), x[:, self.size[1] :]), 1)
+
+    def _checked(self, method: str, given: list[Tensor], step: int | None) -> Tensor:
+        """All states as one, (rows, n) float64."""
+        found = []
+        for world, seed, each in zip(self.worlds, self.seeds, given, strict=True):
+            x = states_of(world, method, each, self.size)
+            when = "" if step is None else f"at step {step} "
+            require_numbers(world, method, x, (self.names, f"{when}(seed {seed})"))
+            found.append(x)
+        return torch.cat(found)
+
+    # ------------------------------------------------------------- what worlds tell of themselves
+
+    def progress(self) -> tuple[Mapping[str, float], ...]:
+        """How much of the task got done, seed by seed."""
+        found = []
+        for world in self.worlds:
+            with blamed(world, "progress", "say its progress"):
+                found.append({str(name): float(value) for name, value in world.progress().items()})
+        return tuple(found)
+
+    def units(self) -> dict[str, str]:
+        """Units of entries of `progress`."""
+        with blamed(self.worlds[0], "units", "say its units"):
+            return {str(name): str(unit) for name, unit in self.worlds[0].units().items()}
+
+    def snapshot(self) -> Mapping[str, NDArray[Any]]:
+        """What a picture of the first seed needs; arrays that keep their shapes."""
+        world = self.worlds[0]
+        with blamed(world, "snapshot", "give a snapshot"):
+            given = world.snapshot()
+        self._scene = scene_of(world, given, self._scene)
+        return self._scene
+
+    @property
+    def charting(self) -> bool:
+        """Whether plans can be drawn into the picture of the first seed."""
+        return isinstance(self.worlds[0], Charting)
+
+    def charted(self, states: Tensor) -> NDArray[np.float64]:
+        """Where planned states of the first seed, (agents, k, n), are in its picture, (agents, k, 2 or 3)."""
+        world = self.worlds[0]
+        assert isinstance(world, Charting)
+        with blamed(world, "charted", "say where plans are"):
+            places = np.asarray(world.charted(states), dtype=np.float64)
+        if places.ndim != 3 or places.shape[:2] != states.shape[:2] or places.shape[2] not in (2, 3):
+            agents, count = states.shape[:2]
+            raise wrong(world, "charted", f"gives places of shape {places.shape}, not ({agents}, {count}, 2)")
+        return places
+
+
+def _cannot_redraw(world: object, test: TestDecl) -> SystemFileError:
+    return SystemFileError(
+        Diagnostic(
+            "S211",
+            f"the world `{type(world).__name__}` cannot draw the start of one agent again",
+            None if test.world is None else test.world.span,
+            label="named here",
+            note=(f"`starts: {test.starts}` draws starts again from which no plan is known",),
+            help=("`--set test.starts=any` takes them all", "a method `redraw` gives agents another start"),
+        )
+    )
+
+
+def _hopeless(starts: Starts, seed: int, agents: int) -> RunError:
+    plan = "a safe plan" if starts == "savable" else "a plan that satisfies everything"
+    weaker = ("`--set test.starts=savable` asks for a safe plan",) if starts == "feasible" else ()
+    message = (
+        f"no start from which {plan} is known, in {REDRAWN} draws each, for {agents} agents of seed {seed}"
+    )
+    return RunError(Diagnostic("R405", message, help=(*weaker, "`--set test.starts=any` takes them all")))

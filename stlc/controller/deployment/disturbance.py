@@ -1,0 +1,155 @@
+"""What a scenario adds to the truth, and to what agents see of it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from stlc.controller.streams import seeded
+from stlc.dynamics.declaration.deployment import ErrorsDecl
+from stlc.dynamics.init.draws import Drawing, Rows
+from stlc.dynamics.scenarios.mistaken import Mistaken
+from stlc.dynamics.scenarios.uncertain import loosened
+from stlc.units import parse_unit
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from torch import Tensor
+
+    from stlc.dynamics.declaration.model import Assign
+    from stlc.dynamics.model.system import System
+
+SECOND = parse_unit("s")
+_GAINS, _PUSHES, _BLURS, _NUMBERS = range(4)
+"""Which stream of a seed is whose: worlds meet the same, whatever is disturbed."""
+
+
+class Disturbance:
+    """The `disturb`, `noise` and `errors` of the scenario of a system; nothing without one.
+
+    The former two read the state at hand and the time `t` of the deployment, and may draw.
+    """
+
+    def __init__(self, system: System, generators: Sequence[torch.Generator], agents: int) -> None:
+        scenario = system.decl.scenario
+        self._names, self._dt = system.decl.signature.names, system.dt
+        self._scale = 1.0 if system.decl.discrete else system.dt
+        self._clamps = system.decl.clamps
+        self._generators, self._agents = generators, agents
+        self._pushes = _drawings(scenario.disturb if scenario else ())
+        self._noises = _drawings(scenario.noise if scenario else ())
+        self._errors = scenario.errors if scenario else ErrorsDecl()
+        own = [[seeded(each.initial_seed(), key) for key in range(4)] for each in generators]
+        self._streams = tuple(zip(*own, strict=True))
+        self._angle = torch.tensor([control.squash == "angle" for control in system.controls])
+        self._factor, self._offset = self._wrong_gains()
+        half = 0.5 * torch.tensor([high - low for low, high in system.actuators]).double()
+        self._reach = torch.where(self._angle, 1.0, half)
+        self._spread = self._errors.sensor_noise * _ranges(system)
+
+    def acted(self, action: Tensor) -> Tensor:
+        """What actuators make of (rows, m) commands at this step."""
+        given = action
+        if self._errors.actuator_gain:
+            given = given * self._factor.to(given) + self._offset.to(given)
+        if self._errors.actuator_noise:
+            drawn = self._normal(_PUSHES, action.shape[1])
+            given = given + (self._errors.actuator_noise * self._reach * drawn).to(given)
+        return given
+
+    def truths(self, truth: System) -> list[System]:
+        """The truth of each seed, from what it is where no number is wrong."""
+        off = self._errors.parameters
+        loose = loosened(truth.decl) if off else None
+        if loose is None or not loose.numbers:
+            return [truth] * len(self._generators)
+        factors = 1.0 + off * self._signs(_NUMBERS, len(loose.numbers))
+        return [Mistaken(loose, each) for each in torch.split(factors, self._agents)]
+
+    def _wrong_gains(self) -> tuple[Tensor, Tensor]:
+        """Factors and offsets of controls, (rows, m) each: as much too large as too small, evenly."""
+        off, angle = self._errors.actuator_gain, self._angle
+        signs = self._signs(_GAINS, len(angle))
+        return torch.where(angle, 1.0, 1.0 + off * signs), torch.where(angle, off * signs, 0.0)
+
+    def _signs(self, stream: int, count: int) -> Tensor:
+        """(rows, count) numbers that are 1 or -1, those of each seed from its own stream."""
+        shape = (self._agents, count)
+        drawn = [torch.randint(2, shape, generator=each) for each in self._streams[stream]]
+        return 2.0 * torch.cat(drawn).double() - 1.0
+
+    def _normal(self, stream: int, count: int) -> Tensor:
+        """(rows, count) standard normal numbers, those of each seed from its own stream."""
+        shape = (self._agents, count)
+        streams = self._streams[stream]
+        return torch.cat([torch.randn(shape, generator=each, dtype=torch.float64) for each in streams])
+
+    def pushed(self, x: Tensor, before: Tensor, step: int) -> Tensor:
+        """The (rows, n) states after a step that began in `before` at time `(step - 1) dt`, disturbed."""
+        if not self._pushes:
+            return x
+        added = self._drawn(self._pushes, before, step - 1)
+        return self._changed(x, {name: self._scale * value for name, value in added.items()}, clamped=True)
+
+    def seen(self, x: Tensor, step: int) -> Tensor:
+        """What agents see of (rows, n) states; columns behind those of the system are as they are."""
+        seen = x
+        if self._noises:
+            seen = self._changed(x, self._drawn(self._noises, x, step), clamped=False)
+        if self._errors.sensor_noise:
+            drawn = self._spread * self._normal(_BLURS, len(self._spread))
+            later = torch.zeros((len(x), x.shape[1] - len(self._spread)), dtype=drawn.dtype)
+            seen = seen + torch.cat((drawn, later), 1).to(x)
+        return seen
+
+    def _drawn(self, drawings: Sequence[Drawing], x: Tensor, step: int) -> dict[str, Tensor]:
+        """Values for all rows, those of each seed from its own generator."""
+        parts = []
+        for rows, generator in zip(torch.split(x, self._agents), self._generators, strict=True):
+            table = dict(zip(self._names, rows.double().unbind(1), strict=False))
+            table["t"] = torch.full_like(table[self._names[0]], step * self._dt)
+            found: dict[str, Tensor] = {}
+            for drawing in drawings:
+                found[drawing.name] = drawing({**found, **table}, Rows(len(rows), generator))
+            parts.append(found)
+        return {drawing.name: torch.cat([part[drawing.name] for part in parts]) for drawing in drawings}
+
+    def _changed(self, x: Tensor, added: dict[str, Tensor], *, clamped: bool) -> Tensor:
+        columns = list(x.unbind(1))
+        for index, name in enumerate(self._names):
+            if name in added:
+                columns[index] = columns[index] + added[name].to(x)
+                if clamped and name in self._clamps:
+                    columns[index] = columns[index].clamp(*self._clamps[name])
+        return torch.stack(columns, 1)
+
+
+def errors_of(truth: System) -> dict[str, Any]:
+    """What the scenario of a system has wrong, as shares, and which numbers of its dynamics that concerns."""
+    scenario = truth.decl.scenario
+    shares = {} if scenario is None else asdict(scenario.errors)
+    found: dict[str, Any] = {name: share for name, share in shares.items() if share}
+    if "parameters" in found:
+        found["numbers"] = [str(each) for each in loosened(truth.decl).numbers]
+    return found
+
+
+def _drawings(assigns: Sequence[Assign]) -> tuple[Drawing, ...]:
+    return tuple(Drawing(assign) for assign in assigns)
+
+
+def _ranges(system: System) -> Tensor:
+    """How wide the nominal range of each state is, (n,); 0 for clocks and for what is no measure."""
+    widths = [
+        column.high - column.low
+        if column.kind == "real"
+        and column.unit.dims != SECOND.dims
+        and column.low is not None
+        and column.high is not None
+        else 0.0
+        for column in system.decl.signature.columns
+    ]
+    return torch.tensor(widths, dtype=torch.float64)

@@ -1,0 +1,88 @@
+"""A deployment as it goes on: the margins of every agent, who decided, and how long that took."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.controller.evaluation.executed import as_driven
+from stlc.controller.guard.guard import SOURCES
+from stlc.monitor.online.margins import Margin, Margins
+
+if TYPE_CHECKING:
+    from stlc.controller.deployment.batched import Setting
+    from stlc.controller.deployment.simulator import Moment
+    from stlc.controller.problem.task import Task
+
+
+class Oversight:
+    """What the monitor says of all agents while they are driven; requirements are those of `stlc check`.
+
+    Taking a moment in is cheap; what is asked of it costs.
+
+    Args:
+        task: specification and system.
+        setting: of the deployment.
+    """
+
+    def __init__(self, task: Task, setting: Setting) -> None:
+        self.task, self.setting = task, setting
+        self.moment: Moment | None = None
+        self.counts: NDArray[np.int64] = np.zeros(len(SOURCES), dtype=np.int64)
+        self._margins = Margins([as_driven(rule, task) for rule in task.rules], task.horizon)
+
+    def push(self, moment: Moment) -> None:
+        """Take the next moment in."""
+        self.moment = moment
+        states = moment.x.numpy(force=True)
+        self._margins.push(dict(zip(self.task.names, states.T, strict=True)))
+        if moment.decision is not None:
+            self.counts += np.bincount(moment.decision.source.numpy(force=True), minlength=len(SOURCES))
+
+    @property
+    def margins(self) -> dict[str, Margin]:
+        """Of every requirement, at the present sample."""
+        return self._margins.look()
+
+    @property
+    def time(self) -> float:
+        """Of the present sample, in seconds."""
+        return (self.moment.step if self.moment else 0) * self.task.dt
+
+    def decided(self, row: int) -> str | None:
+        """Who decides for an agent: `policy`, `backup T0=2`, …; None at the end."""
+        decision = self.moment.decision if self.moment else None
+        if decision is None:
+            return None
+        name, t0 = SOURCES[int(decision.source[row])], int(decision.t0[row])
+        return f"{name} T0={t0}" if name == "backup" else name
+
+    def records(self) -> Iterator[dict[str, Any]]:
+        """The present moment, one object an agent: the lines of `--margins`."""
+        assert self.moment is not None
+        margins, decision = self.margins, self.moment.decision
+        for row in range(len(self.moment.x)):
+            seed, agent = divmod(row, self.setting.agents)
+            yield {
+                "step": self.moment.step,
+                "t": round(self.time, 9),
+                "seed": self.setting.seeds[seed],
+                "agent": agent,
+                "decided": self.decided(row),
+                "plan_rho": None if decision is None else float(decision.rho[row]),
+                "policy_rho": None if decision is None else float(decision.policy_rho[row]),
+                "plan_safe": None if decision is None else bool(decision.safe[row]),
+                "margins": {name: _margin(found, row) for name, found in margins.items()},
+            }
+
+
+def _margin(found: Margin, row: int) -> dict[str, Any]:
+    return {
+        "status": found.status(row),
+        "low": float(found.low[row]),
+        "high": float(found.high[row]),
+        "violated": int(found.violated[row]),
+    }

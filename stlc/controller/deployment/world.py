@@ -1,0 +1,219 @@
+"""The world of a deployment: what is true outside the model that the policy plans with.
+
+A system file names one as `test: {world: "traffic_grid.py:TrafficGrid"}`, a class in a Python file beside it
+that is imported only when that system is deployed. Without one, independent agents move as the model does and
+meet the `events` of the file.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stlc.controller.deployment.events import Events
+from stlc.controller.sketch import DECIDED, Scene, deciders
+from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.registry import closest
+
+if TYPE_CHECKING:
+    from stlc.dynamics.declaration.decl import SystemDecl
+    from stlc.dynamics.declaration.deployment import WorldRef
+    from stlc.dynamics.model.system import System
+
+
+class World(Protocol):
+    """What agents meet, and what they cannot plan for. States are the system's, float64, without timers."""
+
+    def reset(self) -> Tensor:
+        """Begin; (agents, n) states."""
+
+    def advance(self, x: Tensor, action: Tensor) -> Tensor:
+        """One step of the truth: (agents, n), (agents, m) -> (agents, n)."""
+
+    def progress(self) -> Mapping[str, float]:
+        """How much of the task got done since `reset`."""
+
+    def snapshot(self) -> Scene:
+        """What a picture of this instant needs: arrays that keep their shape through a deployment.
+
+        What belongs to an agent has the agents first: (agents, …).
+        """
+
+    def units(self) -> Mapping[str, str]:
+        """Units of entries of `progress` that have one."""
+
+    @staticmethod
+    def draw(axes: Any, scene: Scene, index: int) -> None:
+        """Draw frame `index` of snapshots stacked to (frames, …); `decision` is (frames, agents)."""
+
+
+@runtime_checkable
+class Choosing(Protocol):
+    """What a world has, too, where agents choose among ways to take it, such as the station to go to.
+
+    A choice is made whenever a plan is, and takes the one that can be planned for best.
+    """
+
+    def options(self) -> Tensor:
+        """The present states under every choice, (agents, k, n); option 0 is how things are."""
+
+    def choose(self, pick: Tensor) -> Tensor:
+        """Every agent takes an option, (agents,) int64; returns the states, (agents, n)."""
+
+
+@runtime_checkable
+class Redrawing(Protocol):
+    """What a world has, too, where an agent may be given another start before anything has moved."""
+
+    def redraw(self, rows: Tensor) -> Tensor:
+        """Draw the starts of some agents again, (k,) int64; returns all states, (agents, n).
+
+        Other agents keep theirs, unless they depend on those.
+        """
+
+
+@runtime_checkable
+class Charting(Protocol):
+    """What a world has, too, where plans can be drawn into its picture."""
+
+    def charted(self, states: Tensor) -> NDArray[np.float64]:
+        """Where planned states (agents, k, n) are in the picture as things are now, (agents, k, 2 or 3).
+
+        Row by row for the agents, from their present state on; NaN where the states are.
+        """
+
+
+class WorldType(Protocol):
+    """How a world is made: everything random in it comes from `generator`."""
+
+    draw: Callable[[Any, Scene, int], None]
+
+    def __call__(self, system: System, agents: int, generator: torch.Generator) -> World: ...
+
+
+class ModelWorld:
+    """Independent agents that move exactly as the model does, and the events of the system file."""
+
+    def __init__(self, system: System, agents: int, generator: torch.Generator) -> None:
+        self._system, self._agents, self._generator = system, agents, generator
+        self._events = Events(system.decl.test.events, system.names, system.dt)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._step = 0
+        self._counts = {event.name: 0.0 for event in self._system.decl.test.events if event.when is not None}
+
+    def reset(self) -> Tensor:
+        """Initial states as in training, (agents, n)."""
+        self._begin()
+        self._drawn = self._sampled(self._agents)
+        return self._happen(self._drawn)
+
+    def redraw(self, rows: Tensor) -> Tensor:
+        """Other initial states for some agents, (k,) -> (agents, n); what happens at once, happens anew."""
+        self._begin()
+        self._drawn = self._drawn.index_copy(0, rows, self._sampled(len(rows)))
+        return self._happen(self._drawn)
+
+    def advance(self, x: Tensor, action: Tensor) -> Tensor:
+        """One step of the model, then what happens to whom: (agents, n), (agents, m) -> (agents, n)."""
+        moved = self._system.step(x, action)
+        self._step += 1
+        return self._happen(moved)
+
+    def progress(self) -> Mapping[str, float]:
+        """How often each event that waits for a state has happened, over all agents."""
+        return dict(self._counts)
+
+    def units(self) -> Mapping[str, str]:
+        """Counts have none."""
+        return {}
+
+    def snapshot(self) -> Scene:
+        """The states, (agents, n), and the names of their columns, (n,)."""
+        return {"state": self._x.numpy(force=True), "names": np.array(self._system.names)}
+
+    def charted(self, states: Tensor) -> NDArray[np.float64]:
+        """The first two columns of planned states, (agents, k, 2)."""
+        return states[..., [0, min(1, states.shape[2] - 1)]].numpy(force=True)
+
+    @staticmethod
+    def draw(axes: Any, scene: Scene, index: int) -> None:
+        """Agents in the plane of the first two columns; `scene["state"]` is (frames, agents, n)."""
+        names, state = scene["names"][index], scene["state"]
+        decided = deciders(scene, index, state.shape[1])
+        second = min(1, state.shape[2] - 1)
+        for source, color in enumerate(DECIDED):
+            points = state[index][decided == source]
+            axes.scatter(points[:, 0], points[:, second], s=18, color=color, lw=0)
+        for column, limit in ((0, axes.set_xlim), (second, axes.set_ylim)):
+            low, high = float(state[..., column].min()), float(state[..., column].max())
+            limit(low - 0.05 * (high - low) - 1e-3, high + 0.05 * (high - low) + 1e-3)
+        axes.set(xlabel=str(names[0]), ylabel=str(names[second]))
+
+    def _sampled(self, count: int) -> Tensor:
+        return self._system.sample(count, generator=self._generator, dtype=torch.float64)
+
+    def _happen(self, x: Tensor) -> Tensor:
+        self._x, counts = self._events.apply(x, self._step, self._generator)
+        for name, count in counts.items():
+            self._counts[name] += count
+        return self._x
+
+
+_METHODS = ("reset", "advance", "progress", "units", "snapshot", "draw")
+
+
+def world_type(decl: SystemDecl) -> WorldType:
+    """The world that a system file names, else `ModelWorld`.
+
+    Raises:
+        SystemFileError: S206, the file or the class cannot be loaded or is no world.
+    """
+    return cast(WorldType, ModelWorld) if decl.test.world is None else _load(decl.test.world)
+
+
+def _load(reference: WorldRef) -> WorldType:
+    path, name = reference.path, reference.name
+    if not path.is_file():
+        raise _refused(reference, f"there is no file `{path}`")
+    module_name = f"stlc_world_{path.stem}"
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    if spec is None or spec.loader is None:
+        raise _refused(reference, f"`{path}` is not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[module_name] = module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[module_name]
+        raise _refused(reference, f"importing `{path}` fails", f"{type(error).__name__}: {error}") from error
+    found = getattr(module, name, None)
+    if not isinstance(found, type):
+        guess = closest(name, [key for key, value in vars(module).items() if isinstance(value, type)])
+        advice = f"did you mean `{guess}`?" if guess else ""
+        raise _refused(reference, f"`{path}` has no class `{name}`", advice=advice)
+    missing = [method for method in _METHODS if not callable(getattr(found, method, None))]
+    if missing:
+        raise _refused(reference, f"`{name}` in `{path}` is no world: it lacks {', '.join(missing)}")
+    return cast(WorldType, found)
+
+
+def _refused(reference: WorldRef, message: str, note: str = "", advice: str = "") -> SystemFileError:
+    return SystemFileError(
+        Diagnostic(
+            "S206",
+            message,
+            reference.span,
+            label="named here",
+            note=(note,) if note else (),
+            help=(advice,) if advice else (),
+        )
+    )

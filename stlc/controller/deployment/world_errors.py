@@ -1,0 +1,135 @@
+"""Whatever a world does wrong becomes a finding that points into its file: S207, or S302 for no numbers."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from traceback import extract_tb
+from types import CodeType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
+from stlc.files import read_source
+from stlc.source import Source, Span
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from stlc.controller.sketch import Scene
+
+
+@contextmanager
+def blamed(world: object, method: str, what: str) -> Iterator[None]:
+    """Whatever `method` of a world, a class or one that was made, raises becomes S207: it cannot `what`."""
+    try:
+        yield
+    except StlcError:
+        raise
+    except (Exception, SystemExit) as error:
+        place = _raised_at(error, _file_of(world)) or _defined_at(world, method)
+        note = f"{type(error).__name__}: {error}"
+        finding = Diagnostic("S207", f"the world cannot {what}: {error}", place, "here", note=(note,))
+        raise SystemFileError(finding) from error
+
+
+def states_of(world: object, method: str, given: object, size: tuple[int, int]) -> Tensor:
+    """What a method of a world has given as states, float64, (agents, n). Raises SystemFileError (S207)."""
+    if not isinstance(given, torch.Tensor):
+        raise wrong(world, method, f"gives {_article(given)}, not a tensor of shape {size}")
+    if given.shape != size:
+        raise wrong(world, method, f"gives states of shape {tuple(given.shape)}, not {size}")
+    with blamed(world, method, "give states"):
+        return given.detach().to("cpu", torch.float64)
+
+
+def require_numbers(world: object, method: str, x: Tensor, where: tuple[tuple[str, ...], str]) -> None:
+    """Raise SystemFileError (S302) where states (agents, n) hold NaN or infinity.
+
+    `where`: the names of the columns, and when it happened.
+    """
+    bad = ~torch.isfinite(x)
+    if not bool(bad.any()):
+        return
+    names, when = where
+    agent, column = torch.nonzero(bad)[0].tolist()
+    message = f"the world gives {x[agent, column]:g} for `{names[column]}` of agent {agent} {when}"
+    raise SystemFileError(Diagnostic("S302", message, _defined_at(world, method), "by this"))
+
+
+def scene_of(world: object, given: Scene, before: Mapping[str, NDArray[Any]] | None) -> dict[str, Any]:
+    """A snapshot as plain arrays that have kept their names and shapes. Raises SystemFileError (S207)."""
+    with blamed(world, "snapshot", "give a snapshot"):
+        scene = {str(name): np.asarray(value) for name, value in given.items()}
+    for name, value in scene.items():
+        if value.dtype == object:
+            raise wrong(world, "snapshot", f"gives `{name}`, which is no array of numbers")
+    if before is not None:
+        then, now = _shapes(before), _shapes(scene)
+        for name in then | now:
+            if then.get(name) != now.get(name):
+                told = f"gives `{name}` of shape {now.get(name)}, and {then.get(name)} before"
+                raise wrong(world, "snapshot", told)
+    return scene
+
+
+def wrong(world: object, method: str, what: str) -> SystemFileError:
+    """A method of a world does what it should not."""
+    message = f"`{method}` of the world {what}"
+    return SystemFileError(Diagnostic("S207", message, _defined_at(world, method), "this method"))
+
+
+def _shapes(scene: Mapping[str, NDArray[Any]]) -> dict[str, tuple[int, ...]]:
+    return {name: value.shape for name, value in scene.items()}
+
+
+def _article(given: object) -> str:
+    name = type(given).__name__
+    return "nothing" if given is None else f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
+
+
+# ----------------------------------------------------------------------- places
+
+
+def _class_of(world: object) -> type:
+    return world if isinstance(world, type) else type(world)
+
+
+def _file_of(world: object) -> str:
+    module = sys.modules.get(_class_of(world).__module__)
+    return getattr(module, "__file__", None) or ""
+
+
+def _raised_at(error: BaseException, file: str) -> Span | None:
+    """The line of the world's file from which an error came, the innermost one."""
+    lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == file]
+    return _line(file, lines[-1]) if lines and lines[-1] else None
+
+
+def _defined_at(world: object, method: str) -> Span | None:
+    """The line of a world's file where a method begins; None where it is not one of its own."""
+    code = getattr(getattr(_class_of(world), method, None), "__code__", None)
+    if not isinstance(code, CodeType) or Path(__file__).parents[1] in Path(code.co_filename).parents:
+        return None
+    return _line(code.co_filename, code.co_firstlineno)
+
+
+def _line(file: str, number: int) -> Span | None:
+    """A line of a file without the blanks around it; None where it cannot be read."""
+    try:
+        text = read_source(Path(file)).text
+    except StlcError:
+        return None
+    near = os.path.relpath(file)
+    source = Source(file if near.startswith("..") else near, text)
+    if number > len(source.line_starts):
+        return None
+    start, line = source.line_starts[number - 1], source.line(number)
+    begin = start + len(line) - len(line.lstrip())
+    return source.span(begin, start + len(line.rstrip()))

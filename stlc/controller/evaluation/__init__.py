@@ -1,0 +1,1 @@
+"""What plans and closed loops are worth."""

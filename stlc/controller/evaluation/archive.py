@@ -1,0 +1,152 @@
+"""A deployment on disk: `trace.npz`, `scene.npz` and `eval/simulate.json` in the folder of its run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from stlc.compile.frontend.modules import spec_sha256
+from stlc.controller.evaluation.executed import as_foreseen
+from stlc.controller.training.run import SPEC, SYSTEM, read_library
+from stlc.files import atomic_path, read_source
+from stlc.grammar import ast
+from stlc.grammar.parse.parser import parse
+from stlc.source import Source
+from stlc.trace import Trace, TraceMeta, save_trace
+from stlc.version import __version__
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from stlc.controller.deployment.simulator import Recording, Setting
+    from stlc.controller.evaluation.rules import Rules
+    from stlc.controller.training.run import Run
+    from stlc.dynamics.model.system import System
+
+TRACE = "trace.npz"
+SCENE = "scene.npz"
+UNGUARDED = ("eval/unguarded_trace.npz", "eval/unguarded_scene.npz")
+"""Trace and scene of the first seed without the guard, beside those with it."""
+RESULT = "eval/simulate.json"
+
+
+def trace_of(run: Run, recording: Recording, setting: Setting, rules: Rules | None = None) -> Trace:
+    """All agents of all seeds as traces, decisions beside them.
+
+    Extras, each (traces, steps): `action.NAME` for every control, `decision` (0 policy, 1 backup, 2 safest,
+    3 polished), `t0`, `plan_rho` of the plan that was followed, `policy_rho` of what the policy proposed,
+    `foreseen` (1 where the world did as the model says); and (traces,): `seed`, `agent`.
+    """
+    system = run.task.system
+    states = np.moveaxis(recording.states, -1, 0)
+    actions = zip(system.control_names, np.moveaxis(_commanded(system, recording), -1, 0), strict=True)
+    rows = np.arange(len(recording.states))
+    return Trace(
+        signature=system.signature,
+        dt=run.task.dt,
+        data=dict(zip(run.task.names, states, strict=True)),
+        extras={
+            **{f"action.{name}": action for name, action in actions},
+            "decision": recording.source,
+            "t0": recording.t0,
+            "plan_rho": recording.rho,
+            "policy_rho": recording.policy_rho,
+            "foreseen": as_foreseen(run.task, recording).astype(np.int8),
+            "seed": np.array(setting.seeds)[rows // recording.agents],
+            "agent": rows % recording.agents,
+        },
+        meta=_meta(run, setting, rules),
+    )
+
+
+def _commanded(system: System, recording: Recording) -> NDArray[np.float64]:
+    """What actuators got, (rows, steps, m)."""
+    states = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
+    planned = torch.from_numpy(recording.actions)
+    return system.commanded(states, planned.flatten(0, 1)).reshape(planned.shape).numpy()
+
+
+def save_trace_of(
+    run: Run,
+    recording: Recording,
+    setting: Setting,
+    also: Path | None = None,
+    *,
+    rules: Rules | None = None,
+) -> list[Path]:
+    """Write the trace into the folder of the run, and to `also`; returns where. Raises MissingError.
+
+    `rules` travel in the trace, so that whoever checks it judges what was driven by them.
+    """
+    trace = trace_of(run, recording, setting, rules)
+    paths = [run.dir.path / TRACE, *([also] if also is not None else [])]
+    for path in paths:
+        save_trace(path, trace)
+    return paths
+
+
+def save_unguarded(
+    run: Run, recording: Recording | None, setting: Setting, rules: Rules | None = None
+) -> None:
+    """Write what the first seed drove without a guard, or remove what an older deployment left of it.
+
+    Raises:
+        MissingError: R201, a file cannot be written.
+    """
+    trace_path, scene_path = (run.dir.path / name for name in UNGUARDED)
+    if recording is None:
+        for path in (trace_path, scene_path):
+            path.unlink(missing_ok=True)
+        return
+    trace = trace_of(run, recording, setting, rules)
+    first = slice(0, recording.agents)
+    data = {name: rows[first] for name, rows in trace.data.items()}
+    extras = {name: rows[first] for name, rows in trace.extras.items()}
+    save_trace(trace_path, replace(trace, data=data, extras=extras))
+    save_scene(scene_path, recording.scene)
+
+
+def _meta(run: Run, setting: Setting, rules: Rules | None) -> TraceMeta:
+    record, spec = run.dir.record(), read_source(run.dir.path / SPEC).text
+    library = read_library(run.dir)
+    return TraceMeta(
+        spec_name=run.task.compiled.name,
+        spec_path=str(record.get("spec_path", "")),
+        spec_text=spec,
+        spec_library=library,
+        spec_set=_set_in(spec, run),
+        spec_hash=spec_sha256(spec, library),
+        judge_path="" if rules is None else rules.path,
+        judge_text="" if rules is None else rules.spec.source.text,
+        judge_library={} if rules is None else dict(rules.spec.library or {}),
+        judge_set={} if rules is None else dict(rules.overrides),
+        system_name=run.task.system.name,
+        system_path=str(record.get("system_path", "")),
+        system_text=read_source(run.dir.path / SYSTEM).text,
+        system_hash=run.task.system.hash,
+        run=run.dir.name,
+        seed=setting.seeds[0],
+        horizon=run.task.horizon,
+        dt=run.task.dt,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        stlc_version=__version__,
+    )
+
+
+def _set_in(spec: str, run: Run) -> dict[str, str]:
+    """Constants of the specification that the run, its scenario or the deployment changed."""
+    own = {item.name for item in parse(Source(SPEC, spec)).items if isinstance(item, (ast.Const, ast.Param))}
+    changed = run.task.system.decl.overrides.items()
+    return {name: text for name, text in changed if name in own and name not in run.task.names}
+
+
+def save_scene(path: Path, scene: Mapping[str, NDArray[Any]]) -> None:
+    """Write stacked snapshots as `.npz`; what is not a plain array is refused. Raises MissingError (R201)."""
+    with atomic_path(path) as temporary:
+        np.savez_compressed(temporary, allow_pickle=False, **scene)

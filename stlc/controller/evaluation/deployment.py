@@ -1,0 +1,296 @@
+"""A deployment over several seeds: what was planned, driven and decided, and how fast."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.deployment.simulator import Recorder, Recording, Setting, Watch, drive
+from stlc.controller.deployment.world import world_type
+from stlc.controller.evaluation.executed import Executed, judge_executed
+from stlc.controller.evaluation.rules import Drives, Rules, drives_json, drives_of_plans, judge_drives
+from stlc.controller.evaluation.stats import Interval
+from stlc.controller.guard.feasibility import solvable
+from stlc.controller.guard.guard import SOURCES, Guard, Mode
+from stlc.controller.guard.plan_repair import Limits
+
+if TYPE_CHECKING:
+    from stlc.controller.policies.policy import Policy
+    from stlc.controller.problem.task import Task
+
+LATENCY_SAMPLES = 200
+LATENCY_SECONDS = 5.0
+"""After so long the samples that there are have to do."""
+
+METRICS = {
+    "plan_accuracy": "share of followed plans that satisfy the specification",
+    "policy_accuracy": "share of plans that the policy proposed and that satisfy it",
+    "plan_safety": "share of followed plans that satisfy the safety requirements",
+    "feasible": "share of visited states where the followed plan, or one that a search finds, does",
+    "feasible_followed": "share of those whose followed plan does",
+    "executed": "share of agents that satisfied it at every start",
+    "executed_safe": "share of agents that satisfied the safety requirements at every start",
+    "savable": "share of agents that were driven safely, or from whose start a search finds a safe plan",
+    "saved": "share of those that were driven safely",
+    "saved_starts": "share of the starts of those from which what was driven satisfies them",
+    "executed_starts": "share of starts from which what was driven satisfies it",
+    "executed_safe_starts": "share of starts from which it satisfies the safety requirements",
+    "foreseen": "share of starts from which the world did as the model says, through the window",
+    "foreseen_starts": "share of those from which what was driven satisfies the specification",
+    "foreseen_safe_starts": "share of those from which it satisfies the safety requirements",
+    "quiet": "share of starts from which the world did nothing but what the truth of the dynamics does",
+    "quiet_safe_starts": "share of those from which what was driven satisfies the safety requirements",
+}
+"""What the shares mean; one of nothing is left out."""
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """Seconds a decision for one agent alone, over states that were visited."""
+
+    median: float
+    p99: float
+    samples: int
+
+
+@dataclass(frozen=True, slots=True)
+class Unsafe:
+    """An agent that was not driven safely: its seed (by position), its number, and whether it is savable."""
+
+    seed: int
+    agent: int
+    savable: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Deployment:
+    """One guard in all seeds.
+
+    Attributes:
+        guard: which.
+        recording: what happened.
+        metrics: name -> mean over seeds with its interval; see `METRICS`. Further there are `holds.NAME`, the
+            share of starts that satisfy one requirement, and the progress of the world.
+        decisions: share of decisions by source, and those of the backup by T0 ("backup T0=1").
+        latency: of one decision.
+        unsafe: the agents that were not driven safely.
+        drives: who obeyed the rules that drives are judged by.
+    """
+
+    guard: Mode
+    recording: Recording
+    metrics: Mapping[str, Interval]
+    decisions: Mapping[str, float]
+    latency: Latency
+    unsafe: tuple[Unsafe, ...]
+    drives: Drives
+
+
+class InterruptedDeploymentError(Exception):
+    """A deployment ended early; carries what happened until then."""
+
+    def __init__(self, recording: Recording | None) -> None:
+        super().__init__("the deployment ended early")
+        self.recording = recording
+
+
+def deploy(
+    task: Task,
+    policy: Policy,
+    setting: Setting,
+    guard: Mode,
+    *,
+    watch: Watch | None = None,
+    rules: Rules | None = None,
+) -> Deployment:
+    """Deploy a policy in the world of its system; `watch` is told every step, `rules` judge what was driven.
+
+    Raises:
+        InterruptedDeploymentError: from whatever has ended it early, which is its `__cause__`: a
+            SystemFileError or RunError of `drive`, or an interruption, also one while it is judged.
+        SystemFileError: S206, the world cannot be loaded.
+    """
+    make = world_type(task.system.decl)
+    limits = Limits(seconds=setting.limit, margin=setting.margin, paper=setting.paper_limit)
+    guarded = Guard(task, policy, guard, limits=limits)
+    recorder = Recorder(setting.agents)
+    try:
+        drive(guarded, make, setting, recorder, watch)
+        recording = recorder.recording()
+        assert recording is not None
+        return judged(guarded, recording, setting.ceiling, rules)
+    except BaseException as error:
+        raise InterruptedDeploymentError(recorder.recording()) from error
+
+
+def judged(guard: Guard, recording: Recording, ceiling: int = 0, rules: Rules | None = None) -> Deployment:
+    """What is to be known of a recorded deployment under a guard; see `feasible_states` for `ceiling`.
+
+    Without `rules` a drive obeys where it satisfies the specification of plans from every start.
+    """
+    executed = judge_executed(guard.task, recording)
+    drives = (
+        drives_of_plans(executed.rules, executed.savable, guard.task.dt)
+        if rules is None
+        else judge_drives(rules, guard.task, recording, executed.savable)
+    )
+    return Deployment(
+        guard.mode,
+        recording,
+        measure(recording, executed, feasible_states(guard.task, recording, ceiling)),
+        decided(recording),
+        latency(guard, recording),
+        unsafe_agents(executed, recording.agents),
+        drives,
+    )
+
+
+def unsafe_agents(executed: Executed, agents: int) -> tuple[Unsafe, ...]:
+    """Who was not driven safely, of so many agents a seed."""
+    rows = np.flatnonzero(~executed.agents(executed.safety)).tolist()
+    return tuple(Unsafe(*divmod(row, agents), bool(executed.savable[row])) for row in rows)
+
+
+def feasible_states(task: Task, recording: Recording, count: int) -> NDArray[np.float64]:
+    """Whether some plan satisfies the specification, in `count` visited states, evenly spread: (rows, steps).
+
+    1: the plan that was followed does, or a search has found one; 0: neither; NaN: nobody has looked.
+    """
+    known = np.full(recording.rho.shape, math.nan)
+    if count:
+        known.ravel()[np.linspace(0, known.size - 1, min(count, known.size)).astype(int)] = 1.0
+    open_ = np.isfinite(known) & ~(recording.rho >= -TOLERANCE)
+    known[open_] = solvable(task, torch.from_numpy(recording.states[:, :-1][open_])).numpy()
+    return known
+
+
+def measure(
+    recording: Recording, executed: Executed, feasible: NDArray[np.float64] | None = None
+) -> dict[str, Interval]:
+    """All metrics over the seeds that have them: a share of nothing is none, and so is what is not finite.
+
+    Args:
+        recording: what happened.
+        executed: the verdicts on it.
+        feasible: what `feasible_states` knows.
+    """
+    each = [_of_seed(recording, executed, seed) for seed in range(len(recording.progress))]
+    if feasible is not None:
+        for seed, shares in enumerate(each):
+            rows = slice(seed * recording.agents, (seed + 1) * recording.agents)
+            shares |= _ceiling(feasible[rows], recording.rho[rows] >= -TOLERANCE)
+    found = {
+        name: [seed[name] for seed in each if math.isfinite(seed.get(name, math.nan))] for name in each[0]
+    }
+    return {name: Interval.of(values) for name, values in found.items() if values}
+
+
+def _of_seed(recording: Recording, executed: Executed, seed: int) -> dict[str, float]:
+    rows = slice(seed * recording.agents, (seed + 1) * recording.agents)
+    names, safety = tuple(executed.rules), executed.safety
+    starts, foreseen = executed.starts(names)[:, rows], executed.foreseen[:, rows]
+    safe_starts = executed.starts(safety)[:, rows]
+    shares = {
+        "plan_accuracy": recording.rho[rows] >= -TOLERANCE,
+        "policy_accuracy": recording.policy_rho[rows] >= -TOLERANCE,
+        "plan_safety": recording.safe[rows],
+        "executed": executed.agents(names)[rows],
+        "executed_safe": executed.agents(safety)[rows],
+        "savable": executed.savable[rows],
+        "saved": executed.agents(safety)[rows][executed.savable[rows]],
+        "saved_starts": safe_starts[:, executed.savable[rows]],
+        "executed_starts": starts,
+        "executed_safe_starts": safe_starts,
+        "foreseen": foreseen,
+        "foreseen_starts": starts[foreseen],
+        "foreseen_safe_starts": safe_starts[foreseen],
+    }
+    if executed.quiet is not None:
+        quiet = executed.quiet[:, rows]
+        shares |= {"quiet": quiet, "quiet_safe_starts": safe_starts[quiet & executed.savable[rows]]}
+    shares |= {f"holds.{name}": held[:, rows] for name, held in executed.rules.items()}
+    found = {name: float(mask.mean()) if mask.size else math.nan for name, mask in shares.items()}
+    return found | {name: float(value) for name, value in recording.progress[seed].items()}
+
+
+def _ceiling(feasible: NDArray[np.float64], good: NDArray[np.bool_]) -> dict[str, float]:
+    looked, can = np.isfinite(feasible), feasible == 1.0
+    shares = {"feasible": feasible[looked], "feasible_followed": good[can]}
+    return {name: float(found.mean()) if found.size else math.nan for name, found in shares.items()}
+
+
+def decided(recording: Recording) -> dict[str, float]:
+    """Who decided, as shares of all decisions."""
+    found = {name: float((recording.source == index).mean()) for index, name in enumerate(SOURCES)}
+    backup = recording.source == SOURCES.index("backup")
+    for length in np.unique(recording.t0[backup]).tolist():
+        found[f"backup T0={length}"] = float((backup & (recording.t0 == length)).mean())
+    return found
+
+
+def latency(guard: Guard, recording: Recording, samples: int = LATENCY_SAMPLES) -> Latency:
+    """Time decisions for one agent alone in states drawn evenly from those visited, some seconds at most.
+
+    Each goes on from a decision in the state before, as in the deployment; that one is not timed.
+    """
+    rows, steps = recording.actions.shape[:2]
+    picked = np.linspace(0, rows * steps - 1, min(samples, rows * steps)).astype(int)
+    picked, seconds, stop = np.random.default_rng(0).permutation(picked), [], perf_counter() + LATENCY_SECONDS
+    for row, step in zip(picked // steps, picked % steps, strict=True):
+        before, now = torch.from_numpy(recording.states[row, [max(step - 1, 0), step]])[:, None]
+        begun = guard.decide(before).later()
+        begin = perf_counter()
+        if recording.options is not None:
+            guard.prefer(torch.from_numpy(recording.options[row, step])[None], begun)
+        guard.decide(now, begun)
+        seconds.append(perf_counter() - begin)
+        if perf_counter() > stop:
+            break
+    return Latency(float(np.median(seconds)), float(np.quantile(seconds, 0.99)), len(seconds))
+
+
+def as_json(
+    deployments: Mapping[Mode, Deployment], setting: Setting, facts: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The document of `eval/simulate.json`."""
+    return {
+        **facts,
+        "seeds": list(setting.seeds),
+        "agents": setting.agents,
+        "steps": setting.steps,
+        "replan": setting.replan,
+        "time_limit": setting.limit,
+        "paper_time_limit": setting.paper_limit,
+        "ceiling": setting.ceiling,
+        "margin": dict(setting.margin),
+        "interval": "95 %, Student's t over the deployment seeds",
+        "guards": {
+            name: {
+                "metrics": {
+                    key: {"mean": m.mean, "low": m.low, "high": m.high, "values": list(m.values)}
+                    for key, m in found.metrics.items()
+                },
+                "drives": drives_json(found.drives, setting.seeds, setting.agents),
+                "units": dict(found.recording.units),
+                "decisions": dict(found.decisions),
+                "unsafe": [
+                    {"seed": setting.seeds[each.seed], "agent": each.agent, "savable": each.savable}
+                    for each in found.unsafe
+                ],
+                "latency": {
+                    "median": found.latency.median,
+                    "p99": found.latency.p99,
+                    "samples": found.latency.samples,
+                },
+            }
+            for name, found in deployments.items()
+        },
+    }

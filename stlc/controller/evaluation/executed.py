@@ -1,0 +1,121 @@
+"""What was driven, judged exactly: executed satisfaction, and how much of it went as the model foresaw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from stlc.compile.augment.lift import recorded
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir.horizon import reach
+from stlc.compile.lowering.lower import lower
+from stlc.compile.lowering.simplify import simplify
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.deployment.batched import SURPRISE
+from stlc.controller.guard.feasibility import savable as search_safe
+
+if TYPE_CHECKING:
+    from stlc.compile.pipeline import Rule
+    from stlc.controller.deployment.simulator import Recording
+    from stlc.controller.problem.task import Task
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Executed:
+    """Verdicts on recorded agents. A requirement that mentions T is judged at every start whose window fits.
+
+    Attributes:
+        rules: requirement -> (starts, rows), whether it holds there; one start where it does not mention T.
+        safety: names of the requirements that are tagged `@safety`.
+        foreseen: (starts, rows), whether the world did as the model says all through the window from there.
+        quiet: (starts, rows), whether the world did nothing through the window but what the truth of the
+            dynamics does, however wrong the model is; None where that was not recorded.
+        savable: (rows,), who was driven safely, or could have been from its first state by a known plan.
+    """
+
+    rules: Mapping[str, Mask]
+    safety: tuple[str, ...]
+    foreseen: Mask
+    savable: Mask
+    quiet: Mask | None = None
+
+    def agents(self, names: Sequence[str]) -> Mask:
+        """(rows,), who satisfies all of `names` at all starts."""
+        held = [self.rules[name].all(0) for name in names]
+        return np.logical_and.reduce(held) if held else np.ones(self.foreseen.shape[1], dtype=bool)
+
+    def starts(self, names: Sequence[str]) -> Mask:
+        """(starts, rows), where all of `names` hold; those that do not mention T count at every start."""
+        held = np.ones_like(self.foreseen)
+        for name in names:
+            held &= self.rules[name][: len(held)] if len(self.rules[name]) > 1 else self.rules[name]
+        return held
+
+
+def judge_executed(task: Task, recording: Recording, *, savable: Mask | None = None) -> Executed:
+    """Judge what happened. Without a window that fits, there are no starts.
+
+    `savable`: (rows,) from whose first states a safe plan is known; a search finds them if not given.
+    """
+    columns = dict(zip(task.names, np.moveaxis(recording.states, -1, 0).transpose(0, 2, 1), strict=True))
+    starts = max(recording.steps + 1 - task.horizon, 0)
+    rules = {rule.name: _held(as_driven(rule, task), columns, task.horizon) for rule in task.rules}
+    safety = tuple(rule.name for rule in task.compiled.safety)
+    found = savable
+    if found is None:
+        found = search_safe(task, torch.from_numpy(recording.states[:, 0])).numpy()
+    quiet = None if recording.quiet is None else _throughout(recording.quiet, task, starts)
+    foreseen = _throughout(as_foreseen(task, recording), task, starts)
+    executed = Executed(rules, safety, foreseen, found, quiet)
+    return replace(executed, savable=found | executed.agents(safety))
+
+
+def as_driven(rule: Rule, task: Task) -> Rule:
+    """A requirement on the mission clock is judged as it was written, once, on all that was driven."""
+    if not rule.absolute:
+        return rule
+    lowered = lower(recorded(rule.typed.formula), task.compiled.grid, [])
+    written = simplify(lowered)
+    return replace(rule, formula=written, lowered=lowered, reach=reach(written).future, windowed=False)
+
+
+def _held(rule: Rule, columns: Mapping[str, NDArray[Any]], horizon: int) -> Mask:
+    """Whether one requirement holds, (starts, rows)."""
+    samples, rows = next(iter(columns.values())).shape
+    if not rule.windowed:
+        return _margin(rule, columns, 1) >= -TOLERANCE
+    count = samples - max(horizon, rule.reach)
+    if count <= 0:
+        return np.ones((0, rows), dtype=bool)
+    if not rule.uses_end:
+        return _margin(rule, columns, count) >= -TOLERANCE
+    windows = ({name: column[k : k + horizon + 1] for name, column in columns.items()} for k in range(count))
+    return np.concatenate([_margin(rule, window, 1) for window in windows]) >= -TOLERANCE
+
+
+def _margin(rule: Rule, columns: Mapping[str, NDArray[Any]], count: int) -> NDArray[Any]:
+    (margin,) = evaluate([rule.formula], columns, ops=NUMPY, count=count, end="truncate")
+    return np.broadcast_to(margin, (count, next(iter(columns.values())).shape[1]))
+
+
+def as_foreseen(task: Task, recording: Recording) -> Mask:
+    """Whether the world did at a step what the model says, (rows, steps)."""
+    before = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
+    action = torch.from_numpy(recording.actions).flatten(0, 1)
+    predicted = task.system.step(before, action).numpy(force=True).reshape(recording.states[:, 1:].shape)
+    return np.asarray((np.abs(predicted - recording.states[:, 1:]) <= SURPRISE).all(-1))
+
+
+def _throughout(right: Mask, task: Task, starts: int) -> Mask:
+    """Where it was so at every step of the window: (rows, steps) -> (starts, rows)."""
+    so_far = np.concatenate([np.zeros((1, len(right)), dtype=int), np.cumsum(right.T, 0)])
+    whole: Mask = so_far[task.horizon : task.horizon + starts] - so_far[:starts] == task.horizon
+    return whole

@@ -1,0 +1,205 @@
+"""The last word on a policy: exact verdicts in float64 on states that training never drew from."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from stlc.controller.guard.feasibility import Hunt
+from stlc.controller.problem.task import satisfied
+from stlc.controller.training.config import HELD_OUT, HELD_OUT_SEED
+from stlc.controller.training.exploration import EFFORTS, Exploration
+from stlc.controller.training.local_search import Searcher
+from stlc.controller.training.missions import mission_steps, visited
+from stlc.files import write_atomic
+from stlc.native import never
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from torch import Tensor
+
+    from stlc.controller.policies.policy import Mlp
+    from stlc.controller.problem.task import Task
+    from stlc.native import Stop
+
+CEILING_TRIES = 8000
+"""Plans that are tried for a held-out state before it counts as infeasible."""
+MOST_SEARCHED = 1024
+"""Failing states that are searched: they speak for the others, to 1.6 % in one standard error."""
+EXPLORED = 4
+"""Failing states that are explored where no plan is known for any."""
+ENOUGH = 1e-4
+CHUNK = 256
+"""Failing states that are searched together."""
+TORCH_CHUNK = 32
+"""The same where torch does the work."""
+JUDGED = 500
+"""States that are judged together; between these groups the judging can be ended."""
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """How a policy does on held-out states.
+
+    Attributes:
+        accuracy: share whose plan satisfies the specification (rho >= -1e-6 in float64).
+        interval: its 95 % Wilson interval.
+        requirements: share per requirement.
+        feasible: share for which some satisfying plan is known, the policy's or one that search found; where
+            not all failing states were searched, those that were, in random order, speak for the others.
+        states: (n, dim), float64.
+        rho: (n,).
+        each: (n, requirements).
+        known: states for which some satisfying plan is known, (n,) bool.
+        searched: states that the policy solves or that were searched, (n,) bool.
+        endless: of missions without end, the seconds of them that were driven for the states; else None.
+    """
+
+    accuracy: float
+    interval: tuple[float, float]
+    requirements: dict[str, float]
+    feasible: float
+    states: Tensor
+    rho: Tensor
+    each: Tensor
+    known: Tensor
+    searched: Tensor
+    endless: float | None = None
+
+    def summary(self) -> dict[str, object]:
+        """The plain numbers, for `run.json`."""
+        return {
+            "accuracy": self.accuracy,
+            "interval": list(self.interval),
+            "held_out": self.states.shape[0],
+            "requirements": self.requirements,
+            "feasible": self.feasible,
+            "searched": int(self.searched.sum()),
+            **({} if self.endless is None else {"judged_seconds": self.endless}),
+        }
+
+
+def score(
+    policy: Mlp,
+    *,
+    n: int = HELD_OUT,
+    seed: int = HELD_OUT_SEED,
+    enough: Stop = never,
+) -> Score:
+    """Judge a policy on `n` held-out states of seed `seed`; of missions, on states along held-out ones.
+
+    The failing states are searched for any satisfying plan, in random order, until `enough` says so, at most
+    `MOST_SEARCHED` of them. A search begins with the plan of the policy. Where that leads nowhere it goes on
+    as if there were no policy (in native code, which is fast enough for it), so that what counts as feasible
+    hardly depends on how well the policy is trained. States that were searched while the time ran out do not
+    count as searched, unless they are the first. Where `enough` is said even before, fewer states are judged.
+    """
+    task = policy.task
+    if task.compiled.timers:
+        states = visited(policy, n, seed, enough)
+    else:
+        states = task.sample(n, seed=seed, dtype=torch.float64)
+    states, plans, rho, each = _judged(policy, states, enough)
+    n, good = len(states), satisfied(rho)
+    shares = satisfied(each).double().mean(0)
+    generator = torch.Generator().manual_seed(HELD_OUT_SEED + 1)
+    failing = (~good).nonzero()[:, 0]
+    failing = failing[torch.randperm(len(failing), generator=generator)]
+    known, searched = good.clone(), good.clone()
+    searcher, hunt = Searcher(task, generator, enough=ENOUGH), Hunt(task)
+    size = TORCH_CHUNK if task.native is None else CHUNK
+    for number, chunk in enumerate(torch.split(failing[:MOST_SEARCHED], size)):
+        if number and enough():
+            break
+        start, bank = plans[chunk].float(), plans[good].float()
+        begun = states[chunk].float(), start, bank
+        found = searcher.repair(*begun, tries=CEILING_TRIES, stop=enough).solved
+        left = torch.nonzero(~found)[:, 0]
+        if len(left) and task.native is not None and not enough():
+            found[left] = hunt.plans(states[chunk[left]], enough)[1]
+        if number and enough():
+            break
+        known[chunk], searched[chunk] = found, True
+    if len(failing) and not bool(known.any()) and not enough():
+        _explore(task, states, failing, known, enough)
+        searched |= known
+    accuracy = float(good.double().mean())
+    return Score(
+        accuracy=accuracy,
+        interval=wilson(accuracy, n),
+        endless=None if task.compiled.recurring is None else mission_steps(task) * task.dt,
+        requirements={rule.name: float(share) for rule, share in zip(task.rules, shares, strict=True)},
+        feasible=_feasible(known, searched, failing),
+        states=states,
+        rho=rho,
+        each=each,
+        known=known,
+        searched=searched,
+    )
+
+
+def _judged(policy: Mlp, states: Tensor, enough: Stop) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """States (k, dim), the plans that are followed from there, their robustness, and that of requirements.
+
+    All states, or as many as are judged before `enough` is said, the first ones in any case.
+    """
+    plans: list[Tensor] = []
+    rho: list[Tensor] = []
+    each: list[Tensor] = []
+    for part in torch.split(states, JUDGED):
+        if rho and enough():
+            break
+        followed, judged = policy.plan_judged(part)
+        plans.append(followed)
+        rho.append(judged.rho)
+        each.append(judged.requirements)
+    count = sum(map(len, rho))
+    return states[:count], torch.cat(plans), torch.cat(rho), torch.cat(each)
+
+
+def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough: Stop) -> None:
+    """Mark failing states for which exploration finds a plan; starts of missions are tried first."""
+    clocks = [task.names.index(timer.name) for timer in task.system.timers if timer.kind == "clock"]
+    age = states[failing][:, clocks].sum(1)
+    first = failing[age.argsort(stable=True)[:EXPLORED]]
+    generator = torch.Generator().manual_seed(HELD_OUT_SEED + 2)
+    found = Exploration(task).solved(states[first], EFFORTS[1], generator, ENOUGH, enough)
+    known[first] = (states[first][:, None] == found.states[None]).all(2).any(1)
+
+
+def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:
+    """The share of states that are known to be feasible; failing ones stand for those not searched."""
+    found, tried = int(known[failing].sum()), int(searched[failing].sum())
+    left = len(failing) - tried
+    return (int(known.sum()) + left * found / max(1, tried)) / len(known)
+
+
+def wilson(share: float, n: int, z: float = 1.96) -> tuple[float, float]:
+    """Wilson's score interval of a share of `n` trials (E. B. Wilson, 1927)."""
+    middle = (share + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
+    return 0.0 if share == 0.0 else max(0.0, middle - half), 1.0 if share == 1.0 else min(1.0, middle + half)
+
+
+def save_states(path: Path, task: Task, result: Score) -> None:
+    """Keep the states and their verdicts, so that a picture can show where a policy fails."""
+    meta = {"names": list(task.names), "requirements": [rule.name for rule in task.rules]}
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        x0=result.states.numpy(),
+        rho=result.rho.numpy(),
+        requirements=result.each.numpy(),
+        known=result.known.numpy(),
+        searched=result.searched.numpy(),
+        meta=np.array(json.dumps(meta)),
+    )
+    path.parent.mkdir(exist_ok=True)
+    write_atomic(path, buffer.getvalue())

@@ -1,0 +1,412 @@
+"""The rules that drives are judged by: the specification of `test: {judge: …}`, and who obeyed it.
+
+Plans are judged window by window by the specification that they are made for. What was driven is judged once,
+from its first sample to its last, by another one, which may look back and knows what a world does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import torch
+
+from stlc.compile.frontend.modules import file_of, library_of
+from stlc.compile.pipeline import compile_spec
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.guard.feasibility import safely, solvable
+from stlc.controller.training.run import INDEX, read_library, save_library
+from stlc.diagnostics import Diagnostic, RunError, SystemFileError, UsageError
+from stlc.dynamics.schema.schema import load_system_decl
+from stlc.files import read_source, write_atomic
+from stlc.grammar import ast
+from stlc.grammar.parse.parser import parse
+from stlc.monitor.explain.report import explain
+from stlc.monitor.verdict import Monitor
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from stlc.controller.deployment.simulator import Recording
+    from stlc.controller.problem.task import Task
+    from stlc.controller.training.run import Run
+    from stlc.dynamics.declaration.decl import SystemDecl
+    from stlc.dynamics.declaration.deployment import JudgeRef
+    from stlc.monitor.judgement import Verdict
+    from stlc.rundir import RunDir
+
+JUDGE = "judge"
+_INDEX = f"{JUDGE}/{INDEX}"
+MOST_TIMED = 200
+"""Broken rules of one guard whose moment is looked for: each takes some milliseconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """A specification of drives.
+
+    Attributes:
+        spec: as parsed, with the texts that it imports.
+        path: where it was read when the run was made, as a person finds it.
+        overrides: those of its constants that the run or the deployment changed, as texts.
+    """
+
+    spec: ast.Spec
+    path: str
+    overrides: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Of the specification."""
+        return self.spec.name or Path(self.path).stem
+
+    @property
+    def docs(self) -> dict[str, str]:
+        """Rule -> what its `##` comment says."""
+        return {item.name: " ".join((item.doc or "").split()) for item in _requirements(self.spec)}
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """The end of what could be done before a rule was broken.
+
+    A plan is known where the one that was followed keeps what plans are asked for (what is tagged `@safety`,
+    where such a rule was broken), or a search finds one.
+
+    Attributes:
+        why: `start`: no plan is known at any instant before. `told`: the plan that was followed was such a
+            plan; then the world did more than move on (an obstacle came into view), and since then none is
+            known. `later`: the same where the world only moved on: a window of plans ended too early to see
+            it, or the model is not the truth. `missed`: a plan was known, and another one was followed.
+        time: since when no plan is known, seconds from the start; of `missed` when the last one was.
+    """
+
+    why: Literal["start", "told", "later", "missed"]
+    time: float
+
+
+@dataclass(frozen=True, slots=True)
+class Broken:
+    """A drive that broke rules.
+
+    Attributes:
+        row: of the recording.
+        rules: rule -> when, in seconds from the start; None where nobody has looked.
+        lost: when it was lost, and to what; None where plans were good until a rule was broken, or where
+            nobody has looked.
+    """
+
+    row: int
+    rules: Mapping[str, float | None]
+    lost: Lost | None = None
+
+    @property
+    def excused(self) -> bool:
+        """Whether it does not count against a controller: lost from the start, or to what the world told."""
+        return self.lost is not None and self.lost.why in ("start", "told")
+
+
+@dataclass(frozen=True, slots=True)
+class Drives:
+    """What became of each drive, one agent over one seed.
+
+    Attributes:
+        rules: rule -> status of each drive, (rows,): `satisfied`, `violated` or `inconclusive`.
+        broken: the drives that broke a rule, in order.
+        viable: (rows,), who could have obeyed as far as is known: who did, and who was neither lost from the
+            start nor to what the world told later. Of undecided drives those from whose start a safe plan is
+            known.
+    """
+
+    rules: Mapping[str, NDArray[np.str_]]
+    broken: tuple[Broken, ...]
+    viable: NDArray[np.bool_]
+
+    @property
+    def obeyed(self) -> NDArray[np.bool_]:
+        """(rows,), who obeyed every rule."""
+        return obeying(self.rules, len(self.viable))
+
+
+def obeying(rules: Mapping[str, NDArray[np.str_]], rows: int) -> NDArray[np.bool_]:
+    """(rows,), who satisfies every rule."""
+    held = np.ones(rows, dtype=bool)
+    for statuses in rules.values():
+        held &= statuses == "satisfied"
+    return held
+
+
+# ------------------------------------------------------------------------ where rules are
+
+
+def read_rules(judge: JudgeRef) -> ast.Spec:
+    """The specification that a system file names, with what it imports.
+
+    Raises:
+        SystemFileError: S210, there is no such file.
+        SpecError: it is no specification.
+    """
+    try:
+        spec = parse(read_source(judge.path))
+    except UsageError as error:
+        first = error.diagnostics[0]
+        advice = (*first.help, "`--set test.judge=null` does without")
+        finding = Diagnostic("S210", first.message, judge.span, label="named here", help=advice)
+        raise SystemFileError(finding) from None
+    return replace(spec, library=library_of(spec))
+
+
+def keep_rules(folder: RunDir, task: Task) -> None:
+    """Write the rules that a system names into the folder of a run, whether they fit checked before.
+
+    Raises:
+        SystemFileError: S210, there is no such file.
+        SpecError: they are invalid, or do not fit the system.
+    """
+    decl = task.system.decl
+    found = {judge.written: (judge, _fitting(judge, task)) for judge in decl.judges}
+    index: dict[str, dict[str, str]] = {}
+    for number, (written, (judge, spec)) in enumerate(found.items()):
+        name = judge.path.name if number == 0 else f"{number}-{judge.path.name}"
+        write_atomic(folder.path / JUDGE / name, spec.source.text)
+        save_library(folder, spec.library or {}, _library_of(name))
+        index[written] = {"file": name, "path": str(judge.path)}
+    folder.write_json(_INDEX, index)
+
+
+def _fitting(judge: JudgeRef, task: Task) -> ast.Spec:
+    """The rules, compiled for the states that will be recorded: findings come before the training."""
+    spec, system = read_rules(judge), task.plain
+    changed = _own(spec, system.decl.overrides)
+    compile_spec(
+        spec, grid=system.decl.grid, interface=system.interface(), overrides=changed, purpose="check"
+    )
+    return spec
+
+
+def rules_of(run: Run) -> Rules | None:
+    """The rules of a run's system as it is deployed; None where drives are judged as plans are.
+
+    They are those that the run keeps of the file that its `system.yaml` names. A file that is named there
+    since (or with `--set test.judge=…`) is read where it lies. A run that was trained before systems named
+    such files has the rules that its system file names now.
+
+    Raises:
+        RunError: R101, what the run keeps is damaged.
+        SystemFileError, SpecError: the file is missing, or is no specification.
+    """
+    decl = run.task.system.decl
+    judge, overrides = decl.test.judge, decl.overrides
+    if (run.dir.path / _INDEX).is_file():
+        return None if judge is None else _kept(run.dir, judge, overrides)
+    if judge is None:
+        judge = _named_since(run.dir, decl)
+    if judge is None:
+        return None
+    spec = read_rules(judge)
+    return Rules(spec, str(judge.path), _own(spec, overrides))
+
+
+def _kept(folder: RunDir, judge: JudgeRef, overrides: Mapping[str, str]) -> Rules:
+    index = folder.read_json(_INDEX)
+    if isinstance(index, dict) and judge.written not in index:
+        spec = read_rules(judge)
+        return Rules(spec, str(judge.path), _own(spec, overrides))
+    entry = index[judge.written] if isinstance(index, dict) else None
+    name = entry.get("file") if isinstance(entry, dict) else None
+    if not isinstance(entry, dict) or not isinstance(name, str) or Path(name).name != name:
+        raise RunError(Diagnostic("R101", f"`{folder.shown}/{_INDEX}` is damaged"))
+    spec = parse(read_source(folder.path / JUDGE / name))
+    spec = replace(spec, library=read_library(folder, _library_of(name)))
+    return Rules(spec, str(entry.get("path", name)), _own(spec, overrides))
+
+
+def _named_since(folder: RunDir, decl: SystemDecl) -> JudgeRef | None:
+    """What the system file that a run was trained for names today, for the scenario that is laid over."""
+    path = Path(str(folder.record().get("system_path") or ""))
+    if "test.judge" in decl.overrides or not path.is_file():
+        return None
+    try:
+        now = load_system_decl(path)
+    except SystemFileError:
+        return None
+    laid = None if decl.scenario is None else decl.scenario.name
+    own = [each.judge for each in now.scenarios if each.name == laid and each.judge is not None]
+    return own[0] if own else now.test.judge
+
+
+def _library_of(name: str) -> str:
+    return f"{JUDGE}/lib/{file_of(name)}"
+
+
+def _own(spec: ast.Spec, overrides: Mapping[str, str]) -> dict[str, str]:
+    """Those of the constants that were changed which a specification declares."""
+    own = {item.name for item in spec.items if isinstance(item, (ast.Const, ast.Param))}
+    return {name: text for name, text in overrides.items() if name in own}
+
+
+def _requirements(spec: ast.Spec) -> Iterator[ast.Require]:
+    return (item for item in spec.items if isinstance(item, ast.Require))
+
+
+# ----------------------------------------------------------------------- who obeyed
+
+
+def judge_drives(rules: Rules, task: Task, recording: Recording, savable: NDArray[np.bool_]) -> Drives:
+    """Judge every drive from its first sample to its last.
+
+    Args:
+        rules: to judge by.
+        task: the states by name, the time step and the functions from outside.
+        recording: what was driven.
+        savable: (rows,), from whose start a safe plan is known.
+
+    Raises:
+        SpecError: the rules do not fit what was recorded.
+    """
+    verdict = verdict_on_drives(rules, task, recording)
+    found = {judgement.name: np.array(judgement.statuses) for judgement in verdict}
+    safety = frozenset(rule.name for rule in verdict.subject.compiled.safety)
+    broken = tuple(
+        replace(each, lost=_lost(each, safety, task, recording, bool(savable[each.row])))
+        for each in _broken(verdict, found)
+    )
+    viable = savable.copy()
+    for each in broken:
+        viable[each.row] = not each.excused
+    return Drives(found, broken, viable | obeying(found, len(savable)))
+
+
+def verdict_on_drives(rules: Rules, task: Task, recording: Recording) -> Verdict:
+    """The verdict on every drive from its first sample to its last; raises SpecError as `judge_drives`."""
+    outside = any(isinstance(item, ast.Extern) for item in rules.spec.items)
+    decl = task.system.decl
+    monitor = Monitor(
+        rules.spec,
+        dt=decl.dt,
+        horizon=decl.dt * decl.horizon,
+        system=decl.path if outside else None,
+        overrides=rules.overrides,
+    )
+    columns = np.moveaxis(recording.states, -1, 0)
+    return monitor.check(dict(zip(task.names, columns, strict=True)))
+
+
+def _lost(
+    broken: Broken, safety: frozenset[str], task: Task, recording: Recording, savable: bool
+) -> Lost | None:
+    """When a drive was lost that broke rules, by the first of those tagged `@safety`, else by the first."""
+    row, unsafe = broken.row, not safety.isdisjoint(broken.rules)
+    asked = safely(task) if unsafe and task.compiled.safety else task
+    times = [time for name, time in broken.rules.items() if not unsafe or name in safety]
+    looked = [time for time in times if time is not None]
+    if not looked:  # nobody has looked when: by the start alone
+        known = savable if unsafe else bool(solvable(task, torch.from_numpy(recording.states[row, :1]))[0])
+        return None if known else Lost("start", 0.0)
+    dt = float(task.system.decl.dt)
+    last = min(round(min(looked) / dt), recording.steps)
+    good = recording.safe[row] if unsafe else recording.rho[row] >= -TOLERANCE
+    followed = np.flatnonzero(good[: last + 1])
+    since = int(followed[-1]) + 1 if len(followed) else 0  # from here on nothing good was followed
+    if since > last:
+        return None
+    states = torch.from_numpy(recording.states[row, since : last + 1])
+    solved = solvable(asked, states).numpy()
+    if solved.any():
+        return Lost("missed", dt * (since + int(np.flatnonzero(solved)[-1])))
+    if not since:
+        return Lost("start", 0.0)
+    told = recording.quiet is not None and not recording.quiet[row, since - 1]
+    return Lost("told" if told else "later", dt * since)
+
+
+def _violating(rules: Mapping[str, NDArray[np.str_]], rows: int) -> NDArray[np.bool_]:
+    """(rows,), who violates any rule."""
+    found = np.zeros(rows, dtype=bool)
+    for statuses in rules.values():
+        found |= statuses == "violated"
+    return found
+
+
+def drives_of_plans(held: Mapping[str, NDArray[np.bool_]], savable: NDArray[np.bool_], dt: float) -> Drives:
+    """The same where drives are judged as plans are: requirement -> (starts, rows), whether it holds there.
+
+    A requirement is obeyed where it holds at every start; it was broken at the first one where it does not.
+    """
+    rules = {name: np.where(starts.all(0), "satisfied", "violated") for name, starts in held.items()}
+    rules |= {name: np.full(len(savable), "inconclusive") for name, starts in held.items() if not len(starts)}
+    names = {row: [name for name in rules if rules[name][row] == "violated"] for row in range(len(savable))}
+    first = {name: starts.argmin(0) * dt for name, starts in held.items() if len(starts)}
+    broken = (
+        Broken(
+            row,
+            {name: float(first[name][row]) for name in each},
+            None if savable[row] else Lost("start", 0.0),
+        )
+        for row, each in names.items()
+        if each
+    )
+    return Drives(rules, tuple(broken), savable | obeying(rules, len(savable)))
+
+
+def _broken(verdict: Verdict, rules: Mapping[str, NDArray[np.str_]]) -> Iterator[Broken]:
+    left = MOST_TIMED
+    for row in range(verdict.traces):
+        names = [name for name, statuses in rules.items() if statuses[row] == "violated"]
+        if names:
+            yield Broken(row, _moments(verdict, row, names) if left > 0 else dict.fromkeys(names))
+            left -= len(names)
+
+
+def _moments(verdict: Verdict, row: int, names: Sequence[str]) -> dict[str, float | None]:
+    """When a drive broke rules: at the sample that decides."""
+    alone = np.zeros(verdict.traces, dtype=bool)
+    alone[row] = True
+    causes = {name: explain(verdict.within(alone), name) for name in names}
+    return {name: None if cause is None else float(cause.time) for name, cause in causes.items()}
+
+
+# ------------------------------------------------------------------------- as data
+
+
+def drives_json(drives: Drives, seeds: Sequence[int], agents: int) -> dict[str, Any]:
+    """The entry `drives` of a guard in `eval/simulate.json`.
+
+    `count` drives, of which `obeyed` kept every rule and `undecided` ended too early to say; `lost` of the
+    others were lost (`Drives.viable`): `told` of them by what the world
+    told later, the others from their start. `rules`: the same for each rule. `broken`: who broke which, and
+    when (seconds from the start, null where nobody has looked), and `cause`, since when no plan is known and
+    why (`Lost`).
+    """
+    obeyed, rows = drives.obeyed, len(drives.viable)
+    violated = _violating(drives.rules, rows)
+    return {
+        "count": rows,
+        "obeyed": int(obeyed.sum()),
+        "undecided": int((~obeyed & ~violated).sum()),
+        "lost": int((~drives.viable).sum()),
+        "told": sum(each.lost is not None and each.lost.why == "told" for each in drives.broken),
+        "rules": {
+            name: {
+                "obeyed": int((statuses == "satisfied").sum()),
+                "broken": int((statuses == "violated").sum()),
+                "undecided": int((statuses == "inconclusive").sum()),
+            }
+            for name, statuses in drives.rules.items()
+        },
+        "broken": [
+            {
+                "seed": seeds[each.row // agents],
+                "agent": each.row % agents,
+                "lost": not bool(drives.viable[each.row]),
+                "rules": dict(each.rules),
+                "cause": None
+                if each.lost is None
+                else {"why": each.lost.why, "time": round(each.lost.time, 9)},
+            }
+            for each in drives.broken
+        ],
+    }

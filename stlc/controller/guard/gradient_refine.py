@@ -1,0 +1,226 @@
+"""Gradient steps on the exact robustness, for many plans of a state at once: what polishing begins with.
+
+A gradient moves all of a plan at once, and a handful of steps mends most plans that miss by little. It sees
+nothing across an obstacle, so it starts from a batch: the plans at hand, and the same with a stretch of time
+changed. Where none of these comes to satisfy, the best are changed and raised again, beside plans that hold
+each control at an end of its range. Of what was found as much is done as is enough, and no more: the rest of
+it the policy's plan keeps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from time import perf_counter
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.switch import StraightThrough
+from stlc.controller.guard.feasibility import extremes
+from stlc.native import Outcome
+
+if TYPE_CHECKING:
+    from stlc.controller.problem.gradient import NativeGradient
+    from stlc.controller.problem.task import Task
+
+NEAR = 8
+"""Plans at hand and changes of them, of which a round makes its beginning."""
+FAR = 24
+"""Plans of every later round that hold controls at ends of their ranges."""
+KEPT = 2
+"""Plans of a round that the next begins with, and that are handed on in the end."""
+STEPS = 30
+RATES = 0.1, 0.2, 0.2
+"""Share of its range that the first step of each round moves a control by; it falls to 0 with the last."""
+SHARES = 8
+"""In how many parts what was changed is tried."""
+SLOPE = 5.0
+"""Of conditions, per unit, in the gradient."""
+STEEP = 1e100
+"""What is steeper is no slope, nor is what is no number."""
+AGENTS = 256
+"""Agents whose plans are raised side by side, at most."""
+APART = 1e6
+"""Between plans that satisfy phi, those that satisfy phi_safe alone, and the rest."""
+
+Numbers: TypeAlias = NDArray[np.float64]
+Pull: TypeAlias = Callable[[Numbers], Numbers]
+
+
+class Ascent:
+    """Raises plans of one task; what it gives depends on states and plans alone.
+
+    Args:
+        task: specification and system.
+        generator: of the changes, which are drawn once.
+        enough: a state is left alone once one of its plans has this robustness.
+    """
+
+    def __init__(self, task: Task, generator: torch.Generator, *, enough: float) -> None:
+        self.task, self.enough = task, enough
+        self._native = task.gradient
+        system = task.system
+        self._low, self._high = (
+            bound.double().numpy(force=True) for bound in (system.control_low, system.control_high)
+        )
+        self._span = self._high - self._low
+        self._turns = np.array([control.squash == "angle" for control in system.controls])
+        self._factors = np.array([rule.weight / rule.scale for rule in task.rules])
+        safe = {rule.name for rule in task.compiled.safety}
+        self._safe = [at for at, rule in enumerate(task.rules) if rule.name in safe]
+        self._changes = self._drawn(NEAR, generator)
+        bank = extremes(task, generator).double().numpy(force=True)
+        self._far = [bank[torch.randperm(len(bank), generator=generator)[:FAR].numpy()] for _ in RATES[1:]]
+
+    @torch.no_grad()
+    def rise(self, x: Tensor, places: Tensor, until: float = math.inf) -> Tensor:
+        """The best plans that gradient steps reach, best first, (agents, 2, T, m) float64.
+
+        Args:
+            x: (agents, n) float64.
+            places: plans at hand, (agents, places, T, m); finite.
+            until: no step begins when `perf_counter()` has come to it.
+        """
+        if len(x) == 0:
+            return places.new_zeros(0, KEPT, *places.shape[2:], dtype=torch.float64)
+        states, plans = x.double().numpy(force=True), places.double().numpy(force=True)
+        parts = [
+            self._risen(states[at : at + AGENTS], plans[at : at + AGENTS], until)
+            for at in range(0, len(states), AGENTS)
+        ]
+        return torch.from_numpy(np.concatenate(parts)).to(places.device)
+
+    def _risen(self, x: Numbers, places: Numbers, until: float) -> Numbers:
+        best, value = self._round(x, self._changed(places), RATES[0], until)
+        for at, rate in enumerate(RATES[1:]):
+            left = np.flatnonzero(value[:, 0] < APART + self.enough)
+            if not len(left) or perf_counter() >= until:
+                break
+            far = np.broadcast_to(self._far[at], (len(left), *self._far[at].shape))
+            begun = np.concatenate((self._changed(best[left]), far), 1)
+            best[left], value[left] = self._round(x[left], begun, rate, until)
+        done = np.flatnonzero(value[:, 0] >= APART + self.enough)
+        best[done, 0] = self._eased(x[done], places[done, 0], best[done, 0])
+        return best
+
+    def _round(self, x: Numbers, plans: Numbers, rate: float, until: float) -> tuple[Numbers, Numbers]:
+        """The best plans (agents, KEPT, T, m) and what they are worth, best first."""
+        plans, value = self._raised(x, plans, rate, until)
+        order = np.argsort(-value, axis=1, kind="stable")[:, :KEPT]
+        return np.take_along_axis(plans, order[..., None, None], 1), np.take_along_axis(value, order, 1)
+
+    def _eased(self, x: Numbers, own: Numbers, found: Numbers) -> Numbers:
+        """As little of the way from plans (agents, T, m) to those that were found as is enough."""
+        share = np.arange(1, SHARES)[:, None, None] / SHARES
+        tried = np.concatenate((own[:, None] + share * (found - own)[:, None], found[:, None]), 1)
+        each, _ = self._judged(np.repeat(x, SHARES, 0), tried.reshape(-1, *own.shape[1:]))
+        enough = each.min(1).reshape(-1, SHARES) >= self.enough
+        enough[:, -1] = True
+        eased: Numbers = tried[np.arange(len(x)), enough.argmax(1)]
+        return eased
+
+    def _raised(self, x: Numbers, plans: Numbers, rate: float, until: float) -> tuple[Numbers, Numbers]:
+        """Every plan (agents, k, T, m) at its best, and what that is worth, (agents, k)."""
+        agents, count = plans.shape[:2]
+        starts, rows = np.repeat(x, count, 0), plans.reshape(-1, *plans.shape[2:])
+        best, value = rows.copy(), np.full(len(rows), -np.inf)
+        first, second, every = np.zeros_like(rows), np.zeros_like(rows), np.arange(len(rows))
+        solved = np.zeros(agents, dtype=bool)
+        for step in range(STEPS + 1):
+            each, pull = self._judged(starts, rows)
+            now = self._worth(each)
+            better = (now > value) & ~np.repeat(solved, count)
+            value[better], best[better] = now[better], rows[better]
+            solved = value.reshape(agents, count).max(1) >= APART + self.enough
+            if step == STEPS or solved.all() or perf_counter() >= until:
+                break
+            which = each.argmin(1)
+            by = np.zeros_like(each)
+            by[every, which] = self._factors[which]
+            slope = pull(by) * self._span
+            slope[~(np.abs(slope) < STEEP)] = 0.0
+            first += 0.1 * (slope - first)
+            second += 0.01 * (slope * slope - second)
+            size = np.sqrt(second / (1.0 - 0.99 ** (step + 1))) + 1e-8
+            far = rate * (1.0 - step / STEPS) / (1.0 - 0.9 ** (step + 1))
+            rows = self._bounded(rows + far * self._span * first / size)
+        return best.reshape(plans.shape), value.reshape(agents, count)
+
+    def _worth(self, each: Numbers) -> Numbers:
+        """By robustness where phi holds, below that by robustness where phi_safe holds, else by phi_safe."""
+        rho = each.min(1)
+        safe = each[:, self._safe].min(1) if self._safe else np.full_like(rho, np.inf)
+        below = np.where(safe >= -TOLERANCE, rho, safe - APART)
+        value: Numbers = np.where(rho >= -TOLERANCE, APART + rho, below)
+        return value
+
+    def _judged(self, x: Numbers, u: Numbers) -> tuple[Numbers, Pull]:
+        """Robustness per requirement as it counts in the whole, (rows, R), and their gradient by plans.
+
+        What is no number counts as violated without measure. The gradient is a function of weights (rows, R).
+        """
+        if self._native is None:
+            each, pull = self._differentiated(torch.from_numpy(x), torch.from_numpy(u))
+        else:
+            each, pull = self._natively(self._native, x, u)
+        each *= self._factors
+        each[np.isnan(each)] = -np.inf
+        return each, pull
+
+    def _natively(self, native: NativeGradient, x: Numbers, u: Numbers) -> tuple[Numbers, Pull]:
+        threads = torch.get_num_threads()
+
+        def pull(by: Numbers) -> Numbers:
+            return native.adjoint.pull(x, u, Outcome(by, None, SLOPE), threads=threads)
+
+        return native.judge.kernel.judge(x, u, threads=threads)[0], pull
+
+    def _differentiated(self, x: Tensor, u: Tensor) -> tuple[Numbers, Pull]:
+        """The same by torch."""
+        with torch.enable_grad():
+            u = u.requires_grad_()
+            columns = self.task.system.rollout_columns(x, u, StraightThrough(SLOPE))
+            each = self.task.graph.per_requirement_columns(columns, ops=TORCH)
+
+        def pull(by: Numbers) -> Numbers:
+            if not each.requires_grad:
+                return np.zeros(u.shape)
+            gradient: Numbers = torch.autograd.grad(each, u, torch.from_numpy(by))[0].numpy()
+            return gradient
+
+        return each.detach().clone().numpy(), pull
+
+    def _changed(self, plans: Numbers) -> Numbers:
+        """Each of the plans (agents, k, T, m), and changes of it, (agents, NEAR, T, m)."""
+        agents, places, *shape = plans.shape
+        changed = plans[:, :, None] + self._changes[: NEAR // places]
+        changed[:, :, 1:] = self._bounded(changed[:, :, 1:])
+        return changed.reshape(agents, -1, *shape)
+
+    def _drawn(self, count: int, generator: torch.Generator) -> Numbers:
+        """Changes of plans, (count, T, m), the first of them none: shifts or noise over stretches of time."""
+        steps, controls = self.task.horizon, len(self._low)
+        begin = torch.randint(0, steps, (count, 1, controls), generator=generator).numpy()
+        length = torch.randint(1, steps + 1, (count, 1, controls), generator=generator).numpy()
+        time = np.arange(steps)[:, None]
+        size = 2.0 ** -torch.randint(1, 6, (count, 1, 1), generator=generator).double().numpy()
+        noise = torch.randn(count, steps, controls, generator=generator).double().numpy()
+        noise[::2] = noise[::2, :1]
+        stretch = (time >= begin) & (time < begin + length)
+        changes: Numbers = stretch * size * noise * self._span
+        changes[0] = 0.0
+        return changes
+
+    def _bounded(self, plans: Numbers) -> Numbers:
+        clipped: Numbers = np.minimum(np.maximum(plans, self._low), self._high)
+        if not self._turns.any():
+            return clipped
+        turned = self._low + np.remainder(plans - self._low, self._span)
+        bounded: Numbers = np.where(self._turns, turned, clipped)
+        return bounded

@@ -1,0 +1,247 @@
+"""Deployment in MPC fashion: plan at every step, judge the plan, execute its first action."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.guard.plan_repair import FullBackup, Limits
+from stlc.controller.guard.relaxed import Closest
+from stlc.controller.guard.safe_prefix import robustness_until
+from stlc.controller.guard.shooting import Backup, Found, finite
+from stlc.controller.guard.tightened import sparing
+from stlc.controller.policies.policy import Mlp
+from stlc.controller.problem.task import rank
+from stlc.runtime.prefixes import Grid
+
+if TYPE_CHECKING:
+    from stlc.controller.policies.policy import Policy
+    from stlc.controller.problem.task import Judged, Task
+
+Mode: TypeAlias = Literal["none", "paper", "full"]
+SOURCES = ("policy", "backup", "safest", "polished")
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What agents do now, and why.
+
+    Attributes:
+        action: (agents, m) float64, physical units.
+        plan: (agents, T, m) that it begins.
+        source: (agents,) int64, an index into `SOURCES`.
+        t0: (agents,) int64, length of the backup's prefix; 0 for the policy's own plan.
+        rho: (agents,) float64, robustness of `plan`.
+        safe: (agents,) bool, whether `plan` satisfies phi_safe.
+        policy_rho: (agents,) float64, robustness of what the policy planned; -inf where that is no number.
+        proposed: (agents, T, m), what the policy planned, whether it was followed or not.
+    """
+
+    action: Tensor
+    plan: Tensor
+    source: Tensor
+    t0: Tensor
+    rho: Tensor
+    safe: Tensor
+    policy_rho: Tensor
+    proposed: Tensor
+
+    def later(self, steps: int | Tensor = 1) -> Decision:
+        """The same decision so many steps later, (agents,) or one number: what is left of the plans.
+
+        Their last actions are held on.
+        """
+        agents, length, controls = self.plan.shape
+        ahead = torch.as_tensor(steps).expand(agents)[:, None] + torch.arange(length)
+        index = ahead.clamp(max=length - 1)[..., None].expand(-1, -1, controls)
+        plan = self.plan.gather(1, index.to(self.plan.device))
+        return replace(self, plan=plan, action=plan[:, 0])
+
+    def of(self, rows: Tensor) -> Decision:
+        """Those of some agents, (k,) indices."""
+        return Decision(*(getattr(self, name)[rows] for name in _FIELDS))
+
+    def with_new(self, rows: Tensor, new: Decision) -> Decision:
+        """These decisions, but for some agents, (k,) indices, which have decided anew."""
+        pairs = ((getattr(self, name), getattr(new, name)) for name in _FIELDS)
+        return Decision(*(old.index_copy(0, rows, fresh) for old, fresh in pairs))
+
+
+_FIELDS = tuple(each.name for each in fields(Decision))
+
+
+@runtime_checkable
+class _JudgesItself(Protocol):
+    """A policy that has judged its plan while choosing it."""
+
+    def plan_judged(self, x0: Tensor) -> tuple[Tensor, Judged]: ...
+
+
+class Guard:
+    """Who stands between the policy and the actuators.
+
+    Args:
+        task: specification and system.
+        policy: plans.
+        mode: where the monitor finds a plan violated, "paper" calls the paper's backup policy and "full" the
+            polishing one; "none" only records.
+        grid: candidates of the backup; by default what the system file says.
+        limits: of a decision. With a margin robustness and verdicts of decisions are those of the task all
+            the same; only what the guard lets pass is another.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        policy: Policy,
+        mode: Mode = "paper",
+        *,
+        grid: Grid | None = None,
+        limits: Limits | None = None,
+    ) -> None:
+        self.task, self.mode = task, mode
+        self.strict = sparing(task, {} if mode == "none" or limits is None else limits.margin)
+        self.policy = policy
+        if isinstance(policy, Mlp) and self.strict is not task:
+            self.policy = Mlp(
+                self.strict, policy.network
+            )  # of its plans it takes one with that much to spare
+        self.backup: Backup | FullBackup | Closest | None = None
+        match mode:
+            case "paper":
+                seconds = None if limits is None else limits.paper
+                self.backup = Backup(self.strict, self.policy, grid=grid, seconds=seconds)
+            case "full" if self.strict is not task and limits is not None:
+                self.backup = Closest(task, self.strict, self.policy, grid=grid, limits=limits)
+            case "full":
+                self.backup = FullBackup(self.strict, self.policy, grid=grid, limits=limits)
+
+    @torch.no_grad()
+    def decide(self, x: Tensor, begun: Decision | None = None) -> Decision:
+        """Decide for (agents, n) states; verdicts are taken in float64.
+
+        A plan that was begun and still satisfies the specification is gone on with where the new one is no
+        better; otherwise an agent that may do something later could put it off at every step. So is one that
+        is about to keep a promise of a mission with more to spare (`stlc.controller.problem.pending_goals`).
+
+        Args:
+            x: (agents, n) states.
+            begun: what is left of the decision before; see `Decision.later`.
+
+        Returns:
+            The decision. Without a guard a plan that is no number is handed on, with robustness -inf.
+        """
+        x = x.to(torch.float64)
+        fresh, judged = self._plan(x)
+        found = self._kept(x, begun, fresh, judged)
+        plan, source, t0, rho, safe = found.plan, found.source, found.t0, found.rho, found.safe
+        failing = torch.nonzero(~(rho >= -TOLERANCE)).squeeze(1)
+        if self.backup is not None and len(failing):
+            rest = None if begun is None else begun.plan[failing]
+            found = self.backup.search(x[failing], fresh[failing], rest)
+            plan = plan.index_copy(0, failing, found.plan)
+            source, t0 = source.index_copy(0, failing, found.source), t0.index_copy(0, failing, found.t0)
+            rho, safe = rho.index_copy(0, failing, found.rho), safe.index_copy(0, failing, found.safe)
+        decision = Decision(plan[:, 0], plan, source, t0, rho, safe, judged.rho, fresh)
+        return decision if self.strict is self.task else self._plainly(decision, x, fresh)
+
+    def _plainly(self, decision: Decision, x: Tensor, fresh: Tensor) -> Decision:
+        """The decision with the verdicts of the task itself."""
+        taken = self.task.judge(x, decision.plan, states=False)
+        policy_rho = self.task.judge(x, fresh, states=False).rho
+        return replace(decision, rho=taken.rho, safe=taken.safe >= -TOLERANCE, policy_rho=policy_rho)
+
+    @torch.no_grad()
+    def endangered(self, x: Tensor, begun: Decision, steps: int | Tensor) -> Tensor:
+        """Who would, by the model, violate the safety requirements with the next steps of a begun plan.
+
+        Args:
+            x: (agents, n) states.
+            begun: what is left of the decision before.
+            steps: how many count, one number or (agents,).
+
+        Returns:
+            (agents,) booleans; nobody without the full guard: the paper's looks at plans as they are made.
+        """
+        formulas = [rule.formula for rule in self.strict.compiled.safety]
+        if self.mode != "full" or not formulas:
+            return torch.zeros(len(x), dtype=torch.bool)
+        columns = self.strict.system.rollout_columns(x.to(torch.float64), begun.plan.to(torch.float64))
+        return ~(robustness_until(formulas, columns, steps) >= -TOLERANCE)
+
+    @torch.no_grad()
+    def prefer(self, options: Tensor, begun: Decision | None = None) -> Tensor:
+        """Which of its options each agent plans best for; of equals the first.
+
+        Args:
+            options: (agents, k, n) states; option 0 is how things are.
+            begun: what is left of the decision before, which belongs to option 0.
+
+        Returns:
+            (agents,) int64.
+        """
+        agents, count, _ = options.shape
+        options = options.to(torch.float64)
+        _, judged = self._plan(options.flatten(0, 1))
+        score = self._score(judged).view(agents, count)
+        if begun is not None:
+            rest = self._score(self.strict.judge(options[:, 0], begun.plan))
+            score[:, 0] = torch.maximum(score[:, 0], rest)
+        return (score >= score.amax(1, keepdim=True)).to(torch.uint8).argmax(1)
+
+    def _score(self, judged: Judged) -> Tensor:
+        return rank(judged.rho, self.strict.cost(judged), judged.safe)
+
+    @torch.no_grad()
+    def carried_on(self, x: Tensor, begun: Decision, taken: Tensor) -> Decision:
+        """What is left of plans for (agents, n) states, the policy's own from their end on.
+
+        `taken`: how many steps of each are behind it, (agents,); so many of its last actions are replaced.
+        """
+        x, plan = x.to(torch.float64), begun.plan.clone()
+        length = plan.shape[1]
+        for steps in dict.fromkeys(taken.tolist()):
+            rows = torch.nonzero(taken == steps).squeeze(1)
+            left = length - steps
+            if not 0 < left < length:
+                continue
+            end = self.task.rollout(x[rows], plan[rows, :left])[:, -1]
+            tail = finite(self.policy.plan(end).to(plan.dtype), self.task)
+            plan[rows] = torch.cat((plan[rows, :left], tail[:, : length - left]), 1)
+        return replace(begun, plan=plan, action=plan[:, 0])
+
+    def _kept(self, x: Tensor, begun: Decision | None, fresh: Tensor, judged: Judged) -> Found:
+        """The policy's plans, or what is left of those that were begun."""
+        zero = torch.zeros(len(x), dtype=torch.int64, device=x.device)
+        safe = judged.safe >= -TOLERANCE
+        if begun is None:
+            return Found(fresh, zero, zero, judged.rho, safe)
+        rest = self.strict.judge(x, begun.plan)
+        better = rank(rest.rho, self.strict.cost(rest)) >= rank(judged.rho, self.strict.cost(judged))
+        keep = (better | self._deepened(rest)) & (rest.rho >= -TOLERANCE)
+        return Found(
+            torch.where(keep[:, None, None], begun.plan, fresh),
+            torch.where(keep, begun.source, zero),
+            torch.where(keep, begun.t0, zero),
+            torch.where(keep, rest.rho, judged.rho),
+            torch.where(keep, rest.safe >= -TOLERANCE, safe),
+        )
+
+    def _deepened(self, rest: Judged) -> Tensor:
+        """Whether what is left of a plan goes on with keeping a promise, (agents,)."""
+        if not self.task.promises.items:
+            return torch.zeros_like(rest.rho, dtype=torch.bool)
+        return self.task.promises.deepened(rest.columns)
+
+    def _plan(self, x: Tensor) -> tuple[Tensor, Judged]:
+        if isinstance(self.policy, _JudgesItself) and (
+            self.strict is self.task or isinstance(self.policy, Mlp)
+        ):
+            plan, judged = self.policy.plan_judged(x)
+            return plan.to(x.dtype), judged
+        plan = self.policy.plan(x).to(x.dtype)
+        return plan, self.strict.judge(x, plan)

@@ -1,0 +1,141 @@
+"""A state becomes a plan: one network proposes several, the monitor picks one.
+
+A continuous function cannot jump from left of an obstacle to right of it; several can, and judging a few
+plans exactly costs well under a millisecond.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from stlc.controller.problem.task import Judged, rank
+from stlc.dynamics.model.controls import raw_width, squash
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from stlc.controller.problem.task import Task
+    from stlc.controller.training.config import Engine
+    from stlc.dynamics.model.mirror import Mirror
+
+
+class Policy(Protocol):
+    """Anything that plans: a trained network, or a baseline that searches."""
+
+    def plan(self, x0: Tensor) -> Tensor:
+        """Plans in physical units: (B, n) -> (B, T, m)."""
+
+
+class PlanNetwork(nn.Module):
+    """An MLP from what the policy observes to `plans` open-loop plans of the whole horizon.
+
+    Where the system declares a mirror, the MLP sees states of one side only, and gives the others the images
+    of their images' plans.
+
+    Attributes:
+        plans: number of plans.
+        mirror: the system's; None where it has none, or where the method does without.
+        centre: mean of the observations over initial states, (k,).
+        spread: their standard deviation, (k,).
+    """
+
+    centre: Tensor
+    spread: Tensor
+
+    def __init__(self, task: Task, *, hidden: Sequence[int], plans: int, mirrored: bool = True) -> None:
+        super().__init__()
+        self.plans = plans
+        self.mirror: Mirror | None = task.system.mirror if mirrored else None
+        self._task = task
+        self._width = raw_width(task.system.controls)
+        widths = [task.system.observed_count, *hidden]
+        layers: list[nn.Module] = []
+        for inputs, outputs in pairwise(widths):
+            layers += [nn.Linear(inputs, outputs), nn.ReLU()]
+        layers.append(nn.Linear(widths[-1], plans * task.horizon * self._width))
+        self.body = nn.Sequential(*layers)
+        self.register_buffer("centre", torch.zeros(widths[0]))
+        self.register_buffer("spread", torch.ones(widths[0]))
+
+    def normalise(self, x0: Tensor) -> None:
+        """Take the centre and the spread of the inputs from a sample of states, (n, dim).
+
+        Those of timers are taken from their ranges: at first no mission gets far.
+        """
+        observed = self._task.system.observe(self._folded(x0)[0])
+        centre, spread = observed.mean(0), observed.std(0)
+        for index, timer in enumerate(reversed(self._task.compiled.timers), start=1):
+            centre[-index] = 0.5 * (timer.low + timer.high)
+            spread[-index] = 0.25 * (timer.high - timer.low)
+        self.centre.copy_(centre)
+        self.spread.copy_(torch.where(spread > 1e-6, spread, torch.ones_like(spread)))
+
+    def forward(self, x0: Tensor) -> Tensor:
+        """All plans, within the bounds of the controls: (B, n) -> (B, plans, T, m)."""
+        x0, swapped = self._folded(x0)
+        observed = self._task.system.observe(x0).to(self.centre.dtype)
+        raw = self.body((observed - self.centre) / self.spread)
+        raw = raw.view(-1, self.plans, self._task.horizon, self._width)
+        plans = squash(raw, self._task.system.controls)
+        if self.mirror is None or swapped is None:
+            return plans
+        return torch.where(swapped[:, None, None, None], self.mirror.plans(plans), plans)
+
+    def _folded(self, x0: Tensor) -> tuple[Tensor, Tensor | None]:
+        """States on the mirror's side, and which of them are images, (B,); as they are without a mirror."""
+        return (x0, None) if self.mirror is None else self.mirror.fold(x0)
+
+
+def network_of(task: Task, engine: Engine) -> PlanNetwork:
+    """The network that an engine trains; the paper's own method does without a mirror."""
+    guided = engine.method == "guided"
+    return PlanNetwork(task, hidden=engine.hidden, plans=engine.plans, mirrored=guided)
+
+
+class Mlp:
+    """The trained policy: the network's plans, and the monitor's choice among them.
+
+    Among plans that satisfy the specification the one with the least performance cost is taken, otherwise the
+    one with the largest exact robustness.
+    """
+
+    def __init__(self, task: Task, network: PlanNetwork) -> None:
+        self.task = task
+        self.network = network
+
+    @torch.no_grad()
+    def candidates(self, x0: Tensor) -> Tensor:
+        """All plans of the network in the dtype of `x0`: (B, n) -> (B, plans, T, m)."""
+        plans: Tensor = self.network(x0)
+        return plans.to(x0.dtype)
+
+    def plan(self, x0: Tensor) -> Tensor:
+        """The plan to follow, physical units: (B, n) -> (B, T, m)."""
+        return self.plan_judged(x0)[0]
+
+    __call__ = plan
+
+    def plan_judged(self, x0: Tensor) -> tuple[Tensor, Judged]:
+        """The plan to follow and its verdict: (B, n) -> (B, T, m), verdicts over (B,)."""
+        plans = self.candidates(x0)
+        batch, count, steps, controls = plans.shape
+        judged = self.task.judge(x0.repeat_interleave(count, 0), plans.reshape(-1, steps, controls))
+        rows = torch.arange(batch, device=x0.device)
+        best = rank(judged.rho, self.task.cost(judged), judged.safe).view(batch, count).argmax(1)
+        index = rows * count + best
+        return plans[rows, best], select(judged, index)
+
+
+def select(judged: Judged, index: Tensor) -> Judged:
+    """The verdicts at `index`, (k,) positions along the batch."""
+    return Judged(
+        rho=judged.rho[index],
+        safe=judged.safe[index],
+        requirements=judged.requirements[index],
+        plans=judged.plans[index],
+        columns={name: column[:, index] for name, column in judged.columns.items()},
+    )

@@ -1,0 +1,1 @@
+"""A task: specification and system joined, and its native kernels."""

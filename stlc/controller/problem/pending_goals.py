@@ -1,0 +1,121 @@
+"""Promises on the mission clock, and how much they are kept with to spare.
+
+A promise such as `eventually@[0 s, 18 s] [x, y] in b` is kept at the first sample that satisfies it, with
+hardly anything to spare, and from then on the next goal draws. So plans that keep an open promise are told by
+how far they get in, up to gamma, and one that was made to keep it is gone on with while it gets further.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.horizon import Reach, reach
+from stlc.compile.lowering.lower import lower
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from stlc.compile.frontend.interface import Grid
+    from stlc.compile.pipeline import Compiled
+
+HELD = 0.5
+"""A status between minus and plus this is open."""
+
+
+@dataclass(frozen=True, slots=True)
+class Promise:
+    """An `eventually@` of a state formula.
+
+    Attributes:
+        status: column of its status.
+        body: what has to hold once.
+        first: step of the mission from which on it counts.
+        last: the last such step.
+    """
+
+    status: str
+    body: ir.Formula
+    first: float
+    last: float
+
+
+class Promises:
+    """The promises of a mission.
+
+    Attributes:
+        clock: column of the mission clock; empty where there is none.
+        items: requirements that are one promise each; those inside other formulas are left alone.
+    """
+
+    def __init__(self, compiled: Compiled, gamma: float) -> None:
+        """`gamma` is what should be spared."""
+        self._gamma = gamma
+        self.clock = next((timer.name for timer in compiled.timers if timer.kind == "clock"), "")
+        statuses = {timer.name for timer in compiled.timers if timer.kind == "status"}
+        found = [
+            _promise(rule.name, rule.typed.formula, compiled.grid)
+            for rule in compiled.requirements
+            if rule.name in statuses
+        ]
+        self.items = tuple(promise for promise in found if promise is not None)
+
+    def short(self, columns: Mapping[str, Tensor]) -> Tensor:
+        """What plans lack of gamma where promises that are open at their start are concerned: (batch,).
+
+        Args:
+            columns: predicted states, name -> (time, batch); differentiable in them.
+        """
+        clock = columns[self.clock]
+        lack = torch.zeros_like(clock[0])
+        for promise, margin in zip(self.items, self._margins(columns, len(clock)), strict=True):
+            counts = (clock >= promise.first) & (clock <= promise.last)
+            best = torch.where(counts, margin, torch.full_like(clock, -torch.inf)).amax(0)
+            is_open = columns[promise.status][0].abs() < HELD
+            lack = lack + torch.where(is_open, (self._gamma - best).clamp(0.0, self._gamma), 0.0)
+        return lack
+
+    def deepened(self, columns: Mapping[str, Tensor]) -> Tensor:
+        """Where the next step adds to what a promise that holds now has to spare: (batch,) booleans.
+
+        Args:
+            columns: predicted states, name -> (time, batch).
+        """
+        found = torch.zeros_like(columns[self.clock][0], dtype=torch.bool)
+        for margin in self._margins(columns, 2):
+            now, soon = margin.expand(2, -1)
+            found |= (now >= 0.0) & (now < self._gamma) & (soon > now)
+        return found
+
+    def _margins(self, columns: Mapping[str, Tensor], count: int) -> list[Tensor]:
+        """Of every promise at the first `count` samples, (count, batch) each."""
+        env = {name: column[:count] for name, column in columns.items()}
+        found: list[Tensor] = evaluate([promise.body for promise in self.items], env, ops=TORCH, count=count)
+        return found
+
+
+def _promise(name: str, formula: typed.Formula, grid: Grid) -> Promise | None:
+    match formula:
+        case typed.Temporal(
+            op="eventually",
+            interval=typed.Interval(clock="start", lo=lo, hi=typed.Time() as hi),
+            body=body,
+        ):
+            lowered = lower(body, grid, [])
+            if reach(lowered) == Reach(0, 0):
+                return Promise(name, lowered, _steps(lo, grid), _steps(hi, grid))
+        case _:
+            pass
+    return None
+
+
+def _steps(time: typed.Time, grid: Grid) -> float:
+    seconds = float(time.seconds) / float(grid.dt or 1)
+    return seconds + float(time.steps) + float(time.horizons) * (grid.horizon or 0)

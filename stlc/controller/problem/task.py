@@ -1,0 +1,309 @@
+"""Specification and system joined: states to start from, plans to try, and how well they do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.graph import RobustnessGraph, evaluate
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.frontend.interface import Grid
+from stlc.compile.frontend.parameters import fixed
+from stlc.compile.ir.horizon import nodes
+from stlc.compile.pipeline import compile_spec
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.switch import Hard, Switch
+from stlc.controller.problem.gradient import NativeGradient
+from stlc.controller.problem.kernel import NativeJudge
+from stlc.controller.problem.pending_goals import Promises
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from stlc.compile.pipeline import Compiled, Rule
+    from stlc.dynamics.model.system import System
+    from stlc.grammar import ast
+
+HARD = Hard()
+MOST_VALUES = 32_000_000
+"""Numbers that torch may hold at a time while it judges plans: 256 MB in float64."""
+FLOAT32_SLACK = 1e-5
+"""Rounding that a float32 rollout may add to a margin that is 0 by construction."""
+TIE = 1e-4
+"""What cost may weigh where robustness does not differ: it is flat where a deadline cannot be met."""
+PULL = 0.1
+"""Weight of the pull towards the next goal among the performance terms."""
+KEPT = 3.0
+"""Weight of what open promises are kept with less than gamma to spare, among the performance terms."""
+SHORT = 10.0
+"""Weight of what a mission's plan lacks of gamma among the costs that plans are chosen by."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """What became of a batch of plans, exact semantics, no gradient.
+
+    Attributes:
+        rho: robustness of the whole specification, (batch,).
+        safe: robustness of phi_safe, (batch,); +inf where nothing is tagged `@safety`.
+        requirements: robustness per requirement, before weight and scale, (batch, requirements).
+        plans: what was judged, (batch, T, m).
+        columns: the predicted states, name -> (time, batch).
+    """
+
+    rho: Tensor
+    safe: Tensor
+    requirements: Tensor
+    plans: Tensor
+    columns: Mapping[str, Tensor]
+
+
+def satisfied(rho: Tensor) -> Tensor:
+    """Where a robustness counts as satisfied: rho >= -1e-6, with float32 rounding allowed for.
+
+    Args:
+        rho: (batch,), (batch, requirements), or any other shape; float64, or float32 with its own slack.
+
+    Returns:
+        A boolean tensor of the same shape.
+    """
+    slack = TOLERANCE if rho.dtype == torch.float64 else FLOAT32_SLACK
+    return rho >= -slack
+
+
+class Task:
+    """What a policy is trained for.
+
+    Attributes:
+        compiled: the specification in steps, its timers included.
+        plain: the system as it is.
+        system: the system, with the timers as its last columns.
+        graph: robustness of the whole specification.
+        safety: robustness of phi_safe.
+    """
+
+    def __init__(self, compiled: Compiled, system: System) -> None:
+        self.compiled = compiled
+        self.plain = system
+        added = compiled.timers, compiled.parameters
+        self.system = system.augmented(*added) if any(added) else system
+        self.graph = RobustnessGraph(compiled.requirements, self.system.signature)
+        self.safety = RobustnessGraph(compiled.safety, self.system.signature)
+
+    @classmethod
+    def of(
+        cls,
+        spec: ast.Spec,
+        system: System,
+        *,
+        overrides: Mapping[str, str] | None = None,
+        values: Mapping[str, str] | None = None,
+    ) -> Task:
+        """Compile a specification for a system.
+
+        Args:
+            spec: as parsed.
+            system: that it speaks about.
+            overrides: constants to change, name -> text such as `3 s`; a parameter becomes a constant.
+            values: parameters that have one value in all trajectories, and that the policy still sees.
+
+        Raises:
+            UsageError: a value does not fit.
+            SpecError: the specification is invalid, or does not fit the system.
+        """
+        decl = system.decl
+        grid = Grid(dt=decl.dt, horizon=decl.horizon)
+        compiled = compile_spec(spec, grid=grid, interface=system.interface(), overrides=overrides or {})
+        if values:
+            compiled = replace(compiled, parameters=fixed(compiled.parameters, values))
+        return cls(compiled, system)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Columns of a state: the system's, then the timers."""
+        return self.system.names
+
+    @property
+    def dt(self) -> float:
+        """Step in seconds."""
+        return self.system.dt
+
+    @property
+    def horizon(self) -> int:
+        """Steps of a plan."""
+        return self.system.horizon
+
+    @property
+    def rules(self) -> tuple[Rule, ...]:
+        """The compiled requirements, in order."""
+        return self.compiled.requirements
+
+    @cached_property
+    def _safe_indices(self) -> list[int]:
+        names = [rule.name for rule in self.rules]
+        return [names.index(rule.name) for rule in self.compiled.safety]
+
+    def sample(
+        self,
+        n: int,
+        *,
+        seed: int | None = None,
+        generator: torch.Generator | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
+    ) -> Tensor:
+        """Initial states, (n, dim). See `System.sample`."""
+        return self.system.sample(n, seed=seed, generator=generator, dtype=dtype, device=device)
+
+    def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
+        """States under a plan: (B, n), (B, T, m) -> (B, T+1, n).
+
+        Where nothing is differentiated, plans of up to a horizon are rolled out by the native kernel.
+        """
+        differentiated = torch.is_grad_enabled() and (x0.requires_grad or u.requires_grad)
+        apart = differentiated or not switch.exact or u.shape[1] > self.horizon
+        if apart or not len(x0) or x0.device.type != "cpu" or self.native is None:
+            return self.system.rollout(x0, u, switch)
+        whole = u.new_zeros((len(u), self.horizon, u.shape[2]))
+        whole[:, : u.shape[1]] = u
+        _, columns = self.native.judge(x0, whole, columns=True)
+        return torch.stack([columns[name][: u.shape[1] + 1].t() for name in self.names], 2)
+
+    def robustness(self, x: Tensor, smoothing: float | None = None) -> Tensor:
+        """Robustness at time 0: (B, T+1, n) -> (B,). Exact (Eq. 4); `smoothing` is the paper's k (Eq. 7)."""
+        rho: Tensor = self.graph.robustness(x, smoothing)
+        return rho
+
+    def requirement_robustness(self, x: Tensor, smoothing: float | None = None) -> Tensor:
+        """Robustness per requirement, before weight and scale: (B, T+1, n) -> (B, requirements)."""
+        each: Tensor = self.graph.per_requirement(x, smoothing)
+        return each
+
+    @cached_property
+    def native(self) -> NativeJudge | None:
+        """The kernel that does what needs no gradient; None where torch has to."""
+        return NativeJudge.of(self)
+
+    @cached_property
+    def gradient(self) -> NativeGradient | None:
+        """Robustness and states differentiable by plans, natively; None where torch has to differentiate."""
+        return NativeGradient.of(self)
+
+    def judge(self, x0: Tensor, u: Tensor, *, states: bool = True) -> Judged:
+        """Roll plans out exactly and judge them, without gradient.
+
+        Args:
+            x0: initial states, (B, n).
+            u: plans in physical units, (B, T, m).
+            states: whether the predicted states are wanted; `cost` needs them.
+
+        Returns:
+            The verdicts, in the dtype of `x0`. A plan that holds NaN counts as violated (robustness -inf).
+        """
+        with torch.no_grad():
+            u = u.to(x0.dtype)
+            each, columns = self._judged(x0, u, states=states)
+            rho = self.graph.overall(each)
+            safe = self.safety.overall(each[:, self._safe_indices])
+        broken = ~torch.isfinite(u).all(2).all(1) | torch.isnan(rho)
+        if bool(broken.any()):
+            lost = torch.full_like(rho, -torch.inf)
+            rho, safe = torch.where(broken, lost, rho), torch.where(broken, lost, safe)
+            each = torch.where(broken[:, None], lost[:, None], each)
+        return Judged(rho, safe, each, u, columns)
+
+    def _judged(self, x0: Tensor, u: Tensor, *, states: bool) -> tuple[Tensor, Mapping[str, Tensor]]:
+        """Robustness per requirement and states, by the native kernel where it can."""
+        if x0.device.type == "cpu" and self.native is not None:
+            return self.native.judge(x0, u, columns=states)
+        rows = max(1, MOST_VALUES // self._values_of_a_row)
+        if len(x0) <= rows:
+            return self._judged_by_torch(x0, u)
+        parts = [
+            self._judged_by_torch(*part)
+            for part in zip(torch.split(x0, rows), torch.split(u, rows), strict=True)
+        ]
+        each = torch.cat([each for each, _ in parts])
+        if not states:
+            return each, {}
+        return each, {name: torch.cat([part[name] for _, part in parts], 1) for name in self.names}
+
+    def _judged_by_torch(self, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
+        columns = self.system.rollout_columns(x0, u, HARD)
+        return self.graph.per_requirement_columns(columns, ops=TORCH), columns
+
+    @cached_property
+    def _values_of_a_row(self) -> int:
+        """About how many numbers torch holds for a plan that is judged: every part of the formulas."""
+        parts = sum(1 for rule in self.rules for _ in nodes(rule.formula))
+        return (self.horizon + 1) * (2 * len(self.names) + 2 * len(self.system.control_names) + 4 * parts)
+
+    def cost(self, judged: Judged) -> Tensor:
+        """What plans are chosen by where they satisfy the specification, without gradient: (batch,).
+
+        These are the performance terms as if every plan were satisfying. On a mission the pull of the next
+        goal draws plans to the edge of what is allowed now, so there it also costs to spare less than gamma.
+        """
+        with torch.no_grad():
+            cost = self.performance(judged.columns, judged.rho, judged.plans)
+            if not self.compiled.timers:
+                return cost
+            gamma = self.system.decl.objective.gamma
+            return cost + SHORT * (gamma - judged.rho).clamp(0.0, gamma)
+
+    def performance(self, columns: Mapping[str, Tensor], rho: Tensor, u: Tensor) -> Tensor:
+        """Performance terms as if every plan were satisfying, with promises and pull of a mission: (batch,).
+
+        Args:
+            columns: states over time, name -> (time, batch).
+            rho: robustness, (batch,).
+            u: controls, (batch, T, m).
+        """
+        cost = self.system.performance(columns, torch.ones_like(rho), rho.detach(), u)
+        if self.promises.items:
+            cost = cost + KEPT * self.promises.short(columns)
+        if self._pull is None:
+            return cost
+        gap: Tensor = self._pull(columns, TORCH, HARD)["gap"]
+        return cost + PULL * gap.mean(0)
+
+    @cached_property
+    def promises(self) -> Promises:
+        """What a mission promises, and how much it is to be kept with."""
+        return Promises(self.compiled, self.system.decl.objective.gamma)
+
+    @cached_property
+    def _pull(self) -> Program | None:
+        """How far the next goal of the mission is, sample by sample."""
+        return None if self.compiled.pull is None else Program({"gap": self.compiled.pull})
+
+    def alive(self, x: Tensor) -> Tensor:
+        """Whether the mission so far leaves a way to satisfy every requirement: (B, n) -> (B,) booleans."""
+        env = {name: column[None] for name, column in zip(self.names, x.unbind(1), strict=True)}
+        margins = evaluate([rule.alive for rule in self.rules], env, ops=TORCH)
+        return torch.stack([margin[0].expand(len(x)) >= 0.0 for margin in margins]).all(0)
+
+
+def rank(rho: Tensor, cost: Tensor, safe: Tensor | None = None) -> Tensor:
+    """One number to choose plans by: the cheapest that satisfies, else the most robust, safe ones first.
+
+    Args:
+        rho: robustness, any shape.
+        cost: performance terms, the same shape.
+        safe: robustness of phi_safe, the same shape; without it no plan is preferred for being safe.
+
+    Returns:
+        Larger is better: > 1 where satisfied (falling with cost), < 1 elsewhere (rising with robustness, and
+        where that is flat falling with cost), 2 less where it is unsafe.
+    """
+    cheap = torch.nan_to_num(1.0 / (1.0 + cost.clamp(min=0.0)))
+    poor = torch.where(torch.isfinite(rho), rho / (1.0 + rho.abs()), torch.full_like(rho, -1.0))
+    poor = poor + TIE * cheap
+    if safe is not None:
+        poor = torch.where(satisfied(safe), poor, poor - 2.0)
+    return torch.where(satisfied(rho) & ~torch.isnan(cost), 1.0 + cheap, poor)

@@ -1,0 +1,1 @@
+"""Training: steps, validation, search for plans, checkpoints."""

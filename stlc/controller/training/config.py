@@ -1,0 +1,193 @@
+"""Everything that a training run was told, and what the engine chose by itself."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Literal, get_args
+
+import torch
+
+if TYPE_CHECKING:
+    from stlc.controller.problem.task import Task
+    from stlc.controller.training.budget import StepSchedule
+
+Method = Literal["guided", "gradient"]
+Clock = Literal["wall", "processor"]
+"""What a budget counts: time that passes, or processor time as it would pass on an idle machine."""
+
+ENGINE_VERSION = 2
+"""Raised with every change of what the engine reaches; figures that another one made are taken anew."""
+
+DRIVES = 400
+"""Drives under one guard after a training, at most."""
+HELD_OUT = 5000
+HELD_OUT_SEED = 981_273
+"""Seed of the held-out states: used for reports only, never while training or tuning."""
+
+MISSION_HOLD = 0.7
+"""On missions the states to learn from change while a policy gets further: the rate falls late."""
+MISSION_MOST = 128
+"""Failing states of missions are alike: many stand where nothing can be done any more."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrainConfig:
+    """What the user may say; None leaves the choice to the system file, then to the engine.
+
+    Attributes:
+        method: `guided` (the default) searches and distils; `gradient` is the paper's.
+        budget: seconds, the verdict included; planned as steps again and again.
+        clock: of the budget.
+        steps: of the optimiser, or the schedule of a run with a budget; wins over `budget`.
+        seed: of everything random in training.
+        device: of torch.
+        threads: of torch; None leaves a core to the search beside it.
+        plans: number of plans of the network.
+        lr: peak learning rate.
+        batch: fresh states a step.
+        held_out: states of the last verdict.
+        drives: after the training, under one guard at most; 0: none.
+    """
+
+    method: Method | None = None
+    budget: float | None = None
+    steps: int | StepSchedule | None = None
+    seed: int | None = None
+    device: str = "cpu"
+    threads: int | None = None
+    plans: int | None = None
+    lr: float | None = None
+    batch: int | None = None
+    held_out: int = HELD_OUT
+    clock: Clock = "wall"
+    drives: int = DRIVES
+
+
+@dataclass(frozen=True, slots=True)
+class Engine:
+    """The numbers of a run, all of them decided. They are saved with it.
+
+    Attributes:
+        method: as told.
+        seed: as told.
+        hidden: widths of the network.
+        plans: number of plans of the network.
+        batch: fresh states a step.
+        hard: solved hard states a step, once there are any.
+        lr: peak learning rate.
+        warmup: share of the steps over which it rises.
+        hold: share of the steps over which it stays at its peak; it rises in a fixed number of steps then.
+        clip: bound of the gradient's norm.
+        average: decay of the average of the weights.
+        pool: fresh states that a search round judges.
+        every: steps between search rounds, twice as many where a round repaired little.
+        most: failing states that a round repairs at most.
+        slope: backward slope of switches, per unit.
+        imitation: weight of the distance to a repaired plan.
+        share: weight of the mean over plans beside the winner's loss.
+        performance: factor of the performance terms.
+        held_out: states of the last verdict.
+        threads: of torch; sums over other numbers of them round otherwise. 0 leaves what is set.
+        samples: size of a fixed training set; 0: fresh states in every step.
+        clock: of budgets and of the times on record.
+        ranks: processes that train together, each with so many states a step.
+        drives: after the training, under one guard at most; 0: none.
+    """
+
+    method: Method
+    seed: int
+    hidden: tuple[int, ...]
+    plans: int
+    batch: int
+    hard: int
+    lr: float
+    warmup: float = 0.03
+    hold: float = 0.0
+    clip: float = 1.0
+    average: float = 0.99
+    pool: int = 2048
+    every: int = 50
+    most: int = 768
+    slope: float = 5.0
+    imitation: float = 1.0
+    share: float = 0.05
+    performance: float = 0.3
+    held_out: int = HELD_OUT
+    threads: int = 0
+    samples: int = 0
+    clock: Clock = "wall"
+    ranks: int = 1
+    drives: int = DRIVES
+
+
+_MOST = {
+    **dict.fromkeys(("hidden", "plans", "threads", "ranks"), 65_536),
+    **dict.fromkeys(("batch", "hard", "pool", "most", "held_out", "samples", "drives"), 10**8),
+    **dict.fromkeys(("warmup", "average"), 1.0),
+    "hold": 0.999,
+}
+"""Greatest values, of shares and of what decides how much memory is taken."""
+_POSITIVE = ("hidden", "plans", "batch", "pool", "every", "ranks")
+
+
+def checked_engine(engine: Engine) -> Engine:
+    """The same engine. Raises ValueError where a number is of another kind than it must be, or too large."""
+    words = {"method": get_args(Method), "clock": get_args(Clock)}
+    for field in fields(Engine):
+        value = getattr(engine, field.name)
+        if field.name in words:
+            fits = value in words[field.name]
+        else:
+            kinds = (int, float) if field.type == "float" else (int,)
+            most = _MOST.get(field.name, 1e12)
+            each = value if field.name == "hidden" else (value,)
+            least = 1 if field.name in _POSITIVE else 0
+            fits = all(_is_number(number, kinds) and least <= number <= most for number in each)
+        if not fits:
+            raise ValueError(f"`{field.name}` is {value!r:.40}")
+    return engine
+
+
+def _is_number(value: object, kinds: tuple[type, ...]) -> bool:
+    return isinstance(value, kinds) and not isinstance(value, bool)
+
+
+def decide(task: Task, config: TrainConfig) -> Engine:
+    """The engine's numbers for a task: the user's words, then the system file's, then defaults."""
+    declared = task.system.decl.train
+    method: Method = "gradient" if (config.method or declared.method) == "gradient" else "guided"
+    guided = method == "guided"
+    mission = bool(task.compiled.timers)
+    batch = config.batch or declared.batch or (256 if guided else 512)
+    plans = config.plans or (4 if guided else 1)
+    return Engine(
+        method=method,
+        seed=declared.seed if config.seed is None else config.seed,
+        hidden=task.system.decl.policy.hidden,
+        plans=plans,
+        batch=batch,
+        hard=batch if guided else 0,
+        lr=config.lr or declared.lr or 1e-3,
+        hold=MISSION_HOLD if mission else 0.0,
+        most=MISSION_MOST if mission else 768,
+        share=0.05 if plans > 1 else 0.0,
+        performance=0.3 if guided else 1.0,
+        held_out=config.held_out,
+        threads=config.threads or _threads(searching=guided and config.device == "cpu"),
+        samples=0 if guided else declared.samples or 0,
+        clock=config.clock,
+        drives=config.drives,
+    )
+
+
+def cores() -> int:
+    """Cores that this process may use: its share, where several of this machine train together."""
+    found = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, found // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+
+
+def _threads(*, searching: bool) -> int:
+    """Threads of torch: as they are set, or one less than there are cores where a search runs beside it."""
+    most = int(torch.get_num_threads())
+    return max(1, min(most, cores() - 1)) if searching else most

@@ -1,0 +1,47 @@
+"""The files that a training reads: the specification and what it imports, the system and what it names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from stlc.compile.frontend.modules import Module, load_modules
+from stlc.diagnostics import StlcError
+from stlc.dynamics.robots.functions import function_files
+from stlc.dynamics.schema.schema import load_system_decl
+from stlc.files import find_spec, find_system, read_source
+from stlc.grammar.parse.parser import parse
+
+
+def input_files(
+    path: Path, system: str | None = None, overrides: Mapping[str, str] | None = None
+) -> tuple[Path, ...]:
+    """The files behind a training, as far as they can be read: who trains says what is wrong with the rest.
+
+    Args:
+        path: of the specification.
+        system: instead of the one that the specification names.
+        overrides: of `--set`.
+    """
+    path = find_spec(path)
+    found: dict[Path, None] = {path: None}
+    with suppress(StlcError):
+        spec = parse(read_source(path))
+        found.update(dict.fromkeys(_imported(load_modules(spec))))
+        if (wanted := system or spec.system) is not None:
+            there = find_system(wanted, path)
+            found[there] = None
+            decl = load_system_decl(there, overrides or {})
+            found.update(dict.fromkeys(function_files(decl).values()))
+            found.update(dict.fromkeys(world.path for world in decl.worlds))
+            for judge in decl.judges:
+                found[judge.path] = None
+                found.update(dict.fromkeys(_imported(load_modules(parse(read_source(judge.path))))))
+    return tuple(file for file in found if file.is_file())
+
+
+def _imported(modules: tuple[Module, ...]) -> Iterator[Path]:
+    for module in modules:
+        yield Path(module.spec.source.name)
+        yield from _imported(module.imports)

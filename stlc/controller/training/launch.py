@@ -1,0 +1,113 @@
+"""A run's folder before the first step: exact inputs, options, versions, machine."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from stlc.compile.dump import dump
+from stlc.compile.frontend.modules import library_of
+from stlc.controller.evaluation.rules import keep_rules
+from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, decide
+from stlc.controller.training.loop import train
+from stlc.controller.training.run import SPEC, SYSTEM, Run, save_library, spec_hash, system_hash
+from stlc.dynamics.robots.functions import function_files
+from stlc.files import write_atomic
+from stlc.provenance import git_state, hardware, versions
+from stlc.rundir import RUNS, RunDir, now
+from stlc.version import __version__
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from stlc.controller.problem.task import Task
+    from stlc.controller.training.config import Method
+
+
+@dataclass(frozen=True, slots=True)
+class Launch:
+    """Where and under which name a run is made.
+
+    Attributes:
+        root: folder of all runs.
+        name: words of the run; drawn if None.
+        overrides: what `--set` changed.
+        command: as typed.
+    """
+
+    root: Path = RUNS
+    name: str | None = None
+    overrides: Mapping[str, str] = field(default_factory=dict)
+    command: Sequence[str] = ()
+
+
+def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -> RunDir:
+    """Make the folder of a new run and fill it with everything that repeats it.
+
+    Args:
+        task: what is trained for.
+        config: what the user said.
+        launch: where, and under which name.
+
+    Raises:
+        MissingError: R201, the folder cannot be written.
+        UsageError: U101, `name` cannot name a folder.
+    """
+    decl, launch = task.system.decl, launch or Launch()
+    folder = RunDir.create(launch.root, task.compiled.name, launch.name)
+    folder.update(
+        {
+            "stlc": __version__,
+            "command": list(launch.command),
+            "status": "running",
+            "started": now(),
+            "spec": task.compiled.name,
+            "spec_path": task.compiled.spec.source.name,
+            "system": task.system.name,
+            "system_path": str(decl.path),
+            "overrides": dict(launch.overrides),
+            "seed": decide(task, config).seed,
+            "budget": config.budget,
+            "device": config.device,
+            "threads": decide(task, config).threads,
+            "options": asdict(replace(config, steps=None)) | {"steps": config.steps and str(config.steps)},
+            "engine_version": ENGINE_VERSION,
+            "versions": versions(),
+            "git": git_state(),
+            "hardware": hardware(),
+        }
+    )
+    write_atomic(folder.path / SPEC, task.compiled.spec.source.text)
+    save_library(folder, library_of(task.compiled.spec))
+    write_atomic(folder.path / SYSTEM, decl.source.text)
+    for path in {world.path for world in decl.worlds if world.path.is_file()}:
+        write_atomic(folder.path / path.name, path.read_bytes())
+    for name, path in function_files(decl).items():
+        write_atomic(folder.path / name, path.read_bytes())
+    keep_rules(folder, task)
+    write_atomic(folder.path / "compiled.txt", dump(task.compiled))
+    hashes = {"spec_hash": spec_hash(folder), "system_hash": system_hash(folder), "learnt": decl.learnt}
+    folder.update(hashes)
+    return folder
+
+
+def train_here(
+    task: Task,
+    *,
+    budget: float | None = None,
+    steps: int | None = None,
+    seed: int | None = None,
+    method: Method | None = None,
+) -> Run:
+    """Train a policy in a new folder below `runs/` and return the run.
+
+    Args:
+        task: what to train for; see `stlc.compile`.
+        budget: seconds; 60 where neither this nor `steps` nor the system file says otherwise.
+        steps: of the optimiser; wins over `budget`.
+        seed: of everything random; None takes the system file's.
+        method: `guided` (search and distil) or `gradient` (the paper's); None takes the system file's.
+    """
+    config = TrainConfig(method=method, budget=budget, steps=steps, seed=seed)
+    return train(task, config, open_folder(task, config)).run

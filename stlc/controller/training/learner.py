@@ -1,0 +1,423 @@
+"""The training loop's state and its three moves: a gradient step, a search round, a look at the clock.
+
+Search and distil: every few dozen steps fresh states are judged, the failing ones are repaired by search that
+starts at the policy's own plan, and repaired plans are imitated for as long as their state still fails. Each
+gradient step mixes fresh states with such hard ones. Of the network's plans the one that does best is trained
+(winner takes all), with a little of the mean so that none starves.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from stlc.controller.parallel.ddp import ALONE, Ranks
+from stlc.controller.policies.policy import Mlp, PlanNetwork, network_of
+from stlc.controller.problem.task import rank, satisfied
+from stlc.controller.training.exploration import EFFORTS, Exploration
+from stlc.controller.training.local_search import THOROUGH, Repaired, Search, Searcher
+from stlc.controller.training.missions import Missions
+from stlc.controller.training.objective import Objective, guided_objective, loss, paper_objective
+from stlc.controller.training.replay import Buffer
+from stlc.controller.training.samplers import Draws, Fixed, Supply
+from stlc.native import never
+
+if TYPE_CHECKING:
+    from stlc.controller.problem.task import Task
+    from stlc.controller.training.config import Engine
+    from stlc.native import Stop
+
+MARGIN_STATES = 128
+MARGIN_SHARE = 0.2
+MARGIN_RANGE = (0.01, 0.5)
+TORCH_MARGIN_STATES, TORCH_MOST, TORCH_TRIES = 32, 64, 2048
+"""States and plans of the searches of a training where torch does their work: some hundred times slower."""
+BARREN = 0.05
+"""Share of the failing states that a climb solves, below which plans are looked for by exploration too."""
+LEARNT = 0.5
+"""Share of fresh states that a policy satisfies, from which on nothing is explored any more."""
+EXPLORED = 4
+"""Starts that are explored before a round, at most."""
+RISE = 30
+"""Steps to the peak of the learning rate where it is held; independent of how many there will be."""
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What a search round saw on fresh states, of all ranks.
+
+    Attributes:
+        accuracy: share whose plan satisfies the specification.
+        requirements: share per requirement, in the order of the task's rules.
+        feasible: share for which a satisfying plan is known after the search (None: no search was made).
+        failing: states that the search worked on.
+        repaired: how many of them it solved.
+        explored: plans that exploration found, those from states on their way among them.
+    """
+
+    accuracy: float
+    requirements: tuple[float, ...]
+    feasible: float | None
+    failing: int
+    repaired: int
+    explored: int = 0
+
+
+class Trainer:
+    """Everything that changes while training. Same seed and steps: same weights on the same machine."""
+
+    def __init__(
+        self, task: Task, engine: Engine, *, steps: int, device: torch.device, ranks: Ranks = ALONE
+    ) -> None:
+        self.task = task
+        self.engine = engine
+        self.steps = steps
+        self.device = device
+        self.ranks = ranks
+        self.step = 0
+        self.next_look = engine.every
+        self.generator = torch.Generator().manual_seed(ranks.seed(engine.seed))
+        self.network = _network(task, engine, device)
+        self.supply = self._supply()
+        self.average = _network(task, engine, device)
+        self.network.normalise(self.supply.take(4096))
+        ranks.agree_on(self.network)
+        self.training = Fixed(self.supply, engine.samples, self.generator) if engine.samples else self.supply
+        self.average.load_state_dict(self.network.state_dict())
+        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=engine.lr, fused=True)
+        self.buffer = Buffer.empty(len(task.names), task.horizon, len(task.system.control_names), device)
+        self.margin = paper_objective(task).margin
+        if engine.method == "guided":
+            self.margin = ranks.agree(self._feasible_margin())
+        self.objective = self._objective()
+        self.searcher = self._searcher(MARGIN_SHARE * self.margin)
+        self.repairing: Search | None = None
+        self.barren, self.effort, self.explored = False, 0, 0
+        self.accuracy = 0.0
+        self.loss = math.nan
+        self.learnt = torch.empty(0, len(task.names), device=device)
+
+    def advance(self) -> float:
+        """One gradient step; returns its loss. Where that or its gradient is not finite, NaN, and no step."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.rate
+        value = self._loss()
+        self.optimizer.zero_grad()
+        value.backward()  # type: ignore[no-untyped-call]
+        value = self.ranks.learn(self.network.parameters(), value.detach())
+        length = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.engine.clip)
+        if not bool(torch.isfinite(value + length)):
+            return math.nan
+        self.optimizer.step()
+        self.step += 1
+        decay = min(self.engine.average, self.step / (self.step + 10.0))
+        with torch.no_grad():
+            pairs = zip(self.average.parameters(), self.network.parameters(), strict=True)
+            for averaged, current in pairs:
+                averaged.lerp_(current, 1.0 - decay)
+        self.loss = float(value)
+        if self.repairing is not None:
+            self.repairing.advance()
+        return self.loss
+
+    @property
+    def rate(self) -> float:
+        """Learning rate of the next step: a short rise, a while at the peak, then half a cosine to 0."""
+        engine, hold = self.engine, self.engine.hold
+        rise = min(1.0, (self.step + 1) / (RISE if hold else max(1.0, engine.warmup * self.steps)))
+        fallen = max(0.0, self.step / self.steps - hold) / (1.0 - hold)
+        return engine.lr * rise * 0.5 * (1.0 + math.cos(math.pi * fallen))
+
+    @property
+    def policy(self) -> Mlp:
+        """The policy that is handed out: the averaged weights."""
+        return Mlp(self.task, self.average)
+
+    @torch.no_grad()
+    def explore(self, stop: Stop = never) -> bool:
+        """Look for plans by exploration, where the round before has shown that climbing leads nowhere.
+
+        The effort grows with every time that nothing is found. False where `stop` came first; then nothing
+        has changed.
+        """
+        if not self.barren:
+            return True
+        before = self.generator.get_state()
+        starts = self.task.sample(EXPLORED, generator=self.generator)
+        seed = int(torch.randint(2**62, (), generator=self.generator))
+        generator = torch.Generator().manual_seed(seed)
+        effort, spare = EFFORTS[self.effort], self.searcher.enough
+        found = Exploration(self.task).solved(starts, effort, generator, spare, stop).to(self.device)
+        if stop():
+            self.generator.set_state(before)
+            return False
+        self.buffer.add(found.states, found.plans)
+        self.supply.follow(found.states, found.plans)
+        self.barren, self.explored = False, len(found.rho)
+        self.effort += self.explored == 0
+        return True
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether exploration has been tried with all the effort there is, and found nothing."""
+        return self.effort >= len(EFFORTS)
+
+    @torch.no_grad()
+    def look(self) -> Look:
+        """Judge fresh states; with the guided method also repair what fails.
+
+        The repair goes on beside the training steps; the next look takes what it has found.
+        """
+        x0 = self.supply.take(self.engine.pool)
+        plans, judged = Mlp(self.task, self.network).plan_judged(x0)
+        good = satisfied(judged.rho)
+        shares = tuple(float(share) for share in satisfied(judged.requirements).double().mean(0))
+        accuracy = float(good.double().mean())
+        self.next_look = self.step + self.engine.every
+        if self.engine.method != "guided":
+            return self._of_all(Look(accuracy, shares, None, 0, 0))
+        failing, repaired, before = self._take_repaired()
+        feasible = None if before is None else max(before, accuracy)
+        bad = (~good).nonzero()[:, 0][: self._effort[0]]
+        self.repairing = self._begin(x0[bad], plans[bad])
+        self.accuracy = accuracy
+        self.barren = repaired < BARREN * failing and accuracy < LEARNT and not self.exhausted
+        explored, self.explored = self.explored, 0
+        return self._of_all(Look(accuracy, shares, feasible, failing, repaired, explored))
+
+    def _begin(self, x0: Tensor, plans: Tensor, seed: int | None = None) -> Search:
+        """A search beside the steps until the next round."""
+        tries, steps = self._effort[1], self.engine.every
+        return self.searcher.begin(x0, plans, self.buffer.bank, tries=tries, steps=steps, seed=seed)
+
+    @property
+    def _effort(self) -> tuple[int, int]:
+        """Failing states of a search round at most, and plans that are tried for each."""
+        native = self.task.native is not None
+        return (self.engine.most, THOROUGH) if native else (min(self.engine.most, TORCH_MOST), TORCH_TRIES)
+
+    def close(self) -> None:
+        """End the search that goes on beside the steps."""
+        if self.repairing is not None:
+            self.repairing.cancel()
+
+    def _of_all(self, look: Look) -> Look:
+        """What the ranks saw together."""
+        counts = (look.failing, look.repaired, look.explored)
+        own = (look.feasible or 0.0, *counts, look.accuracy, *look.requirements)
+        feasible, failing, repaired, explored, accuracy, *shares = self.ranks.mean(own)
+        size = self.ranks.size
+        return Look(
+            accuracy,
+            tuple(shares),
+            None if look.feasible is None else feasible,
+            round(failing * size),
+            round(repaired * size),
+            round(explored * size),
+        )
+
+    def _take_repaired(self) -> tuple[int, int, float | None]:
+        """Put what the search round before this one has found where it is learnt from.
+
+        Returns:
+            How many states it worked on, how many it solved, and the share of all states of that
+            time known to be feasible.
+        """
+        if self.repairing is None:
+            return 0, 0, None
+        repaired_by_then = self.repairing.result()
+        assert repaired_by_then is not None
+        found = repaired_by_then.to(self.device)
+        solved = found.solved
+        self.buffer.add(found.states[solved], found.plans[solved])
+        self.supply.follow(found.states[solved], found.plans[solved])
+        failing, repaired = len(solved), int(solved.sum())
+        rate = repaired / max(1, failing)
+        return failing, repaired, self.accuracy + (1.0 - self.accuracy) * rate
+
+    # ------------------------------------------------------------------ pieces
+
+    def _loss(self) -> Tensor:
+        engine = self.engine
+        fresh = self.training.take(engine.batch)
+        hard = engine.hard if len(self.buffer) else 0
+        x0, targets = fresh, fresh.new_zeros(0)
+        if hard:
+            states, targets = self.buffer.draw(hard, self.generator)
+            x0 = torch.cat((fresh, states))
+        self.learnt = x0
+        plans: Tensor = self.network(x0)
+        winner, good = self._winner(x0, plans)
+        rows = torch.arange(len(x0), device=self.device)
+        chosen = plans[rows, winner]
+        value = loss(self.task, self.objective, x0, chosen).total.mean()
+        if engine.share:
+            some = rows[:: engine.plans]
+            other = torch.randint(engine.plans, (len(some),), generator=self.generator).to(self.device)
+            value = (
+                value
+                + engine.share * loss(self.task, self.objective, x0[some], plans[some, other]).total.mean()
+            )
+        if hard:
+            value = value + self._imitation(plans[-hard:], targets, good[-hard:])
+        return value
+
+    @torch.no_grad()
+    def _winner(self, x0: Tensor, plans: Tensor) -> tuple[Tensor, Tensor]:
+        """Which plan is trained, the one that does best, (B,), and whether it satisfies the specification."""
+        batch, count = plans.shape[:2]
+        if count == 1 and self.engine.hard == 0:
+            first = torch.zeros(batch, dtype=torch.int64, device=self.device)
+            return first, torch.zeros_like(first, dtype=torch.bool)
+        judged = self.task.judge(x0.repeat_interleave(count, 0), plans.flatten(0, 1))
+        score = rank(judged.rho, self.task.cost(judged)).view(batch, count)
+        return score.argmax(1), satisfied(judged.rho).view(batch, count).any(1)
+
+    def _imitation(self, plans: Tensor, targets: Tensor, solved: Tensor) -> Tensor:
+        """Distance of the nearest plan to the repaired one, where the state still fails."""
+        half = (0.5 * (self.task.system.control_high - self.task.system.control_low)).to(plans.device)
+        distance = ((plans - targets[:, None]) / half).square().mean((2, 3)).amin(1)
+        return self.engine.imitation * torch.where(solved, torch.zeros_like(distance), distance).mean()
+
+    def _feasible_margin(self) -> float:
+        """A gamma of the size that plans can reach: a share of what search reaches on the median state."""
+        native = self.task.native is not None
+        count, tries = (MARGIN_STATES, THOROUGH) if native else (TORCH_MARGIN_STATES, TORCH_TRIES)
+        x0 = self.supply.take(min(count, MARGIN_STATES))
+        middle = 0.5 * (self.task.system.control_low + self.task.system.control_high)
+        start = middle.to(self.device).expand(len(x0), self.task.horizon, -1)
+        rho = self._searcher(math.inf).repair(x0, start, self.buffer.bank, tries=tries).rho
+        reached = rho[satisfied(rho)]
+        if reached.numel() == 0:
+            return MARGIN_RANGE[0]
+        return min(max(MARGIN_SHARE * float(reached.median()), MARGIN_RANGE[0]), MARGIN_RANGE[1])
+
+    def _searcher(self, enough: float) -> Searcher:
+        return Searcher(self.task, self.generator, enough=enough, device=self.device)
+
+    def _supply(self) -> Supply:
+        """States that missions pass through where the specification has memory, else independent ones."""
+        if not self.task.compiled.timers:
+            return Draws(self.task, self.generator, self.device)
+        policy = Mlp(self.task, self.network)
+        return Missions(self.task, self.generator, self.device, lambda x0: policy.plan_judged(x0)[1])
+
+    def _objective(self) -> Objective:
+        if self.engine.method == "gradient":
+            return paper_objective(self.task)
+        return guided_objective(
+            self.margin, slope=self.engine.slope, performance_weight=self.engine.performance
+        )
+
+    # ------------------------------------------------------------- checkpoints
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything that a resumed run needs to go on bit for bit; on the first of several ranks, of all.
+
+        All of them have to ask at the same time.
+        """
+        found: dict[str, Tensor] = self._own()
+        for index, theirs in enumerate(self.ranks.gather(found), start=1):
+            found.update({f"rank{index}.{name}": value for name, value in theirs.items()})
+        for prefix, module in (("network", self.network), ("average", self.average)):
+            found.update({f"{prefix}.{name}": value for name, value in module.state_dict().items()})
+        for index, state in self.optimizer.state_dict()["state"].items():
+            found.update({f"adam.{index}.{name}": value for name, value in state.items()})
+        return found
+
+    def _own(self) -> dict[str, Tensor]:
+        """What every rank has for itself."""
+        found: dict[str, Tensor] = {"generator": self.generator.get_state()}
+        if not self.ranks.first:
+            counts = [self.accuracy, self.buffer.count, self.barren, self.effort]
+            found["counts"] = torch.tensor(counts, dtype=torch.float64)
+        kept = len(self.buffer)
+        if isinstance(self.training, Fixed):
+            found.update({f"training.{name}": value for name, value in self.training.tensors().items()})
+        found.update({f"supply.{name}": value for name, value in self.supply.tensors().items()})
+        known = self.repairing.result(stop=lambda: True) if self.repairing is not None else None
+        if known is not None:
+            found.update({f"repairing.{name}": getattr(known, name) for name in ("states", "plans", "rho")})
+        elif self.repairing is not None:
+            pending = {"states": self.repairing.states, "plans": self.repairing.plans}
+            found.update({f"searching.{name}": value for name, value in pending.items()})
+            found["searching.seed"] = torch.tensor(self.repairing.seed)
+        found["buffer.states"], found["buffer.plans"] = self.buffer.states[:kept], self.buffer.plans[:kept]
+        return found
+
+    def facts(self) -> dict[str, float | int]:
+        """The plain numbers that go with `tensors`."""
+        last = {"loss": self.loss} if math.isfinite(self.loss) else {}
+        return last | {
+            "step": self.step,
+            "steps": self.steps,
+            "margin": self.margin,
+            "solved": self.buffer.count,
+            "next_look": self.next_look,
+            "accuracy": self.accuracy,
+            "barren": int(self.barren),
+            "effort": self.effort,
+        }
+
+    def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
+        """Go on where `tensors` and `facts` were taken."""
+        tensors, facts = self._restored(tensors, facts)
+        self.step, self.steps = int(facts["step"]), int(facts["steps"])
+        self.margin, self.next_look = float(facts["margin"]), int(facts["next_look"])
+        self.accuracy, self.loss = float(facts["accuracy"]), float(facts.get("loss", math.nan))
+        self.effort = max(int(facts.get("effort", 0)), 0)
+        self.barren = bool(facts.get("barren", 0)) and not self.exhausted
+        self.objective = self._objective()
+        self.searcher = self._searcher(MARGIN_SHARE * self.margin)
+        for prefix, module in (("network", self.network), ("average", self.average)):
+            module.load_state_dict(_below(tensors, prefix))
+        layout = self.optimizer.state_dict()
+        adam = _below(tensors, "adam")
+        for key, value in adam.items():
+            index, name = key.split(".")
+            layout["state"].setdefault(int(index), {})[name] = value
+        self.optimizer.load_state_dict(layout)
+        kept = tensors["buffer.states"].shape[0]
+        self.buffer.states[:kept] = tensors["buffer.states"]
+        self.buffer.plans[:kept] = tensors["buffer.plans"]
+        self.buffer.count = int(facts["solved"])
+        self.supply.restore(_below(tensors, "supply"))
+        if isinstance(self.training, Fixed):
+            self.training.restore(_below(tensors, "training"))
+        self.generator.set_state(tensors["generator"].cpu())
+        if known := _below(tensors, "repairing"):
+            self.repairing = Search.of(Repaired(**known))
+        elif begun := _below(tensors, "searching"):
+            states, plans = begun["states"].to(self.device), begun["plans"].to(self.device)
+            self.repairing = self._begin(states, plans, int(begun["seed"]))
+
+    def _restored(
+        self, tensors: dict[str, Tensor], facts: dict[str, float | int]
+    ) -> tuple[dict[str, Tensor], dict[str, float | int]]:
+        """What this rank goes on with: its own part in the place of the first one's."""
+        if self.ranks.first:
+            return tensors, facts
+        shared = ("network.", "average.", "adam.")
+        common = {name: value for name, value in tensors.items() if name.startswith(shared)}
+        own = _below(tensors, f"rank{self.ranks.rank}")
+        accuracy, solved, barren, effort = own.pop("counts").tolist()
+        counts = {"solved": int(solved), "barren": int(barren), "effort": int(effort)}
+        return common | own, {**facts, "accuracy": accuracy, **counts}
+
+
+def _network(task: Task, engine: Engine, device: torch.device) -> PlanNetwork:
+    """A network whose first weights depend on the seed alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(engine.seed)
+        return network_of(task, engine).to(device)
+
+
+def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The entries under `prefix.`, without it."""
+    return {
+        name[len(prefix) + 1 :]: value for name, value in tensors.items() if name.startswith(prefix + ".")
+    }

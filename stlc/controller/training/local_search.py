@@ -1,0 +1,319 @@
+"""Repairing plans: batched hill climbing on the exact robustness, from the policy's own plan.
+
+Gradients see nothing from outside a stop zone or across an obstacle; a search does. Each generation tries a
+batch of changed plans per state and keeps the best. Changes are noise over a random stretch of time, a
+constant shift of a stretch, a stretch held at one random level, and plans that solved other states. The
+native kernel does it where there is one, torch elsewhere.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from threading import Event
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from stlc.compile.backends.c.emit import LANES
+from stlc.controller.problem.kernel import Effort
+from stlc.controller.problem.task import FLOAT32_SLACK
+from stlc.controller.training.config import cores
+from stlc.native import never
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from stlc.controller.problem.task import Task
+    from stlc.native import Stop
+
+THOROUGH = 4000
+"""Plans that are tried per state at most, unless told otherwise."""
+TRIES = 64
+"""Plans of a generation where torch does the work."""
+MOST_TRIED = 4_000_000
+"""Numbers in the plans that torch tries at a time: what bounds its memory."""
+LOOK = 0.1
+"""Seconds between two looks at whether waiting is to end."""
+
+
+@dataclass(frozen=True, slots=True)
+class Repaired:
+    """What a search found.
+
+    Attributes:
+        states: where plans start, (B, n).
+        plans: the best plan per state, (B, T, m).
+        rho: its exact robustness, (B,).
+    """
+
+    states: Tensor
+    plans: Tensor
+    rho: Tensor
+
+    @property
+    def solved(self) -> Tensor:
+        """Where the plan satisfies the specification with a little to spare, (B,)."""
+        return self.rho >= FLOAT32_SLACK
+
+    def to(self, device: torch.device) -> Repaired:
+        """The same on another device."""
+        return Repaired(self.states.to(device), self.plans.to(device), self.rho.to(device))
+
+
+class Search:
+    """A search for better plans that goes on beside whatever else is done.
+
+    What it gives depends on its states, plans, seed and bank alone, not on when it is asked or stopped and
+    begun again. The native kernel works on a thread of its own; torch in `advance`.
+
+    Attributes:
+        states: where plans start, (B, n).
+        plans: that it begins with, (B, T, m).
+        seed: of its random numbers.
+    """
+
+    def __init__(self, states: Tensor, plans: Tensor, seed: int) -> None:
+        self.states, self.plans, self.seed = states, plans, seed
+        self._cancelled = Event()
+        self._climb: _TorchClimb | None = None
+        self._share = 1
+        self._found: Future[Repaired] = Future()
+
+    @classmethod
+    def of(cls, found: Repaired) -> Search:
+        """A search that has come to its end."""
+        search = cls(found.states, found.plans, 0)
+        search._found.set_result(found)
+        return search
+
+    def on_thread(self, pool: ThreadPoolExecutor, climb: Callable[[Stop], Repaired]) -> Search:
+        """This search, begun on a thread."""
+        self._found = pool.submit(climb, self._cancelled.is_set)
+        return self
+
+    def by_steps(self, climb: _TorchClimb, steps: int) -> Search:
+        """This search, to be done in so many equal shares."""
+        self._climb, self._share = climb, -(-climb.left // max(1, steps))
+        return self
+
+    def done(self) -> bool:
+        """Whether it has come to its end."""
+        return self._found.done()
+
+    def advance(self) -> None:
+        """Do a share of the work, where that is not done on another thread."""
+        if self._climb is not None and not self.done():
+            for _ in range(self._share):
+                if not self._climb.generation():
+                    self._found.set_result(self._climb.found)
+                    break
+
+    def result(self, stop: Stop = never) -> Repaired | None:
+        """What was found once it has come to its end; None where `stop` says first not to wait any longer."""
+        while not self.done():
+            if stop():
+                return None
+            if self._climb is not None:
+                self.advance()
+            else:
+                with suppress(TimeoutError):
+                    self._found.result(LOOK)
+        return self._found.result()
+
+    def cancel(self) -> None:
+        """End it; it gives nothing then."""
+        self._cancelled.set()
+
+
+class Searcher:
+    """A hill climber over open-loop plans of one task."""
+
+    def __init__(
+        self,
+        task: Task,
+        generator: torch.Generator,
+        *,
+        enough: float,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """Search plans of `task`; a state is left alone once its robustness reaches `enough`.
+
+        The generator is of the processor, and so is the native search; states and plans are on `device`.
+        """
+        self.task = task
+        self.generator = generator
+        self.enough = enough
+        self.device = device
+        self._aside = ThreadPoolExecutor(1, thread_name_prefix="search")
+
+    @torch.no_grad()
+    def repair(
+        self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH, stop: Stop = never
+    ) -> Repaired:
+        """Improve plans until they satisfy the specification or the effort is spent.
+
+        Args:
+            x0: states, (B, n).
+            plans: where to start, (B, T, m).
+            bank: plans that solved other states, (k, T, m); may be empty.
+            tries: plans per state at most.
+            stop: ends the search early, with what was found until then.
+        """
+        if self.task.native is not None:
+            return self._climbing(x0, plans, bank, tries, cores(), self._seed())(stop).to(x0.device)
+        return self._climb(x0, plans, bank, tries, self._seed()).finish(stop)
+
+    @torch.no_grad()
+    def begin(
+        self,
+        x0: Tensor,
+        plans: Tensor,
+        bank: Tensor,
+        *,
+        tries: int = THOROUGH,
+        steps: int = 1,
+        seed: int | None = None,
+    ) -> Search:
+        """`repair` beside whatever else goes on.
+
+        The native kernel leaves what it found on the processor; torch works in `steps` shares.
+        """
+        seed = self._seed() if seed is None else seed
+        search = Search(x0, plans, seed)
+        if self.task.native is not None:
+            return search.on_thread(self._aside, self._climbing(x0, plans, bank, tries, idle_cores(), seed))
+        return search.by_steps(self._climb(x0, plans, bank, tries, seed), steps)
+
+    @torch.no_grad()
+    def at_once(self, x0: Tensor, plans: Tensor, *, tries: int) -> Repaired:
+        """`repair` without a bank on the caller's own thread, as many threads of the kernel as torch has."""
+        bank = plans.new_zeros(0, *plans.shape[1:])
+        if self.task.native is None:
+            return self._climb(x0, plans, bank, tries, self._seed()).finish()
+        return self._climbing(x0, plans, bank, tries, torch.get_num_threads(), self._seed())(never)
+
+    def _seed(self) -> int:
+        return int(torch.randint(2**62, (), generator=self.generator))
+
+    def _climbing(
+        self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int, threads: int, seed: int
+    ) -> Callable[[Stop], Repaired]:
+        """A native climb that is ready to go; it has its own copies and its own random numbers."""
+        native = self.task.native
+        assert native is not None
+        x0, plans, bank = (part.to("cpu", copy=True) for part in (x0, plans, bank))
+
+        def climb(stop: Stop) -> Repaired:
+            effort = Effort(-(-tries // LANES), self.enough, seed, threads, stop)
+            best, _ = native.climb(x0, plans, bank, effort)
+            rho = self.task.judge(x0, best, states=False).rho
+            return Repaired(x0, best, rho)
+
+        return climb
+
+    def _climb(self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int, seed: int) -> _TorchClimb:
+        rho = self.task.judge(x0, plans, states=False).rho.clone()
+        found = Repaired(x0.clone(), plans.clone(), rho)
+        generator = torch.Generator().manual_seed(seed)
+        return _TorchClimb(self.task, found, bank.clone(), -(-tries // TRIES), self.enough, generator)
+
+
+class _TorchClimb:
+    """The same climb in torch, a generation at a time.
+
+    Attributes:
+        found: the best plans so far.
+        left: generations that are still to come, at most.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        found: Repaired,
+        bank: Tensor,
+        generations: int,
+        enough: float,
+        generator: torch.Generator,
+    ) -> None:
+        self.task, self.found, self.bank, self.left = task, found, bank, generations
+        self.enough, self.generator = enough, generator
+        device = found.states.device
+        self.low, self.high = task.system.control_low.to(device), task.system.control_high.to(device)
+
+    @torch.no_grad()
+    def generation(self, stop: Stop = never) -> bool:
+        """Try `TRIES` changed plans for every state that needs it; False once there is nothing left to do."""
+        still = (self.found.rho < self.enough).nonzero()[:, 0]
+        if self.left == 0 or not len(still):
+            return False
+        self.left -= 1
+        for part in torch.split(still, max(1, MOST_TRIED // (TRIES * self.found.plans[0].numel()))):
+            if stop():
+                break
+            self._keep_better(part, self._proposals(self.found.plans[part], TRIES, self.bank))
+        return self.left > 0
+
+    def finish(self, stop: Stop = never) -> Repaired:
+        """What was found at the end."""
+        while not stop() and self.generation(stop):
+            pass
+        return self.found
+
+    def _keep_better(self, still: Tensor, tried: Tensor) -> None:
+        """Judge plans (k, tries, T, m) for the states `still`, (k,), and update `found` in place."""
+        found, tries = self.found, tried.shape[1]
+        x0 = found.states[still].repeat_interleave(tries, 0)
+        judged = self.task.judge(x0, tried.flatten(0, 1), states=False)
+        value, which = judged.rho.view(-1, tries).max(1)
+        better = (value > found.rho[still]).nonzero()[:, 0]
+        rows = still[better]
+        found.plans[rows] = tried[better, which[better]]
+        found.rho[rows] = value[better]
+
+    def _proposals(self, plans: Tensor, tries: int, bank: Tensor) -> Tensor:
+        """Changed plans, (B, tries, T, m), within the bounds."""
+        quarter = tries // 4
+        span = self.high - self.low
+        start = plans[:, None]
+        shape = (plans.shape[0], quarter, *plans.shape[1:])
+        size = span * 0.5 * torch.exp(-3.0 * self._rand(*shape[:2], 1, 1))
+        noise = start + size * self._stretch(shape) * self._randn(*shape)
+        shift = start + size * self._stretch(shape) * self._randn(*shape[:2], 1, shape[3])
+        level = self.low + span * self._rand(*shape[:2], 1, shape[3])
+        held = torch.where(self._stretch(shape) > 0, level, start)
+        others = self._others(plans, tries - 3 * quarter, bank)
+        return torch.cat((noise, shift, held, others), 1).clamp(self.low, self.high)
+
+    def _others(self, plans: Tensor, count: int, bank: Tensor) -> Tensor:
+        """Plans that solved other states; piecewise constant ones while there are few."""
+        states, steps, controls = plans.shape
+        if bank.shape[0] >= 64:
+            return bank[self._randint(0, bank.shape[0], states, count)]
+        pieces = 4
+        levels = self.low + (self.high - self.low) * self._rand(states, count, pieces, controls)
+        return levels.repeat_interleave(-(-steps // pieces), 2)[:, :, :steps]
+
+    def _stretch(self, shape: tuple[int, ...]) -> Tensor:
+        """1 on a random stretch of time per plan and control, else 0; (B, tries, T, m)."""
+        states, tries, steps, controls = shape
+        first = self._randint(0, steps, states, tries, 1, controls)
+        length = self._randint(1, steps + 1, states, tries, 1, controls)
+        time = torch.arange(steps, device=self.low.device)[None, None, :, None]
+        return ((time >= first) & (time < first + length)).to(self.low.dtype)
+
+    def _rand(self, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=self.generator).to(self.low.device)
+
+    def _randn(self, *shape: int) -> Tensor:
+        return torch.randn(*shape, generator=self.generator).to(self.low.device)
+
+    def _randint(self, low: int, high: int, *shape: int) -> Tensor:
+        return torch.randint(low, high, shape, generator=self.generator).to(self.low.device)
+
+
+def idle_cores() -> int:
+    """Cores that torch leaves to a search beside it, at least one."""
+    return max(1, cores() - int(torch.get_num_threads()))

@@ -1,0 +1,127 @@
+"""What training minimises: the paper's truncated robustness and its performance terms (Eq. 8 to 10)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.semantics.switch import StraightThrough, Switch, Tanh
+from stlc.controller.problem.task import satisfied
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from stlc.controller.problem.task import Task
+
+
+@dataclass(frozen=True, slots=True)
+class Objective:
+    """The numbers of a loss.
+
+    Attributes:
+        margin: the paper's gamma; robustness beyond it earns nothing more.
+        smoothing: the paper's k; None trains on exact min and max with subgradients.
+        switch: how jumps and indicators become differentiable.
+        saturation: s of `s log(1 + hinge / s)`, so that infeasible states do not dominate; None: plain hinge.
+        stl_weight: the paper's lambda.
+        performance_weight: factor of the performance terms.
+    """
+
+    margin: float
+    smoothing: float | None
+    switch: Switch
+    saturation: float | None
+    stl_weight: float = 1.0
+    performance_weight: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """Losses per plan, (batch,) each, differentiable.
+
+    Attributes:
+        total: what is averaged over the batch.
+        stl: the part that the specification adds, before lambda.
+        cost: the performance terms as if every plan were satisfying, without gradient.
+        satisfied: exact verdicts of the plans that were rolled out.
+    """
+
+    total: Tensor
+    stl: Tensor
+    cost: Tensor
+    satisfied: Tensor
+
+
+def paper_objective(task: Task) -> Objective:
+    """The paper's own: hinge at gamma on the log-sum-exp robustness, tanh switching (Eq. 6 to 10)."""
+    declared = task.system.decl.objective
+    return Objective(
+        margin=declared.gamma,
+        smoothing=declared.smoothing,
+        switch=Tanh(),
+        saturation=None,
+        stl_weight=declared.stl_weight,
+    )
+
+
+def guided_objective(margin: float, *, slope: float, performance_weight: float) -> Objective:
+    """The engine's: exact operators, a margin of the size that is feasible, a saturating hinge."""
+    return Objective(
+        margin=margin,
+        smoothing=None,
+        switch=StraightThrough(slope),
+        saturation=2.0 * margin,
+        performance_weight=performance_weight,
+    )
+
+
+def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Loss:
+    """Loss of plans (Eq. 10: L_perf + lambda L_STL).
+
+    Args:
+        task: to be solved.
+        objective: its numbers.
+        x0: initial states, (B, n).
+        u: plans in physical units, (B, T, m), differentiable.
+
+    Returns:
+        Losses per plan.
+    """
+    rho, columns = _rolled(task, objective, x0, u)
+    exact = rho if objective.smoothing is None else task.graph.columns(columns, ops=TORCH)
+    good = satisfied(exact.detach())
+    hinge = (objective.margin - rho).clamp(min=0.0)
+    if objective.saturation is not None:
+        hinge = objective.saturation * torch.log1p(hinge / objective.saturation)
+    cost = task.performance(columns, rho, u)
+    total = objective.stl_weight * hinge + objective.performance_weight * torch.where(
+        good, cost, torch.zeros_like(cost)
+    )
+    return Loss(total=total, stl=hinge, cost=cost.detach(), satisfied=good)
+
+
+def native_rolled(
+    task: Task, objective: Objective, x0: Tensor, u: Tensor
+) -> tuple[Tensor, Mapping[str, Tensor]] | None:
+    """Robustness per requirement (B, R) and states (T+1, B) by name, differentiable, from emitted C.
+
+    None where that is not what the objective means, or where torch has to do the work.
+    """
+    switch = objective.switch
+    if objective.smoothing is None and isinstance(switch, StraightThrough) and x0.device.type == "cpu":
+        native = task.gradient
+        return None if native is None else native(x0, u, slope=switch.slope)
+    return None
+
+
+def _rolled(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
+    """Robustness (B,) and states (T+1, B) by name, differentiable: natively where that means the same."""
+    native = native_rolled(task, objective, x0, u)
+    if native is not None:
+        return task.graph.overall(native[0]), native[1]
+    columns = task.system.rollout_columns(x0, u, objective.switch)
+    return task.graph.columns(columns, ops=TORCH, smoothing=objective.smoothing), columns

@@ -1,0 +1,1 @@
+"""A system file as data."""

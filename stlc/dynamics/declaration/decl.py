@@ -1,0 +1,126 @@
+"""What a system file says, as data: names bound, units checked, expressions in the IR. No torch."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+
+from stlc.compile.frontend.interface import Grid, Interface
+from stlc.diagnostics import Diagnostic
+from stlc.dynamics.declaration.deployment import BackupDecl, JudgeRef, ScenarioDecl, TestDecl, WorldRef
+from stlc.dynamics.declaration.init import InitDecl
+from stlc.dynamics.declaration.learning import ObjectiveDecl, PolicyDecl, TrainDecl
+from stlc.dynamics.declaration.model import Assign, ControlDecl, Feedback, FunctionDecl, JumpDecl
+from stlc.signature import Signature
+from stlc.source import Source, Span
+from stlc.units import Unit
+
+LEARNT = (
+    *("dt", "horizon", "substeps", "integrator", "discrete", "constants", "signature", "controls"),
+    *("flow", "jumps", "clamps", "init", "objective", "policy", "feedback"),
+)
+"""The fields of a system that decide what a policy learns."""
+
+
+@dataclass(frozen=True)
+class SystemDecl:
+    """A system file, validated.
+
+    Attributes:
+        name: as written.
+        doc: one line for people.
+        path: of the file.
+        source: its text.
+        spec: path of its default specification, or None.
+        dt: seconds a step, exact.
+        horizon: planning horizon in steps.
+        substeps: integration steps within one step.
+        integrator: name of the integrator.
+        discrete: `flow` holds next-state maps instead of derivatives.
+        constants: name -> (value in SI units, unit).
+        signature: the state columns, in order.
+        controls: what is planned, in order: the inputs, or how far they are from what `feedback` gives.
+        flow: derivative (or next value) a column, in its unit per second; unlisted ones are constant.
+        jumps: in file order.
+        clamps: columns that are kept within (low, high).
+        feedback: beneath the plans; None where actuators get what is planned.
+        scenarios: named overlays.
+        scenario: the one that is laid over, if any.
+        functions: from outside, for specifications.
+        bases: the texts of the files that it extends, the nearest first.
+        overrides: what `--set` changed.
+        places: name of a state, control, constant or definition -> where it is declared.
+        warnings: findings that do not stop anything.
+    """
+
+    name: str
+    doc: str
+    path: Path
+    source: Source = field(repr=False)
+    spec: Path | None
+    dt: Fraction
+    horizon: int
+    substeps: int
+    integrator: str
+    discrete: bool
+    constants: Mapping[str, tuple[float, Unit]]
+    signature: Signature
+    controls: tuple[ControlDecl, ...]
+    flow: tuple[Assign, ...]
+    jumps: tuple[JumpDecl, ...]
+    clamps: Mapping[str, tuple[float, float]]
+    init: InitDecl
+    objective: ObjectiveDecl
+    policy: PolicyDecl
+    train: TrainDecl
+    backup: BackupDecl
+    test: TestDecl
+    feedback: Feedback | None = None
+    scenarios: tuple[ScenarioDecl, ...] = ()
+    scenario: ScenarioDecl | None = None
+    functions: tuple[FunctionDecl, ...] = ()
+    bases: tuple[Source, ...] = field(default=(), repr=False)
+    overrides: Mapping[str, str] = field(default_factory=dict)
+    places: Mapping[str, Span] = field(default_factory=dict, repr=False)
+    warnings: tuple[Diagnostic, ...] = field(default=(), repr=False)
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of the text and of what was overridden, in hexadecimal."""
+        changes = "".join(f"\0{key}={value}" for key, value in sorted(self.overrides.items()))
+        texts = "".join(base.text for base in self.bases)
+        return hashlib.sha256((self.source.text + texts + changes).encode()).hexdigest()
+
+    @property
+    def learnt(self) -> str:
+        """SHA-256 of what a policy learns from, in hexadecimal: all but names, comments, and deployment."""
+        return hashlib.sha256(repr([getattr(self, name) for name in LEARNT]).encode()).hexdigest()
+
+    @property
+    def worlds(self) -> tuple[WorldRef, ...]:
+        """Every world that the file names, for `test` and for scenarios."""
+        named = (self.test.world, *(scenario.world for scenario in self.scenarios))
+        return tuple(world for world in named if world is not None)
+
+    @property
+    def judges(self) -> tuple[JudgeRef, ...]:
+        """Every specification of drives that the file names, for `test` and for scenarios."""
+        named = (self.test.judge, *(scenario.judge for scenario in self.scenarios))
+        return tuple(judge for judge in named if judge is not None)
+
+    @property
+    def grid(self) -> Grid:
+        """The steps that formulas are compiled for."""
+        return Grid(self.dt, self.horizon)
+
+    def interface(self) -> Interface:
+        """What the compiler of specifications may know of this system, nothing loaded."""
+        names = frozenset(function.name for function in self.functions)
+        known = {function.name: function for function in self.functions if function.body is not None}
+        path = self.source.name
+        return Interface(
+            self.name, self.signature, self.constants, names, known, path=path, places=self.places
+        )

@@ -1,0 +1,59 @@
+"""Network outputs become controls within their ranges."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from stlc.dynamics.declaration.model import ControlDecl
+
+EPS = 1e-6
+"""Keeps the gradient of an angle finite where both components are 0."""
+
+
+def raw_width(controls: tuple[ControlDecl, ...]) -> int:
+    """Network outputs a step: two for an angle (a planar vector), one for everything else."""
+    return sum(2 if control.squash == "angle" else 1 for control in controls)
+
+
+def squash(raw: Tensor, controls: tuple[ControlDecl, ...]) -> Tensor:
+    """Controls in physical units: (…, raw_width) -> (…, m).
+
+    `tanh` and `clip` map [-1, 1] onto the range, smoothly or with corners; `angle` turns a planar vector into
+    its direction, so that there is no seam at the ends of the range.
+    """
+    middle, half = _affine(controls, raw.dtype, raw.device)
+    kinds = {control.squash for control in controls}
+    if kinds == {"tanh"}:
+        return torch.addcmul(middle, torch.tanh(raw), half)
+    if kinds == {"clip"}:
+        return torch.addcmul(middle, torch.clamp(raw, -1.0, 1.0), half)
+    return torch.addcmul(middle, torch.stack(_units(raw, controls), -1), half)
+
+
+def _units(raw: Tensor, controls: tuple[ControlDecl, ...]) -> list[Tensor]:
+    """Every control on the scale [-1, 1]."""
+    columns = iter(raw.unbind(-1))
+    out: list[Tensor] = []
+    for control in controls:
+        first = next(columns)
+        match control.squash:
+            case "tanh":
+                out.append(torch.tanh(first))
+            case "clip":
+                out.append(torch.clamp(first, -1.0, 1.0))
+            case "angle":
+                out.append(torch.atan2(next(columns), first + EPS) / torch.pi)
+    return out
+
+
+@lru_cache(maxsize=64)
+def _affine(
+    controls: tuple[ControlDecl, ...], dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Middles and half widths of the ranges, (m,) each."""
+    low = torch.tensor([control.low for control in controls], dtype=torch.float64)
+    high = torch.tensor([control.high for control in controls], dtype=torch.float64)
+    return ((low + high) / 2).to(device, dtype), ((high - low) / 2).to(device, dtype)

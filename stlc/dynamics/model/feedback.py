@@ -1,0 +1,292 @@
+"""A feedback beneath the plans: controls are planned as deviations from a linear law that stabilises.
+
+A plan that fixes the controls of a whole horizon in advance cannot hold an unstable plant: what differs by
+1e-7 now differs by 1e-7 exp(4 T) at the end where x' = 4 x + u. With `policy: {feedback: …}` actuators get
+at every step
+
+    clip(u0 + v + clip(K (x0 - x), -a, a), low, high)
+
+where `v` is planned, so that rollouts, searches and gradients see a plant that forgets. `a` is the authority
+of the feedback, half the range of the actuator unless said otherwise; `v` may be as large as range and
+authority together need, so that every control can still be had in every state. The gain of `lqr` is that of
+the linear-quadratic regulator of the linearised step (R. E. Kalman, 1960), by the Riccati recursion over a
+long horizon.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.diagnostics import Diagnostic
+from stlc.dynamics.declaration.model import Feedback
+from stlc.dynamics.model.step import build_step
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from stlc.dynamics.declaration.decl import SystemDecl
+    from stlc.dynamics.declaration.learning import FeedbackDecl
+
+SLOPE = 1e-5
+"""Share of its range by which a column is moved to see what depends on it."""
+RECURSIONS = 3000
+"""Steps of the Riccati recursion; beyond some time constants the gain stands still."""
+STILL = 1e-12
+GROWING = 10.0
+"""An open loop that grows by more over a horizon is told of."""
+
+
+class NoFeedbackError(ValueError):
+    """A gain that cannot be computed, and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Linear:
+    """The linearised step x+ - x0 = A (x - x0) + B (u - u0) + rest.
+
+    Attributes:
+        a: (n, n), of the moving states.
+        b: (n, m).
+        rest: (n,), how far one step leads from (x0, u0).
+        scale: (n,), half the range of each moving state, 1 where it has none.
+        moving: their names.
+    """
+
+    a: NDArray[np.float64]
+    b: NDArray[np.float64]
+    rest: NDArray[np.float64]
+    scale: NDArray[np.float64]
+    moving: tuple[str, ...]
+
+    @property
+    def growth(self) -> float:
+        """The factor by which the fastest mode grows in one step."""
+        return float(np.abs(np.linalg.eigvals(self.a)).max(initial=0.0))
+
+
+def closed(decl: SystemDecl, asked: FeedbackDecl) -> SystemDecl:
+    """The declaration with a feedback beneath its plans.
+
+    Raises NoFeedbackError: an unstable mode that no control reaches, or a control that turns (`angle`).
+    """
+    turning = [control.name for control in decl.controls if control.squash == "angle"]
+    if turning:
+        raise NoFeedbackError(f"the control `{turning[0]}` is a direction (`squash: angle`)")
+    state, control = _rest(decl, asked.around)
+    gain = _given(decl, asked.gain) if asked.gain else _lqr(decl, asked.weights, state, control)
+    half = [0.5 * (each.high - each.low) for each in decl.controls]
+    authority = tuple(asked.authority * each for each in half)
+    feedback = Feedback(
+        tuple(map(tuple, gain.tolist())),
+        tuple(state.tolist()),
+        tuple(control.tolist()),
+        tuple(each.low for each in decl.controls),
+        tuple(each.high for each in decl.controls),
+        authority,
+    )
+    deviations = tuple(
+        replace(each, low=each.low - at - most, high=each.high - at + most)
+        for each, at, most in zip(decl.controls, control.tolist(), authority, strict=True)
+    )
+    return replace(decl, controls=deviations, feedback=feedback)
+
+
+# ------------------------------------------------------------------ the point and the slopes
+
+
+def _rest(decl: SystemDecl, around: Mapping[str, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The point of operation, (n,) and (m,), in the units of the columns.
+
+    States that are not given are 0, or in the middle of a range that 0 is not in; controls those that hold
+    the states best, within their ranges.
+    """
+    state = np.array(
+        [
+            around.get(each.name, 0.0)
+            if each.low is None or each.high is None or each.low <= 0.0 <= each.high
+            else around.get(each.name, 0.5 * (each.low + each.high))
+            for each in decl.signature.columns
+        ]
+    )
+    low, high = (np.array([getattr(each, end) for each in decl.controls]) for end in ("low", "high"))
+    control = np.clip(np.zeros(len(low)), low, high)
+    free = [index for index, each in enumerate(decl.controls) if each.name not in around]
+    control = np.array([around.get(each.name, at) for each, at in zip(decl.controls, control, strict=True)])
+    for _ in range(5 if free else 0):  # Gauss-Newton
+        linear = linearised(decl, state, control)
+        held = _held(linear)
+        slopes = (linear.b / linear.scale[:, None])[held][:, free]
+        step = np.linalg.lstsq(slopes, -(linear.rest / linear.scale)[held], rcond=None)[0]
+        control[free] = np.clip(control[free] + step, low[free], high[free])
+    return state, control
+
+
+def _held(linear: Linear) -> NDArray[np.bool_]:
+    """The moving states that a point of operation holds: not those that nothing depends on (a place)."""
+    others = np.abs(linear.a - np.eye(len(linear.a)))
+    return np.asarray(others.max(0, initial=0.0) > STILL)
+
+
+def linearised(decl: SystemDecl, state: NDArray[np.float64], control: NDArray[np.float64]) -> Linear:
+    """The exact step around a point, by central differences: (n,), (m,) in the units of the columns."""
+    columns, names = decl.signature.columns, decl.signature.names
+    moved = {assign.name for assign in decl.flow}
+    moving = [
+        i
+        for i, each in enumerate(columns)
+        if each.kind == "real" and each.role == "state" and each.name in moved
+    ]
+    spans = [(each.low, each.high) for each in columns] + [(each.low, each.high) for each in decl.controls]
+    half = np.array(
+        [1.0 if low is None or high is None or high <= low else 0.5 * (high - low) for low, high in spans]
+    )
+    turned = [*moving, *range(len(names), len(spans))]
+    at = np.concatenate((state, control))
+    nudge = SLOPE * half[turned]
+    points = np.tile(at, (2 * len(turned) + 1, 1))
+    for row, (index, size) in enumerate(zip(turned, nudge, strict=True)):
+        points[1 + 2 * row, index] += size
+        points[2 + 2 * row, index] -= size
+    after = _stepped(decl, points)[:, moving]
+    if not np.isfinite(after).all():
+        raise NoFeedbackError("the dynamics give no number at the point of operation")
+    slopes = (after[1::2] - after[2::2]) / (2.0 * nudge[:, None])
+    count = len(moving)
+    return Linear(
+        slopes[:count].T,
+        slopes[count:].T,
+        after[0] - state[moving],
+        half[moving],
+        tuple(names[i] for i in moving),
+    )
+
+
+def _stepped(decl: SystemDecl, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """One exact step from states and controls (k, n + m), without a feedback: (k, n)."""
+    names = (*decl.signature.names, *(control.name for control in decl.controls))
+    step = build_step(replace(decl, feedback=None, clamps={}, jumps=()), soft=False)
+    env = dict(zip(names, points.T, strict=True))
+    for name, value in step.lets:
+        env[name] = Program({name: value})(env, NUMPY)[name]
+    moved = Program(dict(step.next))(env, NUMPY) if step.next else {}
+    return np.stack(
+        [np.broadcast_to(moved.get(name, env[name]), len(points)) for name in decl.signature.names], 1
+    )
+
+
+# ---------------------------------------------------------------------------------- gains
+
+
+def _given(decl: SystemDecl, gain: Mapping[str, Mapping[str, float]]) -> NDArray[np.float64]:
+    rows = [
+        [gain.get(each.name, {}).get(name, 0.0) for name in decl.signature.names] for each in decl.controls
+    ]
+    return np.array(rows, dtype=np.float64)
+
+
+def _lqr(
+    decl: SystemDecl, weights: Mapping[str, float], state: NDArray[np.float64], control: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The gain of the linear-quadratic regulator, (m, n), in the units of the columns.
+
+    Costs are squares of deviations by half their ranges, times `weights`; a state that nothing depends on (a
+    place in an open field) costs nothing unless it is weighed: a plan may want to be elsewhere.
+    """
+    linear = linearised(decl, state, control)
+    held, names = _held(linear), decl.signature.names
+    default = dict(zip(linear.moving, held.astype(float).tolist(), strict=True))
+    q = np.diag(
+        [
+            weights.get(name, default[name]) / size**2
+            for name, size in zip(linear.moving, linear.scale, strict=True)
+        ]
+    )
+    r = np.diag([weights.get(each.name, 1.0) / (0.5 * (each.high - each.low)) ** 2 for each in decl.controls])
+    gain = riccati(linear.a, linear.b, q, r)
+    left = np.abs(np.linalg.eigvals(linear.a - linear.b @ gain)).max(initial=0.0)
+    if not np.isfinite(gain).all() or left > max(1.0 + 1e-6, 0.999 * linear.growth):
+        raise NoFeedbackError(
+            f"a mode that grows by {linear.growth:.3g} a step is out of reach of the controls"
+        )
+    whole = np.zeros((len(decl.controls), len(names)))
+    whole[:, [names.index(name) for name in linear.moving]] = gain
+    return whole
+
+
+def riccati(
+    a: NDArray[np.float64], b: NDArray[np.float64], q: NDArray[np.float64], r: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The gain (m, n) that the recursion of dynamic programming settles at.
+
+    It needs no stabilising solution of the algebraic equation, which there is none of where an integrator is
+    out of reach of the controls.
+    """
+    cost: NDArray[np.float64] = q.copy()
+    gain: NDArray[np.float64] = np.zeros((b.shape[1], len(a)))
+    with np.errstate(all="ignore"):
+        for _ in range(RECURSIONS):
+            before = gain
+            gain = np.asarray(np.linalg.solve(r + b.T @ cost @ b, b.T @ cost @ a), dtype=np.float64)
+            cost = q + a.T @ cost @ (a - b @ gain)
+            cost = 0.5 * (cost + cost.T)
+            if not np.isfinite(cost).all() or np.abs(gain - before).max() <= STILL * np.abs(gain).max():
+                break
+    return gain
+
+
+# ------------------------------------------------------------------------- a hint
+
+
+def unstable(decl: SystemDecl) -> tuple[Diagnostic, ...]:
+    """W602 where plans are open-loop controls of a plant whose fastest mode grows too much over a horizon."""
+    growth = growth_of(decl)
+    if not growth > GROWING:
+        return ()
+    message = (
+        f"{decl.name} is unstable: a difference at the start of a plan is {growth:.2g} times it at the end"
+    )
+    advice = (
+        "another gain or point of operation: these plans still grow"
+        if decl.feedback is not None
+        else "`policy: {feedback: lqr}` plans deviations from a stabilising feedback"
+    )
+    place = decl.policy.feedback_span
+    note = "plans fix the controls of a whole horizon in advance; so do rollouts, searches and gradients"
+    return (Diagnostic("W602", message, place, note=(note,), help=(advice,)),)
+
+
+def growth_of(decl: SystemDecl) -> float:
+    """The growth of the fastest mode over a horizon, linearised at rest; 1 where that cannot be said.
+
+    With a feedback the loop is closed by it.
+    """
+    try:
+        if decl.feedback is None:
+            linear = linearised(decl, *_rest(decl, {}))
+            return _power(linear.growth, decl.horizon)
+        point = np.array(decl.feedback.state), np.array(decl.feedback.control)
+        linear = linearised(_opened(decl, decl.feedback), *point)
+    except (NoFeedbackError, ArithmeticError, TypeError, KeyError, np.linalg.LinAlgError):
+        return 1.0
+    at = [decl.signature.names.index(name) for name in linear.moving]
+    gain = np.array(decl.feedback.gain)[:, at]
+    loop = np.abs(np.linalg.eigvals(linear.a - linear.b @ gain)).max(initial=0.0)
+    return _power(float(loop), decl.horizon)
+
+
+def _opened(decl: SystemDecl, feedback: Feedback) -> SystemDecl:
+    """The same plant with the actuators' own ranges."""
+    ends = zip(decl.controls, feedback.low, feedback.high, strict=True)
+    own = tuple(replace(each, low=low, high=high) for each, low, high in ends)
+    return replace(decl, controls=own, feedback=None)
+
+
+def _power(factor: float, steps: int) -> float:
+    return math.exp(min(steps * math.log(max(factor, 1e-300)), 700.0))

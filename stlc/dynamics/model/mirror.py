@@ -1,0 +1,67 @@
+"""A symmetry of a system: states and controls that behave as their mirror images do.
+
+A ship on the left of a river is a ship on the right of it seen in a mirror. A policy that knows this learns
+one half of the states and has learnt the other.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.semantics.switch import Hard
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from stlc.dynamics.declaration.model import Assign, ControlDecl
+
+HARD = Hard()
+
+
+class Mirror:
+    """What the entry `mirror` of a system's policy says; applied twice it changes nothing.
+
+    Attributes:
+        side: index of the state that tells a state from its image; the larger of the two is kept.
+    """
+
+    def __init__(
+        self, images: Sequence[Assign], names: Sequence[str], controls: Sequence[ControlDecl]
+    ) -> None:
+        """`images` of states among `names` and of `controls`, the first one of a state."""
+        self._names = tuple(names)
+        self._controls = tuple(controls)
+        known = {control.name for control in controls}
+        self._states = Program({each.name: each.value for each in images if each.name not in known})
+        self._inputs = Program({each.name: each.value for each in images if each.name in known})
+        self.side = self._names.index(images[0].name)
+
+    def states(self, x: Tensor) -> Tensor:
+        """The images of states: (…, n) -> (…, n)."""
+        return _applied(self._states, x, self._names)
+
+    def plans(self, u: Tensor) -> Tensor:
+        """The images of controls: (…, m) -> (…, m). Angles stay within a turn of their range."""
+        moved = _applied(self._inputs, u, [control.name for control in self._controls])
+        for index, each in enumerate(self._controls):
+            if each.squash == "angle":
+                moved[..., index] = torch.remainder(moved[..., index] - each.low, 2.0 * torch.pi) + each.low
+        return moved
+
+    def fold(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """States or their images, whichever lie on the side that is kept, (B, n), and where images, (B,)."""
+        image = self.states(x)
+        swapped = x[..., self.side] < image[..., self.side]
+        return torch.where(swapped[..., None], image, x), swapped
+
+
+def _applied(program: Program, x: Tensor, names: Sequence[str]) -> Tensor:
+    """`x` with the columns that the program computes: (…, k) -> (…, k)."""
+    columns = dict(zip(names, x.unbind(-1), strict=True))
+    images = program(columns, TORCH, HARD) if program.columns else {}
+    return torch.stack([images.get(name, column) for name, column in columns.items()], -1)

@@ -1,0 +1,167 @@
+"""Many steps: columns of shape (time, batch), as few array operations as the dynamics allow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.semantics.switch import Switch
+from stlc.dynamics.model.algebra import names_in
+from stlc.dynamics.model.schedule import Stage, blocks, schedule
+from stlc.dynamics.model.step import Step
+
+Columns = dict[str, Tensor]
+
+
+@dataclass
+class _Film:
+    """What is known so far: states at all T+1 samples, and numbers at the T steps.
+
+    `now` maps every name to its values at the T steps, shape (T, B), or (B,) where it never changes.
+    """
+
+    states: Columns
+    now: Columns
+    steps: int
+    batch: int
+    switch: Switch
+
+    def run(self, program: Program) -> Columns:
+        """All outputs of a program, as tensors."""
+        like = next(iter(self.states.values()))
+        outputs = program(self.now, TORCH, self.switch)
+        return {
+            name: torch.as_tensor(out, dtype=like.dtype, device=like.device) for name, out in outputs.items()
+        }
+
+    def enter(self, name: str, column: Tensor) -> None:
+        """A state whose T+1 samples are known."""
+        self.states[name] = column
+        self.now[name] = column[:-1]
+
+    def full(self, values: Tensor) -> Tensor:
+        """Values at every step, shape (T, B)."""
+        return values.expand(self.steps, self.batch)
+
+    def sliced(self, names: Iterable[str]) -> tuple[dict[str, Tensor], list[tuple[str, Sequence[Tensor]]]]:
+        """What stays through the loop, and what changes from step to step."""
+        fixed: dict[str, Tensor] = {}
+        timed: list[tuple[str, Sequence[Tensor]]] = []
+        for name in names:
+            values = self.now[name]
+            if values.dim() == 2 and values.shape[0] == self.steps and self.steps != 1:
+                timed.append((name, values.unbind(0)))
+            else:
+                fixed[name] = values[0] if values.dim() == 2 else values
+        return fixed, timed
+
+
+class _Accumulated(torch.autograd.Function):
+    """(B,) and (T, B) -> (T+1, B): every row is the one above plus an increment. Faster than `cumsum`."""
+
+    @staticmethod
+    def forward(ctx: Any, start: Tensor, increments: Tensor) -> Tensor:  # noqa: ARG004
+        out = increments.new_empty(len(increments) + 1, increments.shape[1])
+        rows = out.unbind(0)
+        rows[0].copy_(start)
+        for before, after, increment in zip(rows, rows[1:], increments.unbind(0), strict=False):
+            torch.add(before, increment, out=after)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:  # noqa: ARG004
+        below = grad.clone(memory_format=torch.contiguous_format)
+        rows = below.unbind(0)
+        for step in range(len(rows) - 2, -1, -1):
+            rows[step].add_(rows[step + 1])
+        return rows[0], below[1:]
+
+
+def _accumulated(start: Tensor, increments: Tensor) -> Tensor:
+    """`_Accumulated`, as one operation while a program is recorded for export."""
+    if torch.compiler.is_exporting():
+        return torch.cat((start[None], increments)).cumsum(0)
+    column: Tensor = _Accumulated.apply(start, increments)  # type: ignore[no-untyped-call]
+    return column
+
+
+class _StageRunner:
+    """A stage, its programs compiled."""
+
+    def __init__(self, stage: Stage) -> None:
+        self.stage = stage
+        self.early = Program(stage.early) if stage.early else None
+        self.blocks = tuple(Program(block) for block in stage.blocks)
+        inside = stage.stepped.keys() | {name for block in stage.blocks for name in block}
+        read = {name for block in stage.blocks for num in block.values() for name in names_in(num)}
+        self.outside = tuple(sorted(read - inside))
+
+    def __call__(self, film: _Film) -> None:
+        if self.early is not None:
+            film.now.update(film.run(self.early))
+        for state, source in self.stage.follows.items():
+            start = film.states[state]
+            film.enter(state, torch.cat((start[None], film.full(film.now[source]))))
+        for state, source in self.stage.sums.items():
+            increments = film.full(film.now[source])
+            film.enter(state, _accumulated(film.states[state], increments))
+        if self.blocks:
+            self._loop(film)
+
+    def _loop(self, film: _Film) -> None:
+        """Step what feeds back into itself."""
+        stage = self.stage
+        env, timed = film.sliced(self.outside)
+        kept = (*stage.stepped.values(), *stage.lets)
+        history: dict[str, list[Tensor]] = {name: [] for name in kept}
+        env.update((state, film.states[state]) for state in stage.stepped)
+        for step in range(film.steps):
+            env.update((name, values[step]) for name, values in timed)
+            for block in self.blocks:
+                env.update(block(env, TORCH, film.switch))
+            for name in kept:
+                history[name].append(env[name])
+            env.update((state, env[source]) for state, source in stage.stepped.items())
+        for state, source in stage.stepped.items():
+            start = film.states[state]
+            film.enter(state, torch.stack([start, *(value.expand(film.batch) for value in history[source])]))
+        film.now.update((name, torch.stack(history[name])) for name in stage.lets)
+
+
+class Stepper:
+    """A step, ready to run: once on (B,) columns, or over time on (T, B) controls."""
+
+    def __init__(self, step: Step) -> None:
+        self.next = dict(step.next)
+        numbers = dict(step.lets) | {f"{name}'": num for name, num in step.next.items()}
+        self.once = tuple(Program(block) for block in blocks(numbers))
+        self.stages = tuple(_StageRunner(stage) for stage in schedule(step))
+
+    def step(self, state: Mapping[str, Tensor], controls: Mapping[str, Tensor], switch: Switch) -> Columns:
+        """The columns one step later; those that do not move are the same tensors."""
+        env = {**state, **controls}
+        for block in self.once:
+            env.update(block(env, TORCH, switch))
+        like = next(iter(state.values()))
+        moved = {
+            name: torch.as_tensor(env[f"{name}'"], dtype=like.dtype, device=like.device) for name in self.next
+        }
+        return {**state, **{name: value.expand_as(like) for name, value in moved.items()}}
+
+    def rollout(self, start: Columns, controls: Columns, steps: int, switch: Switch) -> Columns:
+        """From (B,) columns and (T, B) controls to (T+1, B) columns; constant ones are expanded views."""
+        batch = next(iter(start.values())).shape[0]
+        steady = {name: column for name, column in start.items() if name not in self.next}
+        film = _Film(dict(start), {**steady, **controls}, steps, batch, switch)
+        for stage in self.stages:
+            stage(film)
+        film.states.update((name, column.expand(steps + 1, batch)) for name, column in steady.items())
+        return film.states

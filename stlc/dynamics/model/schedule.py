@@ -1,0 +1,175 @@
+"""In which order the components of a step are run over time.
+
+A rollout need not take all components through one loop. Components are ordered by what they read: one that
+depends only on earlier ones is computed for all steps at once, one that adds a known increment is a
+cumulative sum, and only components that feed back into themselves are stepped, with everything that
+does not change inside their loop computed before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from stlc.compile.ir import nodes as ir
+from stlc.dynamics.model.algebra import Hoist, names_in
+from stlc.dynamics.model.step import Step
+
+Lets: TypeAlias = Mapping[str, ir.Num]
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """What can be run together, once everything that it reads is known.
+
+    Attributes:
+        early: numbers of all steps, computed together, before anything else here.
+        follows: state -> name of its next value, an early number of this stage or of one before.
+        sums: state -> name of the early number that it adds every step.
+        blocks: computed in every step, one after the other.
+        stepped: state -> name of its next value in `blocks`.
+        lets: names in `blocks` that later stages read.
+    """
+
+    early: Lets
+    follows: Mapping[str, str]
+    sums: Mapping[str, str]
+    blocks: tuple[Lets, ...]
+    stepped: Mapping[str, str]
+    lets: tuple[str, ...]
+
+
+def schedule(step: Step) -> tuple[Stage, ...]:
+    """The stages of a step, in an order in which each reads only states and numbers of earlier ones."""
+    numbers = dict(step.lets) | {_next(name): num for name, num in step.next.items()}
+    reads = {name: names_in(num) & (numbers.keys() | step.next.keys()) for name, num in numbers.items()}
+    reads |= {name: frozenset((_next(name),)) for name in step.next}
+    level: dict[str, int] = {}
+    groups: list[list[list[str]]] = []
+    for group in _components(reads):
+        before = [level[name] for member in group for name in reads[member] if name in level]
+        alone_state = len(group) == 1 and group[0] not in numbers
+        depth = max(before, default=-1) + (not alone_state)
+        level |= dict.fromkeys(group, depth)
+        if depth == len(groups):
+            groups.append([])
+        groups[depth].append(group)
+    writers = [_StageWriter(numbers, reads, depth) for depth in range(len(groups))]
+    for writer, members in zip(writers, groups, strict=True):
+        for group in members:
+            writer.add(group)
+    return tuple(writer.stage() for writer in writers)
+
+
+class _StageWriter:
+    """Gathers the groups of one level."""
+
+    def __init__(self, numbers: Lets, reads: Mapping[str, frozenset[str]], depth: int) -> None:
+        self.numbers = numbers
+        self.reads = reads
+        self.prefix = f"early{depth}."
+        self.early: dict[str, ir.Num] = {}
+        self.follows: dict[str, str] = {}
+        self.sums: dict[str, str] = {}
+        self.stepped: dict[str, str] = {}
+        self.body: dict[str, ir.Num] = {}
+        self.lets: list[str] = []
+
+    def add(self, group: Sequence[str]) -> None:
+        """One strongly connected group of names."""
+        name = group[0]
+        if len(group) == 1 and name not in self.reads[name]:
+            if name in self.numbers:
+                self.early[name] = self.numbers[name]
+            else:
+                self.follows[name] = _next(name)
+            return
+        inside = frozenset(group)
+        states = {name: _next(name) for name in group if name not in self.numbers}
+        body = {name: num for name, num in self.numbers.items() if name in inside}
+        increment = _increment(states, body)
+        if increment is not None:
+            (state,) = states
+            self.sums[state] = f"{state}+"
+            self.early[f"{state}+"] = increment
+            return
+        hoist = Hoist(inside, self.prefix, self.early)
+        self.body |= {name: hoist.split(num) for name, num in body.items()}
+        self.stepped |= states
+        read_outside = {
+            name for reader, names in self.reads.items() if reader not in inside for name in names
+        }
+        self.lets += [name for name in body if name in read_outside]
+
+    def stage(self) -> Stage:
+        """The level as a stage."""
+        return Stage(self.early, self.follows, self.sums, blocks(self.body), self.stepped, tuple(self.lets))
+
+
+def blocks(numbers: Lets) -> tuple[Lets, ...]:
+    """Numbers in blocks of which each reads only earlier blocks."""
+    level: dict[str, int] = {}
+    for name, num in numbers.items():
+        level[name] = 1 + max((level[other] for other in names_in(num) if other in level), default=-1)
+    depth = max(level.values(), default=-1) + 1
+    return tuple({name: numbers[name] for name in numbers if level[name] == at} for at in range(depth))
+
+
+def _next(name: str) -> str:
+    """How the next value of a state is called."""
+    return f"{name}'"
+
+
+def _increment(states: Mapping[str, str], body: Lets) -> ir.Num | None:
+    """What is added every step, if that is all that happens to a single state."""
+    if len(states) != 1 or len(body) != 1:
+        return None
+    (state,) = states
+    (num,) = body.values()
+    match num:
+        case ir.Op("add", (ir.Col(name), increment)) if name == state and state not in names_in(increment):
+            return increment
+        case _:
+            return None
+
+
+def _components(reads: Mapping[str, frozenset[str]]) -> list[list[str]]:
+    """Strongly connected components, dependencies first (Tarjan's algorithm, without recursion)."""
+    order: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[list[str]] = []
+    for root in reads:
+        path: list[tuple[str, Iterator[str]]] = (
+            [] if root in order else [_enter(root, reads, order, low, stack)]
+        )
+        while path:
+            name, rest = path[-1]
+            other = next(rest, None)
+            if other is None:
+                path.pop()
+                if path:
+                    low[path[-1][0]] = min(low[path[-1][0]], low[name])
+                if low[name] == order[name]:
+                    at = stack.index(name)
+                    found.append(stack[at:])
+                    del stack[at:]
+            elif other not in order:
+                path.append(_enter(other, reads, order, low, stack))
+            elif other in stack:
+                low[name] = min(low[name], order[other])
+    return found
+
+
+def _enter(
+    name: str,
+    reads: Mapping[str, frozenset[str]],
+    order: dict[str, int],
+    low: dict[str, int],
+    stack: list[str],
+) -> tuple[str, Iterator[str]]:
+    """Number a name that is seen for the first time."""
+    order[name] = low[name] = len(order)
+    stack.append(name)
+    return name, iter(sorted(reads[name]))

@@ -1,0 +1,131 @@
+"""One step of a hybrid system (the paper's Eq. 6) as a list of assignments in the IR."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from stlc.compile.ir import nodes as ir
+from stlc.dynamics.declaration.decl import SystemDecl
+from stlc.dynamics.declaration.model import JumpDecl
+from stlc.dynamics.model.algebra import add, blend, map_formula, multiply, substitute
+from stlc.dynamics.model.integrators import INTEGRATORS, State
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """Straight-line code: each assignment reads states, controls and earlier assignments.
+
+    Attributes:
+        lets: (name, number), in order.
+        next: name of a state that moves -> what it is one step later.
+    """
+
+    lets: tuple[tuple[str, ir.Num], ...]
+    next: Mapping[str, ir.Num]
+
+
+@dataclass
+class _Writer:
+    """Gathers assignments, so that no number is written out twice."""
+
+    lets: list[tuple[str, ir.Num]] = field(default_factory=list)
+
+    def name(self, hint: str, num: ir.Num) -> ir.Num:
+        """A column that holds `num`."""
+        if isinstance(num, ir.Lit | ir.Col):
+            return num
+        name = f"{hint}#{len(self.lets)}"
+        self.lets.append((name, num))
+        return ir.Col(name)
+
+    def named(self, state: State) -> dict[str, ir.Num]:
+        """Every component held by a column."""
+        return {name: self.name(name, num) for name, num in state.items()}
+
+
+def build_step(decl: SystemDecl, *, soft: bool) -> Step:
+    """The step of a declaration.
+
+    `soft` blends jumps as `I_w(g) reset + (1 - I_w(g)) flow`; otherwise a jump is a choice.
+    Guards and resets read the state at the start of the step, clamps act after each substep,
+    and of two jumps on one component the later one wins.
+    """
+    writer = _Writer()
+    start: State = {name: ir.Col(name) for name in decl.signature.names}
+    given = {name: writer.name(name, num) for name, num in commands(decl).items()}
+    state = _flow(decl, writer, start, given)
+    moved = {assign.name for assign in decl.flow}
+    for jump in decl.jumps:
+        state = _jump(_given(jump, given), state, soft=soft)
+        moved |= {assign.name for assign in jump.resets}
+    reset = {assign.name for jump in decl.jumps for assign in jump.resets}
+    state = {name: _clamped(decl, name, num) if name in reset else num for name, num in state.items()}
+    ordered = [name for name in decl.signature.names if name in moved | set(decl.clamps)]
+    return Step(tuple(writer.lets), {name: state[name] for name in ordered})
+
+
+def commands(decl: SystemDecl) -> dict[str, ir.Num]:
+    """Name of a control -> what its actuator gets, from the state and from what is planned.
+
+    {} where actuators get what is planned. It is computed once a step, as a sampled controller does.
+    """
+    feedback = decl.feedback
+    if feedback is None:
+        return {}
+    found: dict[str, ir.Num] = {}
+    for i, each in enumerate(decl.controls):
+        back: ir.Num = ir.Lit(0.0)
+        for gain, state, at in zip(feedback.gain[i], decl.signature.names, feedback.state, strict=True):
+            if gain:
+                back = add(back, multiply(ir.Lit(gain), ir.Op("sub", (ir.Lit(at), ir.Col(state)))))
+        most = feedback.authority[i]
+        bounded = ir.Op("clip", (back, ir.Lit(-most), ir.Lit(most)))
+        total = add(add(ir.Col(each.name), ir.Lit(feedback.control[i])), bounded)
+        found[each.name] = ir.Op("clip", (total, ir.Lit(feedback.low[i]), ir.Lit(feedback.high[i])))
+    return found
+
+
+def _given(jump: JumpDecl, given: State) -> JumpDecl:
+    """The jump, where it reads controls of what actuators get."""
+    if not given:
+        return jump
+    resets = tuple(replace(each, value=substitute(each.value, given)) for each in jump.resets)
+    return replace(jump, guard=map_formula(jump.guard, lambda num: substitute(num, given)), resets=resets)
+
+
+def _flow(decl: SystemDecl, writer: _Writer, state: State, given: State) -> State:
+    """All substeps of the continuous part; `given` is what actuators get."""
+
+    def rate(at: State) -> State:
+        table = {**writer.named(at), **given}
+        return {assign.name: substitute(assign.value, table) for assign in decl.flow}
+
+    integrate = INTEGRATORS.get(decl.integrator)
+    length = float(decl.dt) / decl.substeps
+    for substep in range(decl.substeps):
+        if substep:
+            state = writer.named(state)
+        moved = {**state, **rate(state)} if decl.discrete else integrate(rate, state, length)
+        state = {name: _clamped(decl, name, num) for name, num in moved.items()}
+    return state
+
+
+def _jump(jump: JumpDecl, state: State, *, soft: bool) -> State:
+    """The state with the resets of one jump blended in."""
+    changed = dict(state)
+    for assign in jump.resets:
+        flowed = changed[assign.name]
+        if soft:
+            changed[assign.name] = blend(jump.guard, assign.value, flowed, jump.sharpness)
+        else:
+            changed[assign.name] = ir.Where(jump.guard, assign.value, flowed)
+    return changed
+
+
+def _clamped(decl: SystemDecl, name: str, num: ir.Num) -> ir.Num:
+    """A component kept in its range, where that is declared."""
+    if name not in decl.clamps:
+        return num
+    low, high = decl.clamps[name]
+    return ir.Op("clip", (num, ir.Lit(low), ir.Lit(high)))

@@ -1,0 +1,424 @@
+"""A declaration becomes something that steps: tensors in, hybrid dynamics, initial states, objective."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from stlc.compile.augment.timers import Timer
+from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.frontend.interface import Interface
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.typed import Parameter
+from stlc.compile.semantics.switch import Hard, Switch
+from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.dynamics.declaration.decl import SystemDecl
+from stlc.dynamics.declaration.describe import describe
+from stlc.dynamics.declaration.learning import START
+from stlc.dynamics.declaration.model import Assign, ControlDecl
+from stlc.dynamics.init.draws import Drawing, Rows
+from stlc.dynamics.init.samplers import InitialStates
+from stlc.dynamics.model.algebra import add, multiply, names_in, substitute
+from stlc.dynamics.model.feedback import unstable
+from stlc.dynamics.model.mirror import Mirror
+from stlc.dynamics.model.rollout import Columns, Stepper
+from stlc.dynamics.model.step import Step, build_step, commands
+from stlc.dynamics.robots.functions import load_functions
+from stlc.dynamics.scenarios.scenario import truth, under
+from stlc.dynamics.schema.schema import load_system_decl
+from stlc.files import find_system
+
+HARD = Hard()
+PROBED = 1000
+"""Steps that a probe drives at most: what explodes does so soon, and a horizon may be long."""
+
+
+class System:
+    """A controlled hybrid system in discrete time (the paper's Eq. 1 and 6).
+
+    Tensors are float32 or float64 on any device; dtype and device follow the input. `B` is the batch, `T` the
+    number of steps, `n` the number of states, `m` the number of controls.
+
+    Attributes:
+        decl: the declaration.
+        timers: states that a specification adds, the last columns.
+        parameters: constants of a trajectory that a specification adds, the columns before the timers.
+        added: the columns of both.
+        signature: the state columns, in order.
+        initial: the distribution of initial states, without what a specification adds.
+    """
+
+    def __init__(
+        self, decl: SystemDecl, timers: Sequence[Timer] = (), parameters: Sequence[Parameter] = ()
+    ) -> None:
+        self.decl = decl
+        self.timers = tuple(timers)
+        self.parameters = tuple(parameters)
+        self.added = (*(each.column for each in parameters), *(timer.column for timer in timers))
+        self.signature = decl.signature.extended(*self.added)
+        self.initial = InitialStates(decl.init, decl.signature.names)
+        self._steppers: dict[bool, Stepper] = {}
+
+    @classmethod
+    def load(
+        cls, path: Path | str, overrides: Mapping[str, str] | None = None, *, scenario: str | None = None
+    ) -> System:
+        """The system of a file, or of the name of one that `stlc.files.find_system` finds, under a scenario.
+
+        Raises UsageError where there is none, SystemFileError where it is invalid.
+        """
+        decl = load_system_decl(find_system(str(path)), overrides or {})
+        return cls(decl if scenario is None else under(decl, scenario))
+
+    @cached_property
+    def truth(self) -> System:
+        """The system as it is, where its scenario says that the model is mistaken; parameters apart."""
+        real = truth(self.decl)
+        return self if real is self.decl else System(real)
+
+    def augmented(self, timers: Sequence[Timer], parameters: Sequence[Parameter] = ()) -> System:
+        """The same system with parameters, and with timers as its last columns.
+
+        Parameters are drawn for every trajectory, and nothing moves them. Timers follow from the states
+        before; no gradient goes through them. Initial states are the starts of missions.
+        """
+        return System(self.decl, (*self.timers, *timers), (*self.parameters, *parameters))
+
+    def interface(self) -> Interface:
+        """What the compiler may know of this system, its functions loaded. Raises SystemFileError (S208)."""
+        return replace(self.decl.interface(), functions=load_functions(self.decl))
+
+    # ---------------------------------------------------------------- description
+
+    @property
+    def name(self) -> str:
+        """As written in the file."""
+        return self.decl.name
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of the file's text and of what was overridden."""
+        return self.decl.hash
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the state columns."""
+        return self.signature.names
+
+    @cached_property
+    def dt(self) -> float:
+        """Length of a step in seconds."""
+        return float(self.decl.dt)
+
+    @property
+    def horizon(self) -> int:
+        """Steps of a plan."""
+        return self.decl.horizon
+
+    @property
+    def controls(self) -> tuple[ControlDecl, ...]:
+        """The inputs."""
+        return self.decl.controls
+
+    @cached_property
+    def control_names(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return tuple(control.name for control in self.controls)
+
+    @cached_property
+    def control_low(self) -> Tensor:
+        """Lower ends of the control ranges, (m,)."""
+        return torch.tensor([control.low for control in self.controls], dtype=torch.float32)
+
+    @cached_property
+    def control_high(self) -> Tensor:
+        """Upper ends of the control ranges, (m,)."""
+        return torch.tensor([control.high for control in self.controls], dtype=torch.float32)
+
+    @property
+    def actuators(self) -> tuple[tuple[float, float], ...]:
+        """Ranges of what actuators get; those of plans are wider where a feedback lies beneath."""
+        if self.decl.feedback is None:
+            return tuple((control.low, control.high) for control in self.controls)
+        return tuple(zip(self.decl.feedback.low, self.decl.feedback.high, strict=True))
+
+    @property
+    def observed_count(self) -> int:
+        """Numbers that the policy sees."""
+        observe = self.decl.policy.observe
+        return len(observe) + len(self.added) if observe else len(self.names)
+
+    def describe(self) -> str:
+        """States, controls, flow, jumps and initial situations, as a table of text."""
+        return describe(self.decl)
+
+    # -------------------------------------------------------------------- motion
+
+    def step(self, x: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
+        """One step: (B, n), (B, m) -> (B, n)."""
+        before = self._named(x)
+        moved = self._stepper(switch).step(before, self._inputs(u), switch) | self._later(before)
+        return torch.stack([moved[name] for name in self.names], 1)
+
+    def begun(self, states: Tensor, generator: torch.Generator) -> Tensor:
+        """States of the declaration with parameters drawn, and timers as at the start of a mission.
+
+        (B, n - added) -> (B, n).
+        """
+        if not self.added:
+            return states
+        table = dict(zip(self.decl.signature.names, states.double().unbind(1), strict=True))
+        rows = Rows(len(states), generator)
+        for drawing in self._drawings:
+            table[drawing.name] = drawing(table, rows)
+        drawn = [table[each.column.name].to(states) for each in self.parameters]
+        clocks = [torch.full_like(states[:, 0], timer.initial) for timer in self.timers]
+        return torch.cat((states, torch.stack([*drawn, *clocks], 1)), 1)
+
+    @cached_property
+    def _drawings(self) -> tuple[Drawing, ...]:
+        return tuple(Drawing(Assign(each.column.name, each.draw)) for each in self.parameters)
+
+    def added_later(self, x: Tensor) -> Tensor:
+        """Parameters and timers one step after a state, whatever moved it: (B, n) -> (B, added)."""
+        before = self._named(x)
+        later = before | self._later(before)
+        return torch.stack([later[column.name] for column in self.added], 1) if self.added else x[:, :0]
+
+    def commanded(self, x: Tensor, u: Tensor) -> Tensor:
+        """What actuators get in states (B, n) where `u` (B, m) is planned; `u` itself without a feedback."""
+        if self._commands is None:
+            return u
+        found = self._commands({**self._named(x), **self._inputs(u)}, TORCH, HARD)
+        return torch.stack([found[name] for name in self.control_names], 1)
+
+    def planned(self, x: Tensor, command: Tensor) -> Tensor:
+        """What has to be planned in states (B, n) for actuators to get `command` (B, m), where they can."""
+        if self._commands is None:
+            return command
+        feedback = self.decl.feedback
+        assert feedback is not None
+        gain, at = x.new_tensor(feedback.gain), x.new_tensor(feedback.state)
+        most = x.new_tensor(feedback.authority)
+        back = ((at - x[:, : len(at)]) @ gain.T).clamp(-most, most)
+        return command - x.new_tensor(feedback.control) - back
+
+    @cached_property
+    def _commands(self) -> Program | None:
+        found = commands(self.decl)
+        return Program(found) if found else None
+
+    def rollout(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Tensor:
+        """Many steps: (B, n), (B, T, m) -> (B, T+1, n), the initial state first."""
+        columns = self.rollout_columns(x0, u, switch)
+        return torch.stack([columns[name].t() for name in self.names], 2)
+
+    def rollout_columns(self, x0: Tensor, u: Tensor, switch: Switch = HARD) -> Columns:
+        """The same as (T+1, B) columns by name; columns that never change are expanded views."""
+        if (
+            x0.shape[1:] != (len(self.names),)
+            or u.shape[2:] != (len(self.controls),)
+            or x0.shape[0] != u.shape[0]
+        ):
+            raise ValueError(
+                f"{self.name} takes x0 (B, {len(self.names)}) and u (B, T, {len(self.controls)}),"
+                f" not {tuple(x0.shape)} and {tuple(u.shape)}"
+            )
+        start = dict(zip(self.names, x0.t().contiguous().unbind(0), strict=True))
+        inputs = dict(zip(self.control_names, u.permute(2, 1, 0).contiguous().unbind(0), strict=True))
+        moving = {name: column for name, column in start.items() if name not in self._keeper.next}
+        columns = self._stepper(switch).rollout(moving, inputs, u.shape[1], switch)
+        return columns | self._kept(start, columns, u.shape[1])
+
+    def _later(self, before: Columns) -> Columns:
+        with torch.no_grad():
+            after = self._keeper.step(before, {}, HARD)
+        return {timer.name: after[timer.name] for timer in self.timers}
+
+    def _kept(self, start: Columns, columns: Columns, steps: int) -> Columns:
+        """The timers over time, which follow from the states over time."""
+        if not self.timers:
+            return {}
+        with torch.no_grad():
+            seen = {name: column[:-1].detach() for name, column in columns.items()}
+            begun = {timer.name: start[timer.name] for timer in self.timers}
+            kept = self._keeper.rollout(begun, seen, steps, HARD)
+        return {timer.name: kept[timer.name] for timer in self.timers}
+
+    @cached_property
+    def _keeper(self) -> Stepper:
+        """What moves the timers."""
+        return Stepper(Step((), {timer.name: timer.update for timer in self.timers}))
+
+    @cached_property
+    def exact_step(self) -> Step:
+        """One exact step in the IR, timers included, for those who compile it."""
+        step = build_step(self.decl, soft=False)
+        return Step(step.lets, {**step.next, **{timer.name: timer.update for timer in self.timers}})
+
+    def _stepper(self, switch: Switch) -> Stepper:
+        soft = not switch.exact
+        if soft not in self._steppers:
+            self._steppers[soft] = Stepper(build_step(self.decl, soft=soft))
+        return self._steppers[soft]
+
+    def _named(self, x: Tensor) -> Columns:
+        return dict(zip(self.names, x.unbind(-1), strict=True))
+
+    def _inputs(self, u: Tensor) -> Columns:
+        return dict(zip(self.control_names, u.unbind(-1), strict=True))
+
+    # ------------------------------------------------------------------- sampling
+
+    def sample(
+        self,
+        n: int,
+        *,
+        seed: int | None = None,
+        generator: torch.Generator | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
+    ) -> Tensor:
+        """Initial states, (n, dim), parameters drawn, timers as at the start of a mission.
+
+        The same seed gives the same states, whatever the dtype.
+
+        Raises SystemFileError (S301) where `where` rejects (nearly) everything.
+        """
+        if generator is None:
+            generator = torch.Generator()
+            if seed is None:
+                generator.seed()
+            else:
+                generator.manual_seed(seed)
+        states = self.initial.sample(n, generator)
+        return self.begun(states, generator).to(device=device, dtype=dtype)
+
+    # -------------------------------------------------------------- policy, objective
+
+    def observe(self, x: Tensor) -> Tensor:
+        """What the policy sees, parameters and timers last: (…, n) -> (…, k)."""
+        if self._observation is None:
+            return x
+        seen = self._observation(self._named(x), TORCH, HARD)
+        return torch.stack([seen[str(i)].expand(x.shape[:-1]) for i in range(self.observed_count)], -1)
+
+    @cached_property
+    def _observation(self) -> Program | None:
+        observe = self.decl.policy.observe
+        seen = (*observe, *(ir.Col(column.name) for column in self.added))
+        return Program({str(i): num for i, num in enumerate(seen)}) if observe else None
+
+    @cached_property
+    def mirror(self) -> Mirror | None:
+        """The symmetry that the file declares; None where it declares none."""
+        images = self.decl.policy.mirror
+        return Mirror(images, self.names, self.controls) if images else None
+
+    def performance(
+        self,
+        columns: Mapping[str, Tensor],
+        sat: Tensor,
+        rho: Tensor | None = None,
+        u: Tensor | None = None,
+        switch: Switch = HARD,
+    ) -> Tensor:
+        """The weighted performance terms of the objective, mean over time: (B,), differentiable.
+
+        Args:
+            columns: states over time, (T+1, B) each.
+            sat: 1 where the trajectory satisfies the specification, (B,); its gradient is not followed.
+            rho: robustness, (B,), for terms that name it; 0 if left out.
+            u: controls, (B, T, m), for terms that name one; such a term is the mean over the T steps.
+            switch: how `ind(…)` in a term becomes a number.
+        """
+        like = next(iter(columns.values()))
+        sat = sat.detach().to(like.dtype)
+        rho = torch.zeros_like(sat) if rho is None else rho
+        states, controlled = self._terms
+        total = self._mean(states, columns, sat, rho, switch)
+        if controlled is None:
+            return total
+        if u is None:
+            raise ValueError(f"the objective of {self.name} needs the controls")
+        inputs = dict(zip(self.control_names, u.permute(2, 1, 0), strict=True))
+        before = {name: column[:-1] for name, column in columns.items()}
+        return total + self._mean(controlled, {**before, **inputs}, sat, rho, switch)
+
+    def _mean(
+        self, program: Program | None, columns: Mapping[str, Tensor], sat: Tensor, rho: Tensor, switch: Switch
+    ) -> Tensor:
+        """Mean over time of a program's output, (B,)."""
+        if program is None:
+            return torch.zeros_like(sat)
+        like = next(iter(columns.values()))
+        k = torch.arange(len(like), dtype=like.dtype, device=like.device)[:, None]
+        first = {name + START: columns[name][0] for name in self._named_first}
+        env = {"k": k, "t": k * self.dt, "sat": sat, "rho": rho, **first, **columns}
+        cost: Tensor = program(env, TORCH, switch)["cost"]
+        return cost.expand(len(like), sat.shape[0]).mean(0)
+
+    @cached_property
+    def _named_first(self) -> tuple[str, ...]:
+        """The states whose value at the start of the plan a term reads."""
+        read = {name for term in self.decl.objective.terms for name in names_in(term.value)}
+        return tuple(name for name in self.names if name + START in read)
+
+    @cached_property
+    def _terms(self) -> tuple[Program | None, Program | None]:
+        """`objective` as programs."""
+        states, controlled = (None if total is None else Program({"cost": total}) for total in self.objective)
+        return states, controlled
+
+    @cached_property
+    def objective(self) -> tuple[ir.Num | None, ir.Num | None]:
+        """The weighed sum of the performance terms over states, and of those that read a control."""
+        sums: list[ir.Num | None] = [None, None]
+        given = commands(self.decl)
+        for term in self.decl.objective.terms:
+            if term.weight:
+                kind = bool(names_in(term.value) & set(self.control_names))
+                value = multiply(ir.Lit(term.weight), substitute(term.value, given) if kind else term.value)
+                before = sums[kind]
+                sums[kind] = value if before is None else add(before, value)
+        return sums[0], sums[1]
+
+    # -------------------------------------------------------------------- health
+
+    def require_finite(self, x: Tensor) -> None:
+        """Raise SystemFileError (S302) where states (…, n) hold NaN or infinity."""
+        bad = ~torch.isfinite(x.detach())
+        if not bool(bad.any()):
+            return
+        hit = [name for name, column in zip(self.names, bad.unbind(-1), strict=True) if bool(column.any())]
+        place = self.decl.places.get(hit[0])
+        listed = ", ".join(f"`{name}`" for name in hit)
+        raise SystemFileError(
+            Diagnostic(
+                "S302",
+                f"the dynamics of {self.name} give NaN or infinity in {listed}",
+                place,
+                label="declared here",
+                help=("clamp the state, shorten the step, or keep divisors away from 0",),
+            )
+        )
+
+    def probe(self, n: int = 256, *, seed: int = 0) -> tuple[Diagnostic, ...]:
+        """Try the system: initial states, random plans of at most `PROBED` steps; warnings come back.
+
+        Raises SystemFileError where states cannot be drawn (S301) or are not finite (S302).
+        """
+        x0 = self.sample(n, seed=seed, dtype=torch.float64)
+        self.require_finite(x0)
+        generator = torch.Generator().manual_seed(seed)
+        shape = (n, min(self.horizon, PROBED), len(self.controls))
+        low, high = self.control_low.double(), self.control_high.double()
+        u = low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
+        self.require_finite(self.rollout(x0, u))
+        return (*self.decl.warnings, *self.initial.warnings(), *unstable(self.decl))

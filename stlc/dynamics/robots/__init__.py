@@ -1,0 +1,1 @@
+"""Robots: descriptions, kinematics, functions from outside."""

@@ -1,0 +1,109 @@
+"""Forward kinematics as it is computed here against another library's, on a user's robot description.
+
+`stlc.dynamics.robots.kinematics` unrolls a chain of joints into a few operations; pytorch-kinematics
+multiplies batches of transforms. Where that package is installed, `stlc system check` compares the two.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+import numpy as np
+import torch
+
+from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir import nodes as ir
+from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.dynamics.declaration.model import FunctionDecl
+from stlc.dynamics.robots.urdf import Doubles, read_urdf
+
+LIBRARY = "pytorch-kinematics"
+POSITIONS = 256
+_NEAR = 1e-5
+"""How far apart the two may be, in parts of the reach: the library keeps offsets in single precision."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """What came of comparing one function.
+
+    Attributes:
+        name: of the function.
+        distance: the largest, m; None where the two were not compared.
+        why: why not.
+    """
+
+    name: str
+    distance: float | None
+    why: str = ""
+
+
+def compared(function: FunctionDecl, *, seed: int = 0) -> Comparison:
+    """Compare forward kinematics with pytorch-kinematics in random positions of the joints.
+
+    Args:
+        function: of the kind `urdf`.
+        seed: of the positions, uniform in [-pi, pi] rad or m.
+
+    Raises:
+        SystemFileError: S208, the two do not agree.
+    """
+    assert function.body is not None
+    if find_spec("pytorch_kinematics") is None:
+        return Comparison(function.name, None, f"{LIBRARY} is not installed: pip install 'stlc[panda]'")
+    q = np.random.default_rng(seed).uniform(-np.pi, np.pi, (POSITIONS, len(function.body.formals)))
+    try:
+        with _silent():
+            theirs = _by_library(function, q)
+    except Exception as error:  # whatever it raises about a description that it does not take
+        return Comparison(function.name, None, f"{LIBRARY} does not take it: {type(error).__name__}")
+    ours = _by_body(function.body, q)
+    far = float(np.abs(ours - theirs).max())
+    if not far <= _NEAR * max(1.0, float(np.abs(ours).max())):
+        raise SystemFileError(
+            Diagnostic(
+                "S208",
+                f"`{function.name}` is up to {far:.2g} m from where {LIBRARY} puts `{function.attribute}`",
+                function.span,
+                "named here",
+                note=("one of the two reads the description otherwise; compare origins, axes and `base`",),
+            )
+        )
+    return Comparison(function.name, far)
+
+
+def _by_library(function: FunctionDecl, q: Doubles) -> Doubles:
+    import pytorch_kinematics
+
+    text = read_urdf(function.module).encode() if not isinstance(function.module, str) else b""
+    arguments = (function.attribute, function.base) if function.base else (function.attribute,)
+    chain = pytorch_kinematics.build_serial_chain_from_urdf(text, *arguments).to(dtype=torch.float64)
+    found: Doubles = chain.forward_kinematics(torch.from_numpy(q)).get_matrix()[:, :3, 3].numpy()
+    return found
+
+
+def _by_body(body: ir.Body, q: Doubles) -> Doubles:
+    """The function's numbers, (n, joints) -> (n, 3) m."""
+    args = tuple(ir.Col(f"a{index}") for index in range(q.shape[1]))
+    program = Program({str(i): ir.Extern("f", args, i, body) for i in range(3)})
+    found = program({"": q[:, 0], **{arg.name: q[:, i] for i, arg in enumerate(args)}}, NUMPY)
+    return np.stack([np.broadcast_to(found[str(i)], len(q)) for i in range(3)], 1)
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """The library tells of every tag that it passes over."""
+    nowhere = io.StringIO()
+    with (
+        contextlib.redirect_stdout(nowhere),
+        contextlib.redirect_stderr(nowhere),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore")
+        yield

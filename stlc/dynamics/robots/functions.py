@@ -1,0 +1,164 @@
+"""Functions from outside: loaded when somebody asks for them, on arrays of either library."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, final
+
+import numpy as np
+
+from stlc.compile.backends.array.namespace import Array
+from stlc.compile.frontend.interface import Function
+from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.dynamics.declaration.decl import SystemDecl
+from stlc.dynamics.declaration.init import FileDecl
+from stlc.dynamics.declaration.model import FunctionDecl
+from stlc.registry import closest
+
+
+def load_functions(decl: SystemDecl) -> Mapping[str, Function]:
+    """The functions of a system, by name: their modules are imported, which runs them.
+
+    Raises:
+        SystemFileError: S208, a module or a function cannot be loaded.
+    """
+    return {
+        function.name: function if function.body is not None else PythonFunction(function, _loaded(function))
+        for function in decl.functions
+    }
+
+
+def function_files(decl: SystemDecl) -> dict[str, Path]:
+    """The files that a system file names: by their paths below its folder, else by their last names.
+
+    These are the files that it extends, those of its functions, and those of its initial states.
+    """
+    home = decl.path.parent.resolve()
+    named = [Path(base.name) for base in decl.bases]
+    named += [function.module for function in decl.functions if isinstance(function.module, Path)]
+    named += [part.points.path for part in decl.init.mixture if isinstance(part.points, FileDecl)]
+    found: dict[str, Path] = {}
+    for path in (each.resolve() for each in named if each.is_file()):
+        below = path.is_relative_to(home)
+        found[path.relative_to(home).as_posix() if below else path.name] = path
+    return found
+
+
+def _loaded(decl: FunctionDecl) -> Callable[..., Array]:
+    try:
+        module = _module(decl.module)
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise _refused(decl, f"`{decl.module}` cannot be imported", reason) from error
+    found = getattr(module, decl.attribute, None)
+    if not callable(found):
+        near = closest(decl.attribute, [name for name, value in vars(module).items() if callable(value)])
+        advice = (f"did you mean `{near}`?",) if near else ()
+        raise _refused(decl, f"`{decl.module}` has no function `{decl.attribute}`", help_=advice)
+    return found  # type: ignore[no-any-return]
+
+
+def _module(where: str | Path) -> ModuleType:
+    if isinstance(where, str):
+        return importlib.import_module(where)
+    if not where.is_file():
+        raise FileNotFoundError(f"there is no file `{where}`")
+    spec = importlib.util.spec_from_file_location(f"stlc_functions_{where.stem}", where)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _refused(
+    decl: FunctionDecl, message: str, note: str = "", help_: tuple[str, ...] = ()
+) -> SystemFileError:
+    notes = (note,) if note else ()
+    return SystemFileError(Diagnostic("S208", message, decl.span, "named here", help=help_, note=notes))
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class PythonFunction:
+    """A loaded function: vectors are arrays (…, size), numbers arrays (…), and so is the result."""
+
+    decl: FunctionDecl
+    call: Callable[..., Array]
+
+    def bound(self, arguments: tuple[int | None, ...], result: int | None) -> Bound:
+        """The function on components; see `stlc.compile.frontend.interface.Function`."""
+        return Bound(self.decl, self.call, arguments, result)
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """A function with the sizes that a specification gives it."""
+
+    decl: FunctionDecl
+    call: Callable[..., Array]
+    arguments: tuple[int | None, ...]
+    result: int | None
+
+    def __call__(self, *components: Array) -> Sequence[Array]:
+        """All components of the result. Raises SystemFileError (S208) where the function fails."""
+        torch_there = not all(isinstance(part, (float, np.ndarray, np.generic)) for part in components)
+        to_torch, to_numpy = self.decl.library == "torch", self.decl.library == "numpy"
+        parts: Sequence[Array] = components
+        if to_torch and not torch_there:
+            parts = [_torch().as_tensor(np.asarray(part)) for part in np.broadcast_arrays(*components)]
+        elif to_numpy and torch_there:
+            parts = [part.detach().cpu().numpy() for part in _torch().broadcast_tensors(*components)]
+        found = self._checked(_joined(parts, self.arguments), _shape(parts))
+        if to_torch and not torch_there:
+            found = found.detach().numpy()
+        elif to_numpy and torch_there:
+            found = _torch().as_tensor(found).to(components[0])
+        return [found] if self.result is None else [found[..., i] for i in range(self.result)]
+
+    def _checked(self, values: Sequence[Array], batch: tuple[int, ...]) -> Array:
+        """The result, of the shape that was declared."""
+        try:
+            found = self.call(*values)
+            shape = tuple(found.shape)
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise _refused(self.decl, f"the function `{self.decl.name}` fails", reason) from error
+        wanted = batch if self.result is None else (*batch, self.result)
+        if shape == wanted:
+            return found
+        given = ", ".join(str(tuple(value.shape)) for value in values)
+        message = f"the function `{self.decl.name}` gives an array {shape}, declared is {wanted}"
+        raise _refused(self.decl, message, f"for arguments {given}")
+
+
+def _torch() -> Any:
+    return importlib.import_module("torch")
+
+
+def _shape(parts: Sequence[Array]) -> tuple[int, ...]:
+    return np.broadcast_shapes(*(tuple(getattr(part, "shape", ())) for part in parts))
+
+
+def _joined(parts: Sequence[Array], sizes: tuple[int | None, ...]) -> list[Array]:
+    """Components as the arguments that they make up, all of one shape but for the last axis."""
+    if all(isinstance(part, (float, np.ndarray, np.generic)) for part in parts):
+        library: Any = np
+        spread = np.broadcast_arrays(*parts)
+    else:
+        library = _torch()
+        spread = library.broadcast_tensors(*parts)
+    values, start = [], 0
+    for size in sizes:
+        if size is None:
+            values.append(spread[start])
+        else:
+            values.append(library.stack(list(spread[start : start + size]), -1))
+        start += 1 if size is None else size
+    return values

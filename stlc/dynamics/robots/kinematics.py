@@ -1,0 +1,123 @@
+"""Forward kinematics: a chain of joints, unrolled into numbers of the IR.
+
+Everything that is known now is folded, so what stays of a seven-joint arm are the sines and cosines of its
+joints and some thirty products and sums: the torch graph and the C kernel compute the same few operations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+
+from stlc.compile.ir import nodes as ir
+from stlc.dynamics.robots.urdf import Doubles, Joint
+
+Point: TypeAlias = tuple[ir.Num, ir.Num, ir.Num]
+
+
+def position(joints: Sequence[Joint]) -> ir.Body:
+    """Where the tip is in the frame of the base, (3,) m, from the positions of the moving joints."""
+    moving = [joint for joint in joints if joint.kind != "fixed"]
+    formals = {joint.name: f"q{index}" for index, joint in enumerate(moving)}
+    writer = _Lines()
+    point: Point = (ir.Lit(0.0), ir.Lit(0.0), ir.Lit(0.0))
+    for joint in reversed(joints):
+        if joint.kind == "revolute":
+            point = _turned(joint.axis, point, ir.Col(formals[joint.name]), writer)
+        elif joint.kind == "prismatic":
+            point = _pushed(joint.axis, point, ir.Col(formals[joint.name]), writer)
+        point = _affine(joint.rotation, joint.offset, point, writer)
+    return ir.Body(tuple(formals.values()), tuple(writer.lets), point)
+
+
+class _Lines:
+    """Gathers named numbers, so that none is written out twice."""
+
+    def __init__(self) -> None:
+        self.lets: list[tuple[str, ir.Num]] = []
+
+    def name(self, num: ir.Num) -> ir.Num:
+        """A column that holds `num`."""
+        if isinstance(num, ir.Lit | ir.Col):
+            return num
+        name = f"v{len(self.lets)}"
+        self.lets.append((name, num))
+        return ir.Col(name)
+
+
+def _turned(axis: Doubles, point: Point, angle: ir.Num, writer: _Lines) -> Point:
+    """A point turned about an axis (Rodrigues): what is along it stays, the rest turns."""
+    along = _linear(np.outer(axis, axis), point)
+    across = tuple(writer.name(num) for num in _linear(np.eye(3) - np.outer(axis, axis), point))
+    if all(num == ir.Lit(0.0) for num in across):
+        return point
+    x, y, z = axis
+    aside = _linear(np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]), point)
+    cosine, sine = (writer.name(ir.Op(name, (angle,))) for name in ("cos", "sin"))
+    a, b, c = (
+        writer.name(_sum(_sum(kept, _product(cosine, part)), _product(sine, turned)))
+        for kept, part, turned in zip(along, across, aside, strict=True)
+    )
+    return a, b, c
+
+
+def _pushed(axis: Doubles, point: Point, length: ir.Num, writer: _Lines) -> Point:
+    """A point pushed along an axis."""
+    a, b, c = (
+        writer.name(_sum(part, _product(ir.Lit(float(share)), length)))
+        for part, share in zip(point, axis, strict=True)
+    )
+    return a, b, c
+
+
+def _affine(rotation: Doubles, offset: Doubles, point: Point, writer: _Lines) -> Point:
+    """`rotation @ point + offset`."""
+    a, b, c = (
+        writer.name(_sum(part, ir.Lit(float(shift))))
+        for part, shift in zip(_linear(rotation, point), offset, strict=True)
+    )
+    return a, b, c
+
+
+def _linear(matrix: Doubles, point: Point) -> Point:
+    """`matrix @ point`, constants folded."""
+    rows: list[ir.Num] = []
+    for row in matrix:
+        total: ir.Num = ir.Lit(0.0)
+        for factor, part in zip(row, point, strict=True):
+            total = _sum(total, _product(ir.Lit(float(factor)), part))
+        rows.append(total)
+    a, b, c = rows
+    return a, b, c
+
+
+def _sum(left: ir.Num, right: ir.Num) -> ir.Num:
+    match left, right:
+        case ir.Lit(a), ir.Lit(b):
+            return ir.Lit(a + b)
+        case (ir.Lit(0.0), kept) | (kept, ir.Lit(0.0)):
+            return kept
+        case _, ir.Op("neg", (taken,)):
+            return ir.Op("sub", (left, taken))
+        case ir.Op("neg", (taken,)), _:
+            return ir.Op("sub", (right, taken))
+        case _:
+            return ir.Op("add", (left, right))
+
+
+def _product(left: ir.Num, right: ir.Num) -> ir.Num:
+    match left, right:
+        case ir.Lit(a), ir.Lit(b):
+            return ir.Lit(a * b)
+        case (ir.Lit(0.0), _) | (_, ir.Lit(0.0)):
+            return ir.Lit(0.0)
+        case (ir.Lit(1.0), kept) | (kept, ir.Lit(1.0)):
+            return kept
+        case (ir.Lit(-1.0), kept) | (kept, ir.Lit(-1.0)):
+            return kept.args[0] if isinstance(kept, ir.Op) and kept.name == "neg" else ir.Op("neg", (kept,))
+        case _, ir.Op("neg", (kept,)):
+            return ir.Op("neg", (_product(left, kept),))
+        case _:
+            return ir.Op("mul", (left, right))

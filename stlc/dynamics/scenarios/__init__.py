@@ -1,0 +1,1 @@
+"""A system that is not as its model says."""

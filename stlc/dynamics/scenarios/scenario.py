@@ -1,0 +1,95 @@
+"""A scenario laid over a system: what is different in it, and for whom.
+
+Some are there for every system: `mismatch`, `disturb` and `noise`, with a number of per cent behind a hyphen
+or without.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.dynamics.declaration.decl import SystemDecl
+from stlc.dynamics.declaration.deployment import ErrorsDecl, ScenarioDecl
+from stlc.dynamics.schema.schema import load_system_decl, parse_system
+from stlc.registry import closest
+
+DISTURBED = ("mismatch-5", "mismatch-10", "mismatch-20", "disturb", "noise")
+"""Scenarios of every system that the documentation measures."""
+_STANDARD = re.compile(r"(mismatch|disturb|noise)(?:-(\d{1,3}(?:\.\d{1,3})?))?")
+_USUAL = {"mismatch": 10.0, "disturb": 10.0, "noise": 0.5}
+
+
+def standard(name: str) -> ScenarioDecl | None:
+    """A scenario that every system has, such as `mismatch-20`; None where the name is not one of theirs."""
+    found = _STANDARD.fullmatch(name)
+    percent = float(found[2] or _USUAL[found[1]]) if found else 0.0
+    if found is None or not 0.0 < percent <= 100.0:
+        return None
+    match found[1]:
+        case "mismatch":
+            doc = f"actuators and numbers of the dynamics are {percent:g} % more or less than the model says"
+            errors = ErrorsDecl(actuator_gain=percent / 100, parameters=percent / 100)
+        case "disturb":
+            doc = f"noise on what actuators give, {percent:g} % of half their range"
+            errors = ErrorsDecl(actuator_noise=percent / 100)
+        case _:
+            doc = f"noise on what agents see, {percent:g} % of the range of each state"
+            errors = ErrorsDecl(sensor_noise=percent / 100)
+    return ScenarioDecl(name, doc, "ood", errors=errors)
+
+
+def find_scenario(decl: SystemDecl, name: str) -> ScenarioDecl:
+    """The overlay of that name, one of the file or one of every system's. Raises UsageError (U101)."""
+    for scenario in decl.scenarios:
+        if scenario.name == name:
+            return scenario
+    if (usual := standard(name)) is not None:
+        return usual
+    names = [scenario.name for scenario in decl.scenarios]
+    near = closest(name, [*names, *DISTURBED, "mismatch"])
+    listed = f"scenarios of {decl.name}: {', '.join(names)}" if names else f"{decl.name} declares none"
+    every = f"every system has {', '.join(DISTURBED)}"
+    help_ = (f"did you mean `{near}`?  {listed}" if near else listed, every)
+    raise UsageError(Diagnostic("U101", f"there is no scenario `{name}`", help=help_))
+
+
+def scenario_constants(path: Path, name: str, overrides: Mapping[str, str]) -> Mapping[str, str]:
+    """What a scenario of a system file says about constants: specification and model change together."""
+    return find_scenario(load_system_decl(path, overrides), name).constants
+
+
+def under(decl: SystemDecl, name: str) -> SystemDecl:
+    """The system under a scenario: what agents start from and meet; its model stays, but for constants.
+
+    Raises UsageError (U101) where there is no such scenario.
+    """
+    scenario = find_scenario(decl, name)
+    return _laid_over(_with_constants(decl, scenario.constants) if scenario.constants else decl, name)
+
+
+def truth(decl: SystemDecl) -> SystemDecl:
+    """The system as it is where its scenario says that the model is mistaken."""
+    scenario = decl.scenario
+    if scenario is None or not scenario.mismatch:
+        return decl
+    real = replace(_with_constants(decl, scenario.mismatch), controls=decl.controls, feedback=decl.feedback)
+    return _laid_over(real, scenario.name)
+
+
+def _laid_over(decl: SystemDecl, name: str) -> SystemDecl:
+    scenario = find_scenario(decl, name)
+    init = replace(decl.init, override=(*decl.init.override, *scenario.override))
+    events = (*decl.test.events, *scenario.events)
+    world, judge = scenario.world or decl.test.world, scenario.judge or decl.test.judge
+    test = replace(decl.test, events=events, world=world, judge=judge)
+    objective = replace(decl.objective, terms=(*decl.objective.terms, *scenario.prefer))
+    backup = scenario.backup or decl.backup
+    return replace(decl, init=init, test=test, objective=objective, backup=backup, scenario=scenario)
+
+
+def _with_constants(decl: SystemDecl, constants: Mapping[str, str]) -> SystemDecl:
+    return parse_system(decl.source, decl.path, {**decl.overrides, **constants})

@@ -1,0 +1,252 @@
+"""The numbers in the dynamics of a system, each with a factor by which it may be wrong. No torch.
+
+These are, unless `test: {uncertain: […]}` names them, the constants that `flow` and the resets of jumps
+compute with, and the numbers that `flow` and resets have written in them. What a condition reads (where a
+station is, when a light changes) is a place or an instant and no property of what moves; exponents, indices
+and numbers that a function is called with are mathematics. Constants that a condition reads too stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+from stlc.compile.frontend.scope import Definition, Entry, Known
+from stlc.compile.frontend.values import Number, Vector
+from stlc.compile.ir import nodes as ir
+from stlc.dynamics.declaration.decl import SystemDecl
+from stlc.dynamics.declaration.model import Assign, JumpDecl
+from stlc.dynamics.model.algebra import multiply, names_in, names_in_formula
+from stlc.dynamics.schema.expressions import Expressions
+from stlc.dynamics.schema.flow import read_flow, read_jumps
+from stlc.dynamics.schema.names import Names, base_name
+from stlc.dynamics.schema.reader import Reader
+from stlc.dynamics.schema.schema import moving_parts
+from stlc.dynamics.schema.yaml_nodes import Node
+from stlc.grammar import ast
+from stlc.grammar.children import children, descendants
+from stlc.units import SYMBOLS
+
+
+@dataclass(frozen=True, slots=True)
+class Uncertain:
+    """A number that may be wrong.
+
+    Attributes:
+        factor: the column that multiplies it; 1 is what the model says.
+        text: as it is written: `vy`, `0.01 m/rad`.
+        states: whose equations or resets have it.
+    """
+
+    factor: str
+    text: str
+    states: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.text} (of {', '.join(self.states)})"
+
+
+@dataclass(frozen=True, slots=True)
+class Loose:
+    """A declaration whose `flow` and `jumps` read a factor for each of its uncertain numbers."""
+
+    decl: SystemDecl
+    numbers: tuple[Uncertain, ...]
+
+
+def loosened(decl: SystemDecl) -> Loose:
+    """The dynamics of a declaration with a factor at every uncertain number."""
+    names, clock, flow, jump = moving_parts(decl)
+    seen, listed = _Seen(names), decl.test.uncertain
+
+    def read(marked: Names) -> tuple[tuple[Assign, ...], tuple[JumpDecl, ...]]:
+        scratch = Reader(decl.source)  # what cannot be wrong by a factor stays, and is no finding
+        return read_flow(flow, scratch, marked, clock), read_jumps(jump, scratch, marked)
+
+    read(_Marked.of(names, seen.look))
+    chosen = seen.computed_with - seen.compared if listed is None else frozenset(listed)
+    texts = {_factor(name): name for name in sorted(chosen)}
+    if listed is None:
+        texts |= {_place(each): each.span.text for each in seen.literals.values()}
+    marked = _Marked.of(names, seen.rewritten if listed is None else _as_it_is)
+    for name in chosen:
+        marked.entries[name] = _times(names.entries[name], ir.Col(_factor(name)))
+    for factor in texts:
+        marked.entries[factor] = Known(Number(ir.Col(factor), flexible=True, bare=True))
+    loose = _laid_over(decl, *read(marked))
+    found = (Uncertain(factor, text, _readers(loose, factor)) for factor, text in texts.items())
+    return Loose(loose, tuple(each for each in found if each.states))
+
+
+def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl, ...]) -> SystemDecl:
+    """The declaration, but for the numbers of its real states, and for guards."""
+    real = {column.name for column in decl.signature.columns if column.kind == "real"}
+    rates = {assign.name: assign for assign in flow if assign.name in real}
+    again = {jump.name: jump for jump in jumps}
+    return replace(
+        decl,
+        flow=tuple(rates.get(assign.name, assign) for assign in decl.flow),
+        jumps=tuple(_jump(jump, again.get(jump.name, jump), real) for jump in decl.jumps),
+    )
+
+
+def _jump(jump: JumpDecl, again: JumpDecl, real: set[str]) -> JumpDecl:
+    values = {assign.name: assign for assign in again.resets if assign.name in real}
+    resets = tuple(values.get(assign.name, assign) for assign in jump.resets)
+    return replace(jump, guard=again.guard, resets=resets)
+
+
+def _readers(decl: SystemDecl, factor: str) -> tuple[str, ...]:
+    """The states whose equations, or whose jumps, read a factor."""
+    found = [assign.name for assign in decl.flow if factor in names_in(assign.value)]
+    for jump in decl.jumps:
+        guarded = factor in names_in_formula(jump.guard)
+        found += [each.name for each in jump.resets if guarded or factor in names_in(each.value)]
+    return tuple(dict.fromkeys(map(base_name, found)))
+
+
+def _factor(name: str) -> str:
+    return f"?{name}"
+
+
+def _is_point(node: ast.Quantity) -> bool:
+    known = SYMBOLS.get(node.unit)
+    return known is not None and bool(known.offset)
+
+
+def _place(node: ast.Quantity) -> str:
+    return f"?{node.span.source.name}:{node.span.start}"
+
+
+def _times(entry: Entry, factor: ir.Num) -> Entry:
+    """A constant with a factor, all components of a vector with the same one."""
+    assert isinstance(entry, Known)
+    match entry.value:
+        case Number() as number:
+            return replace(entry, value=_scaled(number, factor))
+        case Vector(items=items) as vector:
+            return replace(entry, value=replace(vector, items=tuple(_scaled(item, factor) for item in items)))
+        case _:
+            return entry
+
+
+def _scaled(number: Number, factor: ir.Num) -> Number:
+    """A number with a factor; a point of a scale has no share that it could be wrong by."""
+    if number.unit.offset:
+        return number
+    return replace(number, num=multiply(number.num, factor), exact=None)
+
+
+# -------------------------------------------------------------------- reading expressions again
+
+Rewrite = Callable[[ast.Expr], ast.Expr]
+
+
+def _as_it_is(expr: ast.Expr) -> ast.Expr:
+    return expr
+
+
+@dataclass
+class _Marked(Names):
+    """Names whose expressions are rewritten before they are resolved."""
+
+    rewrite: Rewrite = field(default=_as_it_is)
+
+    @classmethod
+    def of(cls, names: Names, rewrite: Rewrite) -> _Marked:
+        return cls(names.constants, names.columns, names.controls, dict(names.entries), names.places, rewrite)
+
+    def expressions(self, reader: Reader) -> Expressions:
+        """A compiler of rewritten expressions."""
+        return _Rewriting(reader, Names.expressions(self, reader).scope, rewrite=self.rewrite)
+
+
+@dataclass(frozen=True, slots=True)
+class _Rewriting(Expressions):
+    rewrite: Rewrite = field(default=_as_it_is)
+
+    def parse(self, node: Node | None, where: str) -> ast.Expr | None:
+        """The syntax tree of a field, rewritten."""
+        expr = Expressions.parse(self, node, where)
+        return None if expr is None else self.rewrite(expr)
+
+
+class _Seen:
+    """Constants and numbers that expressions compute with, and constants that they compare with."""
+
+    def __init__(self, names: Names) -> None:
+        self.names = names
+        self.constants = frozenset(map(base_name, names.constants))
+        self.computed_with: set[str] = set()
+        self.compared: set[str] = set()
+        self.literals: dict[str, ast.Quantity] = {}
+
+    def look(self, expr: ast.Expr) -> ast.Expr:
+        """Take an expression in, and give it back."""
+        self.rewritten(expr)
+        return expr
+
+    def rewritten(self, expr: ast.Expr, *, called: bool = False) -> ast.Expr:
+        """An expression with a factor at each number that it computes with; definitions are put in."""
+        match expr:
+            case ast.Quantity(span=span, value=value):
+                if called or not value or _is_point(expr):
+                    return expr
+                self.literals[_place(expr)] = expr
+                return ast.Binary(span, "*", expr, ast.Name(span, _place(expr)))
+            case ast.Name(name=name):
+                found = self.names.entries.get(name)
+                if isinstance(found, Definition):
+                    return self.rewritten(found.body, called=called)
+                self.computed_with |= {name} & self.constants
+                return expr
+        inside, changed = called or isinstance(expr, ast.Call), {}
+        for part, computes in _parts(expr):
+            if computes:
+                changed[id(part)] = self.rewritten(part, called=inside)
+            else:
+                self._compare(part)
+        return _with_parts(expr, changed)
+
+    def _compare(self, part: ast.Node) -> None:
+        for node in descendants(part):
+            if isinstance(node, ast.Name):
+                found = self.names.entries.get(node.name)
+                self.compared |= {node.name} & self.constants
+                if isinstance(found, Definition):
+                    self._compare(found.body)
+
+
+def _parts(expr: ast.Expr) -> Iterator[tuple[Any, bool]]:
+    """The parts of an expression, and whether it computes with them."""
+    match expr:
+        case ast.Neg(operand=operand):
+            yield operand, True
+        case ast.Vector(items=items):
+            yield from ((item, True) for item in items)
+        case ast.Binary(left=left, right=right, op=op):
+            yield from ((left, True), (right, op in "+-*/"))
+        case ast.Index(base=base, index=index):
+            yield from ((base, True), (index, False))
+        case ast.IfThenElse(cond=cond, yes=yes, no=no):
+            yield from ((cond, False), (yes, True), (no, True))
+        case ast.Call(func=ast.Name(name=name), args=args):
+            yield from ((arg.value, name != "ind" and arg.name is None) for arg in args)
+        case _:
+            yield from ((child, False) for child in children(expr))
+
+
+def _with_parts(expr: ast.Expr, changed: Mapping[int, ast.Expr]) -> ast.Expr:
+    """An expression with other parts in the place of some of its own."""
+
+    def put(value: Any) -> Any:
+        match value:
+            case tuple():
+                return tuple(map(put, value))
+            case ast.Arg():
+                return replace(value, value=put(value.value))
+            case _:
+                return changed.get(id(value), value)
+
+    return replace(expr, **{each.name: put(getattr(expr, each.name)) for each in fields(expr)})

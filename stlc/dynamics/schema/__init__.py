@@ -1,0 +1,1 @@
+"""A system file read, checked, and turned into a declaration."""

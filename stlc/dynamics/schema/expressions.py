@@ -1,0 +1,308 @@
+"""Expressions inside a system file: parsed where they stand, typed by the compiler."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import TypeVar
+
+from stlc.compile.frontend.algebra import difference_for_point, point_for_amount
+from stlc.compile.frontend.formulas import resolve_region, resolve_state_formula
+from stlc.compile.frontend.numbers import resolve_number, resolve_numbers, stored
+from stlc.compile.frontend.scope import Entry, Scope
+from stlc.compile.frontend.values import Number
+from stlc.compile.ir import nodes as ir
+from stlc.diagnostics import Diagnostic, StlcError
+from stlc.dynamics.model.algebra import names_in, names_in_formula
+from stlc.dynamics.schema.reader import Reader, first_line
+from stlc.dynamics.schema.yaml_nodes import Node, Scalar
+from stlc.dynamics.schema.yaml_nodes import Sequence as ListNode
+from stlc.grammar import ast
+from stlc.grammar.parse.parser import parse_expr
+from stlc.source import Span
+from stlc.units import Unit, parse_unit, same_dims
+
+_T = TypeVar("_T")
+SECOND = parse_unit("s")
+MAX_STEPS = 100_000
+_ATTRIBUTE = re.compile(r"(?<=[\w)\]\"'])(?<!\d)\.\s*([A-Za-z_]\w*)")
+_NOT_FINITE = frozenset(
+    {".nan", ".NaN", ".NAN", "nan", "NaN", ".inf", "-.inf", ".Inf", "-.Inf", "inf", "-inf"}
+)
+_SORTS = {"E201": "S203", "E202": "S203"}
+_SORTS_DIFFER = frozenset({"E201", "E202", "E205"})
+
+
+@dataclass(frozen=True, slots=True)
+class Expressions:
+    """Compiles the values of fields.
+
+    Attributes:
+        reader: where findings go.
+        scope: what names mean.
+        ready: columns that have a value here; None where all of them do.
+        amounts: numbers are added to what columns hold: differences, where those are points of a scale.
+    """
+
+    reader: Reader
+    scope: Scope
+    ready: frozenset[str] | None = None
+    amounts: bool = False
+
+    def extended(
+        self, entries: Mapping[str, Entry], *, samplers: bool = False, ready: frozenset[str] | None = None
+    ) -> Expressions:
+        """The same with more names."""
+        scope = self.scope.extended(entries, samplers=samplers)
+        return Expressions(self.reader, scope, ready, self.amounts)
+
+    # ------------------------------------------------------------------ parsing
+
+    def parse(self, node: Node | None, where: str) -> ast.Expr | None:
+        """The syntax tree of a field."""
+        if not isinstance(node, Scalar) or node.is_null:
+            if node is not None:
+                self.reader.wrong(node, where, "an expression")
+            return None
+        if node.text in _NOT_FINITE and node.style == "plain":
+            self.reader.wrong(node, where, "a finite number", "write a value, or leave the key out")
+            return None
+        span = node.inside
+        if node.escaped:
+            self.reader.report("S201", "an expression has no escapes", span, "write it without quotes")
+            return None
+        attribute = _ATTRIBUTE.search(span.text)
+        if attribute:
+            self._attribute(span, attribute)
+            return None
+        try:
+            return parse_expr(span.source, span.start, span.end)
+        except StlcError as error:
+            self.reader.add(*(replace(finding, code="S201") for finding in error.diagnostics))
+            return None
+
+    def _attribute(self, span: Span, found: re.Match[str]) -> None:
+        """Report something that Python would take for an attribute."""
+        place = Span(span.source, span.start + found.start(1), span.start + found.end(1))
+        finding = Diagnostic(
+            "S201",
+            "attributes and their calls are not part of the expression language",
+            place,
+            note=("expressions are parsed, never evaluated as Python",),
+        )
+        self.reader.add(finding)
+
+    # -------------------------------------------------------------------- typing
+
+    def number(self, node: Node | None, where: str) -> Number | None:
+        """The number that a field holds, in SI units from the zero of its unit."""
+        expr = self.parse(node, where)
+        if expr is None:
+            return None
+        number = self._typed(resolve_number, expr)
+        if number is not None and not self._known(names_in(number.num), expr.span):
+            return None
+        return number
+
+    def numbers(self, node: Node | None, where: str) -> tuple[Number, ...] | None:
+        """The components that a field holds, as `number` gives them: one expression, or a list of them."""
+        if isinstance(node, ListNode):
+            each = [self.number(item, f"a component of {where}") for item in self.reader.items(node, where)]
+            found = tuple(number for number in each if number is not None)
+            return found if found and len(found) == len(each) else None
+        expr = self.parse(node, where)
+        if expr is None:
+            return None
+        numbers = self._typed(resolve_numbers, expr)
+        read = frozenset().union(*(names_in(number.num) for number in numbers or ()))
+        return numbers if self._known(read, expr.span) else None
+
+    def formula(self, node: Node | None, where: str) -> ir.Formula | None:
+        """The state formula that a field holds."""
+        expr = self.parse(node, where)
+        return None if expr is None else self.formula_of(expr)
+
+    def formula_of(self, expr: ast.Expr) -> ir.Formula | None:
+        """The state formula that an expression is."""
+        formula = self._typed(resolve_state_formula, expr)
+        if formula is not None and not self._known(names_in_formula(formula), expr.span):
+            return None
+        return formula
+
+    def check(self, expr: ast.Expr) -> None:
+        """Report what is wrong with an expression of any sort."""
+        rejected: list[list[Diagnostic]] = []
+        resolvers: tuple[Callable[[ast.Expr, Scope], object], ...] = (
+            resolve_numbers,
+            resolve_state_formula,
+            resolve_region,
+        )
+        for resolve in resolvers:
+            sink: list[Diagnostic] = []
+            try:
+                resolve(expr, replace(self.scope, sink=sink, cache={}))
+                return
+            except StlcError as error:
+                rejected.append([*sink, *(f for f in error.diagnostics if f not in sink)])
+        for findings in rejected:
+            inner = [f for f in findings if f.code not in _SORTS_DIFFER or f.span != expr.span]
+            if inner:
+                self._report(inner)
+                return
+
+    def _typed(self, resolve: Callable[[ast.Expr, Scope], _T], expr: ast.Expr) -> _T | None:
+        """What a resolver of the compiler makes of an expression, or None with its findings reported."""
+        sink: list[Diagnostic] = []
+        try:
+            return resolve(expr, replace(self.scope, sink=sink))
+        except StlcError as error:
+            sink.extend(finding for finding in error.diagnostics if finding not in sink)
+            return None
+        finally:
+            self._report(sink)
+
+    def _report(self, findings: Sequence[Diagnostic]) -> None:
+        """Remember findings of the compiler under the codes of system files."""
+        self.reader.add(*(replace(f, code=_SORTS.get(f.code, f.code)) for f in findings))
+
+    def _known(self, names: frozenset[str], span: Span) -> bool:
+        """Whether all columns have a value here."""
+        early = sorted(names - self.ready) if self.ready is not None else []
+        if early:
+            listed = ", ".join(f"`{name}`" for name in early)
+            self.reader.report("S202", f"{listed} has no value yet", span, "draw it on an earlier line")
+        return not early
+
+    # --------------------------------------------------------------------- values
+
+    def stored(self, node: Node | None, where: str, unit: Unit) -> ir.Num | None:
+        """A number as it is stored in a column of `unit`."""
+        number = self.number(node, where)
+        if number is None or node is None:
+            return None
+        return self._in_unit(number, node, where, unit)
+
+    def stored_each(self, node: Node, where: str, unit: Unit, size: int) -> tuple[ir.Num, ...] | None:
+        """The components of a vector of `size` as they are stored in columns of `unit`.
+
+        One number stands for all components; a random one is drawn for each.
+        """
+        numbers = self.numbers(node, where)
+        if numbers is None:
+            return None
+        if len(numbers) == 1 and size > 1 and isinstance(node, Scalar):
+            again = [self.number(node, where) for _ in range(size)]
+            numbers = tuple(number for number in again if number is not None)
+        if len(numbers) != size:
+            message = f"{where} has {size} components, this has {len(numbers)}"
+            self.reader.report("S203", message, first_line(node.span))
+            return None
+        found = [self._in_unit(number, node, where, unit) for number in numbers]
+        kept = tuple(value for value in found if value is not None)
+        return kept if len(kept) == size else None
+
+    def _in_unit(self, number: Number, node: Node, where: str, unit: Unit) -> ir.Num | None:
+        """A number as it is stored in a column of `unit`, or None with E203 reported."""
+        if self._fits(number, unit):
+            place = first_line(node.span)
+            if self.amounts and number.unit.offset:
+                self._report((point_for_amount(where, number, place),))
+                return None
+            unit = unit.interval if self.amounts else unit
+            if unit.offset and number.sense == "difference":
+                self._report((difference_for_point(number, unit, place),))
+                return None
+            return in_stored_unit(number, unit)
+        message = f"{where} is in [{unit}], this is in [{number.unit}]"
+        self.reader.report("E203", message, first_line(node.span), label=f"[{number.unit}]")
+        return None
+
+    def truth(self, node: Node | None, where: str) -> ir.Num | None:
+        """A number or a formula as the 0 or 1 of a bool column."""
+        expr = self.parse(node, where)
+        match expr:
+            case None:
+                return None
+            case ast.Bool(_, value):
+                return ir.Lit(float(value))
+            case ast.Compare() | ast.Not() | ast.Logic() | ast.Member():
+                formula = self.formula_of(expr)
+                return None if formula is None else ir.Ind(formula)
+            case _:
+                return self.stored(node, where, Unit())
+
+    def constant(self, node: Node | None, where: str, unit: Unit) -> float | None:
+        """A number that is known now, as it is stored in a column of `unit`."""
+        value = self.stored(node, where, unit)
+        if value is None or node is None:
+            return None
+        if not isinstance(value, ir.Lit):
+            self.reader.wrong(node, where, "a constant", "use numbers and the names under `const`")
+            return None
+        return value.value
+
+    def constants(self, node: Node, where: str, unit: Unit, size: int) -> tuple[float, ...] | None:
+        """Components that are known now, as they are stored in columns of `unit`."""
+        values = self.stored_each(node, where, unit, size)
+        if values is None:
+            return None
+        found = tuple(value.value for value in values if isinstance(value, ir.Lit))
+        if len(found) < size:
+            self.reader.wrong(node, where, "a constant", "use numbers and the names under `const`")
+            return None
+        return found
+
+    def duration(self, node: Node | None, where: str) -> Fraction | None:
+        """Seconds, exactly; a bare number counts as seconds."""
+        number = self.number(node, where)
+        if number is None or node is None:
+            return None
+        if number.exact is None or not self._fits(number, SECOND) or number.exact <= 0:
+            self.reader.wrong(node, where, "a positive time", "for example `0.1 s`")
+            return None
+        return number.exact
+
+    def steps(self, node: Node | None, where: str, dt: Fraction) -> int | None:
+        """A whole number of steps, given as `25 steps`, `25` or a time."""
+        if node is None:
+            return None
+        expr = self.parse(node, where)
+        match expr:
+            case None:
+                return None
+            case ast.Quantity(_, value, unit) if unit in ("", "steps", "step"):
+                count = value
+            case _:
+                seconds = self.duration(node, where)
+                if seconds is None:
+                    return None
+                count = seconds / dt
+        if count > MAX_STEPS:
+            self.reader.wrong(node, where, f"at most {MAX_STEPS} steps")
+            return None
+        if count.denominator != 1 or count < 1:
+            self.reader.wrong(
+                node,
+                where,
+                "a positive whole number of steps",
+                f"one step is {float(dt):g} s: give a multiple of it, or a number of steps",
+            )
+            return None
+        return int(count)
+
+    @staticmethod
+    def _fits(number: Number, unit: Unit) -> bool:
+        """Whether a number may be stored in a column of `unit`; an undeclared unit takes anything."""
+        return number.flexible or number.bare or not unit.text or same_dims(number.unit, unit)
+
+
+def in_stored_unit(number: Number, unit: Unit) -> ir.Num:
+    """SI to the unit of a column; a bare number is in that unit already."""
+    return number.num if number.bare else stored(number, unit)
+
+
+def written(node: Node | None) -> str:
+    """The text of a field, on one line, for tables."""
+    return " ".join(node.text.split()) if isinstance(node, Scalar) else ""

@@ -1,0 +1,212 @@
+"""What the names of a system file are: time, constants, states, controls, definitions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from fractions import Fraction
+
+from stlc.compile.frontend.algebra import absolute
+from stlc.compile.frontend.scope import (
+    Definition,
+    Entry,
+    Known,
+    Scope,
+    constant_value,
+    enforced,
+)
+from stlc.compile.frontend.values import Vector
+from stlc.diagnostics import Label, SystemFileError
+from stlc.dynamics.declaration.model import ControlDecl
+from stlc.dynamics.schema.expressions import SECOND, Expressions
+from stlc.dynamics.schema.reader import Reader, first_line
+from stlc.dynamics.schema.yaml_nodes import Mapping, Node, Scalar, Sequence
+from stlc.grammar import ast
+from stlc.signature import Column, Signature
+from stlc.source import Span
+from stlc.units import CELSIUS, Unit, means_celsius, parse_unit
+
+TIME_KEYS = ("dt", "horizon", "integrator", "substeps", "discrete")
+INTEGRATORS = ("euler", "heun", "rk4")
+
+
+@dataclass(frozen=True, slots=True)
+class Clockwork:
+    """The section `time`; a horizon of 0 is not known."""
+
+    dt: Fraction = Fraction(1, 10)
+    horizon: int = 0
+    substeps: int = 1
+    integrator: str = "euler"
+    discrete: bool = False
+
+
+def base_name(column: str) -> str:
+    """The name of the vector whose component a column is; its own name where it is none."""
+    return column.partition("[")[0]
+
+
+def component_names(name: str, size: int | None) -> tuple[str, ...]:
+    """The columns of a state or control: its name, or one for each component of a vector."""
+    return (name,) if size is None else tuple(f"{name}[{index}]" for index in range(size))
+
+
+@dataclass
+class Names:
+    """What has been declared so far.
+
+    Attributes:
+        constants: name -> (value in SI units, unit).
+        columns: the states, in order.
+        controls: the inputs, in order.
+        entries: everything that expressions may name.
+        places: name -> where it is declared.
+    """
+
+    constants: dict[str, tuple[float, Unit]] = field(default_factory=dict)
+    columns: list[Column] = field(default_factory=list)
+    controls: list[ControlDecl] = field(default_factory=list)
+    entries: dict[str, Entry] = field(default_factory=dict)
+    places: dict[str, Span] = field(default_factory=dict)
+
+    @property
+    def signature(self) -> Signature:
+        """The state columns."""
+        return Signature(tuple(self.columns))
+
+    def expressions(self, reader: Reader) -> Expressions:
+        """A compiler of expressions that knows all of it."""
+        return Expressions(
+            reader, Scope(dict(self.entries), error=SystemFileError, facts=enforced(self.columns))
+        )
+
+    def group(self, name: str) -> tuple[Column, ...]:
+        """The state of that name: one column, or the components of a vector; none where there is none."""
+        exact = tuple(column for column in self.columns if column.name == name)
+        return exact or tuple(column for column in self.columns if base_name(column.name) == name)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states; a vector has one."""
+        return tuple(dict.fromkeys(base_name(column.name) for column in self.columns))
+
+    def vector(self, name: str) -> bool:
+        """Whether a state of that name is a vector."""
+        return all(column.name != name for column in self.columns)
+
+    def place_components(self, name: str, columns: Iterable[str]) -> None:
+        """The components of a vector are declared where it is."""
+        if name in self.places:
+            self.places |= dict.fromkeys(columns, self.places[name])
+
+    def declare(self, key: Scalar, what: str, reader: Reader) -> bool:
+        """Whether `key` may become a name; says why not."""
+        first = self.places.get(key.text)
+        if first is not None:
+            reader.report(
+                "E102",
+                f"`{key.text}` is declared twice",
+                key.span,
+                "rename one of the two",
+                label=f"{what} here",
+                labels=(Label(first, "declared first"),),
+            )
+            return False
+        if not key.text.isidentifier() or key.text == "dt":
+            reader.report(
+                "S103", f"`{key.text}` cannot be the name of a {what}", key.span, "choose another name"
+            )
+            return False
+        self.places[key.text] = key.span
+        return True
+
+
+def read_time(node: Node | None, reader: Reader, names: Names) -> Clockwork:
+    """The section `time`; `dt` becomes a name."""
+    found = reader.fields(node, "`time`", TIME_KEYS, required=("dt", "horizon"))
+    here = names.expressions(reader)
+    default = Clockwork()
+    dt = here.duration(found.get("dt"), "`dt`") or default.dt
+    names.entries["dt"] = Known(constant_value(float(dt), SECOND), "the step")
+    return Clockwork(
+        dt,
+        here.steps(found.get("horizon"), "`horizon`", dt) or default.horizon,
+        reader.integer(found.get("substeps"), "`substeps`", high=1000) or default.substeps,
+        reader.option(found.get("integrator"), "`integrator`", INTEGRATORS) or default.integrator,
+        reader.flag(found.get("discrete"), "`discrete`") or default.discrete,
+    )
+
+
+def read_constants(node: Node | None, reader: Reader, names: Names) -> None:
+    """The section `const`: numbers and vectors with units; later ones may use earlier ones."""
+    for entry in reader.entries(node, "`const`"):
+        name = entry.key.text
+        if not names.declare(entry.key, "constant", reader):
+            continue
+        where = f"the constant `{name}`"
+        numbers = names.expressions(reader).numbers(entry.value, where)
+        if numbers is None:
+            names.entries[name] = Known(constant_value(1.0), "constant")
+            continue
+        vector = len(numbers) > 1 or isinstance(entry.value, Sequence)
+        called = component_names(name, len(numbers) if vector else None)
+        for component, number in zip(called, numbers, strict=True):
+            if number.constant is None:
+                reader.wrong(entry.value, where, "a number that is known now")
+                break
+            known = absolute(number).constant or 0.0
+            names.constants[component] = (known, Unit() if number.bare else number.unit)
+        names.place_components(name, called)
+        value = Vector(numbers) if vector else numbers[0]
+        names.entries[name] = Known(value, "constant", entry.key.span)
+
+
+def read_unit(node: Node | None, reader: Reader) -> Unit:
+    """The unit of a field; nothing written is a unit too."""
+    text = reader.text(node, "`unit`")
+    if node is None or text is None:
+        return Unit()
+    try:
+        return parse_unit(text)
+    except ValueError as error:
+        advice = CELSIUS if means_celsius(text) else "a unit is a product of powers, for example `m/s^2`"
+        reader.report("S103", str(error), node.span, advice)
+        return Unit()
+
+
+def read_definitions(node: Node | None, reader: Reader, names: Names) -> None:
+    """The section `def`: named sub-expressions, numbers or formulas; checked even where nothing uses them."""
+    written: list[ast.Expr] = []
+    for entry in reader.entries(node, "`def`"):
+        if not names.declare(entry.key, "definition", reader):
+            continue
+        expr = names.expressions(reader).parse(entry.value, f"the definition `{entry.key.text}`")
+        if expr is not None:
+            written.append(expr)
+            names.entries[entry.key.text] = Definition(
+                entry.key.text, expr, about="definition", span=entry.key.span
+            )
+    here = names.expressions(reader)
+    for expr in written:
+        here.check(expr)
+
+
+def later(reader: Reader, node: Node, what: str) -> None:
+    """Report a key whose meaning this version does not act on."""
+    place = first_line(node.span)
+    reader.report(
+        "E015", f"{what} is not supported by this version", place, label="not acted on, so it is refused"
+    )
+
+
+def empty(node: Node | None) -> bool:
+    """Whether a section says nothing."""
+    match node:
+        case None:
+            return True
+        case Scalar():
+            return node.is_null
+        case Mapping(entries=entries):
+            return not entries
+        case Sequence(items=items):
+            return not items

@@ -1,0 +1,1 @@
+"""Malformed texts and what is said of them."""

@@ -1,0 +1,296 @@
+"""Malformed texts -> diagnostics: the slips that deserve a word of their own, in a table.
+
+Each recogniser looks at one `Stumble` and returns a finding or None; the first that knows it wins, and
+`expected.py` says something about every other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from stlc.diagnostics import Diagnostic, Fix, Label
+from stlc.grammar.errors.expected import (
+    expected,
+    misspelt_operator,
+    point,
+    stray_bracket,
+    unknown_declaration,
+    unknown_unit,
+    wrong_name,
+)
+from stlc.grammar.errors.failure import Piece, Stumble
+from stlc.grammar.errors.unicode import replacement, unexpected_character
+from stlc.grammar.scan import Bracket, Lexeme, brackets, opens_interval
+from stlc.grammar.words import BINARY_TEMPORAL
+from stlc.source import Span
+
+Recogniser = Callable[[Stumble], Diagnostic | None]
+
+_TAKES_LEFT = frozenset({"in", "not", "<", "<=", ">", ">=", "==", "!=", "*", "/", "%", "^"})
+
+
+def diagnose(piece: Piece, at: int) -> Diagnostic:
+    """What is wrong with a piece in which the parser gave up at offset `at`."""
+    stumble = Stumble(piece, at)
+    for recognise in RECOGNISERS:
+        finding = recognise(stumble)
+        if finding is not None:
+            return finding
+    return expected(stumble)
+
+
+def too_deep(span: Span, limit: int) -> Diagnostic:
+    """A piece that parses, but is nested deeper than the passes behind the parser go."""
+    first_line = span.source.span(span.start, min(span.end, span.start + 40))
+    return Diagnostic(
+        "E005",
+        f"this is nested more than {limit} deep",
+        first_line,
+        help=("name its inner parts with `def`",),
+    )
+
+
+# ---------------------------------------------------------------- E001: characters
+
+
+def _unclosed_text(stumble: Stumble) -> Diagnostic | None:
+    found = stumble.found
+    if found is None or found.text not in ('"', "`"):
+        return None
+    what = "text" if found.text == '"' else "name"
+    return Diagnostic(
+        "E011", f"this `{found.text}` is never closed", point(stumble, found), f"a {what} ends on its line"
+    )
+
+
+def _character(stumble: Stumble) -> Diagnostic | None:
+    found = stumble.found
+    if found is None or not unexpected_character(found):
+        return None
+    char = found.text[0]
+    span = stumble.piece.source.span(found.start, found.start + 1)
+    named = f"`{char}`" if char.isprintable() else f"U+{ord(char):04X} (invisible)"
+    message = f"unexpected character {named}"
+    advice = replacement(char)
+    if advice is None:
+        return Diagnostic("E001", message, span)
+    if advice.text is None:
+        return Diagnostic("E001", message, span, help=(advice.help,))
+    edits = _all_replacements(stumble, found)
+    fix = Fix(tuple((stumble.piece.source.span(low, high), text) for low, high, text in edits))
+    return Diagnostic("E001", message, span, help=(f"{advice.help}:  {stumble.line_with(*edits)}",), fix=fix)
+
+
+def _all_replacements(stumble: Stumble, found: Lexeme) -> list[tuple[int, int, str]]:
+    """Edits for all characters of this line that have a spelling in the language."""
+    source = stumble.piece.source
+    line = source.position(found.start)[0]
+    edits: list[tuple[int, int, str]] = []
+    for lexeme in stumble.lexemes:
+        advice = replacement(lexeme.text[0]) if unexpected_character(lexeme) else None
+        if advice is None or advice.text is None or source.position(lexeme.start)[0] != line:
+            continue
+        text = advice.text
+        if text[-1].isalpha() and source.text[lexeme.start + 1 : lexeme.start + 2].isalnum():
+            text += " "
+        if text[0].isalpha() and lexeme.start and source.text[lexeme.start - 1].isalnum():
+            text = f" {text}"
+        edits.append((lexeme.start, lexeme.start + 1, text))
+    return edits
+
+
+# ------------------------------------------------------------------- E002: bars
+
+
+def _bars(stumble: Stumble) -> Diagnostic | None:
+    found = stumble.found
+    if found is None or found.text not in ("|", "||") or not stumble.wants_operand:
+        return None
+    closing = next((lexeme for lexeme in stumble.after[1:] if lexeme.text == found.text), None)
+    if closing is None:
+        return None
+    span = stumble.of(found, closing)
+    function = "abs" if found.text == "|" else "norm"
+    inner = stumble.piece.source.text[found.end : closing.start].strip()
+    what = "absolute value" if function == "abs" else "a norm"
+    return Diagnostic(
+        "E002",
+        f"`{found.text}` is `or` here; there is no {found.text}…{found.text} for {what}",
+        span,
+        help=(f"write `{function}({inner})`",),
+        fix=Fix(((span, f"{function}({inner})"),)),
+    )
+
+
+# ------------------------------------------------------------------ E011: brackets
+
+
+def _unclosed(stumble: Stumble) -> Diagnostic | None:
+    if stumble.found is not None or not stumble.open_brackets:
+        return None
+    bracket = stumble.open_brackets[-1]
+    opening = bracket.opening
+    labels: tuple[Label, ...] = ()
+    if stumble.follower is not None:
+        labels = (Label(stumble.of(stumble.follower), "the next declaration starts here"),)
+    return Diagnostic(
+        "E011",
+        f"this `{opening.text}` is never closed",
+        stumble.of(opening),
+        "opened here",
+        labels,
+        note=_closed_inside(stumble, bracket),
+    )
+
+
+def _closed_inside(stumble: Stumble, outer: Bracket) -> tuple[str, ...]:
+    for inner in brackets(stumble.before):
+        same = inner.opening.text == outer.opening.text and inner.opening.start > outer.opening.start
+        if same and inner.closing is not None:
+            line, column = stumble.piece.source.position(inner.opening.start)
+            return (f"the inner `{inner.opening.text}` on line {line}, column {column} is closed",)
+    return ()
+
+
+# ----------------------------------------------------------- E012: chains of until
+
+
+def _chain(stumble: Stumble) -> Diagnostic | None:
+    found = stumble.found
+    if found is None or _operator(found) not in BINARY_TEMPORAL or "AND" not in stumble.accepts:
+        return None
+    second = len(stumble.before)
+    first = _until_before(stumble, second)
+    if first is None:
+        return None
+    text = stumble.piece.source.text
+    start = stumble.lexemes[stumble.operand_before(first)].start
+    middle = stumble.lexemes[_behind_interval(stumble, first)].start
+    last = stumble.operand_after(_behind_interval(stumble, second)) - 1
+    left, head = text[start:middle].rstrip(), text[start : stumble.lexemes[second - 1].end]
+    right = text[middle : stumble.lexemes[last].end]
+    tail = text[found.start : stumble.lexemes[last].end]
+    return Diagnostic(
+        "E012",
+        f"`{_operator(found)}` does not chain; say which one is inside",
+        stumble.of(found),
+        labels=(Label(stumble.of(stumble.lexemes[first]), f"first `{_operator(stumble.lexemes[first])}`"),),
+        help=(f"{left} ({right})     or     ({head}) {tail}",),
+    )
+
+
+def _operator(lexeme: Lexeme) -> str:
+    return lexeme.text.rstrip("_") if lexeme.kind == "word" else lexeme.text
+
+
+def _until_before(stumble: Stumble, index: int) -> int | None:
+    depth = 0
+    for i in range(index - 1, -1, -1):
+        text = stumble.lexemes[i].text
+        depth += (text in (")", "]", "}")) - (text in ("(", "[", "{"))
+        if depth < 0:
+            return None
+        if depth == 0 and _operator(stumble.lexemes[i]) in BINARY_TEMPORAL:
+            return i
+    return None
+
+
+def _behind_interval(stumble: Stumble, index: int) -> int:
+    """Index of what follows the operator at `index` and its interval."""
+    items = stumble.lexemes
+    last = len(items) - 1
+    behind = min(index + 1, last)
+    if items[behind].text == "@":
+        behind = min(behind + 1, last)
+    for bracket in brackets(items):
+        if bracket.opening == items[behind] and bracket.closing is not None:
+            inside = items[behind : items.index(bracket.closing)]
+            if bracket.opening.text == "[" or any(lexeme.text == "," for lexeme in inside):
+                return min(items.index(bracket.closing) + 1, last)
+    return behind
+
+
+# -------------------------------------------------------------------- E013, E014
+
+
+def _equals(stumble: Stumble) -> Diagnostic | None:
+    found = stumble.found
+    if found is None or found.text != "=" or "CMP" not in stumble.accepts or "EQUAL" in stumble.accepts:
+        return None
+    span = stumble.of(found)
+    return Diagnostic(
+        "E013", "`=` defines, `==` compares", span, fix=Fix(((span, "=="),), "replace `=` with `==`")
+    )
+
+
+def _vector(stumble: Stumble) -> Diagnostic | None:
+    found, previous = stumble.found, stumble.previous
+    if found is None or previous is None:
+        return None
+    if previous.text == "]" and stumble.wants_operand and found.text in _TAKES_LEFT:
+        bracket = next((b for b in brackets(stumble.before) if b.closing == previous), None)
+        return None if bracket is None else _vector_read_as_interval(stumble, bracket, found)
+    if found.text in (",", "]") and stumble.open_brackets and stumble.open_brackets[-1].interval:
+        return _not_two_bounds(stumble, stumble.open_brackets[-1].opening, found)
+    return None
+
+
+def _vector_read_as_interval(stumble: Stumble, bracket: Bracket, found: Lexeme) -> Diagnostic | None:
+    inside = [x for x in stumble.before if x.start > bracket.opening.start][:-1]
+    if not bracket.interval or bracket.closing is None or _looks_like_time(inside):
+        return None
+    operator = stumble.before[stumble.before.index(bracket.opening) - 1]
+    index = len(stumble.before)
+    last = stumble.lexemes[max(stumble.operand_after(index) - 1, index)]
+    read, rest = stumble.of(bracket.opening, bracket.closing), stumble.of(found, last)
+    bounds = " to ".join(part.strip() for part in read.text[1:-1].split(",", 1))
+    return Diagnostic(
+        "E014",
+        f"`[` after `{operator.text}` starts a time interval",
+        read,
+        f"read as the interval from {bounds}",
+        (Label(rest, "so this has no left-hand side"),),
+        help=(f"{operator.text} ({read.text} {rest.text})     or name it:  def p = {read.text}",),
+    )
+
+
+def _looks_like_time(inside: list[Lexeme]) -> bool:
+    units = {"s", "ms", "us", "ns", "min", "h", "step", "steps"}
+    return any(
+        x.text in ("T", "end", "inf", "dt") or (x.text in units and before.kind == "number")
+        for before, x in zip([inside[0], *inside], inside, strict=False)
+    )
+
+
+def _not_two_bounds(stumble: Stumble, opening: Lexeme, found: Lexeme) -> Diagnostic | None:
+    index = stumble.before.index(opening)
+    operator = stumble.before[index - 1]
+    if opening.text != "[" or not opens_interval(operator):
+        return None
+    written = stumble.piece.source.text[opening.end : found.start].strip()
+    if found.text == "]":
+        advice = f"{operator.text}[0, {written}] …" if written else f"{operator.text}[0, T] …"
+        label = "it needs both ends"
+    else:
+        advice = f"a vector needs parentheses here:  {operator.text} ([{written}, …] in …)"
+        label = "read as an interval, which has two ends"
+    span = stumble.of(opening, found)
+    return Diagnostic(
+        "E014", f"`[` after `{operator.text}` starts a time interval", span, label, help=(advice,)
+    )
+
+
+RECOGNISERS: tuple[Recogniser, ...] = (
+    _unclosed_text,
+    _character,
+    _bars,
+    _equals,
+    _chain,
+    misspelt_operator,
+    _vector,
+    unknown_unit,
+    unknown_declaration,
+    wrong_name,
+    _unclosed,
+    stray_bracket,
+)

@@ -1,0 +1,178 @@
+"""Documents that know where their lines may break, and their text within a width (after Wadler and Leijen).
+
+A group stands on one line if it fits and holds no comment; otherwise all of its own lines break. Comments
+end their line whatever stands behind them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias, assert_never
+
+from stlc.grammar.parse.tokens import Comment
+
+INDENT = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Word:
+    """A text without line breaks, comments above it and one behind it."""
+
+    text: str
+    before: tuple[Comment, ...] = ()
+    after: Comment | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Blank:
+    """One blank, never at either end of a line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line break in a group that does not fit, `flat` in one that does."""
+
+    flat: str = " "
+
+
+@dataclass(frozen=True, slots=True)
+class Nest:
+    """Parts whose new lines are indented one level more."""
+
+    parts: tuple[Doc, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Parts that stand on one line if they fit."""
+
+    parts: tuple[Doc, ...]
+
+
+Doc: TypeAlias = Word | Blank | Line | Nest | Group
+
+BLANK = Blank()
+LINE = Line()
+SOFT = Line("")
+
+_Entry: TypeAlias = tuple[int, bool, Doc]
+
+
+def render(parts: Sequence[Doc], *, width: int, indent: int = 0) -> list[str]:
+    """The lines of a document; only what cannot be broken is wider than `width`."""
+    page = _Page(indent)
+    stack: list[_Entry] = [(indent, False, part) for part in reversed(parts)]
+    while stack:
+        level, flat, doc = stack.pop()
+        match doc:
+            case Word():
+                page.write(doc, level)
+            case Blank():
+                page.blank = True
+            case Line(text):
+                if flat:
+                    page.blank = page.blank or text == " "
+                else:
+                    page.end_line(level)
+            case Nest(inner):
+                stack.extend((level + INDENT, flat, part) for part in reversed(inner))
+            case Group(inner):
+                fits = flat or _fits(doc, stack, width - page.column)
+                stack.extend((level, fits, part) for part in reversed(inner))
+            case _:
+                assert_never(doc)
+    return page.finish()
+
+
+def is_plain(parts: Sequence[Doc]) -> bool:
+    """Whether a document holds no comment."""
+    stack = list(parts)
+    while stack:
+        doc = stack.pop()
+        if isinstance(doc, Word) and (doc.before or doc.after is not None):
+            return False
+        if isinstance(doc, Nest | Group):
+            stack.extend(doc.parts)
+    return True
+
+
+def _fits(group: Group, rest: Sequence[_Entry], room: int) -> bool:
+    """Whether a group, and what follows it up to the next line break, fits into `room` columns."""
+    inside: list[_Entry] = [(0, True, group)]
+    behind = len(rest)
+    while inside or behind:
+        if inside:
+            _, flat, doc = inside.pop()
+        else:
+            behind -= 1
+            _, flat, doc = rest[behind]
+        if isinstance(doc, Nest | Group):
+            inside.extend((0, flat, part) for part in reversed(doc.parts))
+            continue
+        width = _width(doc)
+        if isinstance(doc, Word) and flat and (doc.before or doc.after is not None):
+            return False
+        room -= width
+        if room < 0 or _ends_line(doc, flat=flat):
+            break
+    return room >= 0
+
+
+def _width(doc: Word | Blank | Line) -> int:
+    """How many columns it takes in a line."""
+    match doc:
+        case Word(text, before, _):
+            return 0 if before else len(text)
+        case Line(text):
+            return len(text)
+        case _:
+            return 1
+
+
+def _ends_line(doc: Word | Blank | Line, *, flat: bool) -> bool:
+    """Whether the line ends before or behind it, whatever follows."""
+    if isinstance(doc, Word):
+        return bool(doc.before) or doc.after is not None
+    return isinstance(doc, Line) and not flat
+
+
+class _Page:
+    """Lines as they are written."""
+
+    def __init__(self, indent: int) -> None:
+        self.lines: list[str] = []
+        self.line = ""
+        self.indent = indent
+        self.blank = False
+        self.commented = False
+
+    @property
+    def column(self) -> int:
+        """How far the current line has come."""
+        return (self.indent if not self.line else len(self.line)) + self.blank
+
+    def write(self, word: Word, level: int) -> None:
+        """Append a word; what a comment has ended goes on in a new line."""
+        if word.before or self.commented:
+            self.end_line(level)
+        for comment in word.before:
+            self.lines.append(" " * self.indent + comment.text)
+        if word.text:
+            glue = " " if self.line and self.blank else ""
+            self.line = (self.line or " " * self.indent) + glue + word.text
+            self.blank = False
+        if word.after is not None:
+            self.line += f"  {word.after.text}"
+            self.commented = True
+
+    def end_line(self, level: int) -> None:
+        """Go on in a new line, unless nothing has been written to this one."""
+        if self.line:
+            self.lines.append(self.line)
+        self.line, self.indent, self.blank, self.commented = "", level, False, False
+
+    def finish(self) -> list[str]:
+        """All lines."""
+        self.end_line(0)
+        return self.lines

@@ -1,0 +1,227 @@
+"""What tokens say to a formatter: their one spelling, which brackets belong together, where blanks stand.
+
+Unary plus and doubled parentheses say nothing and are dropped; the comments at them move to their neighbours.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+from stlc.diagnostics import Diagnostic, SpecError
+from stlc.grammar.parse.parser import MAX_DEPTH
+from stlc.grammar.parse.tokens import Token
+from stlc.grammar.words import BINARY_TEMPORAL, UNARY_TEMPORAL
+
+Role: TypeAlias = Literal["interval", "call", "index", "group", "list", "enum"]
+
+_WORD = re.compile(r"[A-Za-z]+")
+_SPELLED = {"IFF": "<->", "IMPLIES": "->", "AND": "and", "_NOT": "not", "_NOT_IN": "not in"}
+_TEMPORAL = {**UNARY_TEMPORAL, **BINARY_TEMPORAL}
+_OPENING = frozenset("([{")
+_CLOSING = frozenset(")]}")
+_OPERAND = frozenset({"NAME", "NUMBER", "UNIT", "STRING", "TYPE_SIZE", "_TRUE", "_FALSE", "_INF"})
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """The tokens of an item as they are to be printed.
+
+    Attributes:
+        tokens: with their one spelling.
+        partner: index of an opening bracket -> index of the closing one, and back.
+        roles: index of an opening bracket -> what it opens.
+    """
+
+    tokens: tuple[Token, ...]
+    partner: dict[int, int]
+    roles: dict[int, Role]
+
+    def ends_operand(self, index: int) -> bool:
+        """Whether an operand ends with this token, so that `-` behind it subtracts and `(` calls."""
+        token = self.tokens[index]
+        if token.text in _CLOSING:
+            return self.roles[self.partner[index]] != "interval"
+        return token.kind in _OPERAND
+
+    def is_sign(self, index: int) -> bool:
+        """Whether this is a unary `-` or `+`."""
+        return self.tokens[index].kind in ("PLUS", "MINUS") and not (index and self.ends_operand(index - 1))
+
+
+def prepare(tokens: Sequence[Token]) -> Text:
+    """Spell the tokens of an item (its tags left out), pair its brackets, and drop what says nothing.
+
+    Raises:
+        SpecError: E005, its brackets are nested deeper than any tree may be.
+    """
+    text = _paired(tuple(map(_spelled, tokens)))
+    signs = {i for i, token in enumerate(text.tokens) if token.kind == "PLUS" and text.is_sign(i)}
+    text = _without(text, signs)
+    text = _without(text, _doubled(text))
+    _check_depth(text)
+    return _with_commas(text)
+
+
+def spelling(kind: str, text: str) -> str:
+    """The one way to write a token."""
+    if kind.startswith(("UNARY", "BINARY")):
+        match = _WORD.match(text)
+        assert match is not None
+        return _TEMPORAL[match[0]] + ("@" if kind.endswith("_AT") else "")
+    if kind == "OR":
+        return "xor" if text == "xor" else "or"
+    if kind in ("UNIT_BRACKET", "TYPE_SIZE"):
+        return re.sub(r"\s+", "", text)
+    return _SPELLED.get(kind, text)
+
+
+def gap(text: Text, index: int) -> str:
+    """What stands between the token before `index` and the one there: a blank or nothing."""
+    left, right = text.tokens[index - 1], text.tokens[index]
+    if _hugs_right(text, index - 1) or _hugs_left(text, index):
+        return ""
+    if right.text in _OPENING:
+        return "" if text.roles[index] in ("call", "index", "interval") else " "
+    if left.text in (".", "..", "^") or right.text in (".", "..", "^"):
+        return " " if _would_join(left, right) else ""
+    return " "
+
+
+def _hugs_right(text: Text, index: int) -> bool:
+    """Whether nothing may stand behind this token."""
+    token = text.tokens[index]
+    if token.text in _OPENING:
+        return text.roles[index] != "enum"
+    return token.text == "@" or text.is_sign(index)
+
+
+def _hugs_left(text: Text, index: int) -> bool:
+    """Whether nothing may stand before this token."""
+    token = text.tokens[index]
+    if token.text in _CLOSING:
+        return text.roles[text.partner[index]] != "enum"
+    return token.text == "," or token.kind == "TYPE_SIZE" or (token.text == ":" and not _typed(text, index))
+
+
+def _typed(text: Text, index: int) -> bool:
+    """`signal x : Sort` has a blank before its colon."""
+    declared = any(token.kind in ("_SIGNAL", "_CONST", "_PARAM") for token in text.tokens[:2])
+    return declared and not any(token.text == "=" for token in text.tokens[:index])
+
+
+def _would_join(left: Token, right: Token) -> bool:
+    """Whether two tokens without a blank between them would read as others: `1 .x`, `1. ..`, `m ^2`."""
+    if right.text == "^":
+        return left.kind == "UNIT"
+    if left.kind == "NUMBER":
+        return right.text == "." or left.text.endswith(".")
+    return right.kind == "NUMBER" and right.text.startswith(".")
+
+
+# --------------------------------------------------------------------------- brackets
+
+
+def _spelled(token: Token) -> Token:
+    text = spelling(token.kind, token.text)
+    return token if text == token.text else replace(token, text=text)
+
+
+def _paired(tokens: tuple[Token, ...]) -> Text:
+    text = Text(tokens, {}, {})
+    still_open: list[int] = []
+    for index, token in enumerate(tokens):
+        if token.text in _OPENING and token.kind != "UNIT_BRACKET":
+            text.roles[index] = _role(text, index)
+            still_open.append(index)
+        elif token.text in _CLOSING:
+            opening = still_open.pop()
+            text.partner[opening], text.partner[index] = index, opening
+            if text.roles[opening] == "group" and _holds_interval(text, opening):
+                text.roles[opening] = "interval"
+    return text
+
+
+def _role(text: Text, index: int) -> Role:
+    """What an opening bracket opens, as far as the tokens before it say."""
+    token = text.tokens[index]
+    before = text.tokens[index - 1] if index else None
+    if before is not None and before.kind.endswith(("_AT", "_BRACKET")):
+        return "interval"
+    if token.text == "{":
+        return "enum" if text.tokens[0].kind == "_ENUM" else "list"
+    if index and text.ends_operand(index - 1):
+        return "call" if token.text == "(" else "index"
+    return "group" if token.text == "(" else "list"
+
+
+def _holds_interval(text: Text, opening: int) -> bool:
+    """Whether the parenthesis behind a temporal word holds two bounds; any other holds no comma."""
+    closing = text.partner[opening]
+    if not opening or text.tokens[opening - 1].kind not in ("UNARY", "BINARY"):
+        return False
+    return text.tokens[closing].text == "]" or any(text.tokens[i].text == "," for i in level(text, opening))
+
+
+def level(text: Text, opening: int) -> list[int]:
+    """Indices of the tokens directly within a bracket; see `behind`."""
+    found: list[int] = []
+    index = opening + 1
+    while index < text.partner[opening]:
+        found.append(index)
+        index = behind(text, index)
+    return found
+
+
+def behind(text: Text, index: int) -> int:
+    """The token behind this one; behind the bracket that it opens, or the names that it binds."""
+    if index in text.roles:
+        return text.partner[index] + 1
+    last = {"QUANTIFIER": "COLON", "_FREEZE": "_IN"}.get(text.tokens[index].kind, "")
+    index += 1
+    while last and text.tokens[index - 1].kind != last:
+        index = text.partner[index] + 1 if index in text.roles else index + 1
+    return index
+
+
+def _doubled(text: Text) -> set[int]:
+    """The outer of two parentheses with nothing between them."""
+    found: set[int] = set()
+    for opening, role in text.roles.items():
+        inner = opening + 1
+        twin = text.roles.get(inner) == "group" and text.partner[inner] == text.partner[opening] - 1
+        pair = {opening, text.partner[opening]}
+        if role == "group" and twin and not any(map(_commented, (text.tokens[i] for i in pair))):
+            found |= pair
+    return found
+
+
+def _commented(token: Token) -> bool:
+    return bool(token.before) or token.after is not None
+
+
+def _without(text: Text, dropped: set[int]) -> Text:
+    """The tokens that are kept; one with a comment is never dropped."""
+    kept = tuple(t for i, t in enumerate(text.tokens) if i not in dropped or _commented(t))
+    return _paired(kept) if len(kept) < len(text.tokens) else text
+
+
+def _check_depth(text: Text) -> None:
+    depth = 0
+    for token in text.tokens:
+        depth += (token.text in _OPENING) - (token.text in _CLOSING)
+        if depth > MAX_DEPTH:
+            raise SpecError(Diagnostic("E005", f"brackets are nested more than {MAX_DEPTH} deep"))
+
+
+def _with_commas(text: Text) -> Text:
+    """`[0:5]` as `[0, 5]`."""
+    tokens = list(text.tokens)
+    for opening, role in text.roles.items():
+        if role == "interval":
+            for index in level(text, opening):
+                if tokens[index].text == ":":
+                    tokens[index] = replace(tokens[index], text=",", kind="COMMA")
+    return Text(tuple(tokens), text.partner, text.roles)

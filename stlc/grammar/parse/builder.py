@@ -1,0 +1,241 @@
+"""Parse tree -> AST, expressions. One function a rule of `stl.lark`; a rule without one is an error.
+
+A function takes the children of its node, already built: AST nodes, `Leaf`s for tokens, None where an
+optional part is not written.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, TypeAlias
+
+from stlc.grammar import ast
+from stlc.grammar.parse.literals import Context, Leaf, name_of, number_of, own_name, unit_of
+from stlc.grammar.words import BINARY_TEMPORAL, UNARY_TEMPORAL
+from stlc.source import Span
+
+_WORD = re.compile(r"[A-Za-z]+")
+
+Rule: TypeAlias = Callable[[Context, Span, Sequence[Any]], Any]
+
+
+# -------------------------------------------------------------------------- atoms
+
+
+def _quantity(context: Context, span: Span, children: Sequence[Any]) -> ast.Quantity:
+    number, unit = children
+    return ast.Quantity(span, number_of(context, number), unit_of(context, unit))
+
+
+def _string(_: Context, span: Span, children: Sequence[Any]) -> ast.String:
+    return ast.String(span, children[0].text[1:-1])
+
+
+def _true(_: Context, span: Span, __: Sequence[Any]) -> ast.Bool:
+    return ast.Bool(span, True)
+
+
+def _false(_: Context, span: Span, __: Sequence[Any]) -> ast.Bool:
+    return ast.Bool(span, False)
+
+
+def _inf(_: Context, span: Span, __: Sequence[Any]) -> ast.Inf:
+    return ast.Inf(span)
+
+
+def _name(_: Context, span: Span, children: Sequence[Any]) -> ast.Name:
+    (leaf,) = children
+    return ast.Name(span, name_of(leaf), quoted=leaf.text.startswith("`"))
+
+
+def _vector(_: Context, span: Span, children: Sequence[Any]) -> ast.Vector:
+    return ast.Vector(span, tuple(item for item in children if item is not None))
+
+
+def _set_literal(_: Context, span: Span, children: Sequence[Any]) -> ast.SetLiteral:
+    return ast.SetLiteral(span, tuple(children))
+
+
+# ------------------------------------------------------------ postfix, arithmetic
+
+
+def _index(_: Context, span: Span, children: Sequence[Any]) -> ast.Index:
+    base, index = children
+    return ast.Index(span, base, index)
+
+
+def _attr(_: Context, span: Span, children: Sequence[Any]) -> ast.Attr:
+    base, leaf = children
+    return ast.Attr(span, base, name_of(leaf))
+
+
+def _call(_: Context, span: Span, children: Sequence[Any]) -> ast.Call:
+    func, args = children
+    return ast.Call(span, func, args or ())
+
+
+def _args(_: Context, __: Span, children: Sequence[Any]) -> tuple[ast.Arg, ...]:
+    return tuple(children)
+
+
+def _arg(_: Context, span: Span, children: Sequence[Any]) -> ast.Arg:
+    leaf, value = children
+    return ast.Arg(span, None if leaf is None else name_of(leaf), value)
+
+
+def _negative(_: Context, span: Span, children: Sequence[Any]) -> ast.Neg:
+    return ast.Neg(span, children[-1])
+
+
+def _binary(_: Context, span: Span, children: Sequence[Any]) -> ast.Binary:
+    left, op, right = children
+    return ast.Binary(span, op.text, left, right)
+
+
+def _compare(_: Context, span: Span, children: Sequence[Any]) -> ast.Compare:
+    return ast.Compare(span, tuple(children[::2]), tuple(op.text for op in children[1::2]))
+
+
+def _member_of(_: Context, span: Span, children: Sequence[Any]) -> ast.Member:
+    item, region = children
+    return ast.Member(span, item, region)
+
+
+def _not_member_of(_: Context, span: Span, children: Sequence[Any]) -> ast.Member:
+    item, region = children
+    return ast.Member(span, item, region, negated=True)
+
+
+# ----------------------------------------------------------------- logic and time
+
+_LOGIC: Mapping[str, Any] = MappingProxyType(
+    {
+        **{"&": "and", "&&": "and", "and": "and", "|": "or", "||": "or", "or": "or", "xor": "xor"},
+        **{"->": "->", "=>": "->", "implies": "->", "<->": "<->", "<=>": "<->", "iff": "<->"},
+    }
+)
+
+
+def _logic(_: Context, span: Span, children: Sequence[Any]) -> ast.Logic:
+    left, op, right = children
+    return ast.Logic(span, _LOGIC[op.text], left, right)
+
+
+def _not(_: Context, span: Span, children: Sequence[Any]) -> ast.Not:
+    return ast.Not(span, children[0])
+
+
+def _interval(*, lo_open: bool, hi_open: bool) -> Rule:
+    def build(_: Context, span: Span, children: Sequence[Any]) -> ast.Interval:
+        lo, hi = children
+        return ast.Interval(span, lo, hi, lo_open, hi_open)
+
+    return build
+
+
+def _clocked(operator: Leaf, interval: ast.Interval) -> ast.Interval:
+    if not operator.kind.endswith("_AT"):
+        return interval
+    return ast.Interval(interval.span, interval.lo, interval.hi, interval.lo_open, interval.hi_open, "start")
+
+
+def _spelled(operator: Leaf, table: Mapping[str, str]) -> tuple[Any, str]:
+    """The operator's name, and its alias if it is written as one."""
+    match = _WORD.match(operator.text)
+    assert match is not None
+    word = match[0]
+    return table[word], "" if table[word] == word else word
+
+
+def _temporal(_: Context, span: Span, children: Sequence[Any]) -> ast.Temporal:
+    operator, interval, body = children
+    op, alias = _spelled(operator, UNARY_TEMPORAL)
+    return ast.Temporal(span, op, _clocked(operator, interval), body, alias)
+
+
+def _temporal_unbounded(_: Context, span: Span, children: Sequence[Any]) -> ast.Temporal:
+    operator, body = children
+    op, alias = _spelled(operator, UNARY_TEMPORAL)
+    return ast.Temporal(span, op, None, body, alias)
+
+
+def _until(_: Context, span: Span, children: Sequence[Any]) -> ast.Until:
+    left, operator, interval, right = children
+    op, alias = _spelled(operator, BINARY_TEMPORAL)
+    return ast.Until(span, op, _clocked(operator, interval), left, right, alias)
+
+
+def _until_unbounded(_: Context, span: Span, children: Sequence[Any]) -> ast.Until:
+    left, operator, right = children
+    op, alias = _spelled(operator, BINARY_TEMPORAL)
+    return ast.Until(span, op, None, left, right, alias)
+
+
+# ------------------------------------------------------------------------ binders
+
+
+def _quantifier(context: Context, span: Span, children: Sequence[Any]) -> ast.Quantifier:
+    kind, name, domain, body = children
+    return ast.Quantifier(span, kind.text, own_name(context, name), domain, body)
+
+
+def _pair(_: Context, __: Span, children: Sequence[Any]) -> tuple[ast.Expr, ast.Expr]:
+    low, high = children
+    return low, high
+
+
+def _freeze(_: Context, span: Span, children: Sequence[Any]) -> ast.Freeze:
+    *bindings, body = children
+    return ast.Freeze(span, tuple(bindings), body)
+
+
+def _binding(context: Context, _: Span, children: Sequence[Any]) -> tuple[str, ast.Expr]:
+    name, value = children
+    return own_name(context, name), value
+
+
+def _if_then_else(_: Context, span: Span, children: Sequence[Any]) -> ast.IfThenElse:
+    cond, yes, no = children
+    return ast.IfThenElse(span, cond, yes, no)
+
+
+EXPRESSIONS: Mapping[str, Rule] = MappingProxyType(
+    {
+        "quantity": _quantity,
+        "string": _string,
+        "true": _true,
+        "false": _false,
+        "inf": _inf,
+        "name": _name,
+        "vector": _vector,
+        "set_literal": _set_literal,
+        "index": _index,
+        "attr": _attr,
+        "call": _call,
+        "args": _args,
+        "arg": _arg,
+        "negative": _negative,
+        "binary": _binary,
+        "compare": _compare,
+        "member_of": _member_of,
+        "not_member_of": _not_member_of,
+        "logic": _logic,
+        "not_": _not,
+        "closed_closed": _interval(lo_open=False, hi_open=False),
+        "closed_open": _interval(lo_open=False, hi_open=True),
+        "open_closed": _interval(lo_open=True, hi_open=False),
+        "open_open": _interval(lo_open=True, hi_open=True),
+        "temporal": _temporal,
+        "temporal_unbounded": _temporal_unbounded,
+        "until": _until,
+        "until_unbounded": _until_unbounded,
+        "quantifier": _quantifier,
+        "range_domain": _pair,
+        "span_domain": _pair,
+        "freeze": _freeze,
+        "binding": _binding,
+        "if_then_else": _if_then_else,
+    }
+)

@@ -1,0 +1,171 @@
+"""Text -> AST. Only this module and `parser_tables.py` know Lark.
+
+A text is cut before its declarations and each piece is parsed for itself, so that one run reports all
+independent errors. Trees are folded bottom-up without recursion: no text can exhaust the stack.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import islice
+from types import MappingProxyType
+from typing import Any
+
+from lark import Token, Tree, UnexpectedInput
+
+from stlc.diagnostics import Diagnostic, SpecError
+from stlc.grammar import ast
+from stlc.grammar.errors import hints
+from stlc.grammar.errors.failure import Piece
+from stlc.grammar.parse.builder import EXPRESSIONS, Rule
+from stlc.grammar.parse.declarations import DECLARATIONS, Item, assemble
+from stlc.grammar.parse.literals import Context, Leaf
+from stlc.grammar.parse.tables import load_parser
+from stlc.grammar.scan import declaration_starts, lexemes
+from stlc.source import Source
+
+MAX_ERRORS = 20
+MAX_DEPTH = 150
+MAX_TEXT = 1_000_000
+MAX_LEXEMES = 30_000
+
+_RULES: Mapping[str, Rule] = MappingProxyType({**EXPRESSIONS, **DECLARATIONS})
+
+
+def parse(source: Source) -> ast.Spec:
+    """The syntax tree of a specification.
+
+    Raises:
+        SpecError: with all independent errors, at most `MAX_ERRORS`.
+    """
+    _check_size(source, 0, len(source.text))
+    context = Context(source)
+    items: list[Item] = []
+    starts = declaration_starts(source.text)
+    skip_line = 0
+    for start, end in zip(starts, [*starts[1:], len(source.text)], strict=True):
+        if skip_line and source.position(start)[0] == skip_line:
+            continue
+        skip_line = 0
+        piece = Piece(source, start, end, "start", accepts=_accepts, parses=_parses)
+        try:
+            items.extend(_build(piece, context))
+        except _PieceError as error:
+            context.findings.append(error.finding)
+            skip_line = source.position(max(start, end - 1))[0]
+        if len(context.findings) >= MAX_ERRORS:
+            break
+    spec = assemble(source, items, context.findings)
+    if context.findings:
+        raise SpecError(*context.findings[:MAX_ERRORS])
+    return spec
+
+
+def parse_expr(source: Source, start: int = 0, end: int | None = None) -> ast.Expr:
+    """The syntax tree of the expression that stands between two offsets of a text.
+
+    Spans point into the whole text. Raises SpecError.
+    """
+    end = len(source.text) if end is None else end
+    _check_size(source, start, end)
+    context = Context(source)
+    piece = Piece(source, start, end, "expr", accepts=_accepts, parses=_parses)
+    try:
+        expr: ast.Expr = _build(piece, context)
+    except _PieceError as error:
+        raise SpecError(*context.findings, error.finding) from None
+    if context.findings:
+        raise SpecError(*context.findings[:MAX_ERRORS])
+    return expr
+
+
+class _PieceError(Exception):
+    """A piece of text that cannot be read."""
+
+    def __init__(self, finding: Diagnostic) -> None:
+        self.finding = finding
+
+
+def _check_size(source: Source, start: int, end: int) -> None:
+    """What takes longer to read than anybody would wait was not written by hand."""
+    if end - start > MAX_TEXT:
+        raise SpecError(Diagnostic("E005", f"`{source.name}` is larger than {MAX_TEXT // 1_000_000} MB"))
+    if any(islice(lexemes(source.text, start, end), MAX_LEXEMES, None)):
+        message = f"`{source.name}` has more than {MAX_LEXEMES:,} words and signs"
+        raise SpecError(Diagnostic("E005", message))
+
+
+def _build(piece: Piece, context: Context) -> Any:
+    try:
+        tree = load_parser().parse(piece.text, start=piece.rule)
+    except UnexpectedInput as error:
+        raise _PieceError(hints.diagnose(piece, _offset(error, piece))) from None
+    assert isinstance(tree, Tree)
+    return _fold(tree, context, piece.start)
+
+
+def _offset(error: UnexpectedInput, piece: Piece) -> int:
+    """Where in the whole text the parser gave up."""
+    token = getattr(error, "token", None)
+    if token is not None and token.type == "$END":
+        return piece.end
+    return piece.start + (error.pos_in_stream or 0)
+
+
+def _fold(tree: Tree[Token], context: Context, base: int) -> Any:
+    """The value of a tree, children first, without recursion."""
+    values: dict[int, Any] = {}
+    depths: dict[int, int] = {}
+    for node in tree.iter_subtrees():
+        meta = node.meta
+        start, end = (0, 0) if meta.empty else (meta.start_pos, meta.end_pos)
+        span = context.source.span(base + start, base + end)
+        depth = 1 + max((depths[id(child)] for child in node.children if isinstance(child, Tree)), default=0)
+        if depth > MAX_DEPTH:
+            raise _PieceError(hints.too_deep(span, MAX_DEPTH))
+        children = [_child(child, values, context, base) for child in node.children]
+        values[id(node)] = _RULES[node.data](context, span, children)
+        depths[id(node)] = depth
+        if node.data.endswith("_decl") or node.data.startswith("param_"):
+            context.documented = span.end
+    return values[id(tree)]
+
+
+def _child(child: Tree[Token] | Token | None, values: Mapping[int, Any], context: Context, base: int) -> Any:
+    match child:
+        case None:
+            return None
+        case Token():
+            assert child.start_pos is not None
+            assert child.end_pos is not None
+            return Leaf(
+                child.type, str(child), context.source.span(base + child.start_pos, base + child.end_pos)
+            )
+        case _:
+            return values[id(child)]
+
+
+# -------------------------------------------------------------------------- lark
+
+
+def _accepts(text: str, rule: str) -> frozenset[str]:
+    """The terminals that may stand where the parser gives up on a text."""
+    interactive = load_parser().parse_interactive(text, start=rule)
+    try:
+        for _ in interactive.iter_parse():
+            pass
+    except UnexpectedInput:
+        pass
+    accepted: set[str] = interactive.accepts()  # type: ignore[no-untyped-call]
+    return frozenset(accepted)
+
+
+def _parses(text: str, rule: str) -> bool:
+    try:
+        load_parser().parse(text, start=rule)
+    except UnexpectedInput:
+        return False
+    return True
+
+
+__all__: Sequence[str] = ("MAX_DEPTH", "MAX_ERRORS", "MAX_LEXEMES", "MAX_TEXT", "parse", "parse_expr")

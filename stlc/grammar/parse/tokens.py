@@ -1,0 +1,191 @@
+"""The tokens of a well-formed text with the comments between them: what a formatter needs and a tree drops.
+
+The text is cut as in `parser.parse`, and each piece goes through the same tables, so a token here is the
+token that the tree was built from.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+from lark import Token as LarkToken
+from lark import Tree, UnexpectedInput
+
+from stlc.diagnostics import Diagnostic, SpecError
+from stlc.grammar.parse.tables import load_parser
+from stlc.grammar.scan import declaration_starts
+from stlc.source import Source
+
+_COMMENT = re.compile(r"(?:#|//)[^\n]*")
+_WITH_BLANKS = frozenset({"UNARY_AT", "BINARY_AT", "_NOT_IN"})
+
+
+@dataclass(frozen=True, slots=True)
+class Comment:
+    """A comment, as it is written, without the blanks at its end.
+
+    Attributes:
+        text: with its `#` or `//`.
+        own_line: nothing but blanks stands before it on its line.
+        apart: an empty line stands before it.
+    """
+
+    text: str
+    own_line: bool
+    apart: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Token:
+    """A token of the grammar with the comments that belong to it.
+
+    Attributes:
+        kind: name of its terminal.
+        text: as it is written.
+        start: offset of its first character.
+        end: offset behind its last one.
+        before: comments between the token before (or its trailing comment) and this one.
+        after: the comment behind it on its line.
+        apart: an empty line stands before it (behind its comments).
+    """
+
+    kind: str
+    text: str
+    start: int
+    end: int
+    before: tuple[Comment, ...] = ()
+    after: Comment | None = None
+    apart: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """A pragma, an import or a declaration: the name of its rule and its tokens."""
+
+    rule: str
+    tokens: tuple[Token, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """A whole text: items in order, and the comments behind the last one."""
+
+    items: tuple[Item, ...]
+    rest: tuple[Comment, ...]
+
+
+def tokenize(source: Source) -> Layout:
+    """The tokens of a text that `parser.parse` accepts.
+
+    Raises:
+        SpecError: E010, the text is not well-formed.
+    """
+    tokens: list[Token] = []
+    places: list[tuple[str, int, int]] = []
+    starts = declaration_starts(source.text)
+    for start, end in zip(starts, [*starts[1:], len(source.text)], strict=True):
+        _read_piece(source, start, end, tokens, places)
+    rest = _attach(source.text, tokens)
+    items = tuple(_items(tokens, places))
+    last = items[-1].tokens[-1].end if items else 0
+    dropped = (comment for token in tokens if token.start >= last for comment in _own(token))
+    return Layout(items, (*dropped, *rest))
+
+
+def _read_piece(
+    source: Source, start: int, end: int, tokens: list[Token], places: list[tuple[str, int, int]]
+) -> None:
+    """Append the tokens of a piece, and (rule, start, end) of each item in it."""
+    interactive = load_parser().parse_interactive(source.text[start:end], start="start")
+    last: LarkToken | None = None
+    try:
+        for token in interactive.iter_parse():
+            last = token
+            tokens.append(Token(token.type, str(token), start + _at(token), start + _at(token) + len(token)))
+        tree = interactive.feed_eof(last)  # type: ignore[no-untyped-call]
+    except UnexpectedInput as error:
+        offset = start + (error.pos_in_stream or 0)
+        place = source.span(offset, offset)
+        raise SpecError(Diagnostic("E010", "this cannot be read", place)) from None
+    assert isinstance(tree, Tree)
+    found = [item for item in tree.children if isinstance(item, Tree)]
+    places += [(str(item.data), start + item.meta.start_pos, start + item.meta.end_pos) for item in found]
+
+
+def _at(token: LarkToken) -> int:
+    assert token.start_pos is not None
+    return token.start_pos
+
+
+def _items(tokens: Sequence[Token], places: Sequence[tuple[str, int, int]]) -> Iterator[Item]:
+    """Tokens by item. What stands between two items (`;`) is dropped; its comments go on to the next."""
+    index = 0
+    for rule, start, end in places:
+        carried: tuple[Comment, ...] = ()
+        apart = False
+        while tokens[index].start < start:
+            carried += _own(tokens[index])
+            apart |= tokens[index].apart
+            index += 1
+        first = index
+        while index < len(tokens) and tokens[index].end <= end:
+            index += 1
+        own = list(tokens[first:index])
+        own[0] = replace(own[0], before=(*carried, *own[0].before), apart=apart or own[0].apart)
+        yield Item(rule, tuple(own))
+
+
+def _own(token: Token) -> tuple[Comment, ...]:
+    """The comments of a token that is dropped. One that stood behind it must not become documentation."""
+    if token.after is None:
+        return token.before
+    text = f"# {token.after.text}" if token.after.text.startswith("##") else token.after.text
+    return (*token.before, Comment(text, own_line=True))
+
+
+# ----------------------------------------------------------------------- comments
+
+
+def _attach(text: str, tokens: list[Token]) -> tuple[Comment, ...]:
+    """Give every comment to a token, in place; the comments behind the last token are returned."""
+    previous, offset = -1, 0
+    for index, token in enumerate(tokens):
+        found, apart = _comments(text, offset, token.start, first=previous < 0)
+        found = _give_trailing(tokens, previous, found)
+        inside = _inside(token)
+        tokens[index] = replace(token, before=(*found, *inside), apart=apart)
+        previous, offset = index, token.end
+    rest, _ = _comments(text, offset, len(text), first=previous < 0)
+    return _give_trailing(tokens, previous, rest)
+
+
+def _inside(token: Token) -> tuple[Comment, ...]:
+    """The comments within `always # … @` or `not # … in`; they move before it."""
+    if token.kind not in _WITH_BLANKS:
+        return ()
+    return tuple(Comment(match[0].rstrip(), own_line=True) for match in _COMMENT.finditer(token.text))
+
+
+def _give_trailing(tokens: list[Token], index: int, found: tuple[Comment, ...]) -> tuple[Comment, ...]:
+    """Hand a comment on the line of a token to that token; a `;` hands it back to the token before."""
+    if not found or found[0].own_line or index < 0:
+        return found
+    owner = index
+    while owner > 0 and tokens[owner].kind == "SEMICOLON" and tokens[owner - 1].after is None:
+        owner -= 1
+    tokens[owner] = replace(tokens[owner], after=found[0])
+    return found[1:]
+
+
+def _comments(text: str, start: int, end: int, *, first: bool) -> tuple[tuple[Comment, ...], bool]:
+    """The comments of a gap between two tokens, and whether an empty line stands behind them."""
+    found: list[Comment] = []
+    offset = start
+    for match in _COMMENT.finditer(text, start, end):
+        breaks = text.count("\n", offset, match.start())
+        own_line = breaks > 0 or bool(found) or first
+        found.append(Comment(match[0].rstrip(), own_line, apart=breaks > 1))
+        offset = match.end()
+    return tuple(found), text.count("\n", offset, end) > 1

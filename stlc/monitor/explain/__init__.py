@@ -1,0 +1,1 @@
+"""Why a formula fails: causes, and words for them."""

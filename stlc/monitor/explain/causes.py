@@ -1,0 +1,532 @@
+"""Why a formula fails at an instant: the least tree of sub-formulas, instants and signals that explains it.
+
+A conjunction fails because of one part, a disjunction because of all; `always` fails at one instant,
+`eventually` at every one, of which the closest is shown. The main path goes from minimum to maximum to the
+parts that attain them, down to one predicate at one instant: its value is the robustness. Where several
+values are equal to it, one is taken whose own change changes the robustness, if there is such a one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeAlias, assert_never
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.backends.array.graph import evaluate_parts
+from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.defined import defined
+from stlc.compile.ir.horizon import numbers, parts
+from stlc.compile.ir.samples import columns_of, leaves
+from stlc.compile.ir.thaw import thaw
+from stlc.compile.ir.traverse import from_now, on_clock
+from stlc.compile.lowering.lower import lower
+from stlc.monitor.holes import KNOWN, unsure
+from stlc.monitor.values import Record, bounds, granted, history
+from stlc.source import Span
+
+Floats = NDArray[np.float64]
+
+MOST_TIED = 64
+"""Values that are equal to the robustness, of which one is looked for that decides alone."""
+
+_MOST_NUMBERS = 1 << 26
+"""Values of predicates that are kept for that."""
+
+_MOST_LATER = 64
+"""How many instants after the last sample are looked at where past operators still know something there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Blame:
+    """A sub-formula that is not as it should be.
+
+    Attributes:
+        formula: as typed.
+        holds: what it is: true or false (it should be the other).
+        sample: where.
+        rho: its robustness there, by whose sign it `holds`.
+        until: for an operator that fails at every instant of a window: the last one.
+        reads: the signals that it reads, and how many samples later; of a predicate alone.
+        parts: why; empty for a predicate.
+        main: which of the parts decides.
+        premise: it is the left side of an implication.
+        moves: a change of the value that decides in it changes it; a frozen value may change along.
+    """
+
+    formula: typed.Formula
+    holds: bool
+    sample: int
+    rho: float
+    until: int | None = None
+    reads: tuple[tuple[str, int], ...] = ()
+    parts: tuple[Blame, ...] = ()
+    main: int = 0
+    premise: bool = False
+    moves: bool = True
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Names of the signals that it reads; of a predicate alone."""
+        return tuple(dict.fromkeys(name for name, _ in self.reads))
+
+    @property
+    def instants(self) -> set[tuple[str, int]]:
+        """The signals that it reads, and the samples at which it does; of a predicate alone."""
+        return {(name, self.sample + later) for name, later in self.reads}
+
+    @property
+    def span(self) -> Span:
+        """Where it is written."""
+        return self.formula.span
+
+    @property
+    def leaf(self) -> Blame:
+        """The predicate that decides."""
+        return self.parts[self.main].leaf if self.parts else self
+
+    @property
+    def path_moves(self) -> bool:
+        """Whether all on the path to the predicate that decides `moves`."""
+        return self.moves and (not self.parts or self.parts[self.main].path_moves)
+
+    @property
+    def leaves(self) -> tuple[Blame, ...]:
+        """All predicates."""
+        return tuple(leaf for part in self.parts for leaf in part.leaves) if self.parts else (self,)
+
+
+Spot: TypeAlias = tuple[ir.Formula, int]
+"""A predicate, or a formula that freezes values, at an instant."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Tied:
+    """A formula over the values of its predicates, of which one may be raised by the least there is.
+
+    Attributes:
+        record: the trace.
+        names: predicate -> its column.
+        env: column -> values (samples, 1); columns of predicates that come later are added.
+        raised: which value is more than it is.
+        stop: how many samples there will be, where that are more than are known.
+    """
+
+    record: Record
+    names: dict[ir.Formula, str]
+    env: dict[str, Floats]
+    raised: Spot | None = None
+    stop: int | None = None
+
+    @property
+    def columns(self) -> dict[str, Floats]:
+        """The columns where that value is raised."""
+        return self.env if self.raised is None else self._with(self.raised)
+
+    def _with(self, spot: Spot) -> dict[str, Floats]:
+        name, column = self.names[spot[0]], self.env[self.names[spot[0]]].copy()
+        column[spot[1]] = np.nextafter(column[spot[1]], np.inf)
+        return {**self.env, name: column}
+
+    def coded(self, formula: ir.Formula) -> ir.Formula:
+        """The formula over the columns."""
+        for leaf in _leaves_of(formula):
+            if leaf not in self.names:
+                self.names[leaf] = f"#{len(self.names)}"
+                values = self.record.values([leaf], range(self.record.samples), "upper", self.stop)[0]
+                self.env[self.names[leaf]] = np.asarray(values, np.float64)
+        return _over_columns(formula, self.names)
+
+    def worth(self, formula: ir.Formula, sample: int, raised: Sequence[Spot]) -> float:
+        """The robustness where a value is raised."""
+        coded = self.coded(formula)
+        env = self._with(raised[0]) if raised else self.env
+        record = replace(self.record, env=env)
+        return float(record.values([coded], range(sample, sample + 1), "upper", self.stop)[0][0, 0])
+
+
+def _leaves_of(formula: ir.Formula) -> dict[ir.Formula, None]:
+    """The predicates of a formula; what freezes values is one."""
+    if isinstance(formula, (ir.Atom, ir.Freeze)):
+        return {formula: None}
+    return {leaf: None for part in parts(formula) for leaf in _leaves_of(part)}
+
+
+def _over_columns(formula: ir.Formula, names: Mapping[ir.Formula, str]) -> ir.Formula:
+    match formula:
+        case ir.Truth():
+            return formula
+        case ir.Atom() | ir.Freeze():
+            return ir.Atom(ir.Col(names[formula]))
+        case ir.Join(items=items):
+            return replace(formula, items=tuple(_over_columns(item, names) for item in items))
+        case ir.Over() | ir.Past() | ir.Shift() | ir.AtStart():
+            return replace(formula, body=_over_columns(formula.body, names))
+        case ir.Until() | ir.Since():
+            left, right = _over_columns(formula.left, names), _over_columns(formula.right, names)
+            return replace(formula, left=left, right=right)
+    assert_never(formula)
+
+
+@dataclass(frozen=True, slots=True)
+class Blamer:
+    """Explains failures on one trace.
+
+    Attributes:
+        record: columns of the one trace, (samples, 1), up to what `end` is.
+        grid: of time.
+        cache: formulas, or their negations, as lowered.
+        known: the most that lowered formulas can be, at which instants.
+        tied: values of predicates that are taken instead of those of the trace, one of them a trifle more.
+        stop: how many samples there will be, where that are more than are known.
+    """
+
+    record: Record
+    grid: Grid
+    cache: dict[tuple[typed.Formula, bool], ir.Formula] = field(default_factory=dict)
+    known: dict[ir.Formula, list[tuple[range, Floats]]] = field(default_factory=dict)
+    tied: _Tied | None = None
+    stop: int | None = None
+
+    # --------------------------------------------------------------------- ties
+
+    def why(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> tuple[Blame, bool]:
+        """Why `formula` is not `wanted`, and whether the value at the end of the path decides alone.
+
+        Where other values are equal to it, the path leads to one whose own change changes the robustness, if
+        there is such a one among the first `MOST_TIED`.
+        """
+        tree = self.blame(formula, sample, wanted=wanted)
+        lowered = self._lowered(formula, wanted)
+        worth = self._margin(formula, sample, wanted)
+        equal = self._equal(lowered, worth) if np.isfinite(worth) else []
+        if len(equal) < 2:
+            return tree, len(equal) == 1 and tree.path_moves
+        tied = self._tied(lowered, equal)
+        if tied is None or tied.worth(lowered, sample, ()) != worth:
+            return tree, False
+        leaf = tree.leaf
+        own = _leaves_of(self._lowered(leaf.formula, not leaf.holds))
+        first = [each for each in equal if each[1] == leaf.sample and each[0] in own]
+        for chosen in (*first, *equal[:MOST_TIED]):
+            if tied.worth(lowered, sample, (chosen,)) > worth:
+                if chosen not in first:
+                    raised = replace(self, cache={}, known={}, tied=replace(tied, raised=chosen))
+                    tree = raised.blame(formula, sample, wanted=wanted)
+                return tree, tree.path_moves
+        return tree, False
+
+    def _equal(self, lowered: ir.Formula, worth: float) -> list[Spot]:
+        """The predicates of a formula, and the instants, at which they are worth the same as it."""
+        wanted = _leaves_of(lowered)
+        found = {
+            (node, its.start + int(k)): None
+            for node, entries in self.known.items()
+            if node in wanted
+            for its, values in entries
+            for k in np.flatnonzero(values == worth)
+        }
+        return sorted(found, key=lambda spot: spot[1])
+
+    def _tied(self, lowered: ir.Formula, equal: Sequence[Spot]) -> _Tied | None:
+        """The values of its predicates as columns; None where some lie beyond the last sample."""
+        leaves = list(_leaves_of(lowered))
+        samples = self.record.samples
+        if any(instant >= samples for _, instant in equal) or samples * len(leaves) > _MOST_NUMBERS:
+            return None
+        values = self.record.values(leaves, range(samples), "upper", self.stop)
+        names = {leaf: f"#{k}" for k, leaf in enumerate(leaves)}
+        env = {name: np.asarray(x, np.float64) for name, x in zip(names.values(), values, strict=True)}
+        return _Tied(self.record, names, env, stop=self.stop)
+
+    def blame(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> Blame:
+        """Why `formula` is not `wanted` at `sample`."""
+        match formula:
+            case typed.Truth() | typed.Recalled():
+                return self._node(formula, wanted, sample)
+            case typed.Pred():
+                return self._predicate(formula, sample, wanted)
+            case typed.Not(span, body) if span == body.span and span.text:
+                return self._predicate(formula, sample, wanted)  # `not in`: to a reader one predicate
+            case typed.Not(_, body):
+                return self.blame(body, sample, wanted=not wanted)
+            case typed.Logic():
+                return self._logic(formula, sample, wanted)
+            case typed.Temporal() | typed.Until():
+                return self._timed(formula, sample, wanted)
+            case typed.Shift(_, steps, body):
+                there = sample + steps
+                inside = there >= 0 and (
+                    there < self.record.samples or not self._unknown(body, there, wanted)
+                )
+                parts = (self.blame(body, there, wanted=wanted),) if inside else ()
+                return replace(self._node(formula, wanted, sample), parts=parts)
+            case typed.Edge():
+                return self._edge(formula, sample, wanted)
+            case typed.Freeze(_, _, body):
+                thawed = thaw(body, self._values(formula, sample))
+                inner = replace(self, cache={}, known={}, tied=None)
+                tree, alone = inner.why(thawed, sample, wanted=wanted)
+                return replace(tree, moves=alone and not self._frozen(formula, sample) & tree.leaf.instants)
+        assert_never(formula)
+
+    # ------------------------------------------------------------------- values
+
+    def _frozen(self, formula: typed.Freeze, sample: int) -> set[tuple[str, int]]:
+        """The signals that a formula freezes, and the samples at which it reads them."""
+        return {
+            (leaf.name, sample + self._later(leaf, sample))
+            for _, num in formula.bindings
+            for leaf in leaves(num)
+            if isinstance(leaf, (ir.Col, ir.At))
+        }
+
+    def _values(self, formula: typed.Freeze, sample: int) -> dict[str, ir.Num]:
+        """What the formula binds at a sample; what does not exist becomes a sample beyond the trace."""
+        values: dict[str, ir.Num] = {}
+        last = self.record.samples - 1
+        for name, num in formula.bindings:
+            given = columns_of(num) <= self.record.env.keys()
+            if given and sample <= last and defined(ir.Atom(num), last + 1)[sample]:
+                value, _ = bounds(ir.Atom(num), self.record, range(sample, sample + 1), "open")
+                values[name] = ir.Lit(float(value[0, 0]))
+            else:
+                values[name] = ir.At(next(iter(self.record.env)), last + 1)
+        return values
+
+    def _lowered(self, formula: typed.Formula, wanted: bool) -> ir.Formula:
+        """The formula, or its negation where it is not wanted: what fails.
+
+        A requirement may not depend on all that it mentions, and what it does not depend on is not given.
+        """
+        key = (formula, wanted)
+        if key not in self.cache:
+            goal = formula if wanted else typed.Not(formula.span, formula)
+            given = granted(lower(goal, self.grid, []), self.record.env)
+            self.cache[key] = unsure(given, self.record.holes, least=False) if self.record.holes else given
+        return self.cache[key]
+
+    def _margins(self, formula: typed.Formula, wanted: bool, instants: range) -> Floats:
+        """By how much the formula is as wanted, at best, at consecutive instants: (instants,)."""
+        lowered = self._lowered(formula, wanted)
+        if self.tied is not None:
+            lowered = self.tied.coded(lowered)
+        found = self._found(lowered, instants)
+        if found is None:
+            env = self.record.env if self.tied is None else self.tied.columns
+            found_in = evaluate_parts(
+                lowered, env, instants, ops=self.record.ops, end="upper", stop=self.stop
+            )
+            for node, its, values in found_in:
+                self.known.setdefault(node, []).append((its, values[:, 0]))
+            found = self._found(lowered, instants)
+        assert found is not None
+        return found
+
+    def _unknown(self, formula: typed.Formula, sample: int, wanted: bool) -> bool:
+        """Whether the trace does not tell: it was cut, and what is not there is not as it is wanted."""
+        return bool(np.isposinf(self._margins(formula, wanted, range(sample, sample + 1))[0]))
+
+    def _found(self, lowered: ir.Formula, instants: range) -> Floats | None:
+        """Its values, where an evaluation of something around it has told them already."""
+        for known, values in self.known.get(lowered, ()):
+            if known.start <= instants.start and instants.stop <= known.stop:
+                rows = values[instants.start - known.start : instants.stop - known.start]
+                return rows.astype(np.float64)
+        return None
+
+    def _node(self, formula: typed.Formula, wanted: bool, sample: int) -> Blame:
+        margin = float(self._margins(formula, wanted, range(sample, sample + 1))[0])
+        return Blame(formula, not wanted, sample, margin if wanted else -margin)
+
+    def _predicate(self, formula: typed.Formula, sample: int, wanted: bool) -> Blame:
+        found = {
+            (leaf.name, self._later(leaf, sample))
+            for num in numbers(self._lowered(formula, wanted))
+            for leaf in leaves(num)
+            if isinstance(leaf, (ir.Col, ir.At)) and not leaf.name.startswith(KNOWN)
+        }
+        return replace(self._node(formula, wanted, sample), reads=tuple(sorted(found)))
+
+    def _later(self, leaf: ir.Col | ir.At, sample: int) -> int:
+        """How many samples after an instant a predicate reads a signal."""
+        if isinstance(leaf, ir.Col):
+            return 0
+        there = sample + leaf.steps
+        return min(max(there, 0), self.record.samples - 1) - sample if leaf.clamped else leaf.steps
+
+    def _least(self, parts: Sequence[tuple[typed.Formula, int, bool]]) -> tuple[typed.Formula, int, bool]:
+        """The part that is farthest from what is wanted of it."""
+        return parts[int(np.argmin([self._margin(*part) for part in parts]))]
+
+    def _margin(self, formula: typed.Formula, sample: int, wanted: bool) -> float:
+        """By how much the formula is as wanted, at best, at one instant."""
+        return float(self._margins(formula, wanted, range(sample, sample + 1))[0])
+
+    # ---------------------------------------------------------------- connectives
+
+    def _logic(self, formula: typed.Logic, sample: int, wanted: bool) -> Blame:
+        node = self._node(formula, wanted, sample)
+        match formula.op:
+            case "and" | "or":
+                items = [(item, sample, wanted) for item in formula.items]
+                all_needed = (formula.op == "and") is wanted
+            case "->":
+                left, right = formula.items
+                items = [(left, sample, not wanted), (right, sample, wanted)]
+                all_needed = not wanted
+            case "<->" | "xor":
+                items, all_needed = self._least_of_both(formula, sample, wanted), False
+            case _:
+                assert_never(formula.op)
+        if all_needed:
+            part, there, its = self._least(items)
+            return replace(node, parts=(self.blame(part, there, wanted=its),))
+        parts = tuple(self.blame(part, there, wanted=its) for part, there, its in items)
+        if formula.op == "->":
+            main = int(self._margin(*items[1]) >= self._margin(*items[0]))
+            return replace(node, parts=(replace(parts[0], premise=True), parts[1]), main=main)
+        margins = np.array([self._margin(*item) for item in items])
+        known = np.where(np.isposinf(margins), -np.inf, margins)
+        return replace(node, parts=parts, main=int(np.argmax(known)))
+
+    def _least_of_both(
+        self, formula: typed.Logic, sample: int, wanted: bool
+    ) -> list[tuple[typed.Formula, int, bool]]:
+        """Of the two ways in which an equivalence is as wanted, what is farthest from it in each."""
+        left, right = formula.items
+        same = (formula.op == "<->") is wanted
+        ways = [[(left, sample, its), (right, sample, its is same)] for its in (True, False)]
+        return sorted(map(self._least, ways), key=lambda item: item[0] is right)
+
+    def _edge(self, formula: typed.Edge, sample: int, wanted: bool) -> Blame:
+        node = self._node(formula, wanted, sample)
+        if sample == 0:
+            return node
+        now = formula.op == "rise"
+        parts = [(formula.body, sample, now is wanted), (formula.body, sample - 1, now is not wanted)]
+        if wanted:
+            part, there, its = self._least(parts)
+            return replace(node, parts=(self.blame(part, there, wanted=its),))
+        main = int(np.argmax([self._margin(*part) for part in parts]))
+        found = tuple(self.blame(part, there, wanted=its) for part, there, its in parts)
+        return replace(node, parts=found, main=main)
+
+    # ------------------------------------------------------------------- windows
+
+    def _instants(self, formula: typed.Formula, sample: int, wanted: bool) -> range:
+        """The instants of the window of a temporal operator of which something is known, in order of time."""
+        lowered = self._lowered(formula, wanted)
+        match lowered:
+            case ir.Over(window=window) | ir.Until(window=window):
+                last, known = self.record.samples - 1, self._stop(lowered) - 1
+                end = known if self.stop is None else min(self.stop - 1, known)
+                high = (
+                    (last if self.stop is None else end)
+                    if window.hi is None
+                    else min(sample + window.hi, known)
+                )
+                return range(sample + window.lo, high + 1)
+            case ir.Past(window=window) | ir.Since(window=window):
+                low = 0 if window.hi is None else max(sample - window.hi, 0)
+                return range(low, sample - window.lo + 1)
+        raise TypeError(f"{type(lowered).__name__} has no window")
+
+    def _stop(self, lowered: ir.Formula) -> int:
+        """The first instant after the last sample at which nothing is known of the parts of a formula."""
+        return self.record.samples + min(max(map(history, parts(lowered))), _MOST_LATER)
+
+    def _timed(self, formula: typed.Temporal | typed.Until, sample: int, wanted: bool) -> Blame:
+        if on_clock(formula):
+            return self._timed(from_now(formula), 0, wanted)
+        if isinstance(formula, typed.Temporal):
+            return self._temporal(formula, sample, wanted)
+        return self._until(formula, sample, wanted)
+
+    def _temporal(self, formula: typed.Temporal, sample: int, wanted: bool) -> Blame:
+        node = self._node(formula, wanted, sample)
+        instants = self._instants(formula, sample, wanted)
+        if not instants:
+            return node
+        margins = self._margins(formula.body, wanted, instants)
+        if (formula.op in ("always", "historically")) is wanted:
+            worst = instants[int(np.argmin(margins))]
+            return replace(node, parts=(self.blame(formula.body, worst, wanted=wanted),))
+        best = instants[int(np.argmax(np.where(np.isposinf(margins), -np.inf, margins)))]
+        part = self.blame(formula.body, best, wanted=wanted)
+        return replace(node, sample=instants[0], until=instants[-1], parts=(part,))
+
+    def _until(self, formula: typed.Until, sample: int, wanted: bool) -> Blame:
+        if formula.op == "unless":
+            return self._unless(formula, sample, wanted)
+        node = self._node(formula, wanted, sample)
+        instants = self._instants(formula, sample, wanted)
+        past, beyond = formula.op == "since", self._looks_beyond(formula, sample, wanted)
+        if not instants and not beyond:
+            return node
+        if past:
+            held = range(instants[0], sample + 1)
+        else:
+            stop = instants[-1] + 1 if instants else self._stop(self._lowered(formula, wanted))
+            held = range(sample, max(stop, sample))
+        left = self._margins(formula.left, wanted, held) if held else np.zeros(0)
+        right = self._margins(formula.right, wanted, instants) if instants else np.zeros(0)
+        if beyond:
+            left = np.append(left, self._margin(formula.left, held.stop, wanted))
+            right = np.append(right, self._margin(formula.right, held.stop, wanted))
+        left = left[::-1] if past else left
+        right = right[::-1] if past else right
+        if (formula.op == "release") is wanted:
+            met, far, main = _released(left, right)
+            there = (sample - far, sample - met) if past else (sample + far, sample + met)
+            parts = (
+                self.blame(formula.left, there[0], wanted=wanted),
+                self.blame(formula.right, there[1], wanted=wanted),
+            )
+            return replace(node, parts=parts, main=main)
+        offset, is_left = _unmet(left, right)
+        there_ = sample - offset if past else sample + offset
+        part = self.blame(formula.left if is_left else formula.right, there_, wanted=wanted)
+        if is_left or beyond or (right >= 0).any():
+            return replace(node, parts=(part,))
+        return replace(node, sample=instants[0], until=instants[-1], parts=(part,))
+
+    def _looks_beyond(self, formula: typed.Until, sample: int, wanted: bool) -> bool:
+        """Whether the window goes on where nothing is known any more."""
+        lowered = self._lowered(formula, wanted)
+        if not isinstance(lowered, ir.Until) or lowered.window.hi is None:
+            return False
+        instants = self._instants(formula, sample, wanted)
+        return not instants or instants[-1] < sample + lowered.window.hi
+
+    def _unless(self, formula: typed.Until, sample: int, wanted: bool) -> Blame:
+        """`always[0, b] left or left until[a, b] right`."""
+        whole = replace(formula.interval, lo=typed.Time(), lo_open=False)
+        held = typed.Temporal(formula.span, "always", whole, formula.left)
+        met = typed.Until(formula.span, "until", formula.interval, formula.left, formula.right)
+        return self.blame(typed.Logic(formula.span, "or", (held, met)), sample, wanted=wanted)
+
+
+def _unmet(left: Floats, right: Floats) -> tuple[int, bool]:
+    """Where `until` comes closest: an offset from now, and whether it is the left side that decides there.
+
+    It is worth the most, over the instants of the right side, of the least of that and the left side so far.
+    """
+    skipped = len(left) - len(right)
+    held = np.minimum.accumulate(left)[skipped:]
+    best = int(np.argmax(np.minimum(held, right)))
+    if held[best] < right[best]:
+        return int(np.argmin(left[: skipped + best + 1])), True
+    return skipped + best, False
+
+
+def _released(left: Floats, right: Floats) -> tuple[int, int, int]:
+    """Where `release` fails: offset of the right side, of the best of the left side so far, which decides."""
+    skipped = len(left) - len(right)
+    freed = np.maximum.accumulate(left)[skipped:]
+    worst = int(np.argmin(np.maximum(freed, right)))
+    return skipped + worst, int(np.argmax(left[: skipped + worst + 1])), int(right[worst] >= freed[worst])

@@ -1,0 +1,312 @@
+"""A violation in the words of the specification: the sub-formula, the instant, the signal and its value."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+from stlc.compile.augment.lift import recorded
+from stlc.compile.ir import typed
+from stlc.compile.ir.traverse import margin_unit
+from stlc.diagnostics import Label
+from stlc.grammar import ast
+from stlc.monitor.explain.causes import Blame, Blamer
+from stlc.monitor.instants import window_of
+from stlc.monitor.judgement import Judgement, Verdict
+from stlc.monitor.prepared import Prepared
+from stlc.monitor.values import Record
+from stlc.signature import Column
+from stlc.source import Span
+
+_MOST_LABELS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What a signal was.
+
+    Attributes:
+        signal: its name.
+        value: in its unit.
+        unit: as declared, "" without one.
+        text: `x = 0.27 m`, `sign = stop`.
+    """
+
+    signal: str
+    value: float
+    unit: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """Why one requirement is violated by one trace in one window.
+
+    Attributes:
+        judgement: of the requirement.
+        trace: which trace.
+        start: sample at which the requirement was judged.
+        sample: sample of the predicate that decides.
+        time: of that sample in seconds.
+        predicate: its text.
+        span: of the predicate.
+        readings: the signals that it reads, at that sample.
+        place: what to underline in the requirement, and what to say there.
+        labels: what else to underline.
+        because: one line in words.
+        tree: the whole explanation.
+        alone: a change of the value that decides, towards the side that is wanted, raises the robustness.
+    """
+
+    judgement: Judgement
+    trace: int
+    start: int
+    sample: int
+    time: float
+    predicate: str
+    span: Span
+    readings: tuple[Reading, ...]
+    place: Label
+    labels: tuple[Label, ...]
+    because: str
+    tree: Blame
+    alone: bool
+
+    @property
+    def unit(self) -> str:
+        """Of the value that decides."""
+        return margin_unit(self.tree.leaf.formula)
+
+
+MOST = 500
+"""Violated requirements that are explained at once: nobody reads more, and each takes half a millisecond."""
+
+
+def explain(verdict: Verdict, name: str) -> Cause | None:
+    """The cause of a violated requirement; None where it is not violated.
+
+    Raises:
+        UsageError: U101, there is no such requirement.
+    """
+    judgement = verdict[name]
+    if judgement.overall != "violated":
+        return None
+    return _cause(judgement, verdict.subject, _definitions(verdict.subject.compiled.spec))
+
+
+def explain_at(verdict: Verdict, name: str, trace: int, start: int) -> Cause:
+    """The cause of a violation of one requirement by a trace in the window that begins at a sample.
+
+    Raises:
+        UsageError: U101, there is no such requirement.
+    """
+    definitions = _definitions(verdict.subject.compiled.spec)
+    return _cause(verdict[name], verdict.subject, definitions, (trace, start))
+
+
+def explain_all(verdict: Verdict) -> dict[str, Cause]:
+    """The causes of violated requirements, by their names; of the first `MOST` where there are more."""
+    definitions = _definitions(verdict.subject.compiled.spec)
+    violated = [judgement for judgement in verdict if judgement.overall == "violated"]
+    return {judgement.name: _cause(judgement, verdict.subject, definitions) for judgement in violated[:MOST]}
+
+
+def _cause(
+    judgement: Judgement,
+    subject: Prepared,
+    definitions: dict[str, ast.Expr],
+    at: tuple[int, int] | None = None,
+) -> Cause:
+    rule, (trace, start) = judgement.rule, judgement.worst if at is None else at
+    one_trace = {name: column[:, trace : trace + 1] for name, column in subject.record.env.items()}
+    record = Record(one_trace, subject.record.ops, holes=subject.record.holes)
+    window = window_of(rule, subject.horizon)
+    stop = None if window is None else start + window + 1
+    record = record if stop is None else record.cut(stop)
+    going_on = stop if stop is not None and stop > record.samples else None
+    formula = recorded(rule.typed.formula) if rule.absolute else rule.typed.formula
+    tree, alone = Blamer(record, subject.compiled.grid, stop=going_on).why(formula, start)
+    words = _Words(subject, record, rule.typed.written, definitions)
+    leaf = tree.leaf
+    place, *labels = words.labels(tree)
+    return Cause(
+        judgement=judgement,
+        trace=trace,
+        start=start,
+        sample=leaf.sample,
+        time=subject.time(leaf.sample),
+        predicate=_flat(leaf.span.text),
+        span=leaf.span,
+        readings=words.readings(leaf),
+        place=place,
+        labels=tuple(labels[: _MOST_LABELS - 1]),
+        because=words.because(tree),
+        tree=tree,
+        alone=alone,
+    )
+
+
+# -------------------------------------------------------------------------- words
+
+
+@dataclass(frozen=True, slots=True)
+class _Words:
+    subject: Prepared
+    record: Record
+    written: ast.Expr
+    definitions: dict[str, ast.Expr]
+
+    def readings(self, blame: Blame) -> tuple[Reading, ...]:
+        """The signals that the predicates below read, each at the instants where they do."""
+        seen: dict[tuple[str, int], Reading] = {}
+        read = self.subject.compiled.signature
+        for leaf in blame.leaves:
+            for name, later in _in_order(leaf):
+                sample = leaf.sample + later
+                if name not in read or not 0 <= sample < self.record.samples:
+                    continue
+                value = float(self.record.env[name][sample, 0])
+                when = f" at {self.subject.moment(sample)}" if later else ""
+                text = f"{name} = {shown(value, read[name])}{when}"
+                seen.setdefault((name, sample), Reading(name, value, read[name].unit.text, text))
+        return tuple(seen.values())
+
+    def labels(self, tree: Blame) -> list[Label]:
+        """What to underline: the predicate that decides first."""
+        found: dict[Span, str] = {}
+        for blame in _told(tree):
+            found.setdefault(self.site(blame.span), self.told(blame))
+        first = self.site(_telling(tree).span)
+        spans = sorted(found, key=lambda span: (span != first, span.start))
+        return [Label(span, found[span]) for span in spans]
+
+    def told(self, blame: Blame) -> str:
+        """What is said beside an underlined part."""
+        word = "true" if blame.holds else "false"
+        if blame.until is not None:
+            window = f"from {self.subject.moment(blame.sample)} to {self.subject.moment(blame.until)}"
+            return f"{'always' if blame.holds else 'never'} true {window}"
+        moment = self.subject.moment(blame.sample)
+        if not blame.premise:
+            return f"{word} at {moment}"
+        values = ", ".join(reading.text for reading in self.readings(blame))
+        return f"{word} at {moment} ({values})" if values else f"{word} at {moment}"
+
+    def because(self, tree: Blame) -> str:
+        """Why, in words: where a premise decides, what the conclusion was is told, too."""
+        text = self.reason(tree)
+        while tree.parts:
+            if tree.parts[0].premise and tree.main == 0:
+                return f"{text}; {self.reason(tree.parts[1])}"
+            tree = tree.parts[tree.main]
+        return text
+
+    def reason(self, tree: Blame) -> str:
+        """`before_junction means x < x_inter / 2, and x = 0.27 m at t = 4.6 s (line 17)`."""
+        leaf = tree.leaf
+        moment, truth = self.subject.moment(leaf.sample), "true" if leaf.holds else "false"
+        values = " and ".join(reading.text for reading in self.readings(leaf))
+        text = _flat(leaf.span.text)
+        if not values:
+            return f"`{text}` is {truth} whatever the signals are"
+        chain = self.chain(self.written, leaf.span)
+        closest = _closest(tree)
+        if not chain:
+            if closest:
+                return f"`{text}` comes closest at {moment}, where {values}"
+            return f"`{text}` is {truth} where {values}, at {moment}"
+        name = chain[-1].name
+        body = _flat(self.definitions[name].span.text)
+        found = f"comes closest at {moment}, where {values}" if closest else f"{values} at {moment}"
+        return f"{name} means {body}, and {found} (line {leaf.span.line})"
+
+    def site(self, span: Span) -> Span:
+        """The place in the requirement that brings `span` in, be it by a definition."""
+        chain = self.chain(self.written, span)
+        return chain[0].span if chain else span
+
+    def chain(self, expr: ast.Expr, span: Span) -> tuple[ast.Name, ...] | None:
+        """The names by which `expr` comes to the definition that holds `span`; None if it does not."""
+        if _within(span, expr.span):
+            return ()
+        for name in names_in(expr):
+            body = self.definitions.get(name.name)
+            rest = None if body is None else self.chain(body, span)
+            if rest is not None:
+                return (name, *rest)
+        return None
+
+
+def _in_order(leaf: Blame) -> list[tuple[str, int]]:
+    """The signals of a predicate as its text has them; those behind a name come last."""
+    words = re.findall(r"\w+(?:\[\d+\])?", leaf.span.text)
+    places = {word: place for place, word in reversed(list(enumerate(words)))}
+    return sorted(
+        leaf.reads, key=lambda read: (places.get(read[0], len(words)), read[0], abs(read[1]), read[1])
+    )
+
+
+def _told(tree: Blame) -> Iterator[Blame]:
+    """The nodes that get a label: premises as a whole, windows without success, predicates."""
+    if tree.premise or tree.until is not None or not tree.parts:
+        yield replace(tree, formula=_body(tree.formula)) if tree.until is not None else tree
+        return
+    for part in tree.parts:
+        yield from _told(part)
+
+
+def _telling(tree: Blame) -> Blame:
+    """The one among them that decides."""
+    if tree.until is not None:
+        return replace(tree, formula=_body(tree.formula))
+    return _telling(tree.parts[tree.main]) if tree.parts else tree
+
+
+def _closest(tree: Blame) -> bool:
+    """Whether the predicate that decides is what a window looks for, the best in it, and nothing succeeds."""
+    if not tree.parts:
+        return False
+    part = tree.parts[tree.main]
+    return _closest(part) or (tree.until is not None and not part.parts)
+
+
+def _body(formula: typed.Formula) -> typed.Formula:
+    match formula:
+        case typed.Temporal(body=body):
+            return body
+        case typed.Until(right=right):
+            return right
+    return formula
+
+
+def shown(value: float, column: Column) -> str:
+    """A value as one reads it: the label of an enum, a number with its unit."""
+    for label, number in column.labels:
+        if number == value:
+            return label
+    return f"{value:.6g} {column.unit.text}".rstrip()
+
+
+def names_in(expr: object) -> Iterator[ast.Name]:
+    """All names in an expression, from left to right."""
+    if isinstance(expr, ast.Name):
+        yield expr
+    elif isinstance(expr, tuple):
+        for item in expr:
+            yield from names_in(item)
+    elif isinstance(expr, ast.Node):
+        for part in fields(expr):
+            yield from names_in(getattr(expr, part.name))
+
+
+def _definitions(spec: ast.Spec) -> dict[str, ast.Expr]:
+    return {item.name: item.value for item in spec.items if isinstance(item, (ast.Def, ast.Region))}
+
+
+def _within(inner: Span, outer: Span) -> bool:
+    return inner.source is outer.source and outer.start <= inner.start and inner.end <= outer.end
+
+
+def _flat(text: str) -> str:
+    return " ".join(text.split())

@@ -1,0 +1,1 @@
+"""Samples one by one: verdicts as soon as they are decided, in bounded memory."""

@@ -1,0 +1,188 @@
+"""Requirements whose windows have an end, judged together: both ends of what is possible in one array.
+
+Every column is `(rows, 2)`: the least and the greatest value over all continuations. Known rows hold a value
+twice, the rows behind them -inf and +inf; so one evaluation gives both bounds of all requirements.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.horizon import reach
+from stlc.monitor.online.asked import Bounds, Floats, Plans
+from stlc.monitor.online.columns import NOTHING, Reader, continued
+from stlc.monitor.online.streams import Latched, Leaf, Plan, plan
+from stlc.monitor.values import by_truth, history
+
+_UNKNOWN = (-math.inf, math.inf)
+
+_SPARE = 64
+"""Rows that are free after the columns were moved."""
+
+
+def fits(plans: Plans) -> bool:
+    """Whether both ends follow from the same formula, over predicates of the present and what is latched."""
+    planned = plans["truncate"]
+    return plans["lower"] == plans["upper"] == planned and all(map(_of_the_present, planned.streams))
+
+
+def _of_the_present(stream: Leaf | Latched) -> bool:
+    if isinstance(stream, Latched):
+        return not stream.ahead
+    return isinstance(stream.formula, ir.Atom) and not stream.back and not stream.ahead
+
+
+@dataclass(slots=True)
+class Pairs:
+    """The columns of requirements whose instants are counted at the same time.
+
+    Attributes:
+        truth: predicates are true or false, +inf or -inf.
+        samples: how many there are by now.
+    """
+
+    truth: bool
+    samples: int = 0
+    _formulas: list[ir.Formula] = field(default_factory=list)
+    _starts: list[int] = field(default_factory=list)
+    _plan: Plan | None = None
+    _leaves: tuple[list[str], Reader] | None = None
+    _latched: list[tuple[Latched, Reader]] = field(default_factory=list)
+    _reader: Reader = field(init=False)
+    _beyond: int = 0
+    _back: int = 0
+    _latch_back: int = 0
+    _rows: dict[str, Floats] = field(default_factory=dict)
+    _origin: int = 0
+    _base: int = 0
+    _room: int = 0
+    _env: dict[str, Floats] = field(default_factory=dict)
+    _found: tuple[tuple[int, int], list[Floats]] | None = None
+
+    def add(self, formula: ir.Formula) -> Paired:
+        """One more requirement; before the first sample."""
+        self._formulas.append(formula)
+        self._starts.append(0)
+        return Paired(self, len(self._starts) - 1, reach(formula).future)
+
+    def grow(self, signals: Mapping[str, Floats], samples: int) -> None:
+        """Take in the samples that are new; `signals` (kept, 1) end with the last one."""
+        if samples == self.samples:
+            return
+        first, self.samples, self._found = self.samples, samples, None
+        if self._plan is None:
+            self._prepare()
+        self._make_room(first)
+        begin, end = first - self._origin, samples - self._origin
+        if self._leaves is not None:
+            names, reader = self._leaves
+            kept = len(next(iter(signals.values())))
+            found = reader.of_signals(signals, kept - (samples - first), samples - first)
+            for name, values in zip(names, found, strict=True):
+                self._rows[name][begin:end] = values
+        self._view()
+        for stream, reader in self._latched:
+            parts = reader(self._env, first - self._base, samples + self._beyond - first)
+            last = self._rows[stream.name][begin - 1] if first else None
+            self._rows[stream.name][begin : end + self._beyond] = continued(stream.op, parts, last)
+
+    def values(self, which: int, start: int, stop: int) -> Floats:
+        """Both bounds of a requirement at consecutive instants, (instants, 2)."""
+        if self._found is None or self._found[0] != (start, stop):
+            self._found = (start, stop), self._reader(self._env, start - self._base, stop - start)
+        return self._found[1][which]
+
+    def drop(self, which: int, start: int) -> None:
+        """Forget what a requirement needs for instants before `start`."""
+        self._starts[which] = start
+        needed = min(min(self._starts) - self._back, self.samples - self._latch_back)
+        if needed > self._base:
+            self._base = needed
+            self._view()
+
+    def _view(self) -> None:
+        """What is kept, from `_base` on."""
+        kept = slice(self._base - self._origin, self.samples - self._origin + self._beyond)
+        self._env = {name: column[kept] for name, column in self._rows.items()}
+
+    def _prepare(self) -> None:
+        whole = plan(ir.Join("and", tuple(self._formulas)))
+        assert isinstance(whole.formula, ir.Join)
+        formulas = whole.formula.items
+        self._plan = whole
+        self._beyond = max(reach(formula).future for formula in formulas)
+        self._latched = [
+            (stream, Reader(stream.parts, "both")) for stream in whole.streams if isinstance(stream, Latched)
+        ]
+        self._back = max(map(history, formulas))
+        self._latch_back = max((max(stream.back, 1) for stream, _ in self._latched), default=0)
+        leaves = [stream for stream in whole.streams if isinstance(stream, Leaf)]
+        judged = [by_truth(leaf.formula) if self.truth else leaf.formula for leaf in leaves]
+        if leaves:
+            self._leaves = [leaf.name for leaf in leaves], Reader(judged, "truncate")
+        self._reader = Reader(formulas, "both")
+        self._rows = {
+            name: np.empty((0, 2)) for name in (NOTHING, *(stream.name for stream in whole.streams))
+        }
+
+    def _make_room(self, known: int) -> None:
+        """Move the rows from `_base` on to the front where those that come find no place behind them."""
+        if self.samples + self._beyond - self._origin <= self._room:
+            return
+        kept = slice(self._base - self._origin, known - self._origin)
+        self._room = 2 * (self.samples + self._beyond - self._base) + _SPARE
+        for name, old in self._rows.items():
+            column = np.full((self._room, 2), _UNKNOWN)
+            column[: known - self._base] = old[kept]
+            self._rows[name] = column
+        self._origin = self._base
+
+
+@dataclass(frozen=True, slots=True)
+class Paired:
+    """A formula whose windows have an end, at consecutive instants, beside others.
+
+    Attributes:
+        shared: the columns.
+        which: number of the formula.
+        ahead: samples after an instant that it reads.
+    """
+
+    shared: Pairs
+    which: int
+    ahead: int
+
+    @property
+    def samples(self) -> int:
+        """How many there are by now."""
+        return self.shared.samples
+
+    @property
+    def settled(self) -> int:
+        """The first instant whose value may still change."""
+        return max(self.shared.samples - self.ahead, 0)
+
+    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:  # noqa: ARG002
+        """Take new samples in."""
+        self.shared.grow(signals, samples)
+
+    def live(self, start: int, stop: int) -> Bounds:
+        """Bounds over all continuations."""
+        if stop <= start:
+            return Bounds(np.zeros(0), np.zeros(0))
+        found = self.shared.values(self.which, start, stop)
+        return Bounds(found[:, 0], found[:, 1])
+
+    def ended(self, starts: range) -> Bounds:
+        """Where the trace is over: what is missing stays unknown."""
+        return self.live(starts.start, starts.stop)
+
+    def drop(self, start: int) -> int:
+        """Forget instants before `start`; no signals are kept."""
+        self.shared.drop(self.which, start)
+        return self.shared.samples

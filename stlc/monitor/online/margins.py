@@ -1,0 +1,198 @@
+"""Margins of many traces side by side while they go on: for each what `Online` says of it, all at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.ir.horizon import columns
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.monitor.instants import window_of
+from stlc.monitor.judgement import Status
+from stlc.monitor.online.trackers import Whole
+from stlc.monitor.values import history
+
+if TYPE_CHECKING:
+    from stlc.compile.pipeline import Rule
+
+Floats: TypeAlias = NDArray[np.float64]
+Counts: TypeAlias = NDArray[np.int64]
+
+_ROOM = 64
+"""Samples that are free after the columns were moved."""
+
+
+@dataclass(frozen=True, slots=True)
+class Margin:
+    """A requirement at the present sample of every trace, (traces,) each.
+
+    Attributes:
+        low: least robustness over all that may follow, the least over the windows that are still open at
+            this sample; of a requirement that is judged once, over its one window.
+        high: greatest robustness, the least over the same windows: what can still be had of them.
+        violated: at how many starts it is violated by now, whatever follows.
+        open: whether a start so far is neither satisfied nor violated for certain.
+    """
+
+    low: Floats
+    high: Floats
+    violated: Counts
+    open: NDArray[np.bool_]
+
+    def status(self, trace: int) -> Status:
+        """Violated if it is at one start, satisfied if it is at all so far."""
+        if self.violated[trace]:
+            return "violated"
+        return "inconclusive" if self.open[trace] else "satisfied"
+
+
+@dataclass(slots=True)
+class _Watched:
+    """A requirement and what is counted of it: starts before `next` are settled.
+
+    Attributes:
+        rule: the requirement.
+        horizon: what `T` means, in steps.
+        whole: its bounds, wherever the traces end.
+        next: the first start that is not settled.
+        violated: settled starts that are violated, (traces,).
+        last: the least margins of the windows that closed with the last sample; None before there is one.
+    """
+
+    rule: Rule
+    horizon: int | None
+    whole: Whole
+    next: int = 0
+    violated: Counts = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    last: Margin | None = None
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether it is judged at every start, and not only at the first sample."""
+        return self.rule.windowed and not self.rule.absolute and self.horizon is not None
+
+    @property
+    def ahead(self) -> int | None:
+        """How many samples behind its start decide it; None where the end of the trace does."""
+        moving = window_of(self.rule, self.horizon)
+        if moving is not None:
+            return max(moving, self.rule.reach)
+        if self.rule.uses_end:
+            return None
+        counted = self.horizon if self.everywhere else None
+        return max(self.rule.reach, counted or 0)
+
+    def needs(self) -> int:
+        """The first sample that is still read."""
+        if not self.everywhere:
+            return 0
+        return max(self.next - history(self.rule.formula), 0)
+
+    def look(self, env: Mapping[str, Floats], first: int, samples: int) -> Margin:
+        """The margin at the last of so many samples; `env` (kept, traces) begins with sample `first`."""
+        if not self.everywhere and self.next:
+            assert self.last is not None
+            return self.last
+        stop = samples if self.everywhere else 1
+        begin = max(self.needs(), first)  # as many samples every time: what is planned for them is known
+        starts = range(self.next - begin, stop - begin)
+        self.whole.grow({name: column[begin - first :] for name, column in env.items()}, 0, samples - begin)
+        shape = (len(starts), _traces(env))
+        low, high = (np.broadcast_to(end, shape) for end in self.whole.of_all(starts))
+        fails, holds = high < -TOLERANCE, low >= -TOLERANCE
+        if len(self.violated) != low.shape[1]:
+            self.violated = np.zeros(low.shape[1], dtype=np.int64)
+        shown = self._shown(samples)
+        self.last = Margin(
+            low[shown:].min(0),
+            high[shown:].min(0),
+            self.violated + fails.sum(0),
+            np.logical_or.reduce(~fails & ~holds, axis=0),
+        )
+        settled = self._settled(samples) - self.next
+        if settled > 0:
+            self.violated = self.violated + fails[:settled].sum(0)
+            self.next += settled
+        return self.last
+
+    def _settled(self, samples: int) -> int:
+        """The first start whose value may still change."""
+        if self.ahead is None:
+            return 0
+        whole = max(samples - self.ahead, 0)
+        return whole if self.everywhere else min(whole, 1)
+
+    def _shown(self, samples: int) -> int:
+        """Where, among the starts that are not settled, the windows begin that hold the last sample."""
+        if not self.everywhere or self.ahead is None:
+            return 0
+        return max(samples - 1 - self.ahead - self.next, 0)
+
+
+class Margins:
+    """Samples of many traces that go on at the same time, in; margins of every requirement, out.
+
+    Memory is bounded by the windows of the requirements, but for those that look at the whole trace. To take
+    a sample in costs next to nothing; to look costs about as much for many traces as for one, and for all
+    samples since the last look as much as for one.
+
+    Args:
+        rules: compiled requirements.
+        horizon: what `T` means, in steps.
+    """
+
+    def __init__(self, rules: Sequence[Rule], horizon: int | None) -> None:
+        self._watched = [_Watched(rule, horizon, Whole(rule, horizon, "open")) for rule in rules]
+        self._names = sorted({name for rule in rules for name in columns(rule.formula)})
+        self._kept: dict[str, Floats] = {}
+        self._first = 0
+        self._found: dict[str, Margin] = {}
+        self._looked = 0
+        self.samples = 0
+
+    @property
+    def requirements(self) -> tuple[str, ...]:
+        """Names of the requirements, in order."""
+        return tuple(watched.rule.name for watched in self._watched)
+
+    def push(self, signals: Mapping[str, Floats]) -> None:
+        """Take one sample of every trace in: (traces,) by name."""
+        used = self.samples - self._first
+        if not self._kept:
+            names = self._names or list(signals)[:1]
+            self._kept = {name: np.empty((_ROOM, len(signals[name]))) for name in names}
+        room = len(next(iter(self._kept.values())))
+        if used == room:
+            used = self._make_room(used)
+        for name, column in self._kept.items():
+            column[used] = signals[name]
+        self.samples += 1
+
+    def look(self) -> dict[str, Margin]:
+        """Every requirement at the last sample; there has to be one."""
+        if self._looked != self.samples:
+            env = {name: column[: self.samples - self._first] for name, column in self._kept.items()}
+            look = (each.look(env, self._first, self.samples) for each in self._watched)
+            self._found, self._looked = dict(zip(self.requirements, look, strict=True)), self.samples
+        return self._found
+
+    def _make_room(self, used: int) -> int:
+        """Drop what nobody reads any more, and double the columns where that is little; what is left."""
+        dropped = min([each.needs() for each in self._watched], default=self.samples) - self._first
+        dropped = max(dropped, 0)
+        left = used - dropped
+        size = max(2 * left, _ROOM)
+        for name, column in self._kept.items():
+            moved = np.empty((size, column.shape[1]))
+            moved[:left] = column[dropped:used]
+            self._kept[name] = moved
+        self._first += dropped
+        return left
+
+
+def _traces(env: Mapping[str, Floats]) -> int:
+    return int(next(iter(env.values())).shape[1])

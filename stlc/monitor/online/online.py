@@ -1,0 +1,417 @@
+"""Samples one by one: verdicts as soon as they are decided, bounds before, in bounded memory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.pipeline import Compiled, Rule
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.monitor.explain.report import Cause
+from stlc.monitor.instants import At, check_length, starts_of
+from stlc.monitor.judgement import Status, unknown_requirement
+from stlc.monitor.needs import Need, needs_of
+from stlc.monitor.online.asked import Asked, Bounds
+from stlc.monitor.online.history import Kept
+from stlc.monitor.online.paced import Paced
+from stlc.monitor.online.recall import Recall, Worst
+from stlc.monitor.online.tally import Flags, Judged, Tally
+from stlc.monitor.online.trackers import Tracker, Trackers
+from stlc.monitor.signals import Gap, arrange, not_finite
+from stlc.trace import Trace
+
+Floats: TypeAlias = NDArray[np.float64]
+Sample: TypeAlias = Mapping[str, Any]
+"""Signal -> number; a vector is a list of them."""
+
+
+_BEYOND_FLOATS = 1 << 1023
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """A verdict that cannot change any more.
+
+    Attributes:
+        requirement: its name.
+        start: sample at which the requirement was judged.
+        time: of that sample in seconds; its number where no time step is known.
+        status: satisfied or violated.
+        low: least robustness over all continuations.
+        high: greatest robustness.
+        sample: the sample that decided it.
+    """
+
+    requirement: str
+    start: int
+    time: float
+    status: Status
+    low: float
+    high: float
+    sample: int
+
+
+@dataclass(frozen=True, slots=True)
+class How:
+    """How a stream of samples is judged.
+
+    Attributes:
+        at: "all" judges every requirement at every sample, a number at that one; None as each asks for.
+        end: where the stream is too short at its end: bounds, a refusal, or cut windows.
+        tolerance: a robustness of at least minus this is satisfied; 0 makes strictness count.
+        t0: time of the first sample in seconds.
+        reasons: keep the samples that `Online.cause` takes.
+    """
+
+    at: At = None
+    end: Literal["open", "strict", "truncate"] = "open"
+    tolerance: float = TOLERANCE
+    t0: float = 0.0
+    reasons: bool = False
+
+
+@final
+@dataclass(slots=True)
+class Watched:
+    """A requirement and what is known of it so far."""
+
+    rule: Rule
+    everywhere: bool
+    values: Tracker
+    truths: Tracker | None
+    tolerance: float
+    tally: Tally = field(default_factory=Tally)
+    decided: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+
+    def grow(self, kept: Kept) -> None:
+        """Take new samples in."""
+        if self.over or self.values.samples == kept.samples:
+            return
+        signals = kept.columns()
+        self.values.grow(signals, kept.first, kept.samples)
+        if self.truths is not None:
+            self.truths.grow(signals, kept.first, kept.samples)
+
+    def due(self, samples: int) -> bool:
+        """Whether it is worth the work to judge it after so many samples."""
+        return not self.over and (not isinstance(self.values, Paced) or self.values.due(samples))
+
+    @property
+    def over(self) -> bool:
+        """Whether it was judged once and for all."""
+        return not self.everywhere and self.tally.instants > 0
+
+    def judged(self, start: int, stop: int) -> Judged:
+        """Bounds and verdicts at instants while the trace goes on."""
+        truths = None if self.truths is None else self.truths.live(start, stop)
+        return self._judged(self.values.live(start, stop), truths)
+
+    def ended(self, starts: range) -> Judged:
+        """The same where the trace is over."""
+        truths = None if self.truths is None else self.truths.ended(starts)
+        return self._judged(self.values.ended(starts), truths)
+
+    def _judged(self, bounds: Bounds, truths: Bounds | None) -> Judged:
+        low, high = bounds
+        if truths is None:
+            return Judged(low, high, low >= -self.tolerance, high < -self.tolerance)
+        return Judged(low, high, truths.low > 0, truths.high < 0)
+
+    def drop(self) -> int:
+        """Forget what has been counted; the first sample that is still needed."""
+        trackers = [self.values] if self.truths is None else [self.values, self.truths]
+        return min(tracker.drop(min(self.tally.next, tracker.settled)) for tracker in trackers)
+
+
+class Online:
+    """A monitor for samples that come one after the other; see `Monitor.online`.
+
+    What is kept is bounded by the windows of the requirements, not by the length of the stream. A window to
+    the end of the trace costs nothing where it stands outermost or under other such windows; a requirement
+    that has one under a window with an end is judged on all samples, which are kept for it.
+    """
+
+    def __init__(self, compiled: Compiled, rules: Sequence[Rule], how: How | None = None) -> None:
+        self.how = how or How()
+        self.compiled = compiled
+        self._needs = needs_of(compiled, [*rules, *compiled.assumptions])
+        self.gaps: dict[str, Gap] = {}
+        """Where signals are not known."""
+        self._kept = Kept()
+        self._trackers = Trackers(compiled.grid.horizon)
+        self._watched = [self._watch(rule) for rule in rules]
+        self._scope = [self._watch(rule, once=True) for rule in compiled.assumptions]
+        self._recall = Recall(compiled, self.how.t0) if self.how.reasons else None
+
+    def _watch(self, rule: Rule, *, once: bool = False) -> Watched:
+        horizon = self.compiled.grid.horizon
+        begin = self.how.at if isinstance(self.how.at, int) and not once else 0
+        once = once or rule.absolute or isinstance(self.how.at, int)
+        everywhere = not once and (self.how.at == "all" or (rule.windowed and horizon is not None))
+        if everywhere and not rule.windowed and rule.uses_end:
+            message = f"`{rule.name}` runs to the end: at every start it would stay open until then"
+            raise UsageError(Diagnostic("U101", message, help=("judge it once, without `--at all`",)))
+        ending: Literal["open", "truncate"] = "truncate" if self.how.end == "truncate" else "open"
+        trackers = [
+            self._trackers.of(rule, Asked(ending, truth, begin), everywhere=everywhere)
+            for truth in ((False, True) if self.how.tolerance == 0 else (False,))
+        ]
+        truths = trackers[1] if trackers[1:] else None
+        tally = Tally(low_at=begin, high_at=begin, first=begin)
+        return Watched(rule, everywhere, trackers[0], truths, self.how.tolerance, tally)
+
+    # ------------------------------------------------------------------------ samples
+
+    def push(self, sample: Sample) -> tuple[Decision, ...]:
+        """Take one sample in; the verdicts that it decides, in the order of the requirements.
+
+        A value that is NaN is not known.
+
+        Raises:
+            TraceError: E601, a signal is missing; E604, one is infinite; E605, one is not a single number.
+        """
+        values = [_number(sample, need) for need in self._needs]
+        for need, value in zip(self._needs, values, strict=True):
+            if not math.isfinite(value):
+                self._unknown(need, np.array([value]))
+        rows = np.array(values).reshape(-1, 1, 1)
+        self._take({need.column.name: row for need, row in zip(self._needs, rows, strict=True)}, 1)
+        found: list[Decision] = []
+        for watched in self._watched:
+            if watched.due(self.samples):
+                watched.grow(self._kept)
+                self._decide(watched, found)
+        self._count_scope()
+        self._trim()
+        return tuple(found)
+
+    def feed(self, signals: Mapping[str, Any] | Trace) -> None:
+        """Take many samples in at once, arrays (time,) by name or a piece of a trace.
+
+        Verdicts are counted, not reported.
+
+        Raises:
+            TraceError: as `push`.
+        """
+        laid = arrange(signals, self._needs, plain=True)
+        columns = {name: np.asarray(values).reshape(laid.samples, 1) for name, values in laid.env.items()}
+        for need in self._needs:
+            values = columns[need.column.name][:, 0]
+            if not np.isfinite(values).all():
+                self._unknown(need, values)
+        self._take(columns, laid.samples)
+        for watched in self._watched:
+            if not watched.due(self.samples):
+                continue
+            watched.grow(self._kept)
+            self._count(watched, self._settled(watched))
+        self._count_scope()
+        self._trim()
+
+    def _unknown(self, need: Need, values: Floats) -> None:
+        """Note which of the next samples (samples,) of a signal are NaN. Raises TraceError (E604) for inf."""
+        if np.isinf(values).any():
+            first = int(np.argmax(np.isinf(values)))
+            moment = f"sample {self.samples + first}"
+            finding = not_finite(f"`{need.column.name}`", values[first], moment, need)
+            raise TraceError(finding)
+        gap = self.gaps.get(need.column.name, Gap())
+        self.gaps[need.column.name] = gap.with_more(np.isnan(values), self.samples)
+
+    def _take(self, columns: dict[str, Floats], count: int) -> None:
+        """Append columns (time, 1) and bring every requirement up to date."""
+        columns = columns or {"": np.zeros((count, 1))}
+        if self._recall is not None:
+            self._recall.take(columns, count)
+        self._kept.take(columns, count)
+        if self._recall is not None and self._recall.full:
+            for watched in self._watched:
+                if (worst := self._worst(watched)) is not None:
+                    self._recall.remember(watched.rule, worst)
+            self._recall.forget()
+
+    def _trim(self) -> None:
+        alive = [watched for watched in (*self._watched, *self._scope) if not watched.over]
+        self._kept.forget(min((watched.drop() for watched in alive), default=self.samples))
+
+    # ----------------------------------------------------------------------- verdicts
+
+    def _pending(self, watched: Watched) -> tuple[int, int]:
+        """The instants that are not counted yet."""
+        start, first, samples = watched.tally.next, watched.tally.first, watched.values.samples
+        return (start, samples if watched.everywhere else max(min(first + 1, samples), first))
+
+    def _decide(self, watched: Watched, found: list[Decision]) -> None:
+        """Add what the last sample has decided. What was decided once stays so."""
+        start, stop = self._pending(watched)
+        judged = watched.judged(start, stop)
+        known = judged.holds | judged.fails
+        if np.count_nonzero(known) > np.count_nonzero(watched.decided):
+            new = known.copy()
+            new[: len(watched.decided)] &= ~watched.decided
+            found += [self._decision(watched.rule, judged, start, i) for i in np.flatnonzero(new).tolist()]
+        count = self._count(watched, judged)
+        watched.decided = known[count:]
+
+    def _decision(self, rule: Rule, judged: Judged, start: int, i: int) -> Decision:
+        status: Status = "violated" if judged.fails[i] else "satisfied"
+        low, high = float(judged.low[i]), float(judged.high[i])
+        return Decision(rule.name, start + i, self.time(start + i), status, low, high, self.samples - 1)
+
+    def _settled(self, watched: Watched) -> Judged:
+        start, stop = self._pending(watched)
+        return watched.judged(start, min(stop, self._countable(watched)))
+
+    def _countable(self, watched: Watched) -> int:
+        """The first instant that is not to be counted yet: unsettled, or without a whole window."""
+        if not watched.everywhere:
+            return watched.values.settled
+        window = self.compiled.grid.horizon if watched.rule.windowed else watched.rule.reach
+        return min(watched.values.settled, max(watched.values.samples - (window or 0), 0))
+
+    def _count(self, watched: Watched, judged: Judged) -> int:
+        """Count what is settled of instants that are not counted yet: how many."""
+        count = min(max(self._countable(watched) - watched.tally.next, 0), len(judged.low))
+        watched.tally.add(judged, count)
+        return count
+
+    def _count_scope(self) -> None:
+        for watched in self._scope:
+            if watched.due(self.samples):
+                watched.grow(self._kept)
+                self._count(watched, self._settled(watched))
+
+    def time(self, sample: int) -> float:
+        """Time of a sample in seconds; its number where no time step is known."""
+        dt = self.compiled.grid.dt
+        return float(sample) if dt is None else self.how.t0 + sample * float(dt)
+
+    # ------------------------------------------------------------------------- answers
+
+    @property
+    def requirements(self) -> tuple[str, ...]:
+        """Names of the requirements, in order."""
+        return tuple(watched.rule.name for watched in self._watched)
+
+    def rule(self, name: str) -> Rule:
+        """A requirement. Raises UsageError (U101) for an unknown name."""
+        return self._find(name).rule
+
+    def repeats(self, name: str) -> bool:
+        """Whether a requirement is judged at every start, and not only at the first sample."""
+        return self._find(name).everywhere
+
+    @property
+    def kept(self) -> int:
+        """How many samples of the signals are kept."""
+        return self.samples - self._kept.first
+
+    @property
+    def samples(self) -> int:
+        """How many there were by now."""
+        return self._kept.samples
+
+    def open_starts(self, name: str) -> list[tuple[int, float, float]]:
+        """Sample, least and greatest robustness of every start that is not settled yet."""
+        watched = self._find(name)
+        if watched.over or not self.samples:
+            return []
+        watched.grow(self._kept)
+        start, stop = self._pending(watched)
+        bounds = watched.values.live(start, min(stop, self.samples))
+        return [(start + i, float(a), float(b)) for i, (a, b) in enumerate(zip(*bounds, strict=True))]
+
+    def standing(self, name: str) -> Tally:
+        """What is known of a requirement so far, its open starts included."""
+        return self._standing(self._find(name))
+
+    def _standing(self, watched: Watched) -> Tally:
+        if watched.over or not self.samples:
+            return watched.tally
+        watched.grow(self._kept)
+        start, stop = self._pending(watched)
+        return watched.tally.with_more(watched.judged(start, min(stop, self.samples)))
+
+    @property
+    def in_scope(self) -> bool | None:
+        """Whether the assumptions hold at the first sample: yes, no, or not known yet."""
+        if not self.samples:
+            return None if self._scope else True
+        found = {self._standing(watched).status for watched in self._scope}
+        if "violated" in found:
+            return False
+        return True if found <= {"satisfied"} else None
+
+    def finish(self) -> dict[str, Tally]:
+        """The trace is over: what `Monitor.check` says of it, requirement by requirement.
+
+        Raises:
+            TraceError: E306 where `end` is "strict" and it is too short; E605, there was no sample.
+        """
+        if not self.samples:
+            raise TraceError(Diagnostic("E605", "there are no samples"))
+        found: dict[str, Tally] = {}
+        refused: list[Diagnostic] = []
+        for watched in self._watched:
+            starts = self._starts(watched)
+            if self.how.end == "strict":
+                finding = check_length(watched.rule, self.samples, starts, self.compiled.grid)
+                refused += [] if finding is None else [finding]
+            found[watched.rule.name] = self._ended(watched, starts)
+        if refused:
+            raise TraceError(*refused)
+        return found
+
+    def _starts(self, watched: Watched) -> range:
+        return starts_of(watched.rule, self.samples, self.compiled.grid.horizon, self.how.at)
+
+    def _ended(self, watched: Watched, starts: range) -> Tally:
+        """A requirement where the trace is over."""
+        watched.grow(self._kept)
+        rest = range(min(watched.tally.next, starts.stop), starts.stop)
+        return watched.tally.with_more(watched.ended(rest)) if rest else watched.tally
+
+    def _worst(self, watched: Watched) -> Worst | None:
+        """Where a requirement would be violated most if the trace were over."""
+        if not self.samples or (isinstance(self.how.at, int) and self.how.at >= self.samples):
+            return None
+        tally = self._ended(watched, self._starts(watched))
+        return Worst(tally.high_at, tally.high) if tally.fails else None
+
+    def cause(self, name: str) -> Cause | None:
+        """Why a requirement is violated at its worst start so far, as `explain` says it of a recording.
+
+        The cause is remembered however long ago it was. None without `reasons`, where nothing is violated,
+        and where the samples that say why are gone: about two million numbers are kept.
+        """
+        watched = self._find(name)
+        worst = None if self._recall is None else self._worst(watched)
+        return None if self._recall is None or worst is None else self._recall.cause(watched.rule, worst)
+
+    def _find(self, name: str) -> Watched:
+        for watched in self._watched:
+            if watched.rule.name == name:
+                return watched
+        raise unknown_requirement(name, list(self.requirements))
+
+
+def _number(sample: Sample, need: Need) -> float:
+    """The value of a signal in a sample; `q[0]` is also a component of `q`."""
+    value = sample.get(need.column.name)
+    if isinstance(value, float):
+        return value
+    if isinstance(value, int):
+        return float(value) if abs(value) < _BEYOND_FLOATS else math.inf
+    names = (need.column.name, need.column.name.partition("[")[0])
+    given = {name: [sample[name]] for name in names if name in sample}
+    laid = arrange(given or {name: [0.0] for name in sample}, [need], plain=True)
+    if laid.samples != 1 or laid.shape:
+        message = f"`{need.column.name}` is one number of a sample, and several are given"
+        raise TraceError(Diagnostic("E605", message, need.span, note=(f"needed by: {', '.join(need.by)}",)))
+    return float(laid.env[need.column.name][0, 0])

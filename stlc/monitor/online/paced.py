@@ -1,0 +1,303 @@
+"""Requirements with wide windows in a stream: judged often enough, at a bounded cost a sample.
+
+What is not settled is worked out anew whenever it is judged. With narrow windows that is done after every
+sample; with wide ones after so many samples that the cost of one stays bounded. A window that is wider than
+the stream is long reads nothing beyond what came so far, so it is cut to a few times that, and lengthened
+while the stream goes on: memory follows what came, not what is written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeAlias, assert_never
+
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.horizon import nodes, parts, reach
+from stlc.compile.ir.samples import Reach, farthest
+from stlc.compile.pipeline import Rule
+from stlc.monitor.online.asked import Bounds, Floats
+from stlc.monitor.online.streams import endless
+
+WIDE = 1 << 13
+"""Rows of windows that are worked out after every sample."""
+
+MOST = 1 << 26
+"""Rows that may be worked out at once because every instant has windows of its own."""
+
+_LATE = 8
+"""A verdict comes later by at most this part of the samples that a requirement looks at."""
+
+_GROWN = 2
+"""By how much cut windows are lengthened at a time."""
+
+_SHORT = 1 << 9
+"""Samples for which windows are cut at first."""
+
+_NARROW = 1 << 12
+"""Samples that windows of one direction look at, at most, where those of the other are cut."""
+
+_FROZEN = 500
+"""Rows that take as long as one instant of a `freeze`, apart from what stands in it."""
+
+
+# ---------------------------------------------------------------------------- measures
+
+
+def span(formula: ir.Formula) -> Reach:
+    """How many samples before and after its instant the windows of a formula look where they have an end."""
+    inner = [span(part) for part in parts(formula)]
+    past, future = (
+        max((each.past for each in inner), default=0),
+        max((each.future for each in inner), default=0),
+    )
+    match formula:
+        case ir.Over(window=window) | ir.Until(window=window):
+            return Reach(past, future + _width(window))
+        case ir.Past(window=window) | ir.Since(window=window):
+            return Reach(past + _width(window), future)
+        case ir.Shift(steps=steps):
+            return Reach(past + max(-steps, 0), future + max(steps, 0))
+        case ir.Atom(num=num):
+            return farthest(num)
+        case ir.Freeze(bindings=bindings):
+            reads = [farthest(num) for _, num in bindings]
+            return Reach(past + max(r.past for r in reads), future + max(r.future for r in reads))
+    return Reach(past, future)
+
+
+def _width(window: ir.Window) -> int:
+    return window.lo if window.hi is None else window.hi
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """Rows that are worked out to judge a formula once.
+
+    Attributes:
+        rows: all of them.
+        own: those that instants have for themselves: of a `freeze`.
+        heaviest: the formula that asks for most of these.
+    """
+
+    rows: int = 0
+    own: int = 0
+    heaviest: ir.Formula | None = None
+
+    def and_(self, other: Work) -> Work:
+        """Both together."""
+        heaviest = self.heaviest if self.own >= other.own else other.heaviest
+        return Work(self.rows + other.rows, self.own + other.own, heaviest)
+
+
+def work(formula: ir.Formula, instants: int, samples: int = 0) -> Work:
+    """What it takes to judge a formula at so many instants.
+
+    Args:
+        formula: what is judged.
+        instants: how many.
+        samples: how many a window without an end looks at.
+    """
+    match formula:
+        case ir.Freeze(body=body):
+            looks = sum(span(body)) + (samples if _endless(body) else 0)
+            own = instants * (_FROZEN + looks + work(body, 1, samples).rows)
+            return Work(own, own, formula)
+        case ir.AtStart():
+            instants = 1
+        case ir.Over(window=window) | ir.Past(window=window):
+            instants += samples if window.hi is None else window.hi - window.lo
+        case ir.Until(window=window) | ir.Since(window=window):
+            instants += samples if window.hi is None else window.hi
+    windows = isinstance(formula, (ir.Over, ir.Past, ir.Until, ir.Since))
+    found = Work(instants if windows else 0)
+    for part in parts(formula):
+        found = found.and_(work(part, instants, samples))
+    return found
+
+
+def _endless(formula: ir.Formula) -> bool:
+    windows = (getattr(node, "window", None) for node in nodes(formula))
+    return any(window is not None and window.hi is None for window in windows)
+
+
+# ------------------------------------------------------------------------------ cutting
+
+
+def cut(formula: ir.Formula, samples: int) -> ir.Formula:
+    """A formula that is worth the same while a stream has no more than so many samples.
+
+    Nothing is known beyond the last sample, apart from what bounded windows of the past and shifts still see
+    of it; further on, all instants are alike. Where these are wide themselves, windows of the future stay as
+    they are; where those are wide, windows of the past do.
+    """
+    past, future = span(formula)
+    slack = sum(1 for _ in nodes(formula))
+    if past <= _NARROW:
+        return _cut(formula, (samples + past + slack, None))
+    if future <= _NARROW:
+        return _cut(formula, (None, samples + future + slack))
+    return formula
+
+
+_Most: TypeAlias = tuple[int | None, int | None]
+"""The longest window of the future, and of the past."""
+
+
+def _cut(formula: ir.Formula, most: _Most) -> ir.Formula:
+    ahead, back = most
+    match formula:
+        case ir.Truth() | ir.Atom() | ir.Freeze() | ir.AtStart():
+            return formula
+        case ir.Join(items=items):
+            return replace(formula, items=tuple(_cut(item, most) for item in items))
+        case ir.Over(window=window, body=body):
+            return replace(formula, window=_shorter(window, ahead), body=_cut(body, most))
+        case ir.Past(window=window, body=body):
+            return replace(formula, window=_shorter(window, back), body=_cut(body, most))
+        case ir.Until(window=window, left=left, right=right):
+            left, right = _cut(left, most), _cut(right, most)
+            return replace(formula, window=_shorter(window, ahead), left=left, right=right)
+        case ir.Since(window=window, left=left, right=right):
+            left, right = _cut(left, most), _cut(right, most)
+            return replace(formula, window=_shorter(window, back), left=left, right=right)
+        case ir.Shift(steps=steps, body=body):
+            if steps > 0 and ahead is not None:
+                steps = min(steps, ahead)
+            if steps < 0 and back is not None:
+                steps = max(steps, -back)
+            return replace(formula, steps=steps, body=_cut(body, most))
+    assert_never(formula)
+
+
+def _shorter(window: ir.Window, most: int | None) -> ir.Window:
+    if most is None:
+        return window
+    return ir.Window(min(window.lo, most), None if window.hi is None else min(window.hi, most))
+
+
+# ------------------------------------------------------------------------------- pacing
+
+
+class Inner(Protocol):
+    """The tracker that is paced; `stlc.monitor.online.trackers.Tracker` is the same."""
+
+    @property
+    def samples(self) -> int:
+        """How many it has taken in."""
+
+    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
+        """Take new samples in."""
+
+    @property
+    def settled(self) -> int:
+        """The first instant whose value may still change."""
+
+    def live(self, start: int, stop: int) -> Bounds:
+        """Bounds over all continuations."""
+
+    def ended(self, starts: range) -> Bounds:
+        """The same where the trace is over."""
+
+    def drop(self, start: int) -> int:
+        """Forget instants before `start`."""
+
+
+class Asking(Protocol):
+    """How a requirement is asked for; `Paced` says it of itself."""
+
+    everywhere: bool
+    all_kept: bool
+    window: int | None
+
+
+def effort(formula: ir.Formula, looks: int, asking: Asking) -> Work:
+    """What it takes to judge a requirement once that looks at so many samples."""
+    many = asking.everywhere or endless(formula) or any(map(_unbounded, nodes(formula)))
+    found = work(formula, looks if many else 1, looks if asking.all_kept else 0)
+    if asking.window is None:
+        return found
+    own = asking.window * (looks if asking.everywhere else 1)
+    return found.and_(Work(own, own, formula))
+
+
+def _unbounded(node: ir.Formula) -> bool:
+    return isinstance(node, (ir.Past, ir.Since)) and node.window.hi is None
+
+
+Make: TypeAlias = Callable[[Rule], Inner]
+
+
+@dataclass(slots=True)
+class Paced:
+    """A requirement that is judged now and then.
+
+    Attributes:
+        rule: the requirement.
+        make: its tracker, or that of the requirement with shorter windows.
+        everywhere: it is judged at every instant, and not only at the first one.
+        all_kept: all samples are kept for it, and all of them looked at.
+        window: how many samples after each instant its record ends, where that depends on the instant.
+        samples: how many it has taken in.
+    """
+
+    rule: Rule
+    make: Make
+    everywhere: bool
+    all_kept: bool
+    window: int | None = None
+    samples: int = 0
+    _inner: Inner | None = None
+    _most: int | None = 0
+    _pace: int = 1
+
+    def due(self, samples: int) -> bool:
+        """Whether it is worth the work to judge it again after so many samples."""
+        return samples - self.samples >= self._pace
+
+    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
+        """Take new samples in."""
+        if self._most is not None and samples > self._most:
+            self._lengthen(samples)
+        assert self._inner is not None
+        self._inner.grow(signals, first, samples)
+        self.samples = samples
+        self._pace = self._paced(samples)
+
+    def _lengthen(self, samples: int) -> None:
+        most = max(samples, _SHORT) * _GROWN
+        formula = cut(self.rule.formula, most)
+        if formula == self.rule.formula:
+            self._most, self._inner = None, self.make(self.rule)
+        else:
+            shorter = replace(self.rule, formula=formula, reach=reach(formula).future)
+            self._most, self._inner = most, self.make(shorter)
+
+    def _paced(self, samples: int) -> int:
+        whole = sum(span(self.rule.formula)) + (self.window or 0)
+        looks = samples if self.all_kept else min(self._most or samples, whole)
+        formula = self.rule.formula if self._most is None else cut(self.rule.formula, self._most)
+        rows = effort(formula, looks, self).rows
+        return max(min(rows // WIDE, min(samples, looks) // _LATE), 1)
+
+    @property
+    def settled(self) -> int:
+        """The first instant whose value may still change."""
+        assert self._inner is not None
+        return self._inner.settled
+
+    def live(self, start: int, stop: int) -> Bounds:
+        """Bounds over all continuations."""
+        assert self._inner is not None
+        return self._inner.live(start, stop)
+
+    def ended(self, starts: range) -> Bounds:
+        """The same where the trace is over."""
+        assert self._inner is not None
+        return self._inner.ended(starts)
+
+    def drop(self, start: int) -> int:
+        """Forget instants before `start`; all samples are needed while windows are cut."""
+        assert self._inner is not None
+        needed = self._inner.drop(start)
+        return needed if self._most is None else 0

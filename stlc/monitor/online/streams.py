@@ -1,0 +1,210 @@
+"""A formula cut into columns that can grow sample by sample.
+
+Predicates become columns of robustness values. A past operator without a bound becomes a column that is
+continued from its last value. What is left is a formula over columns whose windows all have an end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.horizon import columns as names_of_columns
+from stlc.compile.ir.horizon import nodes, numbers, reach
+from stlc.compile.ir.samples import leaves as readings
+from stlc.monitor.values import history
+
+Latch: TypeAlias = Literal["once", "historically", "since", "trigger"]
+
+
+class EndlessError(Exception):
+    """The formula cannot be judged in bounded memory: a past operator looks at what only the end decides."""
+
+
+@dataclass(frozen=True, slots=True)
+class Leaf:
+    """A column that follows from the signals: the robustness of a predicate.
+
+    Attributes:
+        name: of the column.
+        formula: a predicate, or what is frozen around one.
+        back: how many samples before its instant it reads.
+        ahead: how many after it.
+    """
+
+    name: str
+    formula: ir.Formula
+    back: int
+    ahead: int
+
+
+@dataclass(frozen=True, slots=True)
+class Latched:
+    """A column that continues from its last value: a past operator from the start of the trace on.
+
+    `once`: max(body, last). `since`: min(left, max(right, last)); the others are their duals.
+
+    Attributes:
+        name: of the column.
+        op: which operator.
+        parts: its operands, over other columns.
+        back: rows before an instant that the operands read.
+        ahead: rows after it.
+    """
+
+    name: str
+    op: Latch
+    parts: tuple[ir.Formula, ...]
+    back: int
+    ahead: int
+
+
+Stream: TypeAlias = Leaf | Latched
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A formula over columns, and the columns, each after those that it reads.
+
+    Attributes:
+        formula: over the columns.
+        streams: the columns.
+        lag: for how many samples the last rows of a column may still change.
+    """
+
+    formula: ir.Formula
+    streams: tuple[Stream, ...]
+    lag: int
+
+
+def _lag(streams: Sequence[Stream]) -> int:
+    lags: dict[str, int] = {}
+    for stream in streams:
+        before = max((lags[name] for name in read_by(stream)), default=0)
+        lags[stream.name] = stream.ahead + before
+    return max(lags.values(), default=0)
+
+
+def read_by(stream: Stream) -> frozenset[str]:
+    """Names of the columns that a stream reads."""
+    return (
+        frozenset() if isinstance(stream, Leaf) else frozenset().union(*map(names_of_columns, stream.parts))
+    )
+
+
+def endless(formula: ir.Formula) -> bool:
+    """Whether a window of the future has no end."""
+    return any(isinstance(node, (ir.Over, ir.Until)) and node.window.hi is None for node in nodes(formula))
+
+
+def column(name: str) -> ir.Atom:
+    """A column as a formula."""
+    return ir.Atom(ir.Col(name))
+
+
+# ------------------------------------------------------------------------- planning
+
+
+def plan(formula: ir.Formula) -> Plan:
+    """Cut a formula into columns.
+
+    Raises:
+        EndlessError: it has to be judged on the whole trace.
+    """
+    planner = _Planner()
+    over_columns = planner.over_columns(formula)
+    streams = tuple(planner.streams.values())
+    return Plan(over_columns, streams, _lag(streams))
+
+
+@dataclass(slots=True)
+class _Planner:
+    streams: dict[object, Stream] = field(default_factory=dict)
+
+    def over_columns(self, formula: ir.Formula) -> ir.Formula:
+        """The formula with columns for predicates and for unbounded past operators."""
+        match formula:
+            case ir.Truth():
+                return formula
+            case ir.Join(op, items):
+                return ir.Join(op, tuple(map(self.over_columns, items)))
+            case ir.Over(op, window, body):
+                return ir.Over(op, window, self.over_columns(body))
+            case ir.Until(op, window, left, right):
+                return ir.Until(op, window, self.over_columns(left), self.over_columns(right))
+            case ir.Shift(steps, body, outside, _, weak):
+                return ir.Shift(steps, self.over_columns(body), outside, weak=weak)
+            case ir.Past(op, window, body):
+                return self._past(op, window, self.over_columns(body))
+            case ir.Since(op, window, left, right):
+                return self._since(op, window, self.over_columns(left), self.over_columns(right))
+            case ir.Atom():
+                return self._leaf(formula)
+            case ir.AtStart():
+                raise EndlessError
+            case _:
+                return self._frozen(formula)
+
+    def _leaf(self, formula: ir.Formula) -> ir.Formula:
+        if formula not in self.streams:
+            ahead = reach(formula).future
+            ahead = (
+                max(ahead, looks_on(formula)) if isinstance(formula, ir.Atom) else ahead + looks_on(formula)
+            )
+            self.streams[formula] = Leaf(f"#{len(self.streams)}", formula, history(formula), ahead)
+        return column(self.streams[formula].name)
+
+    def _frozen(self, formula: ir.Formula) -> ir.Formula:
+        if endless(formula) or any(
+            unbounded_past(node) or isinstance(node, ir.AtStart) for node in nodes(formula)
+        ):
+            raise EndlessError
+        return self._leaf(formula)
+
+    def _latched(self, op: Latch, *parts: ir.Formula) -> ir.Formula:
+        if any(map(endless, parts)):
+            raise EndlessError
+        key = (op, parts)
+        if key not in self.streams:
+            back, ahead = max(map(history, parts)), max(reach(part).future for part in parts)
+            self.streams[key] = Latched(f"#{len(self.streams)}", op, parts, back, ahead)
+        return column(self.streams[key].name)
+
+    def _past(self, op: Literal["historically", "once"], window: ir.Window, body: ir.Formula) -> ir.Formula:
+        if window.hi is not None:
+            return ir.Past(op, window, body)
+        return _earlier(self._latched(op, body), window.lo, neutral=op == "historically")
+
+    def _since(
+        self, op: Literal["since", "trigger"], window: ir.Window, left: ir.Formula, right: ir.Formula
+    ) -> ir.Formula:
+        if window.hi is not None:
+            return ir.Since(op, window, left, right)
+        reached = _earlier(self._latched(op, left, right), window.lo, neutral=op == "trigger")
+        if not window.lo:
+            return reached
+        recent = ir.Window(0, window.lo - 1)
+        if op == "since":
+            return ir.Join("and", (ir.Past("historically", recent, left), reached))
+        return ir.Join("or", (ir.Past("once", recent, left), reached))
+
+
+def _earlier(formula: ir.Formula, steps: int, *, neutral: bool) -> ir.Formula:
+    return ir.Shift(-steps, formula, outside=neutral) if steps else formula
+
+
+def unbounded_past(node: ir.Formula) -> bool:
+    """Whether a node is a past operator that looks back to the start of the trace."""
+    return isinstance(node, (ir.Past, ir.Since)) and node.window.hi is None
+
+
+def looks_on(formula: ir.Formula) -> int:
+    """How far the predicates look ahead, at samples that some do without at the end of the trace."""
+    return max(0, *_offsets(formula))
+
+
+def _offsets(formula: ir.Formula) -> list[int]:
+    found = [leaf.steps for num in numbers(formula) for leaf in readings(num) if isinstance(leaf, ir.At)]
+    return [0, *found]

@@ -1,0 +1,281 @@
+"""Windows that run to the end of the trace, judged from its first sample on in bounded memory.
+
+What has been seen up to a frontier is a monotone function of what the endless operators will be worth from
+the frontier on: a lattice polynomial. It is known by its values where each of them is -inf or +inf, which are
+the formula on the samples seen, with each endless operator continued by that constant.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.horizon import reach
+from stlc.monitor.online.columns import NOTHING, Reader, Side
+from stlc.monitor.online.streams import EndlessError, Plan, column, endless
+from stlc.monitor.values import history
+
+Floats: TypeAlias = NDArray[np.float64]
+
+_MOST = 6
+"""More endless operators than this are not worth their 2^n coefficients."""
+
+_FOREVER = ir.Window(0, None)
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """A formula without endless windows, read some samples later than its instant."""
+
+    formula: ir.Formula
+    steps: int
+
+    @property
+    def reach(self) -> int:
+        """Samples after the instant that it reads."""
+        return self.steps + reach(self.formula).future
+
+
+@dataclass(slots=True)
+class Skeleton:
+    """The endless operators of a formula over columns `$0`, `$1`, …; each with `lo` 0.
+
+    What an operator is worth from the last row on is a column of its own, `!0`, `!1`, …: the rest.
+
+    Attributes:
+        root: the formula.
+        parts: column -> what it stands for.
+        origins: rest -> its operator, before the lower bound was taken off.
+        operators: rest -> its operator over columns, the rest among them.
+    """
+
+    root: ir.Formula
+    parts: dict[str, Moved] = field(default_factory=dict)
+    origins: dict[str, Moved] = field(default_factory=dict)
+    operators: dict[str, ir.Formula] = field(default_factory=dict)
+
+    @property
+    def reach(self) -> int:
+        """Samples after an instant that have to be known before it goes into a polynomial."""
+        return max((part.reach for part in (*self.parts.values(), *self.origins.values())), default=0)
+
+    def unsure(self, plan: Plan) -> int:
+        """After how many unknown samples one more makes no difference."""
+        streams = sum(stream.back + stream.ahead for stream in plan.streams)
+        return self.reach + self.back + streams + 1
+
+    @property
+    def back(self) -> int:
+        """Rows before an instant that the parts read."""
+        return max((history(part.formula) for part in self.parts.values()), default=0)
+
+
+def skeleton(formula: ir.Formula) -> Skeleton:
+    """Take a formula over columns apart.
+
+    Raises:
+        EndlessError: an endless operator stands under one with an end, or there are too many.
+    """
+    found = Skeleton(formula)
+    found.root = _taken(formula, 0, found)
+    if len(found.origins) > _MOST:
+        raise EndlessError
+    return found
+
+
+def _taken(formula: ir.Formula, steps: int, found: Skeleton) -> ir.Formula:
+    """The formula `steps` samples later, over columns."""
+    if not endless(formula):
+        return _part(formula, steps, found)
+    match formula:
+        case ir.Join(op, items):
+            return ir.Join(op, tuple(_taken(item, steps, found) for item in items))
+        case ir.Shift(later, body, None) if later >= 0:
+            return _taken(body, steps + later, found)
+        case ir.Over(op, ir.Window(lo, None), body):
+            seen = ir.Over(op, _FOREVER, _taken(body, steps + lo, found))
+            rest = _rest(Moved(formula, steps), found)
+            found.operators[rest] = ir.Join("and" if op == "always" else "or", (seen, column(rest)))
+            return found.operators[rest]
+        case ir.Until(op, ir.Window(lo, None), left, right):
+            met = _met(ir.Until(op, _FOREVER, left, right), steps + lo, found)
+            if not lo:
+                return met
+            return _held(op == "until", ir.Window(0, lo - 1), (left, steps, found), met)
+        case _:
+            raise EndlessError
+
+
+def _rest(origin: Moved, found: Skeleton) -> str:
+    """The column of what an operator is worth from the last row on.
+
+    Operators that read the same columns may still end in different ways: `next` of an operator is not the
+    operator of `next` where the trace is over.
+    """
+    for name, known in found.origins.items():
+        if known == origin:
+            return name
+    name = f"!{len(found.origins)}"
+    found.origins[name] = origin
+    return name
+
+
+def _met(node: ir.Until, steps: int, found: Skeleton) -> ir.Formula:
+    """`until` or `release` without a lower bound: met among the rows, or held through them and met later."""
+    left, right = _taken(node.left, steps, found), _taken(node.right, steps, found)
+    name = _rest(Moved(node, steps), found)
+    seen, rest = ir.Until(node.op, _FOREVER, left, right), column(name)
+    if node.op == "until":
+        held = ir.Join("and", (ir.Over("always", _FOREVER, left), rest))
+        found.operators[name] = ir.Join("or", (seen, held))
+    else:
+        freed = ir.Join("or", (ir.Over("eventually", _FOREVER, left), rest))
+        found.operators[name] = ir.Join("and", (seen, freed))
+    return found.operators[name]
+
+
+def _held(
+    every: bool, window: ir.Window, left: tuple[ir.Formula, int, Skeleton], then: ir.Formula
+) -> ir.Formula:
+    """What `until` asks of its left side before its window starts; of `release` the dual."""
+    formula, steps, found = left
+    if endless(formula):
+        raise EndlessError
+    before = ir.Over("always" if every else "eventually", window, formula)
+    return ir.Join("and" if every else "or", (_part(before, steps, found), then))
+
+
+def _part(formula: ir.Formula, steps: int, found: Skeleton) -> ir.Formula:
+    if isinstance(formula, ir.Truth):
+        return formula
+    moved = Moved(formula, steps)
+    for name, known in found.parts.items():
+        if known == moved:
+            return column(name)
+    name = f"${len(found.parts)}"
+    found.parts[name] = moved
+    return column(name)
+
+
+def _neutral(origin: Moved) -> float:
+    """What the rest of an operator is worth where all rows are there: nothing more is met, nothing fails."""
+    assert isinstance(origin.formula, (ir.Over, ir.Until))
+    return math.inf if origin.formula.op in ("always", "release") else -math.inf
+
+
+@dataclass(slots=True)
+class Frontier:
+    """The value of a formula at its first sample, at one end of what is possible.
+
+    Attributes:
+        bones: the formula.
+        side: the columns.
+        begin: the sample at which the formula is judged.
+        at: number of the first sample that is not yet in the polynomial.
+        coefficients: (subsets of the operators, traces): the value where those operators are worth +inf from
+            there on and the others -inf; None at first.
+    """
+
+    bones: Skeleton
+    side: Side
+    begin: int = 0
+    at: int = 0
+    coefficients: Floats | None = None
+    _parts: dict[int, tuple[list[str], Reader]] = field(default_factory=dict, init=False)
+    _root: Reader = field(init=False)
+    _operators: Reader = field(init=False)
+    _chosen: NDArray[np.bool_] = field(init=False)
+    _unsure: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        for steps in dict.fromkeys(part.steps for part in self.bones.parts.values()):
+            alike = {name: part.formula for name, part in self.bones.parts.items() if part.steps == steps}
+            self._parts[steps] = (list(alike), Reader(list(alike.values()), self.side.end))
+        self._root = Reader([self.bones.root], "truncate")
+        self._operators = Reader(list(self.bones.operators.values()), "truncate")
+        operators = len(self.bones.operators)
+        self._chosen = np.arange(1 << operators)[:, None] >> np.arange(operators) & 1 == 1
+        self._unsure = self.bones.unsure(self.side.plan)
+
+    def advance(self, settled: int) -> None:
+        """Put the samples before `settled` into the polynomial."""
+        count = settled - self.at
+        if count <= 0:
+            return
+        subsets = len(self._chosen)
+        env = {name: np.tile(values, subsets) for name, values in self._columns(count).items()}
+        like = env[NOTHING]
+        for name, chosen in zip(self.bones.operators, self._chosen.T, strict=True):
+            ends = np.repeat(np.where(chosen, math.inf, -math.inf), like.shape[1] // subsets)
+            env[name] = np.broadcast_to(ends, like.shape)
+        found = self._first(env).reshape(-1, subsets, like.shape[1] // subsets)
+        self.coefficients = found[0] if self.coefficients is None else self._at(found)
+        self.at = settled
+
+    def value(self, samples: int) -> Floats:
+        """The value while the trace goes on: as many unknown samples follow as the formula can tell apart."""
+        env = self._columns(samples - self.at + self._unsure)
+        for name, origin in self.bones.origins.items():
+            env[name] = np.full(env[NOTHING].shape, _neutral(origin))
+        found = self._first(env)
+        return found if self.coefficients is None else self._at(found[:, None])
+
+    def ended(self, formula: ir.Formula, samples: int) -> Floats:
+        """The value where the last sample is the end of the trace."""
+        if self.coefficients is None:
+            return self._plain(formula, self.begin, samples)
+        origins = self.bones.origins.values()
+        rests = [self._plain(origin.formula, self.at + origin.steps, samples) for origin in origins]
+        return self._at(np.stack(rests))
+
+    def _first(self, env: Mapping[str, Floats]) -> Floats:
+        """The formula, or once there is a polynomial the operators, at the frontier: one row each."""
+        reader = self._root if self.coefficients is None else self._operators
+        return np.concatenate(reader(env, 0, 1))
+
+    def _plain(self, formula: ir.Formula, at: int, samples: int) -> Floats:
+        """A formula over columns at one sample, endless windows up to the last sample."""
+        parts: dict[str, Moved] = {}
+        plain = _outlined(formula, parts)
+        first = min(self.at, at)
+        reader = Reader([part.formula for part in parts.values()], self.side.end)
+        found = self.side.values(reader, first, samples - first) if parts else []
+        env = dict(zip(parts, found, strict=True))
+        env[NOTHING] = np.zeros((samples - first, self.side.rows[NOTHING].shape[1]))
+        return Reader([plain], self.side.end)(env, at - first, 1)[0]
+
+    def _columns(self, count: int) -> dict[str, Floats]:
+        """The parts at the next `count` samples."""
+        env = {NOTHING: np.zeros((count, self.side.rows[NOTHING].shape[1]))}
+        for steps, (names, reader) in self._parts.items():
+            env |= zip(names, self.side.values(reader, self.at + steps, count), strict=True)
+        return env
+
+    def _at(self, rests: Floats) -> Floats:
+        """The polynomial where the operators are worth `rests` (operators, points, traces): a row a point."""
+        assert self.coefficients is not None
+        worth = np.where(self._chosen[:, :, None, None], rests, math.inf).min(axis=1, initial=math.inf)
+        return np.asarray(np.minimum(worth, self.coefficients[:, None]).max(axis=0))
+
+
+def _outlined(formula: ir.Formula, parts: dict[str, Moved]) -> ir.Formula:
+    """The formula with columns for all that has no endless window."""
+    if not endless(formula):
+        return _part(formula, 0, Skeleton(formula, parts))
+    match formula:
+        case ir.Join(op, items):
+            return ir.Join(op, tuple(_outlined(item, parts) for item in items))
+        case ir.Shift(body=body):
+            return replace(formula, body=_outlined(body, parts))
+        case ir.Over(op, window, body):
+            return ir.Over(op, window, _outlined(body, parts))
+        case ir.Until(op, window, left, right):
+            return ir.Until(op, window, _outlined(left, parts), _outlined(right, parts))
+        case _:
+            raise EndlessError

@@ -1,0 +1,148 @@
+"""Words in a trace -> numbers: members of an enum and truth values, as the specification declares them.
+
+What is no number of any kind, words and complex numbers, is set aside, and refused where a signal needs it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.diagnostics import Diagnostic, TraceError
+from stlc.registry import closest
+from stlc.trace.recording import Recording, Strand
+
+Words = Mapping[str, float]
+
+TRUTH: Words = {
+    **dict.fromkeys(("true", "yes", "on"), 1.0),
+    **dict.fromkeys(("false", "no", "off"), 0.0),
+}
+"""What a column of a truth value may say, in any case of letters."""
+
+
+def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
+    """The recording without words.
+
+    Args:
+        recording: whose arrays may be text.
+        words: name in the file -> what its words are worth; empty for a signal that has numbers. A signal
+            that is not among them is of no interest: where it holds words it is set aside.
+
+    Raises:
+        TraceError: E603, words or complex numbers where numbers are needed, or a word that the signal does
+            not have.
+    """
+    strands = tuple(
+        replace(
+            strand,
+            arrays={
+                name: _numbers(recording.name, name, values, words[name]) if _is_odd(values) else values
+                for name, values in strand.arrays.items()
+                if name in words or not _is_odd(values)
+            },
+            clock=_seconds(recording.name, strand) if _is_odd(strand.clock) else strand.clock,
+        )
+        for strand in recording.strands
+    )
+    aside = {
+        name: values
+        for strand in recording.strands
+        for name, values in strand.arrays.items()
+        if name not in words and _is_odd(values)
+    }
+    return replace(recording, strands=strands, extras={**recording.extras, **aside})
+
+
+def wordless(recording: Recording) -> Recording:
+    """The recording, its words set aside. Raises TraceError (E603) where all signals are words."""
+    signals = [values for strand in recording.strands for values in strand.arrays.values()]
+    none_left = all(map(_is_odd, signals))
+    return in_numbers(recording, {name: {} for name in recording.signals} if none_left else {})
+
+
+def _is_odd(values: NDArray[Any] | None) -> bool:
+    """Whether an array holds words, or complex numbers."""
+    return values is not None and values.dtype.kind in "Uc"
+
+
+def _refuse_complex(trace: str, name: str, values: NDArray[Any]) -> None:
+    if values.dtype.kind == "c":
+        advice = (f"save the parts that are meant, e.g.  re = real({name});  im = imag({name});",)
+        raise TraceError(Diagnostic("E603", f"`{name}` in `{trace}` holds complex numbers", help=advice))
+
+
+def instants_of(trace: str, strand: Strand) -> NDArray[np.datetime64]:
+    """The dates and times (ISO 8601) of a clock. Raises TraceError (E603) for other words."""
+    assert strand.clock is not None
+    _refuse_complex(trace, strand.named, strand.clock)
+    written = np.char.rstrip(strand.clock, "Zz")
+    try:
+        return np.asarray(written.astype("datetime64[ns]"))
+    except ValueError:
+        shown = str(strand.clock.flat[0])[:40]
+        message = f"the clock `{strand.named}` in `{trace}` holds words (`{shown}`)"
+        advice = ("seconds, or dates and times such as 2026-01-31T12:00:00.5",)
+        raise TraceError(Diagnostic("E603", message, help=advice)) from None
+
+
+def instant_of_word(word: str) -> np.datetime64 | None:
+    """A date and time (ISO 8601); None for another word."""
+    try:
+        return np.datetime64(word.rstrip("Zz"), "ns")
+    except ValueError:
+        return None
+
+
+def number_of_word(trace: str, name: str, word: str, words: Words) -> float:
+    """What a word of a signal is worth. Raises TraceError (E603) for one that it does not have."""
+    worth = _worth(word, words)
+    if worth is None:
+        raise TraceError(_unknown(trace, name, word, words))
+    return worth
+
+
+def _seconds(trace: str, strand: Strand) -> NDArray[np.float64]:
+    """Dates and times as seconds since the first."""
+    instants = instants_of(trace, strand)
+    first = instants.flat[0] if instants.size else np.datetime64(0, "ns")
+    return np.asarray((instants - first) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)
+
+
+def _numbers(trace: str, name: str, values: NDArray[Any], words: Words) -> NDArray[np.float64]:
+    _refuse_complex(trace, name, values)
+    found, places = np.unique(values, return_inverse=True)
+    worth = [_worth(str(word), words) for word in found]
+    if None in worth:
+        odd = str(found[worth.index(None)])
+        raise TraceError(_unknown(trace, name, odd, words))
+    return np.asarray(worth, dtype=np.float64)[places].reshape(values.shape)
+
+
+def _worth(word: str, words: Words) -> float | None:
+    """A member as it is written, or the only one that differs in the case of letters; NaN for no word."""
+    if word in words:
+        return words[word]
+    if not word and words:
+        return math.nan
+    alike = {value for name, value in words.items() if name.lower() == word.lower()}
+    return alike.pop() if len(alike) == 1 else None
+
+
+def _unknown(trace: str, name: str, word: str, words: Words) -> Diagnostic:
+    shown = word if len(word) <= 40 else f"{word[:40]}…"
+    if not words:
+        advice: tuple[str, ...] = (
+            "truth values are written as true and false, or as 1 and 0",
+            f"words need an enum in the specification: enum Kind {{ … }}  and  signal {name} : Kind",
+        )
+        return Diagnostic("E603", f"`{name}` in `{trace}` holds words (`{shown}`), not numbers", help=advice)
+    note = (f"it is one of {', '.join(words)}, or a number",)
+    near = closest(word, words)
+    advice = (f"did you mean `{near}`?",) if near else ()
+    return Diagnostic("E603", f"`{name}` in `{trace}` cannot be `{shown}`", help=advice, note=note)

@@ -1,0 +1,276 @@
+"""Bags of ROS 1 (`.bag`) and ROS 2 (folders, `.db3`), read without a ROS installation.
+
+A bag of ROS 1 is a file of records, some of them in packed chunks (http://wiki.ros.org/Bags/Format/2.0). One
+of ROS 2 is a folder with a database of SQLite, or with `.mcap` files. Bags of ROS 2 before Iron do not say
+what their messages look like: the definitions of the usual ones are those of `rosbags` (extra `bag`).
+"""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+import struct
+import tempfile
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cache
+from mmap import mmap
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.files import is_stored
+from stlc.trace.formats.extras import needed
+from stlc.trace.formats.messages import MAX_BYTES, DamageError, Decode, Log, Room, mapped
+from stlc.trace.formats.npz import unreadable
+from stlc.trace.formats.parquet import damage
+from stlc.trace.formats.ros import decoder
+from stlc.trace.recording import Recording
+
+_MAGIC = b"#ROSBAG V2.0\n"
+_MESSAGE, _HEADER, _CHUNK, _CONNECTION = 2, 3, 5, 7
+_PACKED = ".zstd"
+_ALLOWED = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ)
+"""What a query may do: no function, no pragma, no recursion that a database brings with it."""
+_LONGEST = 256_000_000
+"""Bytes of a message."""
+
+
+# --------------------------------------------------------------------------------- ROS 1
+
+
+@dataclass(frozen=True, slots=True)
+class _Connection:
+    """A topic, and what reads its messages; None where nothing does."""
+
+    topic: str
+    decode: Decode | None
+
+
+def read_bag(path: Path) -> Recording:
+    """The numbers in all messages of a bag of ROS 1.
+
+    Raises:
+        UsageError: U102, the file does not exist or cannot be opened.
+        MissingError: R301, chunks are packed with `lz4`, which is not installed.
+        TraceError: E603, another format, damaged, or without numbers.
+    """
+    log = Log(path)
+    with mapped(path) as data, damage(path):
+        if data[: len(_MAGIC)] != _MAGIC:
+            raise DamageError("it does not begin like a bag of version 2.0")
+        connections: dict[int, _Connection] = {}
+        room = Room(path, len(data))
+        for kind, fields, content in _records(data, len(_MAGIC)):
+            if kind == _CHUNK:
+                how, size = fields[b"compression"].decode(), _word(fields[b"size"])
+                inner = room.unpacked(how, content, size)
+                for record in _records(inner, 0):
+                    _take(log, connections, *record)
+            else:
+                _take(log, connections, kind, fields, content)
+        return log.recording()
+
+
+Bytes: TypeAlias = bytes | mmap
+
+
+def _records(data: Bytes, at: int) -> Iterator[tuple[int, dict[bytes, bytes], bytes]]:
+    """Every record: what it is, the fields of its head, and its data."""
+    while at < len(data):
+        head, at = _sized(data, at)
+        content, at = _sized(data, at)
+        fields = dict(_fields(head))
+        yield fields[b"op"][0], fields, content
+
+
+def _sized(data: Bytes, at: int) -> tuple[bytes, int]:
+    (size,) = struct.unpack_from("<I", data, at)
+    if at + 4 + size > len(data):
+        raise DamageError(f"{size} bytes are declared, {len(data) - at - 4} follow")
+    return data[at + 4 : at + 4 + size], at + 4 + size
+
+
+def _fields(head: bytes) -> Iterator[tuple[bytes, bytes]]:
+    at = 0
+    while at < len(head):
+        pair, at = _sized(head, at)
+        name, _, value = pair.partition(b"=")
+        yield name, value
+
+
+def _word(field: bytes) -> int:
+    value: int = struct.unpack("<I", field)[0]
+    return value
+
+
+def _take(
+    log: Log,
+    connections: dict[int, _Connection],
+    kind: int,
+    fields: dict[bytes, bytes],
+    content: bytes,
+) -> None:
+    """A record that stands in a chunk or outside of one."""
+    if kind == _CONNECTION:
+        number = _word(fields[b"conn"])
+        if number not in connections:
+            connections[number] = _connection(log, fields[b"topic"].decode(), content)
+    elif kind == _MESSAGE:
+        connection = connections.get(_word(fields[b"conn"]))
+        if connection is None:
+            raise DamageError("a message of an unknown connection")
+        if connection.decode is not None:
+            seconds, rest = struct.unpack("<II", fields[b"time"])
+            log.add(connection.topic, seconds * 10**9 + rest, connection.decode(content))
+
+
+def _connection(log: Log, topic: str, content: bytes) -> _Connection:
+    facts = dict(_fields(content))
+    text = facts[b"message_definition"].decode("utf-8", "replace")
+    try:
+        return _Connection(topic, decoder(text, "ros1"))
+    except DamageError as error:
+        log.unread[topic] = str(error)
+        return _Connection(topic, None)
+
+
+# --------------------------------------------------------------------------------- ROS 2
+
+
+def read_bag2(path: Path) -> Recording:
+    """The numbers in all messages of a bag of ROS 2: its folder, or one `.db3` of it.
+
+    Raises:
+        UsageError: U102, there is no such file, or no bag in the folder.
+        MissingError: R301, a package is not installed.
+        TraceError: E603, another format, damaged, or without numbers.
+    """
+    log = Log(path)
+    if path.is_dir():
+        stored = sorted((each for each in path.iterdir() if is_stored(each)), key=_order)
+        if not stored:
+            help_ = ("the folder of a bag holds .db3 or .mcap files",)
+            raise UsageError(Diagnostic("U102", f"cannot read `{path}`: is a directory", help=help_))
+    else:
+        stored = [path]
+    for each in stored:
+        with damage(path):
+            _add_stored(log, each)
+    return log.recording()
+
+
+def _order(path: Path) -> tuple[object, ...]:
+    """Files in the order of the numbers in their names."""
+    return tuple(
+        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d{1,18})", path.name)
+    )
+
+
+def _add_stored(log: Log, path: Path) -> None:
+    """The messages of one file, unpacked beside where it is packed as a whole."""
+    if path.name.lower().endswith(_PACKED):
+        with mapped(path) as data:
+            content = Room(path, len(data)).of_unknown_size(data[:])
+        with tempfile.TemporaryDirectory(prefix="stlc-bag-") as folder:
+            inner = Path(folder) / f"bag{Path(path.stem).suffix.lower()}"
+            inner.write_bytes(content)
+            del content
+            _add_stored(log, inner)
+    elif path.suffix.lower() == ".mcap":
+        from stlc.trace.formats.mcap import add_mcap
+
+        add_mcap(log, path)
+    else:
+        _add_database(log, path)
+
+
+def _add_database(log: Log, path: Path) -> None:
+    with mapped(path) as data:
+        room = Room(path, len(data))
+        if data[:16] != b"SQLite format 3\0":
+            raise DamageError("it is not a database of SQLite")
+    with closing(_opened(path)) as database:
+        topics = _topics(log, database)
+        query = "SELECT topic_id, timestamp, data FROM messages"
+        for number, time, content in database.execute(query):
+            decode = topics.get(number)
+            if decode is None:
+                continue
+            if not isinstance(time, int) or not isinstance(content, bytes):
+                raise DamageError("a message without a time, or without content")
+            room.left -= len(content) + 16
+            if room.left < 0:
+                raise unreadable(path, "its messages are larger than its file")
+            log.add(decode.topic, time, decode.read(room.whole(content)))
+
+
+def _opened(path: Path) -> sqlite3.Connection:
+    """A database that nothing can be written to, and that brings nothing along that runs."""
+    where = path.resolve().as_uri()
+    database = sqlite3.connect(f"{where}?mode=ro&immutable=1", uri=True)
+    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(_LONGEST, MAX_BYTES))
+    tables = dict(database.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
+    for name in ("topics", "messages"):
+        if not re.match(r"CREATE TABLE\b", str(tables.get(name)), re.IGNORECASE):
+            database.close()
+            raise DamageError(f"the database has no table `{name}`")
+
+    def allow(action: int, *_: object) -> int:
+        return sqlite3.SQLITE_OK if action in _ALLOWED else sqlite3.SQLITE_DENY
+
+    database.set_authorizer(allow)
+    return database
+
+
+@dataclass(frozen=True, slots=True)
+class _Read:
+    """A topic of a database, and what reads its messages."""
+
+    topic: str
+    read: Decode
+
+
+def _topics(log: Log, database: sqlite3.Connection) -> dict[int, _Read]:
+    """What reads the messages of each topic, by its number."""
+    texts = _definitions(database)
+    topics: dict[int, _Read] = {}
+    for number, topic, kind, form in database.execute(
+        "SELECT id, name, type, serialization_format FROM topics"
+    ):
+        if form != "cdr":
+            log.unread[str(topic)] = f"its messages are written as `{str(form)[:40]}`"
+            continue
+        try:
+            text = texts.get(kind) or _usual(str(kind))
+            topics[number] = _Read(str(topic), decoder(text, "cdr"))
+        except DamageError as error:
+            log.unread[str(topic)] = str(error)
+    return topics
+
+
+def _definitions(database: sqlite3.Connection) -> dict[str, str]:
+    """Definitions by the name of a message, where the database has them."""
+    query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+    try:
+        rows = database.execute(query).fetchall()
+    except sqlite3.OperationalError:  # before Iron
+        return {}
+    return {str(kind): str(text) for kind, encoding, text in rows if encoding == "ros2msg"}
+
+
+def _usual(kind: str) -> str:
+    """The definition of a message that comes with ROS 2. Raises DamageError where there is none."""
+    store = _usual_ones()
+    try:
+        text, _ = store.generate_msgdef(kind, ros_version=2)
+    except Exception:  # whatever the library says of a name that it does not know
+        raise DamageError(f"`{kind[:60]}` is defined neither in the bag nor by ROS itself") from None
+    return str(text)
+
+
+@cache
+def _usual_ones() -> Any:
+    types = needed("rosbags.typesys")
+    return types.get_typestore(types.Stores.LATEST)

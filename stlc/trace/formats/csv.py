@@ -1,0 +1,345 @@
+"""Named columns in a `.csv` file, in and out; every cell is a number, a word, empty or a diagnostic.
+
+The first line names the columns, units in brackets if one likes: `t, x [m], v (km/h)`. A column `trace` or
+`agent` says to which of several traces a line belongs. A column whose first
+cell is a word holds words; in the others an empty cell is NaN, which the monitor refuses where it is needed.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.escape import from_spreadsheet, spreadsheet
+from stlc.files import write_atomic
+from stlc.source import Source, Span
+from stlc.trace.formats.cells import NUMBER, STRETCH, Lines, bare, load, read_lines, value_of
+from stlc.trace.formats.npz import unreadable
+from stlc.trace.formats.table import Table, is_unit
+
+Array = NDArray[Any]
+
+MAX_BYTES = 1_000_000_000
+LARGE = 4_000_000
+"""Bytes of a file from which on its numbers are read from its bytes, without a text beside them."""
+
+_HEAD_BYTES = 1 << 16
+_END = re.compile(rb"\r\n|\r|\n")
+_HEAD = re.compile(r"(?P<name>[^\[\]]*[^\[\]\s](?:\[\d+\])?)\s*(?:\[(?P<unit>[^\]]*)\])?")
+_ROUND = re.compile(r"(?P<name>.*[^\s(])\s*\((?P<unit>[^()]+)\)")
+_FILLED = re.compile(r"[^\n]*\S[^\n]*")
+_COMMA = re.compile(r"(?<!\d),|,(?!\d)")
+"""A comma that is not within a number."""
+_MAX_FINDINGS = 20
+_QUOTED = re.compile(r'"(?:[^"]|"")*"')
+
+
+@dataclass(frozen=True, slots=True)
+class _Sheet:
+    """The text of a file, cut into its header and the lines below."""
+
+    source: Source
+    delimiter: str
+    header: str
+    header_at: int
+    body_at: int
+
+
+def read_csv(path: Path) -> Table:
+    """The columns of a `.csv` file (comma, semicolon or tab; UTF-8); those of words are texts.
+
+    Between semicolons or tabs numbers may have decimal commas.
+
+    Raises:
+        UsageError: U102, the file does not exist or cannot be opened.
+        TraceError: E603, not text, or a cell that is no number; E605, a header or line that does not fit.
+    """
+    return table_of_text(path, _read(path))
+
+
+def table_of_text(path: Path, data: bytes) -> Table:
+    """The columns of a text; `path` is for messages. Raises TraceError as `read_csv`."""
+    if len(data) >= LARGE and (table := _read_large(path, data)) is not None:
+        return table
+    sheet = _sheet(path, data)
+    names, units = _read_header(sheet)
+    texts = _text_columns(sheet, len(names))
+    return Table(dict(zip(names, _read_body(sheet, len(names), texts), strict=True)), units)
+
+
+def _read(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        reason = (error.strerror or type(error).__name__).lower()
+        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: {reason}")) from None
+    if len(data) > MAX_BYTES:
+        raise unreadable(path, f"it is larger than {MAX_BYTES / 1e9:.0f} GB", advice="save it as `.npz`")
+    return data
+
+
+def _read_large(path: Path, data: bytes) -> Table | None:
+    """The same where the first lines are those of a table of numbers; None if anything is unusual."""
+    try:
+        sheet = _sheet(path, data[: data.rfind(b"\n", 0, _HEAD_BYTES) + 1])
+        names, units = _read_header(sheet)
+    except TraceError:
+        return None
+    if _text_columns(sheet, len(names)):
+        return None
+    start = 0
+    for _ in range(sheet.source.text.count("\n", 0, sheet.body_at)):
+        end = _END.search(data, start)
+        start = len(data) if end is None else end.end()
+    columns = read_lines(Lines(data, start, len(names), sheet.delimiter))
+    return None if columns is None else Table(dict(zip(names, columns, strict=True)), units)
+
+
+def _sheet(path: Path, data: bytes) -> _Sheet:
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise unreadable(path, f"it is not UTF-8 (byte {error.start})") from None
+    if "\0" in text:
+        raise unreadable(path, "it is a binary file, not a table")
+    body = text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+    stripped = body.lstrip()
+    if not stripped:
+        raise unreadable(path, "it is empty")
+    start = len(body) - len(stripped)
+    end = body.find("\n", start)
+    end = len(body) if end < 0 else end
+    header = body[start:end]
+    delimiter = delimiter_of(header)
+    if delimiter != "," and "," in body[end:] and not _COMMA.search(body, end):
+        body = body[:end] + body[end:].replace(",", ".")  # decimal commas, as many spreadsheets write them
+    return _Sheet(Source(str(path), body), delimiter, header, start, min(end + 1, len(body)))
+
+
+def _read_header(sheet: _Sheet) -> tuple[list[str], dict[str, str]]:
+    findings: list[Diagnostic] = []
+    units: dict[str, str] = {}
+    names: list[str] = []
+    for text, span in _head_cells(sheet):
+        bare = text.removeprefix("#").strip() if not names else text  # how np.savetxt begins a header
+        name, unit = split_head(bare)
+        if not _HEAD.fullmatch(bare):
+            shown = f"`{text}` is not the name of a column" if text else "a column without a name"
+            findings.append(Diagnostic("E605", shown, span, label="expected a signal's name"))
+        elif name in units:
+            findings.append(Diagnostic("E605", f"two columns are called `{name}`", span))
+        elif NUMBER.fullmatch(name):
+            message, advice = "the first line must name the columns", ("e.g. `t,x,v`",)
+            findings.append(Diagnostic("E605", message, span, help=advice))
+        names.append(name)
+        units[name] = unit
+    if findings:
+        raise TraceError(*findings[:_MAX_FINDINGS])
+    return names, units
+
+
+def delimiter_of(header: str) -> str:
+    """What stands between the names of a first line: comma, semicolon or tab."""
+    return max(",;\t", key=_QUOTED.sub("", header).count)
+
+
+def head_cells(header: str, delimiter: str) -> list[str]:
+    """The cells of a first line as they were meant, without quotes and what kept a spreadsheet from them."""
+    return [_head(raw) for raw in _raw_heads(header, delimiter)]
+
+
+def _raw_heads(header: str, delimiter: str) -> list[str]:
+    """The cells of a first line as they stand there; a delimiter within quotes is none."""
+    hidden = _QUOTED.sub(lambda match: "\0" * len(match[0]), header)
+    edges = [-1, *(at for at, char in enumerate(hidden) if char == delimiter), len(header)]
+    return [header[left + 1 : right] for left, right in pairwise(edges)]
+
+
+def _head(raw: str) -> str:
+    text = bare(raw)
+    return from_spreadsheet(text.replace('""', '"') if _QUOTED.fullmatch(raw.strip()) else text)
+
+
+def _head_cells(sheet: _Sheet) -> Iterator[tuple[str, Span]]:
+    start = sheet.header_at
+    for raw in _raw_heads(sheet.header, sheet.delimiter):
+        at = start + (len(raw) - len(raw.lstrip()))
+        yield _head(raw), sheet.source.span(at, max(at + len(raw.strip()), at + 1))
+        start += len(raw) + 1
+
+
+def split_head(text: str) -> tuple[str, str]:
+    """`v [km/h]` or `v (km/h)` as name and unit; what is of another form is a name as a whole."""
+    match = _HEAD.fullmatch(text.strip())
+    if match is None:
+        return text.strip(), ""
+    round_ = _ROUND.fullmatch(match["name"])
+    if match["unit"] is None and round_ is not None and is_unit(round_["unit"].strip()):
+        return round_["name"], round_["unit"].strip()
+    return match["name"], (match["unit"] or "").strip()
+
+
+def _cells(source: Source, start: int, line: str, delimiter: str) -> Iterator[tuple[str, Span]]:
+    """Cells of a line with blanks and quotes taken off, and where each stands."""
+    for raw in line.split(delimiter):
+        at = start + (len(raw) - len(raw.lstrip()))
+        yield bare(raw), source.span(at, max(at + len(raw.strip()), at + 1))
+        start += len(raw) + 1
+
+
+def _text_columns(sheet: _Sheet, width: int) -> frozenset[int]:
+    """The columns whose first cell that is not empty is a word."""
+    words: set[int] = set()
+    open_ = set(range(width))
+    for line in _FILLED.finditer(sheet.source.text, sheet.body_at):
+        cells = line[0].split(sheet.delimiter)[:width]
+        texts = {i: cell.strip().strip('"').strip() for i, cell in enumerate(cells) if i in open_}
+        filled = {i for i, text in texts.items() if text}
+        words |= {i for i in filled if value_of(texts[i]) is None}
+        open_ -= filled
+        if not open_:
+            break
+    return frozenset(words)
+
+
+def _read_body(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array]:
+    """The columns, a stretch of lines after the other: what is unusual is read cell by cell."""
+    findings: list[Diagnostic] = []
+    parts: list[list[Array]] = [[] for _ in range(width)]
+    text, begin = sheet.source.text, sheet.body_at
+    while begin < len(text) and len(findings) < _MAX_FINDINGS:
+        end = text.find("\n", begin + STRETCH) + 1 or len(text)
+        columns = _read_fast(sheet, text[begin:end], width, texts)
+        if columns is None:
+            columns = _read_strict(sheet, (begin, end), (width, texts), findings)
+        for part, column in zip(parts, columns, strict=True):
+            part.append(column)
+        begin = end
+    if findings:
+        raise TraceError(*findings)
+    if not any(map(len, parts[0])):
+        raise unreadable(sheet.source.name, "no line of numbers follows the header")
+    return [np.concatenate(part) for part in parts]
+
+
+def _read_fast(sheet: _Sheet, body: str, width: int, texts: frozenset[int]) -> list[Array] | None:
+    """Whole lines at once with NumPy's reader; None if anything about them is unusual."""
+    if len(texts) == width or (texts and '"' in body):
+        return None
+    numbers = [i for i in range(width) if i not in texts]
+    values = load(body, sheet.delimiter, numbers if texts else None)
+    words = [line.split(sheet.delimiter) for line in body.split("\n") if texts and _told(line, sheet)]
+    if values is None or values.shape[1] != len(numbers) or any(len(cells) != width for cells in words):
+        return None
+    columns: dict[int, Array] = {i: np.ascontiguousarray(values[:, k]) for k, i in enumerate(numbers)}
+    columns |= {i: np.array([cells[i].strip() for cells in words]) for i in texts}
+    return [columns[i] for i in range(width)]
+
+
+def _told(line: str, sheet: _Sheet) -> bool:
+    """Whether any cell of a line is filled."""
+    return bool(line.strip(f" \t{sheet.delimiter}"))
+
+
+def _read_strict(
+    sheet: _Sheet, ends: tuple[int, int], shape: tuple[int, frozenset[int]], findings: list[Diagnostic]
+) -> list[Array]:
+    """The lines of a stretch cell by cell, with the place of everything that is wrong."""
+    width, texts = shape
+    rows: list[list[float | str]] = []
+    start, end = ends
+    for line in sheet.source.text[start:end].removesuffix("\n").split("\n"):
+        if _told(line, sheet):
+            cells = list(_cells(sheet.source, start, line, sheet.delimiter))
+            rows.append(_read_row(sheet, cells, shape, findings))
+        start += len(line) + 1
+        if len(findings) >= _MAX_FINDINGS:
+            break
+    whole = [] if findings else rows
+    return [
+        np.array([row[i] for row in whole], dtype=str if i in texts else np.float64) for i in range(width)
+    ]
+
+
+def _read_row(
+    sheet: _Sheet,
+    cells: Sequence[tuple[str, Span]],
+    shape: tuple[int, frozenset[int]],
+    findings: list[Diagnostic],
+) -> list[float | str]:
+    width, texts = shape
+    if len(cells) != width:
+        span = cells[0][1].to(cells[-1][1])
+        message = f"this line has {len(cells)} cells, the header names {width} columns"
+        findings.append(Diagnostic("E605", message, span, help=_decimal_comma(sheet, cells, width)))
+        return []
+    row: list[float | str] = []
+    for i, (text, span) in enumerate(cells):
+        if i in texts:
+            row.append(text)
+        elif (value := value_of(text)) is not None:
+            row.append(value)
+        else:
+            findings.append(Diagnostic("E603", f"`{text}` is not a number", span))
+    return row
+
+
+def _decimal_comma(sheet: _Sheet, cells: Sequence[object], width: int) -> tuple[str, ...]:
+    if sheet.delimiter == "," and len(cells) == 2 * width:
+        return ("decimal commas? write a point, or separate the columns with `;`",)
+    return ()
+
+
+def write_csv(path: Path | str, columns: Mapping[str, NDArray[Any]], units: Mapping[str, str]) -> None:
+    """Write columns of equal length so that reading them back gives the same numbers.
+
+    The first line names the columns; a name that a spreadsheet would run as a formula, such as `=1+1`, has an
+    apostrophe before it, which reading takes off.
+
+    Raises:
+        TraceError: E605, a name that would be read as something else, such as one with a unit in brackets.
+        MissingError: R201, no room or no permission; an old file stays as it was.
+    """
+    head = _row(f"{name} [{units[name]}]" if units.get(name) else name for name in columns)
+    _require_names(Path(path), head, list(columns))
+    text = io.StringIO(head)
+    text.seek(0, io.SEEK_END)
+    writer = csv.writer(text, lineterminator="\n")
+    for row in zip(*(values.tolist() for values in columns.values()), strict=True):
+        writer.writerow([repr(value) for value in row])
+    write_atomic(path, text.getvalue())
+
+
+def _require_names(path: Path, header: str, names: Sequence[str]) -> None:
+    """Raise TraceError (E605) where a first line is not read back as these names."""
+    if _names_in(path, header) == list(names):
+        return
+    odd = next((name for name in names if _names_in(path, _row((name,))) != [name]), names[0])
+    message = f"no column of a `.csv` can be called `{odd}`"
+    raise TraceError(Diagnostic("E605", message, help=("write a `.npz`, which holds any name",)))
+
+
+def _names_in(path: Path, header: str) -> list[str]:
+    """What a first line is read as; [] where it is refused."""
+    try:
+        return _read_header(_sheet(path, header.encode("utf-8", "replace")))[0]
+    except TraceError:
+        return []
+
+
+def _row(heads: Iterable[str]) -> str:
+    """A first line."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow(map(spreadsheet, heads))
+    return text.getvalue()

@@ -1,0 +1,112 @@
+"""Variables in a MATLAB `.mat` file: version 5 is read here, version 7.3 is HDF5 (extra `mat`).
+
+Numeric and logical arrays are signals, with `t` as the clock; the fields of a structure `s` are called `s.x`.
+A column of a matrix (samples, k) is a component of a vector. Texts, cells and objects are left out. Complex
+numbers are no signal: where one is asked for, that is said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.trace.formats.extras import needed
+from stlc.trace.formats.mat5 import complex_of, read_mat5
+from stlc.trace.formats.npz import MAX_ARRAYS, MAX_BYTES, room_for, unreadable
+from stlc.trace.formats.parquet import damage
+from stlc.trace.recording import Recording, of_arrays
+
+Array = NDArray[Any]
+
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_COMPLEX = ("real", "imag")
+_RATIO = 1100
+"""More than deflate can shrink anything."""
+
+
+def read_mat(path: Path) -> Recording:
+    """The numeric variables of a file.
+
+    Raises:
+        UsageError: U102, the file does not exist or cannot be opened.
+        MissingError: R301, version 7.3 needs `h5py`.
+        TraceError: E603, another format, damaged, or larger than it may be.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(520)
+    except OSError as error:
+        reason = (error.strerror or type(error).__name__).lower()
+        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: {reason}")) from None
+    if path.stat().st_size > MAX_BYTES:
+        raise unreadable(path, f"it is larger than {MAX_BYTES / 1e9:.0f} GB", advice="split it")
+    if _HDF5 in (head[:8], head[512:520]):
+        arrays = _read_hdf5(path)
+    elif head[126:128] in (b"IM", b"MI"):
+        arrays = read_mat5(path)
+    else:
+        what = "it is empty" if not head else "it is not a MATLAB file of version 5 or 7.3"
+        raise unreadable(path, what, advice="save it in MATLAB with  save FILE -v7")
+    if not arrays:
+        raise unreadable(path, "it holds no array of numbers")
+    return of_arrays(path, {name: _as_signal(values) for name, values in arrays.items()})
+
+
+def _as_signal(values: Array) -> Array:
+    """MATLAB's columns and rows are plain signals."""
+    if values.ndim == 2 and 1 in values.shape:
+        return values.reshape(-1)
+    return values
+
+
+# ---------------------------------------------------------------------- version 7.3
+
+
+def _read_hdf5(path: Path) -> dict[str, Array]:
+    h5py = needed("h5py")
+    found: dict[str, Array] = {}
+    room = room_for(path)
+    with damage(path), h5py.File(path, "r") as file:
+        for name, dataset in _datasets(path, file, "", 0):
+            size = int(np.prod(dataset.shape, dtype=np.float64)) * dataset.dtype.itemsize
+            if size > room or size > _RATIO * dataset.id.get_storage_size() + 1024:
+                raise unreadable(path, f"`{name}` declares {size / 1e9:.3g} GB that the file does not hold")
+            room -= size
+            found[name] = _real(np.asarray(dataset[()]).T)
+    return found
+
+
+def _real(values: Array) -> Array:
+    """Pairs of real and imaginary parts as complex numbers; real ones where all of the latter are 0."""
+    if values.dtype.names is None:
+        return values
+    real, turned = (values[part] for part in _COMPLEX)
+    return complex_of(real, turned) if turned.any() else real
+
+
+def _datasets(path: Path, group: Any, prefix: str, depth: int) -> Iterator[tuple[str, Any]]:
+    """Numeric data below a group; nothing that leads out of the file, or round in a circle."""
+    h5py = needed("h5py")
+    if depth > 8 or len(group) > MAX_ARRAYS:
+        raise unreadable(path, "it is nested too deeply, or holds too many arrays")
+    for name in group:
+        if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            continue
+        item = group[name]
+        if isinstance(item, h5py.Group):
+            yield from _datasets(path, item, f"{prefix}{name}.", depth + 1)
+        elif isinstance(item, h5py.Dataset) and _plain(item):
+            yield prefix + name, item
+
+
+def _plain(dataset: Any) -> bool:
+    kind = dataset.attrs.get("MATLAB_class", b"double")
+    numeric = dataset.dtype.kind in "biuf" or dataset.dtype.names == _COMPLEX
+    is_numbers = numeric and kind not in (b"char", b"cell", b"function_handle")
+    empty = dataset.attrs.get("MATLAB_empty", 0)
+    return bool(is_numbers and not empty and not dataset.is_virtual and not dataset.external)

@@ -1,0 +1,181 @@
+"""MATLAB's file format of version 5 ("MAT-File Level 5"), as far as it holds numbers; nothing is ever run.
+
+Elements are a tag (type, number of bytes) and data, padded to 8 bytes; a compressed element is one element
+deflated. Sizes are checked against what is there before memory is asked for.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.trace.formats.npz import MAX_ARRAYS, room_for, unreadable
+
+Array = NDArray[Any]
+
+_HEADER = 128
+_MATRIX, _COMPRESSED = 14, 15
+_DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_STRUCT = 2
+_NUMERIC = range(6, 16)
+_CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+_LOGICAL, _COMPLEX = 0x02, 0x08
+_DEEPEST = 16
+
+
+class _DamageError(Exception):
+    """The bytes are not what the format says."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Element:
+    kind: int
+    data: memoryview
+
+
+def read_mat5(path: Path) -> dict[str, Array]:
+    """Numeric and logical arrays by name; the fields of a 1 x 1 structure `s` are `s.field`.
+
+    An array is complex where an imaginary part is not 0.
+
+    Raises:
+        TraceError: E603, damaged, or larger than it may be.
+    """
+    try:
+        raw = path.read_bytes()
+        order = "<" if raw[126:128] == b"IM" else ">"
+        found: dict[str, Array] = {}
+        room = room_for(path)
+        for element in _elements(memoryview(raw)[_HEADER:], order):
+            if element.kind == _COMPRESSED:
+                data = _inflated(element.data, room)
+                room -= len(data)
+                element = next(_elements(memoryview(data), order), _Element(0, memoryview(b"")))
+            if element.kind == _MATRIX:
+                name, rest = _named(element.data, order)
+                _add(found, name, rest, order, 0)
+    except (_DamageError, struct.error, zlib.error, ValueError, OverflowError, UnicodeDecodeError) as error:
+        raise unreadable(path, f"it is damaged or cut short ({error})") from None
+    return found
+
+
+def _inflated(data: memoryview, room: int) -> bytes:
+    """The element without its compression, never more than there is room for."""
+    engine = zlib.decompressobj()
+    out = engine.decompress(data, room)
+    if engine.unconsumed_tail:
+        raise _DamageError(f"it unpacks to more than {room / 1e9:.1f} GB")
+    if not engine.eof:
+        raise _DamageError("compressed data that ends early")
+    return out
+
+
+def _elements(data: memoryview, order: str) -> Iterator[_Element]:
+    at = 0
+    while at + 8 <= len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, at)
+        if kind >> 16:  # a small element: both in one word, up to 4 bytes behind it
+            kind, size, start = kind & 0xFFFF, kind >> 16, at + 4
+            if size > 4:
+                raise _DamageError("a small element of more than 4 bytes")
+            end = at + 8
+        else:
+            start = at + 8
+            end = start + size if kind == _COMPRESSED else start + (size + 7) // 8 * 8
+        if start + size > len(data):
+            raise _DamageError(f"{size} bytes are declared, {len(data) - start} follow")
+        yield _Element(kind, data[start : start + size])
+        at = end
+    if at < len(data) and any(data[at:]):
+        raise _DamageError("bytes behind the last element")
+
+
+@dataclass(frozen=True, slots=True)
+class _Matrix:
+    """What follows the name of an array."""
+
+    kind: int
+    logical: bool
+    imaginary: bool
+    shape: tuple[int, ...]
+    parts: tuple[_Element, ...]
+
+
+def _named(data: memoryview, order: str) -> tuple[str, _Matrix]:
+    """Name and content of a matrix element; an empty one is an empty array."""
+    parts = []
+    for part in _elements(data, order):
+        parts.append(part)
+        if len(parts) > MAX_ARRAYS:
+            raise _DamageError("too many parts")
+    if not parts:
+        return "", _Matrix(6, False, False, (0,), ())
+    if len(parts) < 3 or len(parts[0].data) < 8:
+        raise _DamageError("an array without a head")
+    flags = struct.unpack_from(f"{order}I", parts[0].data)[0]
+    shape = tuple(int(n) for n in _numbers(parts[1], order))
+    if not shape or min(shape) < 0:
+        raise _DamageError("an array without dimensions")
+    name = bytes(parts[2].data).decode("latin-1").rstrip("\0")
+    bits = flags >> 8
+    return name, _Matrix(flags & 0xFF, bool(bits & _LOGICAL), bool(bits & _COMPLEX), shape, tuple(parts[3:]))
+
+
+def _add(found: dict[str, Array], name: str, matrix: _Matrix, order: str, depth: int) -> None:
+    """The array, or the fields of a structure; everything else is left out."""
+    if depth > _DEEPEST or len(found) > MAX_ARRAYS:
+        raise _DamageError("nested too deeply, or too many arrays")
+    if matrix.kind == _STRUCT:
+        for field, inner in _fields(matrix, order):
+            _add(found, f"{name}.{field}", inner, order, depth + 1)
+    elif matrix.kind in _NUMERIC and matrix.parts:
+        dtype = "?" if matrix.logical else _CLASSES[matrix.kind]
+        values = _part(name, matrix, 0, order).astype(dtype)
+        if matrix.imaginary and (turned := _part(name, matrix, 1, order)).any():
+            values = complex_of(values, turned)
+        found[name] = values.reshape(matrix.shape, order="F")
+
+
+def complex_of(real: Array, turned: Array) -> Array:
+    """Complex numbers of their real and imaginary parts."""
+    made = np.empty(real.shape, dtype=np.complex128)
+    made.real, made.imag = real, turned
+    return made
+
+
+def _part(name: str, matrix: _Matrix, index: int, order: str) -> Array:
+    """The real parts of an array, or the imaginary ones."""
+    values = _numbers(matrix.parts[index], order) if index < len(matrix.parts) else np.zeros(0)
+    if len(values) != math.prod(matrix.shape):
+        shown = " x ".join(map(str, matrix.shape))
+        raise _DamageError(f"`{name}` declares {shown} values, {len(values)} follow")
+    return values
+
+
+def _fields(matrix: _Matrix, order: str) -> Iterator[tuple[str, _Matrix]]:
+    if math.prod(matrix.shape) != 1 or len(matrix.parts) < 2:
+        return
+    width = int(_numbers(matrix.parts[0], order)[:1].sum())
+    names = bytes(matrix.parts[1].data)
+    if width <= 0 or len(names) % width:
+        raise _DamageError("a structure without names")
+    fields = [names[i : i + width].split(b"\0")[0].decode("latin-1") for i in range(0, len(names), width)]
+    if len(fields) != len(matrix.parts) - 2:
+        raise _DamageError(f"a structure of {len(fields)} fields with {len(matrix.parts) - 2} values")
+    for field, part in zip(fields, matrix.parts[2:], strict=True):
+        if part.kind == _MATRIX:
+            yield field, _named(part.data, order)[1]
+
+
+def _numbers(element: _Element, order: str) -> Array:
+    if element.kind not in _DTYPES:
+        raise _DamageError(f"data of type {element.kind} where numbers are expected")
+    return np.frombuffer(element.data, dtype=np.dtype(order + _DTYPES[element.kind]))

@@ -1,0 +1,261 @@
+"""Messages of topics, as robots log them -> a recording: every number is a signal, every topic has a clock.
+
+`/odom` with `twist.twist.linear.x` gives `odom.twist.twist.linear.x`; a message that holds nothing but `data`
+is called by its topic. Times are those at which a message was logged, in seconds since the first one. Most
+logs are read with `--resample`, since no two topics follow the same clock.
+"""
+
+from __future__ import annotations
+
+import bz2
+import math
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from mmap import ACCESS_READ, mmap
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.signature import Column
+from stlc.trace.formats.extras import needed
+from stlc.trace.formats.npz import unreadable
+from stlc.trace.meta import TraceMeta
+from stlc.trace.recording import Recording, Strand
+
+MAX_BYTES = 2_000_000_000
+MAX_VALUES = 100_000_000
+LONGEST = 64
+"""Arrays of more numbers than this are data (images, scans), not signals."""
+DEEPEST = 12
+"""A number below so many fields of fields is no signal."""
+STAMPS = ({"sec", "nanosec"}, {"secs", "nsecs"}, {"sec", "nsec"}, {"seconds", "nanos"})
+"""Fields of a point in time, as the languages of messages call them."""
+HEADER = "header"
+"""A field whose stamps are left to the clock."""
+
+_ROOM = 64_000_000
+_RATIO = 50
+"""What is packed may unpack to `_ROOM`, or to so many times the size of its file."""
+_LATEST = 2**63 - 1
+_ZSTD = b"\x28\xb5\x2f\xfd"
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """One number of a message: where it stands, and whether it is whole (a truth value, too)."""
+
+    name: str
+    value: float
+    whole: bool = False
+
+
+Decode = Callable[[bytes], Iterable[Number]]
+"""A message as bytes -> its numbers; names are relative to the topic, "" is the topic itself."""
+
+
+class DamageError(Exception):
+    """Bytes that are not what the format says."""
+
+
+@dataclass(slots=True)
+class _Topic:
+    times: array[int] = field(default_factory=lambda: array("q"))
+    values: dict[str, array[float]] = field(default_factory=dict)
+    whole: set[str] = field(default_factory=set)
+
+    def arrays(self) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
+        """Times in ns, in order, and the signals that are in every message."""
+        times = np.array(self.times, dtype=np.int64)
+        kept = {n: np.array(x, dtype=np.float64) for n, x in self.values.items() if len(x) == len(times)}
+        if (np.diff(times) < 0).any():
+            order = np.argsort(times, kind="stable")
+            return times[order], {name: values[order] for name, values in kept.items()}
+        return times, kept
+
+
+@contextmanager
+def mapped(path: Path) -> Iterator[mmap]:
+    """The bytes of a file, as far as they are looked at.
+
+    Raises:
+        UsageError: U102, the file does not exist or cannot be opened.
+        TraceError: E603, it is empty, or larger than it may be.
+    """
+    try:
+        with path.open("rb") as file:
+            size = file.seek(0, 2)
+            if size > MAX_BYTES:
+                raise unreadable(path, f"it is larger than {MAX_BYTES / 1e9:.0f} GB", advice="split it")
+            if not size:
+                raise unreadable(path, "it is empty")
+            data = mmap(file.fileno(), 0, access=ACCESS_READ)
+    except OSError as error:
+        reason = (error.strerror or type(error).__name__).lower()
+        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: {reason}")) from None
+    with data:
+        yield data
+
+
+class Log:
+    """The messages of a file, or of several that belong together.
+
+    Attributes:
+        path: for messages.
+        unread: why topics are left out: topic -> reason.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.unread: dict[str, str] = {}
+        self._topics: dict[str, _Topic] = {}
+        self._values = 0
+
+    def add(self, topic: str, time: int, numbers: Iterable[Number]) -> None:
+        """A message, logged at `time` in ns. Raises TraceError (E603) for a time that is none."""
+        if not -_LATEST <= time <= _LATEST:
+            raise unreadable(
+                self.path, f"a message of `{topic[:80]}` was logged at {time} ns, which is no time"
+            )
+        into = self._topics.setdefault(topic, _Topic())
+        into.times.append(time)
+        for number in numbers:
+            name = number.name
+            held = into.values.get(name)
+            if held is None:
+                held = into.values[name] = array("d")
+                if len(into.values) > MAX_VALUES // 1000:
+                    raise unreadable(self.path, f"a message of `{topic[:80]}` has too many fields")
+            held.append(number.value)
+            if number.whole:
+                into.whole.add(name)
+            self._values += 1
+        if self._values > MAX_VALUES:
+            raise unreadable(self.path, f"it holds more than {MAX_VALUES:,} numbers", advice="split it")
+
+    def recording(self) -> Recording:
+        """A strand a topic; signals that are not in every message of their topic are left out.
+
+        Raises:
+            TraceError: E603, no message has a number.
+        """
+        found = {name: topic.arrays() for name, topic in self._topics.items()}
+        origin = min((int(times[0]) for times, _ in found.values() if len(times)), default=0)
+        strands: list[Strand] = []
+        columns: dict[str, Column] = {}
+        for topic, (times, arrays) in found.items():
+            base = topic.strip("/").replace("/", ".")
+            named = {_called(base, name): values for name, values in arrays.items()}
+            clock = np.array([(t - origin) * 1e-9 for t in times.tolist()], dtype=np.float64)
+            strands.append(Strand(named, clock))
+            whole = self._topics[topic].whole
+            columns |= {n: Column(n, kind="int") for n in (_called(base, m) for m in whole if m in arrays)}
+        if not any(strand.arrays for strand in strands):
+            raise unreadable(self.path, self._nothing())
+        return Recording(str(self.path), tuple(strands), columns, TraceMeta(origin=origin))
+
+    def topic(self, name: str) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
+        """Times in ns and signals of one topic, none where it has no message."""
+        return self._topics.get(name, _Topic()).arrays()
+
+    def _nothing(self) -> str:
+        reasons = list(dict.fromkeys(self.unread.values()))
+        return "it holds no message with numbers" + (f": {', '.join(reasons[:3])}" if reasons else "")
+
+
+def _called(topic: str, name: str) -> str:
+    return f"{topic}.{name}" if name and not name.startswith("[") and topic else topic + name
+
+
+# ----------------------------------------------------------------- content of any language
+
+
+def numbers_of(content: object) -> Iterator[Number]:
+    """All numbers of a message of names and values (JSON), by path.
+
+    Raises:
+        OverflowError: a number is larger than a float.
+    """
+    if isinstance(content, dict) and set(content) == {"data"}:
+        content = content["data"]
+    yield from _walk("", content, 0)
+
+
+def _walk(name: str, value: object, depth: int) -> Iterator[Number]:
+    if isinstance(value, (int, float)):
+        yield Number(name, float(value), isinstance(value, int))
+    elif value is None:
+        yield Number(name, math.nan)
+    elif depth > DEEPEST:
+        return
+    elif isinstance(value, (list, tuple)):
+        if len(value) <= LONGEST:
+            for i, item in enumerate(value):
+                yield from _walk(f"{name}[{i}]", item, depth + 1)
+    elif isinstance(value, dict):
+        yield from _entries(name, value, depth)
+
+
+def _entries(name: str, value: Mapping[str, object], depth: int) -> Iterator[Number]:
+    if set(value) in STAMPS:
+        seconds, parts = (v if isinstance(v, (int, float)) else math.nan for v in value.values())
+        yield Number(name, seconds + 1e-9 * parts)
+        return
+    for key, item in value.items():
+        if key != HEADER:
+            yield from _walk(f"{name}.{key}" if name else key, item, depth + 1)
+
+
+# -------------------------------------------------------------------------- what is packed
+
+
+class Room:
+    """How much of a file may be unpacked, all its parts together."""
+
+    def __init__(self, path: Path, size: int) -> None:
+        self.path = path
+        self.left = min(MAX_BYTES, max(_ROOM, _RATIO * size))
+
+    def unpacked(self, how: str, data: bytes, size: int) -> bytes:
+        """The bytes without compression (`bz2`, `lz4`, `zstd`, or none), as many as were declared.
+
+        Raises:
+            TraceError: E603, more than there is room for.
+            MissingError: R301, the compression needs a package.
+            DamageError: another number of bytes.
+        """
+        if size > self.left:
+            raise unreadable(self.path, f"it unpacks to {size / 1e9:.3g} GB or more", advice="split it")
+        if how in ("", "none"):
+            out = bytes(data)
+        elif how == "bz2":
+            out = bz2.BZ2Decompressor().decompress(data, max_length=size + 1)
+        elif how == "lz4":
+            out = needed("lz4.frame").LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+        elif how == "zstd":
+            with needed("zstandard").ZstdDecompressor().stream_reader(data) as reader:
+                out = reader.read(size + 1)
+        else:
+            raise DamageError(f"the compression `{how[:20]}` is not known")
+        if len(out) != size:
+            raise DamageError(f"{size} bytes are declared where {len(out)} are packed")
+        self.left -= size
+        return out
+
+    def whole(self, message: bytes) -> bytes:
+        """A message, unpacked where it is a frame of `zstd` on its own, as ROS 2 packs them."""
+        return self.of_unknown_size(message) if message.startswith(_ZSTD) else message
+
+    def of_unknown_size(self, data: bytes) -> bytes:
+        """The bytes of a frame of `zstd` that need not say how many it holds."""
+        with needed("zstandard").ZstdDecompressor().stream_reader(data) as reader:
+            out: bytes = reader.read(self.left + 1)
+        if len(out) > self.left:
+            raise unreadable(
+                self.path, f"it unpacks to more than {self.left / 1e9:.3g} GB", advice="split it"
+            )
+        self.left -= len(out)
+        return out

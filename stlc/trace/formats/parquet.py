@@ -1,0 +1,160 @@
+"""Named columns in a `.parquet` file (extra `parquet`): numbers, truth values, times, words, and lists.
+
+Units stand in brackets behind a name, `v [km/h]`, or in the field's metadata under `unit`. Columns that hold
+anything else, such as structures, are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.diagnostics import Diagnostic, StlcError, TraceError, UsageError
+from stlc.trace.formats.csv import split_head
+from stlc.trace.formats.extras import needed
+from stlc.trace.formats.npz import MAX_BYTES, room_for, unreadable
+from stlc.trace.formats.table import Table, of_table
+from stlc.trace.recording import Recording
+
+Floats = NDArray[np.float64]
+
+MAX_COMPONENTS = 1000
+MAX_LETTERS = 64
+"""Longer texts are cut; no member of an enum has so long a name."""
+
+
+def read_parquet(path: Path) -> Recording:
+    """The columns of a file that can be signals, and its words.
+
+    Raises:
+        UsageError: U102, the file does not exist or cannot be opened.
+        MissingError: R301, `pyarrow` is not installed.
+        TraceError: E603, no such file format, or damaged; E605, columns that do not fit.
+    """
+    file = open_parquet(path)
+    with damage(path):
+        table = file.read(columns=[name for name, _ in signal_fields(file.schema_arrow)])
+    return of_table(path, table_of(path, table))
+
+
+def open_parquet(path: Path, *, whole: bool = True) -> Any:
+    """The file, opened, and small enough to be read where it is wanted as a whole."""
+    parquet = needed("pyarrow.parquet")
+    if not path.is_file():
+        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: no such file or directory"))
+    with damage(path):
+        file = parquet.ParquetFile(path, memory_map=True)
+        size = file.metadata.num_rows * max(file.metadata.num_columns, 1) * 8
+    most = min(MAX_BYTES, room_for(path))
+    if whole and not 0 <= size <= most:
+        why = f"it unpacks to {size / 1e9:.1f} GB, more than {most / 1e9:.1f} GB"
+        raise unreadable(path, why, advice="split it")
+    return file
+
+
+class damage:  # noqa: N801 - reads as a word: with damage(path): …
+    """Whatever a library says about a file that it cannot read, as E603."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        if isinstance(error, Exception) and not isinstance(error, StlcError):
+            lines = str(error).strip().splitlines()
+            why = lines[0][:100] if lines else type(error).__name__
+            raise unreadable(self.path, f"it is damaged or of another format ({why})") from None
+
+
+def signal_fields(schema: Any) -> Iterator[tuple[str, Any]]:
+    """Name and type of every column that can be a signal, or holds words."""
+    types = needed("pyarrow").types
+    for field in schema:
+        kind = field.type.value_type if _list(field.type, types) else field.type
+        if _numeric(kind, types) or _text(field.type, types):
+            yield field.name, field.type
+
+
+def _numeric(kind: Any, types: Any) -> bool:
+    numbers = (types.is_integer, types.is_floating, types.is_boolean, types.is_decimal)
+    return any(test(kind) for test in (*numbers, types.is_timestamp, types.is_duration))
+
+
+def _text(kind: Any, types: Any) -> bool:
+    plain = kind.value_type if types.is_dictionary(kind) else kind
+    return bool(types.is_string(plain) or types.is_large_string(plain))
+
+
+def _list(kind: Any, types: Any) -> bool:
+    return bool(types.is_fixed_size_list(kind) or types.is_list(kind) or types.is_large_list(kind))
+
+
+def table_of(path: Path, table: Any) -> Table:
+    """An arrow table as numbers and words; a missing number is NaN, a missing word empty.
+
+    Raises:
+        TraceError: E605, a name twice, lists of different lengths; E603, no line of numbers.
+    """
+    columns: dict[str, NDArray[Any]] = {}
+    units: dict[str, str] = {}
+    for field, chunked in zip(table.schema, table.columns, strict=True):
+        name, unit = split_head(field.name)
+        told = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
+        for part, values in _values(path, name, chunked):
+            if part in columns:
+                raise TraceError(Diagnostic("E605", f"two columns of `{path}` are called `{part}`"))
+            columns[part], units[part] = values, unit or told
+    if all(values.dtype.kind == "U" for values in columns.values()) or not table.num_rows:
+        raise unreadable(path, "it holds no line of numbers")
+    return Table(columns, units)
+
+
+def _values(path: Path, name: str, chunked: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+    types = needed("pyarrow").types
+    with damage(path):
+        if _text(chunked.type, types):
+            yield name, _words(chunked)
+            return
+        if not _list(chunked.type, types):
+            yield name, _floats(chunked)
+            return
+        lists = chunked.combine_chunks()
+        rows, flat = len(lists), _floats(lists.flatten())
+    size, rest = divmod(len(flat), max(rows, 1))
+    if rest or not 1 <= size <= MAX_COMPONENTS or lists.null_count or not _even(lists, size):
+        raise TraceError(Diagnostic("E605", f"the lists in `{name}` of `{path}` differ in length"))
+    for i in range(size):
+        yield f"{name}[{i}]", np.ascontiguousarray(flat[i::size])
+
+
+def _even(lists: Any, size: int) -> bool:
+    lengths = needed("pyarrow.compute").list_value_length(lists)
+    return bool((np.asarray(lengths) == size).all())
+
+
+def _words(values: Any) -> NDArray[np.str_]:
+    """Texts, each stored once until they are laid out."""
+    encoded = values if needed("pyarrow").types.is_dictionary(values.type) else values.dictionary_encode()
+    array = encoded.unify_dictionaries().combine_chunks()
+    texts = np.array(["", *(str(word)[:MAX_LETTERS].strip() for word in array.dictionary.to_pylist())])
+    return np.asarray(texts[np.asarray(array.indices.fill_null(-1), dtype=np.int64) + 1])
+
+
+def _floats(values: Any) -> Floats:
+    """Numbers as they are, times in seconds: a point in time since the first one."""
+    arrow = needed("pyarrow")
+    kind = values.type
+    if arrow.types.is_timestamp(kind) or arrow.types.is_duration(kind):
+        scale = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[kind.unit]
+        ticks = np.asarray(values.cast(arrow.int64()).fill_null(0))
+        ticks = ticks - ticks[:1] if arrow.types.is_timestamp(kind) else ticks
+        return ticks.astype(np.float64) * scale
+    if arrow.types.is_boolean(kind):
+        values = values.cast(arrow.uint8())
+    return np.asarray(values.cast(arrow.float64(), safe=False), dtype=np.float64)

@@ -1,0 +1,269 @@
+"""Messages of ROS 1 and 2 -> their numbers, by the definitions that lie in a bag beside them.
+
+A definition is the text of a `.msg` file, followed by those of the messages within, each behind a line of `=`
+and `MSG: package/Type` (https://wiki.ros.org/msg,
+https://design.ros2.org/articles/interface_definition.html). A message is packed bytes in ROS 1; in ROS 2 it
+is CDR: a head of 4 bytes, then values on multiples of their size. No definition is ever turned into code.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from stlc.trace.formats.messages import DEEPEST, HEADER, LONGEST, STAMPS, DamageError, Number
+
+Form = Literal["ros1", "cdr"]
+
+_CODES = {
+    **{"bool": "?", "byte": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H"},
+    **{
+        "int32": "i",
+        "uint32": "I",
+        "int64": "q",
+        "uint64": "Q",
+        "float32": "f",
+        "float64": "d",
+        "octet": "B",
+    },
+}
+_STAMPS = {"time": "II", "duration": "ii"}
+_TEXTS = ("string", "wstring")
+_SECTION = re.compile(r"^={3,}[ \t]*\n(?:MSG: ?)", re.MULTILINE)
+_FIELD = re.compile(
+    r"\s*(?P<type>[A-Za-z]\w*(?:/\w+)*)(?:<=\d+)?(?P<array>\[(?:<=)?\d*\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)",
+    re.ASCII,
+)
+_MAX_TEXT = 1_000_000
+_MAX_NESTED = 32
+
+
+@dataclass(frozen=True, slots=True)
+class _Field:
+    """One field: its name, its type (of another message where `inner`), and how many.
+
+    Attributes:
+        count: of an array of fixed length, -1 of one of any length, None of a single value.
+    """
+
+    name: str
+    kind: str
+    count: int | None
+    inner: _Layout | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """The fields of a message in order, and the fewest bytes that they take."""
+
+    fields: tuple[_Field, ...]
+    least: int
+
+    @property
+    def stamp(self) -> bool:
+        """Whether it is a point in time."""
+        return {each.name for each in self.fields} in STAMPS
+
+
+def decoder(definition: str, form: Form) -> Decoder:
+    """The reader of the messages of a definition.
+
+    Raises:
+        DamageError: it is no definition, has no end, or names a message that it does not define.
+    """
+    if len(definition) > _MAX_TEXT:
+        raise DamageError("a definition of more than a million letters")
+    root, *others = _SECTION.split(definition.replace("\r\n", "\n"))
+    texts = {}
+    for other in others:
+        name, _, text = other.partition("\n")
+        texts[_short(name.strip())] = text
+    return Decoder(_Builder(texts, form).layout(root, "", 0), form)
+
+
+def _short(name: str) -> str:
+    """`package/Type`, without the folder between them that ROS 2 writes."""
+    return name.replace("/msg/", "/").replace("/action/", "/").replace("/srv/", "/")
+
+
+class _Builder:
+    """Texts of definitions -> layouts, each made once."""
+
+    def __init__(self, texts: dict[str, str], form: Form) -> None:
+        self.texts, self.form = texts, form
+        self.made: dict[str, _Layout] = {}
+
+    def layout(self, text: str, package: str, depth: int) -> _Layout:
+        if depth > _MAX_NESTED:
+            raise DamageError("a definition that contains itself, or is nested too deeply")
+        fields = tuple(self.field(line, package, depth) for line in text.split("\n") if _tells(line))
+        least = sum(self.least(each) for each in fields)
+        return _Layout(fields, max(least, 1) if self.form == "cdr" else least)
+
+    def field(self, line: str, package: str, depth: int) -> _Field:
+        match = _FIELD.fullmatch(line.split("#")[0].rstrip())
+        if match is None:
+            raise DamageError(f"`{line.strip()[:40]}` is no line of a definition")
+        size = (match["array"] or "").strip("[]")
+        fixed = match["array"] is not None and size.isdigit()
+        count = None if match["array"] is None else int(size) if fixed else -1
+        kind = match["type"]
+        return _Field(match["name"], kind, count, self.inner(kind, package, depth))
+
+    def inner(self, kind: str, package: str, depth: int) -> _Layout | None:
+        """The layout of a message within; None for what is none."""
+        if kind in _CODES or kind in _TEXTS or (kind in _STAMPS and self.form == "ros1"):
+            return None
+        name = "std_msgs/Header" if kind == "Header" else _short(kind)
+        known = [full for full in (name, f"{package}/{name}") if full in self.texts]
+        known += [full for full in self.texts if full.endswith(f"/{name}")] if "/" not in name else []
+        if not known:
+            raise DamageError(f"`{kind[:40]}` is not defined")
+        full = known[0]
+        if full not in self.made:
+            self.made[full] = self.layout(self.texts[full], full.rpartition("/")[0], depth + 1)
+        return self.made[full]
+
+    def least(self, each: _Field) -> int:
+        if each.count == -1:
+            return 4
+        many = 1 if each.count is None else each.count
+        if each.inner is not None:
+            return many * each.inner.least
+        if each.kind in _TEXTS:
+            return 4 * many
+        return many * struct.calcsize("<" + (_CODES.get(each.kind) or _STAMPS[each.kind]))
+
+
+def _tells(line: str) -> bool:
+    """Whether a line declares a field, not a constant, a remark or nothing."""
+    told = line.split("#")[0]
+    match = _FIELD.fullmatch(told.rstrip())
+    return bool(told.strip()) and (match is None or not match["rest"].startswith("="))
+
+
+@dataclass(frozen=True, slots=True)
+class Decoder:
+    """A reader of the messages of one definition."""
+
+    layout: _Layout
+    form: Form
+
+    def __call__(self, data: bytes) -> Iterator[Number]:
+        """All numbers of a message, by path; stamps of headers are left to the clock.
+
+        Raises:
+            DamageError: the message is shorter than its definition, or has a length that it cannot have.
+            struct.error: it ends early.
+        """
+        if self.form == "ros1":
+            cursor = _Cursor(data, 0, "<", self.form)
+        elif len(data) < 4 or data[1] not in (0, 1):
+            raise DamageError("a message that is not plain CDR")
+        else:
+            cursor = _Cursor(data, 4, "<" if data[1] else ">", self.form)
+        if [each.name for each in self.layout.fields] == ["data"]:
+            return cursor.field("", self.layout.fields[0], 0)
+        return cursor.fields("", self.layout, 0)
+
+
+class _Cursor:
+    """A place in a message."""
+
+    def __init__(self, data: bytes, start: int, order: str, form: Form) -> None:
+        self.data, self.at, self.start, self.order, self.form = data, start, start, order, form
+
+    def fields(self, name: str, layout: _Layout, depth: int) -> Iterator[Number]:
+        if layout.least > len(self.data) - self.at:
+            raise DamageError("a message that is shorter than its definition")
+        if not layout.fields:
+            self.at += layout.least  # what has no fields takes a byte in CDR
+        for each in layout.fields:
+            inner = f"{name}.{each.name}" if name else each.name
+            found = self.field(inner, each, depth)
+            if each.name == HEADER:
+                for _ in found:
+                    pass
+            else:
+                yield from found
+
+    def field(self, name: str, each: _Field, depth: int) -> Iterator[Number]:
+        if each.count is None:
+            yield from self.value(name, each, depth)
+            return
+        count = each.count
+        if count < 0:
+            (count,) = self.take("I")
+        told = count <= LONGEST
+        if each.inner is None and each.kind in _CODES:
+            yield from self.numbers(name, each.kind, count, told=told)
+            return
+        if each.inner is not None and each.inner.least * count > len(self.data) - self.at:
+            raise DamageError("an array that is longer than its message")
+        if each.inner is not None and not each.inner.least:
+            return
+        for i in range(count):
+            found = self.value(f"{name}[{i}]", each, depth + 1)
+            if told:
+                yield from found
+            else:
+                for _ in found:
+                    pass
+
+    def numbers(self, name: str, kind: str, count: int, *, told: bool) -> Iterator[Number]:
+        """An array of numbers, whose bytes are passed over where it is data."""
+        size = struct.calcsize(_CODES[kind])
+        if count and self.form == "cdr":
+            self.align(size)
+        if count * size > len(self.data) - self.at:
+            raise DamageError("an array that is longer than its message")
+        if told:
+            values = struct.unpack_from(f"{self.order}{count}{_CODES[kind]}", self.data, self.at)
+            whole = not kind.startswith("float")
+            for i, value in enumerate(values):
+                yield Number(f"{name}[{i}]", float(value), whole)
+        self.at += count * size
+
+    def value(self, name: str, each: _Field, depth: int) -> Iterator[Number]:
+        if each.inner is not None:
+            if each.inner.stamp:
+                yield self.stamp(name, each.inner)
+            elif depth > DEEPEST:
+                for _ in self.fields(name, each.inner, depth + 1):
+                    pass
+            else:
+                yield from self.fields(name, each.inner, depth + 1)
+        elif each.kind in _TEXTS:
+            self.text(each.kind)
+        elif each.kind in _CODES:
+            (value,) = self.take(_CODES[each.kind])
+            yield Number(name, float(value), not each.kind.startswith("float"))
+        else:
+            seconds, parts = self.take(_STAMPS[each.kind])
+            yield Number(name, seconds + 1e-9 * parts)
+
+    def stamp(self, name: str, layout: _Layout) -> Number:
+        seconds, parts = (number.value for number in self.fields("", layout, 0))
+        return Number(name, seconds + 1e-9 * parts)
+
+    def text(self, kind: str) -> None:
+        (length,) = self.take("I")
+        if kind == "wstring":
+            raise DamageError("texts of wide letters are not read")
+        if length > len(self.data) - self.at:
+            raise DamageError("a text that is longer than its message")
+        self.at += length
+
+    def take(self, code: str) -> tuple[Any, ...]:
+        """The next values, all of one size."""
+        if self.form == "cdr":
+            self.align(struct.calcsize(code[0]))
+        values = struct.unpack_from(self.order + code, self.data, self.at)
+        self.at += struct.calcsize(self.order + code)
+        return values
+
+    def align(self, size: int) -> None:
+        self.at += -(self.at - self.start) % size

@@ -1,0 +1,120 @@
+"""Tables with one line a sample, from whatever file -> a recording; lines may belong to several traces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.diagnostics import Diagnostic, TraceError
+from stlc.signature import Column
+from stlc.trace.meta import TraceMeta
+from stlc.trace.recording import CLOCK, ROSTOPIC, Recording, Strand, clock_among, unit_of
+from stlc.units import parse_unit
+
+Array = NDArray[Any]
+
+GROUPS = ("trace", "agent")
+"""Columns of these names say to which of several traces a line belongs."""
+
+_SPELLINGS = {
+    **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
+    **dict.fromkeys(("msec", "millis", "milliseconds"), "ms"),
+    **dict.fromkeys(("usec", "micros", "microseconds"), "us"),
+    **dict.fromkeys(("nsec", "nanos", "nanoseconds"), "ns"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A file as read.
+
+    Attributes:
+        columns: name -> values, one per line of the file; numbers, or texts.
+        units: unit in brackets behind a name, "" where there is none.
+    """
+
+    columns: dict[str, Array]
+    units: dict[str, str]
+
+    @property
+    def rows(self) -> int:
+        """How many lines of numbers."""
+        return len(next(iter(self.columns.values())))
+
+
+def of_table(path: Path, table: Table, meta: TraceMeta | None = None) -> Recording:
+    """A recording with one strand.
+
+    Raises:
+        TraceError: E605, traces that differ in length or in their times, or a unit that is none.
+    """
+    group = next((name for name in GROUPS if name in table.columns), None)
+    columns = {name: values for name, values in table.columns.items() if name != group}
+    arrays = columns if group is None else _grouped(path, columns, group, table.columns[group])
+    named = clock_among(arrays)
+    clock = None if named is None else arrays.pop(named)
+    if clock is not None and clock.ndim == 2:
+        clock = _common(path, clock)
+    if clock is not None and named is not None:
+        clock = _in_seconds(path, named, clock, table.units.get(named, ""))
+    units = {name: Column(name, unit_of(path, name, table.units.get(name, ""))) for name in arrays}
+    return Recording(str(path), (Strand(arrays, clock, named or CLOCK),), units, meta or TraceMeta())
+
+
+def is_unit(text: str) -> bool:
+    """Whether a text in brackets behind a name says what it is measured in."""
+    if text.lower() in _SPELLINGS:
+        return True
+    try:
+        parse_unit(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _in_seconds(path: Path, name: str, clock: Array, unit: str) -> Array:
+    """The times of a column in seconds. Raises TraceError (E605) for a unit that is no time."""
+    scale = clock_scale(f"`{path}`", name, unit)
+    return clock if scale == 1 or clock.dtype.kind == "U" else clock * scale
+
+
+def clock_scale(trace: str, name: str, unit: str) -> float:
+    """Seconds of one unit of a clock. Raises TraceError (E605) for a unit that is no time."""
+    text = _SPELLINGS.get(unit.lower(), unit) or ("ns" if name == ROSTOPIC else "s")
+    try:
+        time = parse_unit(text)
+    except ValueError as error:
+        raise TraceError(Diagnostic("E605", f"column `{name}` of {trace}: {error}")) from None
+    if time.dims != parse_unit("s").dims:
+        message = f"the clock `{name}` of {trace} is in [{unit}], which is not a time"
+        raise TraceError(Diagnostic("E605", message))
+    return float(time.scale)
+
+
+def _grouped(path: Path, columns: dict[str, Array], group: str, keys: Array) -> dict[str, Array]:
+    """Columns (lines,) -> (traces, samples)."""
+    labels, sizes = np.unique(keys, return_counts=True)
+    if len(set(sizes.tolist())) > 1:
+        i = int(np.argmax(sizes != sizes[0]))
+        message = (
+            f"traces in `{path}` differ in length: {group} {_label(labels[0])} has {sizes[0]} samples, "
+            f"{_label(labels[i])} has {sizes[i]}"
+        )
+        help_ = ("put traces of other lengths into files of their own",)
+        raise TraceError(Diagnostic("E605", message, help=help_))
+    order = np.argsort(keys, kind="stable").reshape(len(labels), -1)
+    return {name: values[order] for name, values in columns.items()}
+
+
+def _label(key: Any) -> str:
+    return str(key) if isinstance(key, str) else f"{key:g}"
+
+
+def _common(path: Path, clock: Array) -> Array:
+    if not np.array_equal(clock, np.broadcast_to(clock[0], clock.shape), equal_nan=clock.dtype.kind == "f"):
+        raise TraceError(Diagnostic("E605", f"the traces in `{path}` were not sampled at the same times"))
+    return np.asarray(clock[0])

@@ -1,0 +1,452 @@
+"""Samples that come line by line, as a table with a header or as JSON -> the same on one grid of time.
+
+What a line says is what a file with these lines would say (`stlc.trace.formats.csv`): names, units, words,
+clocks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.diagnostics import Diagnostic, TraceError
+from stlc.jsontext import loads
+from stlc.trace.enums import instant_of_word, number_of_word
+from stlc.trace.formats.cells import bare, value_of
+from stlc.trace.formats.csv import delimiter_of, head_cells, split_head
+from stlc.trace.formats.table import clock_scale
+from stlc.trace.recording import CLOCK, absent, clock_among
+from stlc.trace.resample import FIRST, MAX_SAMPLES, Spacing, usual_step, values_on
+from stlc.trace.time_grid import (
+    NO_CLOCK,
+    NO_STEP,
+    TOLERANCE,
+    gap_advice,
+    require_step,
+    resample_advice,
+    snapped,
+)
+from stlc.trace.trace import Reading
+
+Floats = NDArray[np.float64]
+Sample = Mapping[str, float]
+"""Signal -> number; NaN where it is not known. The components of a vector are `q[0]`, `q[1]`, …"""
+
+MAX_LINE = 1_000_000
+
+_BEYOND_FLOATS = 2**1000
+_AT_ONCE = 4096
+_SLACK = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A sample, and when it was taken, in seconds; None where nothing says so."""
+
+    time: float | None
+    sample: Sample
+
+
+@dataclass(slots=True)
+class Lines:
+    """Lines of a stream as samples.
+
+    Attributes:
+        name: of the stream, for messages.
+        reading: what signals are called there, what their words are worth, and which clock there is.
+        units: signal -> the unit that the header says, "" where it says none; known with the first sample.
+    """
+
+    name: str
+    reading: Reading
+    units: dict[str, str] = field(default_factory=dict)
+    _delimiter: str = ","
+    _heads: tuple[str, ...] = ()
+    _clock: str | None = None
+    _scale: float = 1.0
+    _begin: np.datetime64 | None = None
+    _signals: dict[str, str] = field(default_factory=dict)
+
+    def moments(self, lines: Iterable[bytes]) -> Iterator[Moment]:
+        """The samples that lines hold; empty lines are passed over.
+
+        Raises:
+            TraceError: E601, a signal or clock that was named is missing; E603, a line that is no sample, or
+                a word that is worth nothing; E605, a header or line that does not fit.
+        """
+        is_json: bool | None = None
+        for number, raw in enumerate(lines, 1):
+            text = self._text(raw, number)
+            if not text:
+                continue
+            if is_json is None:
+                is_json = text.startswith("{")
+            if is_json:
+                yield self._object(text, number)
+            elif not self._heads:
+                self._header(text, number)
+            else:
+                yield self._row(text, number)
+
+    def _text(self, raw: bytes, number: int) -> str:
+        if len(raw) > MAX_LINE:
+            raise self._bad(number, f"is longer than {MAX_LINE:,} bytes")
+        try:
+            return raw.decode("utf-8-sig").strip()
+        except UnicodeDecodeError:
+            raise self._bad(number, "is not UTF-8") from None
+
+    def _bad(self, number: int, what: str, code: str = "E603") -> TraceError:
+        return TraceError(Diagnostic(code, f"line {number} of the {self.name} {what}"))
+
+    # ------------------------------------------------------------------------ names
+
+    def _named(self, there: Iterable[str]) -> None:
+        """Which name there is the clock, and what signals the others are."""
+        known = list(there)
+        names = dict(self.reading.names)
+        self._clock = names.pop(CLOCK, None) or clock_among(known)
+        missing = [old for old in (*names.values(), self._clock) if old is not None and old not in known]
+        if missing:
+            raise TraceError(*(absent(self.name, old, known) for old in missing))
+        back = {old: new for new, old in names.items()}
+        self._signals = {
+            name: back.get(name, name)
+            for name in known
+            if name != self._clock and (name in back or name not in names)
+        }
+
+    def _header(self, text: str, number: int) -> None:
+        self._delimiter = delimiter_of(text)
+        cells = head_cells(text.removeprefix("#").strip(), self._delimiter)
+        names, units = zip(*map(split_head, cells), strict=True)
+        if len(set(names)) < len(names) or not all(names):
+            raise self._bad(number, "does not name every column, or names one twice", "E605")
+        if all(value_of(name) is not None for name in names):
+            raise self._bad(number, "has numbers where the columns are named", "E605")
+        self._heads = names
+        self._named(names)
+        said = dict(zip(names, units, strict=True))
+        self.units = {signal: said[name] for name, signal in self._signals.items()}
+        if self._clock is not None:
+            self._scale = clock_scale(f"the {self.name}", self._clock, said[self._clock])
+
+    # ------------------------------------------------------------------------ values
+
+    def _row(self, text: str, number: int) -> Moment:
+        cells = [bare(cell) for cell in text.split(self._delimiter)]
+        if len(cells) != len(self._heads):
+            what = f"has {len(cells)} cells, the header names {len(self._heads)} columns"
+            raise self._bad(number, what, "E605")
+        if self._delimiter != ",":
+            cells = [_with_point(cell) for cell in cells]
+        return self._moment(dict(zip(self._heads, cells, strict=True)), number)
+
+    def _object(self, text: str, number: int) -> Moment:
+        try:
+            found = loads(text)
+        except (ValueError, RecursionError):
+            raise self._bad(number, "is not a JSON object") from None
+        if not isinstance(found, dict):
+            raise self._bad(number, "is not a JSON object")
+        flat: dict[str, object] = {}
+        for name, value in found.items():
+            if isinstance(value, list):
+                flat |= {f"{name}[{i}]": each for i, each in enumerate(value)}
+            else:
+                flat[name] = value
+        if not self._signals:
+            self._named(flat)
+        elif new := [name for name in flat if name not in self._signals and name != self._clock]:
+            self._signals |= {name: name for name in new if name not in self.reading.names}
+        return self._moment(flat, number)
+
+    def _moment(self, values: Mapping[str, object], number: int) -> Moment:
+        time = None if self._clock is None else self._seconds(values.get(self._clock), number)
+        sample: dict[str, float] = {}
+        for name, signal in self._signals.items():
+            if name in values:
+                value = self._number(signal, values[name], number)
+                if value is not None:
+                    sample[signal] = value
+        return Moment(time, sample)
+
+    def _seconds(self, value: object, number: int) -> float:
+        found = _plain(value)
+        if found is not None and math.isfinite(found):
+            return found * self._scale
+        if isinstance(value, str) and found is None:
+            instant = instant_of_word(value)
+            if instant is not None:
+                self._begin = instant if self._begin is None else self._begin
+                return float((instant - self._begin) / np.timedelta64(1, "ns")) * 1e-9
+        shown = "no time" if value is None or value == "" else f"`{str(value)[:40]}` for a time"
+        raise self._bad(number, f"has {shown}")
+
+    def _number(self, signal: str, value: object, number: int) -> float | None:
+        """What a cell is worth; None where it holds a word and nobody is interested."""
+        if value is None:
+            return math.nan
+        found = _plain(value)
+        if found is not None:
+            return found
+        worth = (self.reading.words or {}).get(signal)
+        if worth is None:
+            return None
+        if worth and isinstance(value, str):
+            return number_of_word(f"line {number} of the {self.name}", signal, value, worth)
+        raise self._bad(number, f"has `{str(value)[:40]}` where a number is expected")
+
+
+def _with_point(cell: str) -> str:
+    """A number with a decimal comma as one with a point."""
+    changed = cell.replace(",", ".")
+    return changed if value_of(cell) is None and value_of(changed) is not None else cell
+
+
+def _plain(value: object) -> float | None:
+    """The number that a value of JSON or the text of a cell is; None where it is none."""
+    if isinstance(value, str):
+        return value_of(value)
+    if isinstance(value, int):
+        return float(value) if abs(value) < _BEYOND_FLOATS else math.inf
+    return value if isinstance(value, float) else None
+
+
+# --------------------------------------------------------------------------------- time
+
+
+@dataclass(frozen=True, slots=True)
+class Uniform:
+    """Samples on one grid.
+
+    Attributes:
+        t0: time of the first one, in seconds.
+        dt: time between two of them; None where nothing says it.
+        samples: one after the other; they raise TraceError where what comes does not fit.
+    """
+
+    t0: float
+    dt: float | None
+    samples: Iterator[Sample]
+
+
+def on_grid(moments: Iterator[Moment], reading: Reading, name: str) -> Uniform:
+    """Samples as `stlc.trace.trace.trace_of` would lay them on a grid, as soon as they are known.
+
+    Without a new grid they have to be on one. With one (`resample`, or a longest gap) a sample is known when
+    the next one of every signal has come, or none within the longest gap.
+
+    Raises:
+        TraceError: E601, nothing says when samples were taken; E602, times that are not uniform, or that
+            decrease; E605, there are none.
+    """
+    first = next(moments, None)
+    if first is None:
+        raise TraceError(Diagnostic("E605", f"the {name} holds no samples"))
+    if reading.resample is None and reading.max_gap is None:
+        return _steady(first, moments, reading.dt, name)
+    gridded = Gridded(name, reading)
+    samples = gridded.samples(first, moments)
+    head = next(samples, None)
+    assert head is not None
+    return Uniform(gridded.t0, gridded.dt, _again(head, samples))
+
+
+def _again(first: Sample, rest: Iterator[Sample]) -> Iterator[Sample]:
+    yield first
+    yield from rest
+
+
+def _steady(first: Moment, rest: Iterator[Moment], dt: float | None, name: str) -> Uniform:
+    if dt is not None:
+        require_step(name, dt)
+    second = next(rest, None)
+    if first.time is None or second is None or second.time is None:
+        begun = [first] if second is None else [first, second]
+        return Uniform(first.time or 0.0, dt, (m.sample for part in (begun, rest) for m in part))
+    step = snapped(second.time - first.time) if dt is None else dt
+    if not step > 0:
+        message = f"time in the {name} does not increase: {first.time:g} s, {second.time:g} s"
+        raise TraceError(Diagnostic("E602", message))
+    return Uniform(first.time, step, _checked(first, second, rest, (step, dt is None, name)))
+
+
+def _checked(
+    first: Moment, second: Moment, rest: Iterator[Moment], how: tuple[float, bool, str]
+) -> Iterator[Sample]:
+    step, measured, name = how
+    assert first.time is not None
+    yield first.sample
+    for number, moment in enumerate(_moments(second, rest), 1):
+        now, wanted = moment.time, first.time + number * step
+        if now is None or not abs(now - wanted) <= TOLERANCE * step + _SLACK * abs(wanted):
+            found = "no time" if now is None else f"{now:.6g} s"
+            message = f"time in the {name} is not uniform: sample {number} has {found}, not {wanted:.6g} s"
+            raise TraceError(
+                Diagnostic("E602", message, help=_ways_out(now, wanted, step, measured=measured))
+            )
+        yield moment.sample
+
+
+def _moments(second: Moment, rest: Iterator[Moment]) -> Iterator[Moment]:
+    yield second
+    yield from rest
+
+
+def _ways_out(now: float | None, wanted: float, step: float, *, measured: bool) -> tuple[str, ...]:
+    if now is None:
+        return ()
+    missed = (now - wanted) / step
+    if missed > 0.5 and abs(missed - round(missed)) <= TOLERANCE:
+        return (gap_advice(step),)
+    said = ("--dt TIME  says what the step is; without it the first two samples do",) if measured else ()
+    return (resample_advice(step), *said)
+
+
+@dataclass(slots=True)
+class _Track:
+    """The samples of a signal that may still be needed."""
+
+    held: bool
+    times: list[float] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+
+    def take(self, time: float, value: float) -> None:
+        if not math.isnan(value):
+            self.times.append(time)
+            self.values.append(value)
+
+    def forget(self, before: float) -> None:
+        """Forget all samples before the last one up to an instant."""
+        there = int(np.searchsorted(self.times, before, side="right")) - 1
+        if there > 0:
+            del self.times[:there], self.values[:there]
+
+    def on(self, grid: Floats, spacing: Spacing, end: float) -> Floats:
+        """Its values on a grid; nothing came after the last sample until `end`."""
+        times, values = np.array(self.times, dtype=np.float64), np.array(self.values, dtype=np.float64)
+        return values_on(grid, times, values, spacing, held=self.held, end=end)
+
+    def known_until(self, now: float, limit: float) -> float:
+        """The instant before which nothing that comes makes a difference."""
+        last = self.times[-1] if self.times else -math.inf
+        return now if now - last > limit else last
+
+
+@dataclass(slots=True)
+class Gridded:
+    """Samples of any times, laid on a grid as they come.
+
+    Attributes:
+        name: of the stream, for messages.
+        reading: the grid, and which signals are discrete.
+        t0: of the first sample, in seconds.
+        dt: of the grid, known with its first sample.
+    """
+
+    name: str
+    reading: Reading
+    t0: float = 0.0
+    dt: float = math.nan
+    _spacing: Spacing | None = None
+    _tracks: dict[str, _Track] = field(default_factory=dict)
+    _done: int = 0
+    _came: int = 0
+    _last: float = -math.inf
+
+    def samples(self, first: Moment, rest: Iterator[Moment]) -> Iterator[Sample]:
+        """The samples on the grid, one by one; the first one comes when the step is known."""
+        waiting: list[float] = []
+        for moment in _moments(first, rest):
+            now = self._take(moment)
+            if self._spacing is None:
+                waiting.append(now)
+                if len(waiting) < FIRST and self._has_to_wait:
+                    continue
+                self._begin(waiting)
+            yield from self._ready(now)
+        if self._spacing is None:
+            self._begin(waiting)
+        yield from self._rest()
+
+    @property
+    def _has_to_wait(self) -> bool:
+        """Whether the usual step matters."""
+        return self.reading.max_gap is None or (self.reading.resample or self.reading.dt) is None
+
+    def _take(self, moment: Moment) -> float:
+        time = moment.time
+        if time is None:
+            if self.reading.dt is None:
+                raise TraceError(Diagnostic("E601", f"the {self.name} has no `t`", help=(NO_CLOCK, NO_STEP)))
+            time = self._came * self.reading.dt
+        if time < self._last:
+            message = f"time in the {self.name} runs backwards: {self._last:g} s, {time:g} s"
+            raise TraceError(Diagnostic("E602", message))
+        if not self._came:
+            self.t0 = time
+        self._came, self._last = self._came + 1, time
+        for signal, value in moment.sample.items():
+            if signal not in self._tracks:
+                self._tracks[signal] = _Track(self._is_held(signal))
+            self._tracks[signal].take(time, value)
+        return time
+
+    def _is_held(self, signal: str) -> bool:
+        kinds = self.reading.kinds
+        return (kinds.get(signal) or kinds.get(signal.partition("[")[0]) or "real") != "real"
+
+    def _begin(self, times: list[float]) -> None:
+        first = np.array(times, dtype=np.float64)
+        self.dt = self.reading.resample or self.reading.dt or snapped(usual_step(first))
+        require_step(self.name, self.dt)
+        self._spacing = Spacing.of(self.dt, first, self.reading.max_gap)
+
+    def _ready(self, now: float) -> Iterator[Sample]:
+        """What is known now that was not before."""
+        assert self._spacing is not None
+        until = [track.known_until(now, self._spacing.limit) for track in self._tracks.values()]
+        stop = min(until, default=now)
+        if stop == -math.inf:
+            return
+        yield from self._upto(lambda grid: grid + self._slack < stop, (stop - self.t0) / self.dt + 1, now)
+
+    def _rest(self) -> Iterator[Sample]:
+        """Where nothing more comes."""
+        count = math.floor((self._last - self.t0) / self.dt + self._slack / self.dt) + 1
+        yield from self._upto(lambda grid: np.ones(len(grid), dtype=np.bool_), count, self._last)
+
+    @property
+    def _slack(self) -> float:
+        return 0.0 if self._spacing is None else self._spacing.slack
+
+    def _upto(
+        self, known: Callable[[Floats], NDArray[np.bool_]], most: float, end: float
+    ) -> Iterator[Sample]:
+        """The instants before number `most` of the grid, as long as they are known."""
+        assert self._spacing is not None
+        if most > MAX_SAMPLES:
+            message = f"the {self.name} spans more than {MAX_SAMPLES:,} steps of {self.dt:g} s"
+            raise TraceError(Diagnostic("E605", message, help=("a larger step",)))
+        while True:
+            stop = min(math.ceil(most), self._done + _AT_ONCE)
+            grid = self.t0 + self.dt * np.arange(self._done, stop, dtype=np.float64)
+            grid = grid[known(grid)]
+            if not len(grid):
+                return
+            columns = {
+                name: track.on(grid, self._spacing, max(end, float(grid[-1])))
+                for name, track in self._tracks.items()
+            }
+            self._done += len(grid)
+            following = self.t0 + self.dt * self._done
+            for track in self._tracks.values():
+                track.forget(following)
+            rows = np.array(list(columns.values())).T.tolist() if columns else [[]] * len(grid)
+            for row in rows:
+                yield dict(zip(columns, row, strict=True))

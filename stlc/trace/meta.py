@@ -1,0 +1,174 @@
+"""What a trace says about itself: where it comes from, and what its signals mean, as a JSON text."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.jsontext import loads
+from stlc.signature import Column, Signature
+from stlc.trace.formats.npz import unreadable
+from stlc.units import DIMENSIONLESS, parse_unit
+
+_KINDS: dict[str, tuple[type, ...]] = {
+    "seed": (int,),
+    "horizon": (int,),
+    "dt": (int, float),
+    "origin": (int,),
+    "spec_library": (dict,),
+    "spec_set": (dict,),
+    "judge_library": (dict,),
+    "judge_set": (dict,),
+}
+_TEXTS = ("spec_library", "spec_set", "judge_library", "judge_set")
+
+
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """A specification in a trace.
+
+    Attributes:
+        name: of it, where that is known.
+        path: where it lay.
+        text: the whole; "" where the trace has none.
+        library: texts of the files that it imports, by key.
+        overrides: constants that were set to something else than the text says, as texts.
+    """
+
+    name: str
+    path: str
+    text: str
+    library: Mapping[str, str]
+    overrides: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class TraceMeta:
+    """What was recorded, and by whom; every field may be unknown ("" or None).
+
+    Attributes:
+        spec_name: name of the specification.
+        spec_path: its path as the user gave it.
+        spec_text: its whole text, so that `stlc check` needs no other file.
+        spec_library: texts of the files that it imports, by key (`stlc.compile.frontend.modules`).
+        spec_set: constants that were set to something else than the text says, as texts.
+        spec_hash: SHA-256 of those texts, hexadecimal.
+        judge_path: where the specification by which drives are judged was read; the same for `judge_text`,
+            `judge_library` and `judge_set`. Without a text what was recorded is judged by `spec_text`.
+        system_name: name of the system.
+        system_path: its path as the user gave it.
+        system_text: the text of its file.
+        system_hash: SHA-256 of the system.
+        run: name of the run that recorded.
+        seed: of the recording.
+        horizon: planning horizon T in steps.
+        dt: time step in seconds.
+        origin: the time 0 in ns since 1970, of what was logged with the time of day.
+        created: ISO 8601 time.
+        stlc_version: of the recorder.
+    """
+
+    spec_name: str = ""
+    spec_path: str = ""
+    spec_text: str = ""
+    spec_library: Mapping[str, str] = field(default_factory=dict)
+    spec_set: Mapping[str, str] = field(default_factory=dict)
+    spec_hash: str = ""
+    judge_path: str = ""
+    judge_text: str = ""
+    judge_library: Mapping[str, str] = field(default_factory=dict)
+    judge_set: Mapping[str, str] = field(default_factory=dict)
+    system_name: str = ""
+    system_path: str = ""
+    system_text: str = ""
+    system_hash: str = ""
+    run: str = ""
+    seed: int | None = None
+    horizon: int | None = None
+    dt: float | None = None
+    origin: int | None = None
+    created: str = ""
+    stlc_version: str = ""
+
+    @property
+    def planned(self) -> Carried:
+        """What plans were made for."""
+        return Carried(self.spec_name, self.spec_path, self.spec_text, self.spec_library, self.spec_set)
+
+    @property
+    def carried(self) -> Carried:
+        """What the trace is judged by: the rules of drives that were recorded with it, else `planned`."""
+        if not self.judge_text:
+            return self.planned
+        return Carried("", self.judge_path, self.judge_text, self.judge_library, self.judge_set)
+
+
+def read_meta(path: Path, array: NDArray[Any] | None) -> tuple[TraceMeta, dict[str, Column]]:
+    """What the array `meta` of a trace says, and the columns that it describes.
+
+    Raises:
+        TraceError: E603, it is no JSON text of the expected form.
+    """
+    if array is None:
+        return TraceMeta(), {}
+    if array.dtype.kind != "U" or array.shape != ():
+        raise unreadable(path, "`meta` is not a JSON text")
+    try:
+        written = loads(str(array))
+        return _meta_of(written), _columns_of(written)
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
+        raise unreadable(path, f"`meta` is damaged ({str(error)[:80]})") from None
+
+
+def meta_array(meta: TraceMeta, signature: Signature) -> NDArray[Any]:
+    """The inverse of `read_meta`: a 0-d array that holds the JSON text."""
+    signals = {column.name: _written(column) for column in signature.columns}
+    return np.array(json.dumps(asdict(meta) | {"signals": signals}))
+
+
+def _meta_of(written: Mapping[str, Any]) -> TraceMeta:
+    known = {f.name: written[f.name] for f in fields(TraceMeta) if f.name in written}
+    for name, value in known.items():
+        optional = name in _KINDS and value is None and name not in _TEXTS
+        if not optional and (not isinstance(value, _KINDS.get(name, (str,))) or isinstance(value, bool)):
+            raise ValueError(f"`{name}` is {value!r:.40}")
+    for name in _TEXTS:
+        if not all(isinstance(text, str) for text in known.get(name, {}).values()):
+            raise ValueError(f"`{name}` does not hold texts")
+    return TraceMeta(**known)
+
+
+def _columns_of(written: Mapping[str, Any]) -> dict[str, Column]:
+    return {name: _column(name, entry) for name, entry in written.get("signals", {}).items()}
+
+
+def _column(name: str, entry: Mapping[str, Any]) -> Column:
+    kind, role = entry.get("kind", "real"), entry.get("role", "state")
+    if kind not in ("real", "int", "bool", "enum") or role not in (
+        "input",
+        "output",
+        "state",
+        "env",
+        "timer",
+    ):
+        raise ValueError(f"`{name}` is {kind!r:.20} {role!r:.20}")
+    labels = tuple((str(label), float(value)) for label, value in entry.get("labels", {}).items())
+    unit = parse_unit(entry["unit"]) if entry.get("unit") else DIMENSIONLESS
+    low, high = (None if entry.get(end) is None else float(entry[end]) for end in ("low", "high"))
+    return Column(name, unit, kind, role, low, high, labels)
+
+
+def _written(column: Column) -> dict[str, Any]:
+    entry: dict[str, Any] = {"kind": column.kind, "role": column.role}
+    if column.unit.text:
+        entry["unit"] = column.unit.text
+    entry |= {key: value for key in ("low", "high") if (value := getattr(column, key)) is not None}
+    if column.labels:
+        entry["labels"] = dict(column.labels)
+    return entry

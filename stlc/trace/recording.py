@@ -1,0 +1,154 @@
+"""What a trace file holds before it is laid on one grid of time: arrays by name, and their clocks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.diagnostics import Diagnostic, TraceError
+from stlc.registry import closest
+from stlc.signature import Column
+from stlc.trace.meta import TraceMeta
+from stlc.units import CELSIUS, DIMENSIONLESS, Unit, means_celsius, parse_unit
+
+Array = NDArray[Any]
+Floats = NDArray[np.float64]
+
+CLOCK = "t"
+ROSTOPIC = "%time"
+"""How `rostopic echo -p` calls the clock, which it gives in nanoseconds."""
+CLOCKS = (CLOCK, "time", "times", "timestamp", "__time", "tout", ROSTOPIC)
+"""Names of a clock, in any case of letters."""
+EXTRA = "extra."
+
+
+@dataclass(frozen=True, slots=True)
+class Strand:
+    """Signals that were sampled at the same instants.
+
+    Attributes:
+        arrays: signal -> (samples,), (traces, samples) or (…, samples, components).
+        clock: times in seconds, (samples,); None where the file does not say.
+        named: how the file calls the clock.
+    """
+
+    arrays: Mapping[str, Array]
+    clock: Array | None
+    named: str = CLOCK
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """A trace file as read.
+
+    Attributes:
+        name: the path as the user gave it, for messages.
+        strands: the signals; files with one clock have one.
+        columns: signal -> unit, kind and range, where the file says so.
+        meta: where it comes from.
+        extras: whatever else was recorded.
+    """
+
+    name: str
+    strands: tuple[Strand, ...]
+    columns: Mapping[str, Column] = field(default_factory=dict)
+    meta: TraceMeta = field(default_factory=TraceMeta)
+    extras: Mapping[str, Array] = field(default_factory=dict)
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Names of all signals."""
+        return tuple(name for strand in self.strands for name in strand.arrays)
+
+    def clocked_by(self, signal: str) -> Recording:
+        """The same with `signal` as the clock of its strand.
+
+        Raises:
+            TraceError: E601, there is no such signal.
+        """
+        for index, strand in enumerate(self.strands):
+            if strand.clock is not None and strand.named == signal:
+                return self
+            if signal in strand.arrays:
+                rest = {name: values for name, values in strand.arrays.items() if name != signal}
+                if strand.clock is not None:
+                    rest[strand.named] = strand.clock
+                changed = Strand(rest, strand.arrays[signal].reshape(-1), signal)
+                strands = (*self.strands[:index], changed, *self.strands[index + 1 :])
+                return replace(self, strands=strands)
+        raise TraceError(absent(self.name, signal, self.signals))
+
+
+def absent(trace: str, signal: str, known: Iterable[str]) -> Diagnostic:
+    """E601: the trace has no such signal."""
+    names = list(known)
+    near = closest(signal, names)
+    return Diagnostic(
+        "E601",
+        f"trace `{trace}` has no signal `{signal}`",
+        help=(f"did you mean `{near}`?",) if near else (),
+        note=(f"signals in {trace}: {', '.join(names)}",),
+    )
+
+
+def clock_among(names: Iterable[str]) -> str | None:
+    """Which of the names is that of the clock: `t`, or the only other one that is a usual one."""
+    known = list(names)
+    found = [name for name in known if name.strip().lower() in CLOCKS]
+    return CLOCK if CLOCK in known else found[0] if len(found) == 1 else None
+
+
+def of_arrays(path: Path, arrays: Mapping[str, Array], meta: TraceMeta | None = None) -> Recording:
+    """A file with one clock among its arrays; those called `extra.…` are set aside."""
+    named = clock_among(arrays)
+    extras = {n.removeprefix(EXTRA): values for n, values in arrays.items() if n.startswith(EXTRA)}
+    signals = {n: values for n, values in arrays.items() if n != named and not n.startswith(EXTRA)}
+    strand = Strand(signals, None) if named is None else Strand(signals, arrays[named], named)
+    return Recording(str(path), (strand,), meta=meta or TraceMeta(), extras=extras)
+
+
+def unit_of(path: Path, name: str, text: str) -> Unit:
+    """The unit that a file gives for a column. Raises TraceError (E605) for a text that is none."""
+    try:
+        return parse_unit(text) if text else DIMENSIONLESS
+    except ValueError as error:
+        help_ = (CELSIUS,) if means_celsius(text) else ()
+        raise TraceError(Diagnostic("E605", f"column `{name}` of `{path}`: {error}", help=help_)) from None
+
+
+def fit(name: str, arrays: Mapping[str, Array], samples: int) -> dict[str, Array]:
+    """Signals as (traces, samples); a further axis holds the components of a vector: `q[0]`, `q[1]`.
+
+    Raises:
+        TraceError: E601, there is no signal; E605, arrays do not fit together.
+    """
+    findings: list[Diagnostic] = []
+    data: dict[str, Array] = {}
+    for signal, values in arrays.items():
+        if values.ndim in (1, 2) and values.shape[-1] == samples:
+            data[signal] = np.atleast_2d(values)
+        elif values.ndim in (2, 3) and values.shape[-2] == samples:
+            stacked = values[None] if values.ndim == 2 else values
+            data |= {f"{signal}[{i}]": stacked[..., i] for i in range(values.shape[-1])}
+        else:
+            shape = " x ".join(map(str, values.shape)) or "a single number"
+            message = f"`{signal}` in `{name}` is {shape}, and `t` has {samples} samples"
+            help_ = ("signals are (samples,) or (traces, samples)",)
+            findings.append(Diagnostic("E605", message, help=help_))
+    traces = max((len(values) for values in data.values()), default=0)
+    for signal, values in data.items():
+        if len(values) not in (1, traces):
+            message = f"`{signal}` in `{name}` has {len(values)} traces, other signals have {traces}"
+            findings.append(Diagnostic("E605", message))
+    if findings:
+        raise TraceError(*findings)
+    if not data:
+        raise TraceError(Diagnostic("E601", f"trace `{name}` has no signals"))
+    if not traces:
+        raise TraceError(Diagnostic("E605", f"the arrays of `{name}` hold no traces"))
+    return {signal: np.broadcast_to(values, (traces, samples)) for signal, values in data.items()}

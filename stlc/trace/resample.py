@@ -1,0 +1,257 @@
+"""Signals of any clocks -> one uniform grid: what is discrete is held, real numbers are interpolated.
+
+In gaps that are too long for that a signal is not known: NaN.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.diagnostics import Diagnostic, TraceError
+from stlc.signature import Kind
+from stlc.trace.recording import Recording, Strand, fit
+from stlc.trace.time_grid import NO_CLOCK, NO_STEP, require_step, snapped
+
+Array = NDArray[Any]
+Floats = NDArray[np.float64]
+
+MAX_SAMPLES = 100_000_000
+
+_ROUNDING = 1e-6
+
+_GAPS = 9
+"""So many gaps between the first samples say what is usual,"""
+
+BRIDGED = 3
+"""and a gap of so many usual steps is bridged where nobody says how long a gap may be."""
+
+_SAME = 1 + 1e-9
+
+
+def usual_step(times: Floats) -> float:
+    """The usual time between samples in seconds: the median of the first nine gaps; 0 where there is none."""
+    gaps = np.diff(times[: _GAPS + 1])
+    gaps = gaps[gaps > 0]
+    return float(np.median(gaps)) if len(gaps) else 0.0
+
+
+FIRST = _GAPS + 1
+"""How many samples `usual_step` looks at."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spacing:
+    """A new grid, and which gaps between samples are bridged.
+
+    Attributes:
+        dt: seconds between the instants of the grid.
+        limit: the longest gap in seconds in which values are known.
+    """
+
+    dt: float
+    limit: float = math.inf
+
+    @staticmethod
+    def of(dt: float, times: Floats, max_gap: float | None, *, events: bool = False) -> Spacing:
+        """The grid for samples at `times`; without `max_gap` three steps are bridged, and all between events.
+
+        A step is the longer of `dt` and the usual one.
+        """
+        if max_gap is not None:
+            return Spacing(dt, max_gap * _SAME)
+        return Spacing(dt, math.inf if events else BRIDGED * max(dt, usual_step(times)) * _SAME)
+
+    @property
+    def slack(self) -> float:
+        """Rounding of a clock, in seconds, must not cost a sample."""
+        return _ROUNDING * self.dt
+
+
+def values_on(
+    grid: Floats, times: Floats, values: Array, spacing: Spacing, *, held: bool, end: float
+) -> Floats:
+    """A signal on a grid: NaN where it is not known.
+
+    It is not within gaps that are too long, before its first sample, and, unless it is held, after the last.
+    Samples that are NaN are none.
+
+    Args:
+        grid: instants (points,) in seconds, which increase.
+        times: of the samples (samples,), which never decrease.
+        values: at those times.
+        spacing: of the grid.
+        held: between samples the last one counts (zero-order hold); else there are straight lines.
+        end: until when nothing came after the last sample.
+    """
+    there = ~np.isnan(values) if values.dtype.kind == "f" else np.ones(len(values), dtype=np.bool_)
+    if not there.all():
+        times, values = times[there], values[there]
+    if not len(times):
+        return np.full(len(grid), math.nan)
+    slack = spacing.slack
+    index = np.searchsorted(times, grid + slack, side="right") - 1
+    before = np.clip(index, 0, None)
+    if held:
+        found = values[before].astype(np.float64)
+    else:
+        found = np.asarray(np.interp(grid, times, values.astype(np.float64)), dtype=np.float64)
+    gaps = np.append(np.diff(times), end - times[-1] if held else math.inf)
+    unknown = (gaps[before] > spacing.limit) | (not held) & (before == len(times) - 1)
+    unknown &= grid - times[before] > slack
+    found[unknown | (index < 0)] = math.nan
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Timed:
+    """Signals (traces, samples) with the times of their samples, which never decrease."""
+
+    times: Floats
+    signals: Mapping[str, Array]
+    held: frozenset[str]
+
+    @property
+    def first(self) -> float:
+        return float(self.times[0])
+
+    @property
+    def events(self) -> bool:
+        """Whether all signals are held."""
+        return len(self.held) == len(self.signals)
+
+    @property
+    def last(self) -> float:
+        """The last time at which all signals are known; held ones are known from their first on."""
+        return math.inf if self.events else float(self.times[-1])
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """What the samples of a file are laid on.
+
+    Attributes:
+        dt: seconds between instants; None takes the usual step of the samples.
+        max_gap: the longest gap in seconds in which values are known; None bridges three steps, and between
+            events (a strand beside others, all of whose signals are discrete) any gap.
+    """
+
+    dt: float | None = None
+    max_gap: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Resampled:
+    """Signals on a grid.
+
+    Attributes:
+        t0: of the first sample, in seconds.
+        dt: seconds between samples.
+        data: signal -> (traces, samples); NaN where a signal is not known.
+    """
+
+    t0: float
+    dt: float
+    data: dict[str, Floats]
+
+
+def resampled(recording: Recording, grid: Grid, kinds: Mapping[str, Kind]) -> Resampled:
+    """The signals of a recording on one grid.
+
+    The grid spans the time in which every signal is known. bool, int and enum signals keep their last value
+    (zero-order hold), real ones are interpolated; in gaps that are too long neither is known.
+
+    Args:
+        recording: of one or more strands.
+        grid: what they are laid on.
+        kinds: signal -> what its numbers mean, where the caller knows better than the file.
+
+    Raises:
+        TraceError: E601, a strand has no clock; E602, times decrease, or have no stretch in common, or `dt`
+            is no time step; E604, a time that is not finite; E605, arrays that do not fit, or too many
+            samples.
+    """
+    strands = [_timed(recording, strand, kinds) for strand in recording.strands if strand.arrays]
+    if not strands:
+        raise TraceError(Diagnostic("E601", f"trace `{recording.name}` has no signals"))
+    dt = grid.dt
+    if dt is None:
+        dt = snapped(min((step for s in strands if (step := usual_step(s.times))), default=0.0))
+    require_step(recording.name, dt)
+    start = max(strand.first for strand in strands)
+    stop = min(strand.last for strand in strands)
+    if math.isinf(stop):
+        stop = max(float(strand.times[-1]) for strand in strands)
+    count = _count(recording.name, start, stop, dt)
+    instants = start + dt * np.arange(count, dtype=np.float64)
+    data: dict[str, Floats] = {}
+    for strand in strands:
+        spacing = Spacing.of(dt, strand.times, grid.max_gap, events=strand.events and len(strands) > 1)
+        end = max(float(strand.times[-1]), float(instants[-1]))
+        for name, rows in strand.signals.items():
+            held = name in strand.held
+            data[name] = np.stack(
+                [values_on(instants, strand.times, row, spacing, held=held, end=end) for row in rows]
+            )
+    return Resampled(start, dt, _same_traces(recording.name, data))
+
+
+def _count(name: str, start: float, stop: float, dt: float) -> int:
+    if stop < start - _ROUNDING * dt:
+        ends = f"one starts at {start:g} s, one ends at {stop:g} s"
+        message = f"the signals of `{name}` have no time in common: {ends}"
+        raise TraceError(Diagnostic("E602", message))
+    steps = (stop - start) / dt + _ROUNDING
+    if steps >= MAX_SAMPLES:
+        message = (
+            f"`{name}` spans {stop - start:g} s: a step of {dt:g} s gives more than {MAX_SAMPLES:,} samples"
+        )
+        raise TraceError(Diagnostic("E605", message, help=("a larger step",)))
+    return math.floor(steps) + 1
+
+
+def _timed(recording: Recording, strand: Strand, kinds: Mapping[str, Kind]) -> _Timed:
+    name = recording.name
+    if strand.clock is None:
+        help_ = (NO_CLOCK, NO_STEP)
+        raise TraceError(Diagnostic("E601", f"trace `{name}` has no `t`", help=help_))
+    times: Floats = strand.clock.astype(np.float64).reshape(-1)
+    _check_times(name, times)
+    signals = fit(name, strand.arrays, len(times))
+    held = frozenset(n for n, values in signals.items() if _discrete(n, values, recording, kinds))
+    return _Timed(times, signals, held)
+
+
+def _check_times(name: str, times: Floats) -> None:
+    if not len(times):
+        raise TraceError(Diagnostic("E605", f"trace `{name}` has no samples"))
+    bad = np.flatnonzero(~np.isfinite(times))
+    if len(bad):
+        raise TraceError(Diagnostic("E604", f"time in `{name}` is {times[bad[0]]} at t[{bad[0]}]"))
+    back = np.flatnonzero(np.diff(times) < 0)
+    if len(back):
+        i = int(back[0])
+        message = f"time in `{name}` runs backwards: t[{i}] = {times[i]:g} s, t[{i + 1}] = {times[i + 1]:g} s"
+        raise TraceError(Diagnostic("E602", message))
+
+
+def _discrete(name: str, values: Array, recording: Recording, kinds: Mapping[str, Kind]) -> bool:
+    said = kinds.get(name) or kinds.get(name.partition("[")[0])
+    if said is not None:
+        return said != "real"
+    if name in recording.columns and recording.columns[name].kind != "real":
+        return True
+    return values.dtype.kind in "biu"
+
+
+def _same_traces(name: str, data: dict[str, Floats]) -> dict[str, Floats]:
+    counts: Sequence[int] = [len(values) for values in data.values()]
+    traces = max(counts)
+    if any(count not in (1, traces) for count in counts):
+        raise TraceError(Diagnostic("E605", f"the signals of `{name}` have different numbers of traces"))
+    return {key: np.ascontiguousarray(np.broadcast_to(x, (traces, x.shape[1]))) for key, x in data.items()}

@@ -1,0 +1,274 @@
+"""Recorded signals: a signature, a time step, arrays; `.npz`, `.csv` and `.mcap` in and out, never a pickle.
+
+An `.npz` trace holds `t` (samples,) in seconds, one array (samples,) or (traces, samples) per signal, arrays
+`extra.NAME` of any shape, and `meta`, a JSON text that says what was recorded, with which specification.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.signature import Column, Kind, Signature
+from stlc.trace.enums import Words, in_numbers, wordless
+from stlc.trace.formats.csv import write_csv
+from stlc.trace.formats.extras import needed
+from stlc.trace.formats.npz import write_npz
+from stlc.trace.formats.registry import read_recording
+from stlc.trace.formats.table import GROUPS
+from stlc.trace.meta import TraceMeta, meta_array
+from stlc.trace.recording import CLOCK, EXTRA, Recording, Strand, absent, fit
+from stlc.trace.resample import Grid, resampled, usual_step
+from stlc.trace.time_grid import read_clock, require_same_step, resample_advice
+
+__all__ = [
+    "Reading",
+    "Trace",
+    "TraceMeta",
+    "as_fraction",
+    "load_trace",
+    "read_recording",
+    "save_trace",
+    "trace_of",
+]
+
+Floats = NDArray[np.float64]
+
+RESERVED = ("t", "meta")
+WRITTEN = (".npz", ".csv", ".mcap")
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """Signals of one or several agents on one uniform time grid.
+
+    Attributes:
+        signature: one column per signal, in the order of the file.
+        dt: time step in seconds.
+        data: signal -> (traces, samples), float64, in the units of the signature.
+        t0: time of the first sample in seconds.
+        extras: whatever else was recorded, any shape; never judged.
+        meta: where it comes from.
+        name: the path as the user gave it, for messages.
+    """
+
+    signature: Signature
+    dt: float
+    data: Mapping[str, Floats]
+    t0: float = 0.0
+    extras: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    meta: TraceMeta = field(default_factory=TraceMeta)
+    name: str = "trace"
+
+    @property
+    def traces(self) -> int:
+        """How many agents or repetitions."""
+        return next((len(values) for values in self.data.values()), 0)
+
+    @property
+    def samples(self) -> int:
+        """How many samples each has."""
+        return next((values.shape[1] for values in self.data.values()), 0)
+
+    @property
+    def times(self) -> Floats:
+        """Time of every sample in seconds, shape (samples,)."""
+        return self.t0 + self.dt * np.arange(self.samples, dtype=np.float64)
+
+    def renamed(self, names: Mapping[str, str]) -> Trace:
+        """The same trace where signal `names[new]` is called `new`.
+
+        Raises:
+            TraceError: E601, a signal that is not in the trace.
+        """
+        if not names:
+            return self
+        findings = [absent(self.name, old, self.data) for old in names.values() if old not in self.data]
+        if findings:
+            raise TraceError(*findings)
+        back = {old: new for new, old in names.items()}
+        kept = [c for c in self.signature.columns if c.name in back or c.name not in names]
+        columns = tuple(replace(c, name=back.get(c.name, c.name)) for c in kept)
+        data = {back.get(c.name, c.name): self.data[c.name] for c in kept}
+        return replace(self, signature=Signature(columns), data=data)
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """How a file is read.
+
+    Attributes:
+        names: signal -> its name in the file; `t` names the clock.
+        resample: put the signals on a grid of so many seconds; None takes the file's own, which is uniform.
+        dt: seconds between samples, where the file does not say; it must not say otherwise.
+        max_gap: put the signals on a grid, on which they are unknown (NaN) within longer gaps in seconds;
+            without `resample` the grid has the usual step of the file.
+        kinds: signal -> what its numbers mean, which says how it is resampled.
+        words: signal -> what its words are worth, of all signals of interest; those of no interest, and with
+            None all, are set aside among the extras.
+    """
+
+    names: Mapping[str, str] = field(default_factory=dict)
+    resample: float | None = None
+    dt: float | None = None
+    max_gap: float | None = None
+    kinds: Mapping[str, Kind] = field(default_factory=dict)
+    words: Mapping[str, Words] | None = None
+
+
+AS_IT_IS = Reading()
+
+
+# ----------------------------------------------------------------------- reading
+
+
+def load_trace(path: Path | str, reading: Reading = AS_IT_IS) -> Trace:
+    """Read a trace; the format follows the suffix.
+
+    It is one of `.csv`, `.tsv`, `.parquet`, `.mat`, `.mcap`, `.bag` and `.db3`, or the folder of a bag;
+    everything else is an `.npz`. Values may be NaN or infinite here: the monitor refuses them where a
+    requirement needs them.
+
+    Raises:
+        UsageError: U102, no such file.
+        MissingError: R301, the format needs a package that is not installed.
+        TraceError: E601, no time, or no such signal; E602, time is not uniform; E603, the file cannot be read
+            safely; E605, its arrays do not fit together.
+    """
+    return trace_of(read_recording(Path(path)), reading)
+
+
+def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
+    """The trace of a file that was read: renamed, and on one uniform grid.
+
+    Raises:
+        TraceError: as `load_trace`.
+    """
+    names = dict(reading.names)
+    clock = names.pop(CLOCK, None)
+    if clock is not None:
+        recording = recording.clocked_by(clock)
+    if reading.words is None:
+        recording = wordless(recording)
+    else:
+        recording = in_numbers(recording, {names.get(n, n): worth for n, worth in reading.words.items()})
+    if reading.resample is None and reading.max_gap is None:
+        trace = _uniform(recording, reading.dt)
+    else:
+        kinds = {names.get(name, name): kind for name, kind in reading.kinds.items()}
+        grid = Grid(reading.resample or reading.dt, reading.max_gap)
+        laid = resampled(_clocked(recording, reading.dt), grid, kinds)
+        trace = _trace(recording, laid.t0, laid.dt, laid.data)
+    return trace.renamed(names)
+
+
+def _clocked(recording: Recording, dt: float | None) -> Recording:
+    """The recording where strands without a clock have one with this step."""
+    step = dt or recording.meta.dt
+    if step is None:
+        return recording
+    strands = tuple(
+        strand if strand.clock is not None else replace(strand, clock=step * np.arange(_longest(strand)))
+        for strand in recording.strands
+    )
+    return replace(recording, strands=strands)
+
+
+def _longest(strand: Strand) -> int:
+    return max((values.shape[-1] for values in strand.arrays.values() if values.ndim), default=0)
+
+
+def _uniform(recording: Recording, step: float | None) -> Trace:
+    """The trace of a file with one uniform clock."""
+    name = recording.name
+    strands = [strand for strand in recording.strands if strand.arrays] or list(recording.strands)
+    if len(strands) > 1:
+        message = f"the signals of `{name}` follow {len(strands)} clocks"
+        usual = [usual_step(s.clock.astype(np.float64).reshape(-1)) for s in strands if s.clock is not None]
+        help_ = (resample_advice(min((each for each in usual if each > 0), default=0.0)),)
+        raise TraceError(Diagnostic("E602", message, help=help_))
+    (strand,) = strands
+    said = recording.meta.dt if step is None else step
+    t0, dt, samples = read_clock(name, strand.clock, said, _longest(strand), others=strand.arrays)
+    if step is not None:
+        require_same_step(name, dt, step)
+    data = fit(name, strand.arrays, samples)
+    whole = {n: np.ascontiguousarray(values, dtype=np.float64) for n, values in data.items()}
+    return _trace(recording, t0, dt, whole)
+
+
+def _trace(recording: Recording, t0: float, dt: float, data: dict[str, Floats]) -> Trace:
+    signature = Signature(tuple(recording.columns.get(name, Column(name)) for name in data))
+    return Trace(signature, dt, data, t0, recording.extras, recording.meta, recording.name)
+
+
+# ----------------------------------------------------------------------- writing
+
+
+def save_trace(path: Path | str, trace: Trace) -> None:
+    """Write a trace; the format follows the suffix. A `.csv` holds the signals alone, an `.mcap` no extras.
+
+    Raises:
+        UsageError: U101, the suffix is none of `.npz`, `.csv` and `.mcap`.
+        MissingError: R301, an `.mcap` needs a package that is not installed.
+        TraceError: E605, a signal has a name that the format reserves.
+        MissingError: R201, no room or no permission; an old file stays as it was.
+    """
+    check_writable(path)
+    taken = [name for name in trace.data if name in RESERVED or name.startswith(EXTRA)]
+    if taken:
+        raise TraceError(Diagnostic("E605", f"a recorded signal cannot be called `{taken[0]}`"))
+    if Path(path).suffix.lower() == ".csv":
+        if grouped := [name for name in trace.data if name in GROUPS]:
+            message = f"the column `{grouped[0]}` of a `.csv` says which trace a line is of"
+            raise TraceError(Diagnostic("E605", message, help=("write a `.npz`, which has no such column",)))
+        _to_csv(path, trace)
+        return
+    meta = meta_array(replace(trace.meta, dt=trace.dt), trace.signature)
+    if Path(path).suffix.lower() == ".mcap":
+        from stlc.trace.formats.mcap import Written, write_mcap
+
+        write_mcap(path, Written(trace.times, trace.data, trace.signature, meta, trace.meta.origin))
+        return
+    arrays: dict[str, NDArray[Any]] = {"t": trace.times}
+    arrays |= trace.data
+    arrays |= {f"{EXTRA}{name}": np.asarray(values) for name, values in trace.extras.items()}
+    arrays["meta"] = meta
+    write_npz(path, arrays)
+
+
+def check_writable(path: Path | str) -> None:
+    """Whether a trace can be written there is known before there is one.
+
+    Raises:
+        UsageError: U101, the suffix is none that traces are written with.
+        MissingError: R301, an `.mcap` needs a package that is not installed.
+    """
+    if Path(path).suffix.lower() == ".mcap":
+        needed("mcap.writer")
+    if Path(path).suffix.lower() not in WRITTEN and not Path(path).is_char_device():
+        message = f"`{path}`: a trace is written as {', '.join(WRITTEN[:-1])} or {WRITTEN[-1]}"
+        raise UsageError(
+            Diagnostic("U101", message, help=(f"e.g. {Path(path).stem or 'trace'}{WRITTEN[0]}",))
+        )
+
+
+def _to_csv(path: Path | str, trace: Trace) -> None:
+    columns: dict[str, NDArray[Any]] = {"t": np.tile(trace.times, trace.traces)}
+    if trace.traces > 1:
+        columns = {GROUPS[0]: np.repeat(np.arange(trace.traces), trace.samples), **columns}
+    columns |= {name: values.ravel() for name, values in trace.data.items()}
+    write_csv(path, columns, {column.name: column.unit.text for column in trace.signature.columns})
+
+
+def as_fraction(dt: float | Fraction) -> Fraction:
+    """A time step as the fraction that was meant: 0.1 is 1/10, 0.0333… is 1/30."""
+    near = Fraction(dt).limit_denominator(1_000_000)
+    return near if near > 0 and abs(float(near) - float(dt)) <= 1e-9 * float(dt) else Fraction(dt)
