@@ -318,6 +318,7 @@ def test_links_lead_somewhere(page):
 
 ROOMS = {
     "": "The ground floor",
+    "trace": "trace: recorded signals, and the files that they come from",
     "grammar": "grammar: what was written",
     "compile": "compile: what satisfied means",
     "lint": "lint: what is worth saying about a valid specification",
@@ -327,21 +328,30 @@ ROOMS = {
     "controller": "controller: who acts",
     "export": "export: a controller taken away",
     "view": "view: what is drawn",
+    "bench": "bench: the tables of the paper, and how fast the library is",
     "editor": "editor: what an editor asks",
     "cli": "cli: the terminal",
 }
 
 
 def test_every_file_is_listed_with_its_first_line(regenerate):
-    parts = []
+    parts, listed = [], 0
     for room, title in ROOMS.items():
-        rows = [
-            f"| `{path.name}` | {first_line(path)} |"
-            for path in sorted((ROOT / "stlc" / room).glob("*.py"))
-            if path.name not in ("__init__.py", "__main__.py")
-        ]
-        parts += [f"## {title}", "", "| file | purpose |", "|---|---|", *rows, ""]
+        parts += [f"## {title}", ""]
+        folders = [ROOT / "stlc" / room]
+        if room:
+            folders += sorted(path.parent for path in folders[0].glob("*/**/__init__.py"))
+        for folder in folders:
+            files = [path for path in sorted(folder.glob("*.py")) if not path.stem.startswith("__")]
+            if folder != folders[0]:
+                name = folder.relative_to(ROOT / "stlc").as_posix()
+                parts += [f"### `{name}`", "", first_line(folder / "__init__.py"), ""]
+            if files:
+                rows = [f"| `{path.name}` | {first_line(path)} |" for path in files]
+                parts += ["| file | purpose |", "|---|---|", *rows, ""]
+            listed += len(files)
     hold(ROOT / "docs/files.md", "files", "\n".join(parts), regenerate=regenerate)
+    assert listed == sum(not path.stem.startswith("__") for path in (ROOT / "stlc").rglob("*.py"))
 
 
 def first_line(path: Path) -> str:
