@@ -72,7 +72,7 @@ def links(q: np.ndarray) -> np.ndarray:
 
 
 class Goals:
-    """The world of `panda.yaml`, a `stlc.controller.deployment.world.World`; see the module's text."""
+    """The world of `panda.yaml`, a `stlc.controller.world.World`; see the module's text."""
 
     def __init__(self, system: Any, agents: int, generator: torch.Generator) -> None:
         self.system, self.agents, self.generator = system, agents, generator

@@ -43,7 +43,7 @@ TAIL = 20  # frames of a way that are seen
 
 
 class MazeLevels:
-    """The world of `maze.yaml`, a `stlc.controller.deployment.world.World`; see the module's text."""
+    """The world of `maze.yaml`, a `stlc.controller.world.World`; see the module's text."""
 
     def __init__(self, system: Any, agents: int, generator: torch.Generator) -> None:
         self.system, self.agents, self.generator = system, agents, generator

@@ -64,7 +64,7 @@ class Chain:
 
 
 class River(ABC):
-    """What the three rivers share. Implements `stlc.controller.deployment.world.World`."""
+    """What the three rivers share. Implements `stlc.controller.world.World`."""
 
     def __init__(self, system: Any, agents: int, generator: torch.Generator) -> None:
         self.system, self.agents, self.generator = system, agents, generator

@@ -47,7 +47,7 @@ TAIL = 25  # frames of a way that are seen
 class Stations:
     """The world of `rover.yaml`; see the module's text.
 
-    Implements `stlc.controller.deployment.world.World` and `Choosing`.
+    Implements `stlc.controller.world.World` and `Choosing`.
     """
 
     def __init__(self, system: Any, agents: int, generator: torch.Generator) -> None:

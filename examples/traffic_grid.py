@@ -219,7 +219,7 @@ class Grid:
 
 
 class TrafficGrid:
-    """The world of `car.yaml`; see the module's text. Implements `stlc.controller.deployment.world.World`."""
+    """The world of `car.yaml`; see the module's text. Implements `stlc.controller.world.World`."""
 
     def __init__(self, system: Any, agents: int, generator: torch.Generator) -> None:
         self.system, self.agents = system, agents

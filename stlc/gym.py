@@ -23,8 +23,8 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.batched import Setting, Worlds
-from stlc.controller.deployment.world import world_type
 from stlc.controller.problem.task import Task
+from stlc.controller.world import world_type
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.model.system import System
 from stlc.files import find_spec, find_system, read_source

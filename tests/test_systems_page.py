@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.controller.deployment.world import ModelWorld
+from stlc.controller.world import ModelWorld
 from stlc.dynamics.model.system import System
 from stlc.dynamics.scenarios.scenario import under
 from stlc.dynamics.schema.schema import load_system_decl, parse_system

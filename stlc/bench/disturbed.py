@@ -12,7 +12,6 @@ import torch
 
 from stlc.bench.cells import BENCHMARKS, read_json
 from stlc.controller.deployment.simulator import Recorder, Setting, drive
-from stlc.controller.deployment.world import world_type
 from stlc.controller.evaluation.deployment import decided, feasible_states, measure
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.stats import Interval
@@ -21,6 +20,7 @@ from stlc.controller.guard.guard import Guard, Mode
 from stlc.controller.guard.margin_request import Asked, parse_margins
 from stlc.controller.guard.plan_repair import Limits
 from stlc.controller.training.run import SPEC, SYSTEM, Run
+from stlc.controller.world import world_type
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.declaration.deployment import ErrorsDecl
 from stlc.dynamics.scenarios.scenario import DISTURBED

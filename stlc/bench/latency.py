@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from stlc.bench.measure import one_thread
 from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
-from stlc.controller.deployment.world import world_type
 from stlc.controller.guard.guard import Guard, Mode
 from stlc.controller.guard.plan_repair import Limits
 from stlc.controller.training.run import Run
+from stlc.controller.world import world_type
 
 if TYPE_CHECKING:
     from stlc.rundir import RunDir

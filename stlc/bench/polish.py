@@ -19,13 +19,13 @@ from stlc.bench.latency import AGENTS, WARM, Times, picked
 from stlc.bench.measure import one_thread
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.simulator import Recorder, Setting, drive
-from stlc.controller.deployment.world import world_type
 from stlc.controller.guard.feasibility import savable, solvable
 from stlc.controller.guard.gradient_refine import Ascent
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.plan_repair import SEED, TO_SPARE, FullBackup, Limits
 from stlc.controller.training.local_search import Searcher
 from stlc.controller.training.run import Run
+from stlc.controller.world import world_type
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task

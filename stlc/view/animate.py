@@ -28,7 +28,7 @@ from stlc.view.strip import Strip
 from stlc.view.video import encoder
 
 if TYPE_CHECKING:
-    from stlc.controller.deployment.world import WorldType
+    from stlc.controller.world import WorldType
 
 SCENE = "scene.npz"
 TRACE = "trace.npz"
@@ -147,7 +147,7 @@ def seen_in(run: RunDir, *, guarded: bool = True) -> Seen | None:
 
     With `guarded` false that of the same seed without the guard, where it was driven to compare.
     """
-    from stlc.controller.deployment.world import world_type
+    from stlc.controller.world import world_type
     from stlc.dynamics.scenarios.scenario import under
     from stlc.dynamics.schema.schema import load_system_decl
 

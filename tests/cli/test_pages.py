@@ -124,7 +124,7 @@ def test_a_program(code, example, tmp_path, monkeypatch):
 
 # ---------------------------------------------------------------------- runs, commands, bugs
 
-WORLD = "from stlc.controller.deployment.world import ModelWorld\n\n\nclass Yard(ModelWorld):\n    pass\n"
+WORLD = "from stlc.controller.world import ModelWorld\n\n\nclass Yard(ModelWorld):\n    pass\n"
 
 
 def quicken(patch: pytest.MonkeyPatch) -> None:

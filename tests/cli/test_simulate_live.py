@@ -14,9 +14,9 @@ from torch import Tensor
 from stlc.cli.simulate.live import LiveView, _fitting, _shown, _signed
 from stlc.controller.deployment.live import Oversight
 from stlc.controller.deployment.simulator import Recorder, Setting, drive
-from stlc.controller.deployment.world import world_type
 from stlc.controller.guard.guard import Guard, Mode
 from stlc.controller.problem.task import Task
+from stlc.controller.world import world_type
 from stlc.dynamics.model.system import System
 from stlc.dynamics.schema.schema import parse_system
 from stlc.grammar.parse.parser import parse

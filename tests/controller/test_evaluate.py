@@ -51,7 +51,7 @@ class Careful:
 
 @pytest.fixture(scope="module")
 def recorded(car_task: Task) -> Recording:
-    from stlc.controller.deployment.world import world_type
+    from stlc.controller.world import world_type
 
     recorder = Recorder(SETTING.agents)
     drive(Guard(car_task, Careful(car_task)), world_type(car_task.system.decl), SETTING, recorder)

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
-from stlc.controller.deployment.world import ModelWorld
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import Mlp, PlanNetwork
@@ -21,6 +20,7 @@ from stlc.controller.training.config import TrainConfig, decide
 from stlc.controller.training.learner import Trainer
 from stlc.controller.training.missions import GLIMPSES, POOL, ROUNDS, Missions, mission_steps, visited
 from stlc.controller.training.samplers import Draws
+from stlc.controller.world import ModelWorld
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from stlc.compile.ir.nodes import Atom, Col
 from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
-from stlc.controller.deployment.world import world_type
 from stlc.controller.guard.guard import Guard, Mode
 from stlc.controller.guard.plan_repair import Limits
 from stlc.controller.guard.safe_prefix import prefix_robustness, robustness_until
 from stlc.controller.guard.tightened import sparing, tighter
 from stlc.controller.policies.policy import Mlp, PlanNetwork
 from stlc.controller.problem.task import Task
+from stlc.controller.world import world_type
 from stlc.dynamics.model.system import System
 from stlc.dynamics.scenarios.scenario import under
 from stlc.dynamics.schema.schema import parse_system

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from stlc.controller.deployment.world import ModelWorld, world_type
+from stlc.controller.world import ModelWorld, world_type
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.model.system import System
 

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from stlc.controller.deployment.batched import Setting, Worlds
-from stlc.controller.deployment.world import ModelWorld, world_type
 from stlc.controller.guard.feasibility import savable, solvable
 from stlc.controller.problem.task import Task
+from stlc.controller.world import ModelWorld, world_type
 from stlc.diagnostics import RunError, SystemFileError
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse

@@ -16,8 +16,8 @@ from dynamics.test_motion_in_c import agree
 from exported import untrained
 
 from stlc.controller.deployment.batched import Setting, Worlds
-from stlc.controller.deployment.world import world_type
 from stlc.controller.problem.task import Task
+from stlc.controller.world import world_type
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.model.feedback import growth_of, linearised, riccati, unstable
 from stlc.dynamics.model.system import System

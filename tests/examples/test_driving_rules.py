@@ -15,7 +15,7 @@ from torch import Tensor
 from traffic_drivers import Driver, careful, driver, reckless
 
 import stlc
-from stlc.controller.deployment.world import world_type
+from stlc.controller.world import world_type
 from stlc.dynamics.model.system import System
 from stlc.monitor.verdict import Monitor
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from test_paper_panda import flange
 
-from stlc.controller.deployment.world import world_type
+from stlc.controller.world import world_type
 from stlc.dynamics.model.system import System
 
 PANDA = Path(__file__).parents[2] / "examples" / "panda.yaml"

@@ -127,7 +127,7 @@ def arm(goal: tuple[float, float, float], q: tuple[float, ...] = HOME, samples: 
 
 
 def flange(q: tuple[float, ...]) -> tuple[float, float, float]:
-    from stlc.controller.deployment.world import world_type
+    from stlc.controller.world import world_type
     from stlc.dynamics.model.system import System
 
     links = sys.modules[world_type(System.load(ROOT / "examples/panda.yaml").decl).__module__].links

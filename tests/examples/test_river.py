@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from stlc.controller.deployment.world import world_type
+from stlc.controller.world import world_type
 from stlc.dynamics.model.system import System
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from stlc.controller.deployment.world import Choosing, world_type
+from stlc.controller.world import Choosing, world_type
 from stlc.dynamics.model.system import System
 
 ROVER = Path(__file__).parents[2] / "examples" / "rover.yaml"

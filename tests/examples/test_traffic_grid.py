@@ -12,7 +12,7 @@ import pytest
 import torch
 from traffic_drivers import Driver, careful, reckless
 
-from stlc.controller.deployment.world import world_type
+from stlc.controller.world import world_type
 from stlc.dynamics.model.system import System
 
 CAR = Path(__file__).parents[2] / "examples" / "car.yaml"

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from stlc.cli.framework.app import main
 from stlc.controller.deployment.simulator import Setting
-from stlc.controller.deployment.world import Choosing, world_type
 from stlc.controller.evaluation.archive import save_trace_of
 from stlc.controller.evaluation.deployment import METRICS, deploy
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.run import Run
+from stlc.controller.world import Choosing, world_type
 from stlc.dynamics.model.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse

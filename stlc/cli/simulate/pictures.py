@@ -46,8 +46,8 @@ def require_robots(run: Run) -> None:
         UsageError: U101, the run's world has no robots.
         MissingError: R301, PyBullet is not installed; R302, there is no display.
     """
-    from stlc.controller.deployment.world import world_type
     from stlc.controller.stage import Staged
+    from stlc.controller.world import world_type
     from stlc.view.bullet import require_window
 
     if not isinstance(world_type(run.task.system.decl), Staged):

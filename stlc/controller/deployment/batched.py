@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stlc.controller.deployment.disturbance import Disturbance
-from stlc.controller.deployment.world import Charting, Choosing, Redrawing
 from stlc.controller.deployment.world_errors import blamed, require_numbers, scene_of, states_of, wrong
 from stlc.controller.guard.feasibility import savable, solvable
 from stlc.controller.guard.tightened import Spare
+from stlc.controller.world import Charting, Choosing, Redrawing
 from stlc.diagnostics import Diagnostic, RunError, SystemFileError
 
 if TYPE_CHECKING:
-    from stlc.controller.deployment.world import WorldType
     from stlc.controller.problem.task import Task
+    from stlc.controller.world import WorldType
     from stlc.dynamics.declaration.deployment import Starts, TestDecl
 
 

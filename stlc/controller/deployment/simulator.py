@@ -17,8 +17,8 @@ from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.diagnostics import Diagnostic, RunError
 
 if TYPE_CHECKING:
-    from stlc.controller.deployment.world import WorldType
     from stlc.controller.guard.guard import Decision, Guard
+    from stlc.controller.world import WorldType
 
 __all__ = ["Moment", "Recorder", "Recording", "Setting", "Watch", "drive"]
 

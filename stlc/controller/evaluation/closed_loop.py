@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stlc.controller.deployment.simulator import Moment, Recorder, Recording, Setting, drive
-from stlc.controller.deployment.world import world_type
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.evaluation.rules import Rules, drives_of_plans, obeying, rules_of, verdict_on_drives
 from stlc.controller.guard.guard import Guard, Mode
 from stlc.controller.guard.plan_repair import Limits
 from stlc.controller.training.config import DRIVES
+from stlc.controller.world import world_type
 from stlc.diagnostics import StlcError
 
 if TYPE_CHECKING:

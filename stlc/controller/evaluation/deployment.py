@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.simulator import Recorder, Recording, Setting, Watch, drive
-from stlc.controller.deployment.world import world_type
 from stlc.controller.evaluation.executed import Executed, judge_executed
 from stlc.controller.evaluation.rules import Drives, Rules, drives_json, drives_of_plans, judge_drives
 from stlc.controller.evaluation.stats import Interval
 from stlc.controller.guard.feasibility import solvable
 from stlc.controller.guard.guard import SOURCES, Guard, Mode
 from stlc.controller.guard.plan_repair import Limits
+from stlc.controller.world import world_type
 
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import Policy
