@@ -1,1 +1,5 @@
 """Samples one by one: verdicts as soon as they are decided, in bounded memory."""
+
+from stlc.monitor.online.online import How, Online
+
+__all__ = ["How", "Online"]
