@@ -27,6 +27,7 @@ def test_a_tank_is_kept(tmp_path, monkeypatch, capsys):
     assert list(tmp_path.glob("runs/pump/*/report.html"))
 
 
+@pytest.mark.slow
 def test_a_quadrotor_flies_through_two_windows(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     found = steps(DOCS / "own-system.md")

@@ -138,6 +138,7 @@ def test_a_finished_run_is_collected_and_then_kept(tmp_path: Path, monkeypatch: 
     assert valid_results(place.out) == []
 
 
+@pytest.mark.slow
 def test_a_run_that_was_cut_short_goes_on(tmp_path: Path) -> None:
     place = Place(tmp_path / "bench", tmp_path / "runs")
     cell, count = quick(length=Length(steps=6)), []

@@ -67,6 +67,7 @@ def test_the_table_has_a_line_for_each_and_the_mean_of_those_that_ended_well(
     assert f"seed 1 broke off with exit code {ended}\nerror[R401]: training diverged" in told.err
 
 
+@pytest.mark.slow
 def test_every_specification_is_trained_for_and_one_that_fails_stops_no_other(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -92,6 +92,7 @@ def test_batches_do_not_change_the_choice_and_bound_the_memory(car_task: Task) -
         assert torch.equal(getattr(whole, name), getattr(pieces, name))
 
 
+@pytest.mark.slow
 def test_a_decision_without_time_takes_the_best_of_what_it_has(car_task: Task) -> None:
     """The clock is looked at after each batch; one of them is always judged."""
     x, plan = failing(car_task, 10.0, n=60)

@@ -51,6 +51,7 @@ def test_what_a_training_reads(project: Path) -> None:
     assert input_files(Path("specs/none.stl")) == ()
 
 
+@pytest.mark.slow
 def test_a_worker_that_does_not_see_the_folders_sends_the_run(project: Path) -> None:
     home = project / "results"
     sent = wrap(errand("--name", "far", runs=home), cores=1)

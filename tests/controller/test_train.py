@@ -58,7 +58,7 @@ def test_the_system_file_may_ask_for_a_training_set() -> None:
     assert decide(task, TrainConfig(method="guided")).samples == 0
 
 
-@pytest.mark.parametrize("method", ["guided", "gradient"])
+@pytest.mark.parametrize("method", ["guided", pytest.param("gradient", marks=pytest.mark.slow)])
 def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(
     car_task: Task, tmp_path: Path, method: str
 ) -> None:
@@ -194,6 +194,7 @@ def test_the_deployment_may_be_edited_but_not_what_is_learnt(car_task: Task, tmp
     assert caught.value.diagnostics[0].code == "R102"
 
 
+@pytest.mark.slow
 def test_a_budget_becomes_steps(car_task: Task, tmp_path: Path) -> None:
     config = TrainConfig(held_out=200, budget=3.0, batch=32)
     folder = _folder(car_task, tmp_path, config)

@@ -57,6 +57,7 @@ def data_in(html):
     return json.loads(re.search(r'id="film-data">([^<]*)</script>', html)[1])
 
 
+@pytest.mark.slow
 def test_both_drives_are_shown_with_what_was_violated(compared):
     shots = shots_of(compared)
     assert [shot.title for shot in shots] == [WITHOUT, WITH]
