@@ -76,7 +76,7 @@ def _online(monitor: Monitor, question: Question, uniform: Uniform) -> Online:
 
 
 def _conversions(online: Online, units: Mapping[str, str]) -> dict[str, Conversion]:
-    """How the numbers of signals are converted that come in other units than are declared.
+    """Conversions of recorded numbers whose unit is another one than is declared.
 
     Raises:
         TraceError: E605, a unit that is none, or of something else.

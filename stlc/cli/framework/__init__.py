@@ -1,1 +1,1 @@
-"""What every command shares: the program, options, output, errors."""
+"""Framework of all commands: the program, options, output, errors."""

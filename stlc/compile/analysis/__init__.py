@@ -1,1 +1,1 @@
-"""What ranges say of a specification before it is used."""
+"""Static analysis of a specification: what its ranges imply before it is used."""

@@ -28,7 +28,7 @@ def contradictions(formula: typed.Formula) -> Iterator[Diagnostic]:
 
 @dataclass(slots=True)
 class _Room:
-    """What predicates leave of a quantity, and which of them bound it."""
+    """Bounds that predicates leave of a quantity, and which of them bind."""
 
     low: float = -math.inf
     high: float = math.inf

@@ -12,7 +12,7 @@ _DEVIATIONS = 3.0
 _CHANGES: Mapping[str, Callable[[float, float], float]] = MappingProxyType(
     {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv}
 )
-"""What a unit does to a draw."""
+"""Units of random draws: points are shifted, deviations are scaled."""
 
 
 def spread(num: ir.Num) -> tuple[float, float] | None:

@@ -76,7 +76,7 @@ def _leaf(leaf: Leaf) -> _Draw | None:
 
 
 def _rounds(leaf: Leaf) -> _Draw | None:
-    """What recurs for ever, `always@[a, end] once[0, c] p`: p draws, and is due c after it was last there."""
+    """Recurring goals, `always@[a, end] once[0, c] p`: p draws, and is due c after it was last there."""
     margin = leaf.formula.margin
     parts = margin.items if isinstance(margin, ir.Join) and margin.op == "and" else (margin,)
     draws = [draw for part in parts if (draw := _round(part, leaf)) is not None]

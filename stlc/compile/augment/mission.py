@@ -84,7 +84,7 @@ def mission_steps(goal: Goal) -> int:
 
 
 def endless(goal: Goal) -> bool:
-    """Whether a mission is never over: one of its formulas has no end."""
+    """True where a mission is never over: one of its formulas has no end."""
     if isinstance(goal, Leaf):
         return goal.formula.window.hi is None
     return any(map(endless, goal.items))

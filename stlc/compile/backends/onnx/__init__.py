@@ -1,1 +1,1 @@
-"""What is computed as an ONNX graph."""
+"""ONNX graphs of what is computed."""
