@@ -203,7 +203,7 @@ def _observed(task: Task, *, time: bool) -> _Box:
     }
     observe = system.decl.policy.observe
     names = [column.name for column in system.added] if observe else list(system.names)
-    numbers = [*observe, *(ir.Col(name) for name in names)]
+    numbers = [*observe, *(ir.Signal(name) for name in names)]
     found = []
     for number, column in zip(numbers, seen.unbind(1), strict=True):
         ends = bounds(number, facts) or (math.inf, -math.inf)

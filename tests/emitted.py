@@ -42,7 +42,7 @@ OPERATIONS = {
 def follower(steps: int = STEPS) -> Motion:
     """A system whose next state is its control: any trace is one of its rollouts."""
     controls = tuple(f"to_{name}" for name in NAMES)
-    after = {name: ir.Col(control) for name, control in zip(NAMES, controls, strict=True)}
+    after = {name: ir.Signal(control) for name, control in zip(NAMES, controls, strict=True)}
     return Motion(NAMES, controls, (), after, steps, 0.1)
 
 
@@ -95,26 +95,28 @@ def planned(formula: typed.Formula) -> ir.Formula | None:
 def choosing(count: int, first: int) -> list[ir.Num]:
     """Numbers with choices and indicators, as resolving leaves them: constants are folded."""
     conditions = state_formulas(numbers)
-    joined = st.builds(ir.Join, st.sampled_from(["and", "or"]), st.tuples(conditions, conditions, conditions))
-    drawn = st.builds(ir.Where, conditions | joined, numbers, numbers) | st.builds(ir.Ind, joined)
+    joined = st.builds(
+        ir.BoolOp, st.sampled_from(["and", "or"]), st.tuples(conditions, conditions, conditions)
+    )
+    drawn = st.builds(ir.Where, conditions | joined, numbers, numbers) | st.builds(ir.Indicator, joined)
     return list(dict.fromkeys(gathered(drawn, count, _is_folded, first)))
 
 
 def _is_folded(num: ir.Num) -> bool:
     for part in everything(num):
-        constant = all(isinstance(leaf, ir.Lit) for leaf in leaves(part))
-        if constant and not isinstance(part, ir.Lit):
+        constant = all(isinstance(leaf, ir.Const) for leaf in leaves(part))
+        if constant and not isinstance(part, ir.Const):
             return False
-        if isinstance(part, ir.Ind | ir.Where) and _decided(part.cond):
+        if isinstance(part, ir.Indicator | ir.Where) and _decided(part.cond):
             return False
     return True
 
 
 def _decided(cond: ir.Formula) -> bool:
     """Whether an atom compares constants."""
-    if isinstance(cond, ir.Join):
+    if isinstance(cond, ir.BoolOp):
         return any(map(_decided, cond.items))
-    return isinstance(cond, ir.Atom) and isinstance(cond.num, ir.Lit)
+    return isinstance(cond, ir.Predicate) and isinstance(cond.num, ir.Const)
 
 
 def slopes_agree(nums: Sequence[ir.Num], points: np.ndarray, slope: float = 4.0) -> None:
@@ -127,7 +129,7 @@ def slopes_agree(nums: Sequence[ir.Num], points: np.ndarray, slope: float = 4.0)
     """
     states = tuple(f"state{i}" for i in range(len(nums)))
     motion = Motion(states, NAMES, (), dict(zip(states, nums, strict=True)), 1, 0.1)
-    adjoint, batch = adjoint_of(motion, [ir.Atom(ir.Col(states[0]))]), len(points)
+    adjoint, batch = adjoint_of(motion, [ir.Predicate(ir.Signal(states[0]))]), len(points)
     for i, num in enumerate(nums):
         by_states = np.zeros((len(nums), 2, batch))
         by_states[i, 1] = 1.0

@@ -12,7 +12,7 @@ from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.horizon import reach, uses_end
-from stlc.compile.pipeline import Rule
+from stlc.compile.pipeline import CompiledRequirement
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source, Span
 
@@ -21,7 +21,7 @@ NAMES = ("x", "y", "z")
 GRID = Grid(Fraction(1, 10), 6)
 
 _values = st.integers(-40, 40).map(lambda n: n / 8)
-_columns = st.sampled_from(NAMES).map(ir.Col)
+_columns = st.sampled_from(NAMES).map(ir.Signal)
 
 
 def _op(name: str, *args: st.SearchStrategy[ir.Num]) -> st.SearchStrategy[ir.Num]:
@@ -30,8 +30,8 @@ def _op(name: str, *args: st.SearchStrategy[ir.Num]) -> st.SearchStrategy[ir.Num
 
 def state_formulas(numbers: st.SearchStrategy[ir.Num]) -> st.SearchStrategy[ir.Formula]:
     """Formulas of the IR without temporal operators."""
-    atoms = st.builds(ir.Atom, numbers, sign=st.sampled_from([1, -1]), strict=st.booleans())
-    joins = st.builds(ir.Join, st.sampled_from(["and", "or"]), st.tuples(atoms, atoms))
+    atoms = st.builds(ir.Predicate, numbers, sign=st.sampled_from([1, -1]), strict=st.booleans())
+    joins = st.builds(ir.BoolOp, st.sampled_from(["and", "or"]), st.tuples(atoms, atoms))
     return atoms | joins
 
 
@@ -43,28 +43,28 @@ def _grown(inner: st.SearchStrategy[ir.Num]) -> st.SearchStrategy[ir.Num]:
     return (
         st.builds(lambda name, a, b: ir.Op(name, (a, b)), binary, inner, inner)
         | st.builds(lambda name, a: ir.Op(name, (a,)), unary, inner)
-        | _op("clip", inner, _values.map(ir.Lit), st.integers(5, 9).map(lambda n: ir.Lit(float(n))))
-        | _op("mod", inner, st.sampled_from([ir.Lit(2.0), ir.Lit(0.75)]))
-        | _op("div", inner, st.sampled_from([ir.Lit(2.0), ir.Lit(-0.5)]))
-        | _op("pow", inner, st.sampled_from([ir.Lit(2.0), ir.Lit(3.0)]))
+        | _op("clip", inner, _values.map(ir.Const), st.integers(5, 9).map(lambda n: ir.Const(float(n))))
+        | _op("mod", inner, st.sampled_from([ir.Const(2.0), ir.Const(0.75)]))
+        | _op("div", inner, st.sampled_from([ir.Const(2.0), ir.Const(-0.5)]))
+        | _op("pow", inner, st.sampled_from([ir.Const(2.0), ir.Const(3.0)]))
         | _op("norm", inner, inner)
         | _op("norm1", inner, inner)
         | _op("norminf", inner, inner)
-        | st.builds(ir.Ind, state_formulas(inner))
+        | st.builds(ir.Indicator, state_formulas(inner))
         | st.builds(ir.Where, state_formulas(inner), inner, inner)
     )
 
 
-numbers: st.SearchStrategy[ir.Num] = st.recursive(_columns | _values.map(ir.Lit), _grown, max_leaves=8)
+numbers: st.SearchStrategy[ir.Num] = st.recursive(_columns | _values.map(ir.Const), _grown, max_leaves=8)
 
 _linear = st.builds(
-    lambda a, b, c: ir.Op("sub", (ir.Op("add", (a, ir.Op("mul", (b, ir.Lit(0.5))))), ir.Lit(c))),
+    lambda a, b, c: ir.Op("sub", (ir.Op("add", (a, ir.Op("mul", (b, ir.Const(0.5))))), ir.Const(c))),
     _columns,
     _columns,
     _values,
 )
 _predicates = st.builds(
-    typed.Pred,
+    typed.Predicate,
     st.just(SPAN),
     _columns | _linear,
     strict=st.booleans(),
@@ -75,16 +75,20 @@ _predicates = st.builds(
 _seen = (
     _columns
     | _columns
-    | st.builds(ir.At, st.sampled_from(NAMES), st.sampled_from([-2, -1, 1, 2]), clamped=st.booleans())
+    | st.builds(
+        ir.ShiftedSignal, st.sampled_from(NAMES), st.sampled_from([-2, -1, 1, 2]), clamped=st.booleans()
+    )
 )
 """A column, now or at another sample."""
 
 
 def _looking(held: tuple[str, ...]) -> st.SearchStrategy[typed.Formula]:
     """Predicates about other samples and frozen values."""
-    right = _seen | st.sampled_from(held).map(ir.Held) if held else _seen
-    number = st.builds(lambda a, b, c: ir.Op("sub", (ir.Op("sub", (a, b)), ir.Lit(c))), _seen, right, _values)
-    return st.builds(typed.Pred, st.just(SPAN), number, strict=st.booleans())
+    right = _seen | st.sampled_from(held).map(ir.FrozenVar) if held else _seen
+    number = st.builds(
+        lambda a, b, c: ir.Op("sub", (ir.Op("sub", (a, b)), ir.Const(c))), _seen, right, _values
+    )
+    return st.builds(typed.Predicate, st.just(SPAN), number, strict=st.booleans())
 
 
 def _interval(*, bounded_only: bool) -> st.SearchStrategy[typed.Interval]:
@@ -176,7 +180,7 @@ def traces(low: int = 1, high: int = 14, batch: int = 2) -> st.SearchStrategy[di
     return st.builds(build, st.integers(low, high), st.integers(0, 2**32 - 1))
 
 
-def a_rule(formula: ir.Formula) -> Rule:
+def a_rule(formula: ir.Formula) -> CompiledRequirement:
     """A requirement that is judged once, or at every sample."""
     like = Monitor("signal x\nrequire r: x > 0\n", dt=0.1).compiled.requirements[0]
     return replace(

@@ -222,14 +222,14 @@ def no_step(draw: Draw) -> tuple[Formula, Formula]:
 
 def unread_binding(draw: Draw) -> tuple[Formula, Formula]:
     p = draw(part)
-    return typed.Freeze(SPAN, (("unread", ir.Col("x")),), p), p
+    return typed.Freeze(SPAN, (("unread", ir.Signal("x")),), p), p
 
 
 def frozen_now(draw: Draw) -> tuple[Formula, Formula]:
     """A predicate of the instant at which its values are kept."""
-    name, column = draw(st.sampled_from("xyz")), ir.Col(draw(st.sampled_from("xyz")))
-    gap = lambda kept: typed.Pred(SPAN, ir.Op("sub", (column, kept)), strict=True)  # noqa: E731
-    return typed.Freeze(SPAN, (("kept", ir.Col(name)),), gap(ir.Held("kept"))), gap(ir.Col(name))
+    name, column = draw(st.sampled_from("xyz")), ir.Signal(draw(st.sampled_from("xyz")))
+    gap = lambda kept: typed.Predicate(SPAN, ir.Op("sub", (column, kept)), strict=True)  # noqa: E731
+    return typed.Freeze(SPAN, (("kept", ir.Signal(name)),), gap(ir.FrozenVar("kept"))), gap(ir.Signal(name))
 
 
 LAWS = {

@@ -24,7 +24,9 @@ SAMPLES = 36
 """Longer than any formula below looks."""
 
 _predicates = st.builds(
-    lambda name, level, strict: typed.Pred(SPAN, ir.Op("sub", (ir.Col(name), ir.Lit(level))), strict=strict),
+    lambda name, level, strict: typed.Predicate(
+        SPAN, ir.Op("sub", (ir.Signal(name), ir.Const(level))), strict=strict
+    ),
     st.sampled_from(NAMES),
     st.sampled_from([-1.0, 0.0, 0.5, 1.0]),
     st.booleans(),

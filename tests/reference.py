@@ -54,9 +54,9 @@ class Trace:
 
     def _there(self, leaf: ir.Num, t: int) -> bool:
         match leaf:
-            case ir.At(_, steps, clamped):
+            case ir.ShiftedSignal(_, steps, clamped):
                 return clamped or 0 <= t + steps < self.samples
-            case ir.Held(name):
+            case ir.FrozenVar(name):
                 return self.held[name] is not None
         return True
 
@@ -64,17 +64,17 @@ class Trace:
 def _leaves(node: object) -> Iterator[ir.Num]:
     """Columns, other samples and frozen values, wherever they stand."""
     match node:
-        case ir.Col() | ir.At() | ir.Held():
+        case ir.Signal() | ir.ShiftedSignal() | ir.FrozenVar():
             yield node
         case ir.Op(_, args) | ir.Extern(_, args):
             yield from (leaf for arg in args for leaf in _leaves(arg))
-        case ir.Ind(cond):
+        case ir.Indicator(cond):
             yield from _leaves(cond)
         case ir.Where(cond, yes, no):
             yield from (leaf for part in (cond, yes, no) for leaf in _leaves(part))
-        case ir.Atom(num):
+        case ir.Predicate(num):
             yield from _leaves(num)
-        case ir.Join(_, items):
+        case ir.BoolOp(_, items):
             yield from (leaf for item in items for leaf in _leaves(item))
 
 
@@ -93,13 +93,13 @@ class Row(Mapping[str, float]):
     def __len__(self) -> int:
         return len(self.trace.columns)
 
-    def at(self, leaf: ir.At) -> float:
+    def at(self, leaf: ir.ShiftedSignal) -> float:
         there = self.t + leaf.steps
         if leaf.clamped:
             there = min(max(there, 0), self.trace.samples - 1)
         return float(self.trace.columns[leaf.name][there])
 
-    def held(self, leaf: ir.Held) -> float:
+    def held(self, leaf: ir.FrozenVar) -> float:
         value = self.trace.held[leaf.name]
         assert value is not None
         return value
@@ -144,17 +144,17 @@ _PLAIN = {
 def number(num: ir.Num, row: Mapping[str, float]) -> float:
     """A number at one instant, conditions switched exactly."""
     match num:
-        case ir.Lit(value):
+        case ir.Const(value):
             return value
-        case ir.Col(name):
+        case ir.Signal(name):
             return row[name]
-        case ir.At():
+        case ir.ShiftedSignal():
             return row.at(num)
-        case ir.Held():
+        case ir.FrozenVar():
             return row.held(num)
         case ir.Op(name, args):
             return float(_PLAIN[name](*[number(arg, row) for arg in args]))
-        case ir.Ind(cond):
+        case ir.Indicator(cond):
             return 1.0 if true(cond, row) else 0.0
         case ir.Where(cond, yes, no):
             return number(yes if true(cond, row) else no, row)
@@ -166,10 +166,10 @@ def true(cond: ir.Formula, row: Mapping[str, float]) -> bool:
     match cond:
         case ir.Truth(value):
             return value
-        case ir.Atom(num, sign, strict):
+        case ir.Predicate(num, sign, strict):
             value = sign * number(num, row)
             return value > 0 if strict else value >= 0
-        case ir.Join(op, items):
+        case ir.BoolOp(op, items):
             return (all if op == "and" else any)(true(item, row) for item in items)
     raise TypeError(cond)
 
@@ -292,7 +292,7 @@ class Robustness:
         match node:
             case typed.Truth(_, value):
                 return TRUE if value else FALSE
-            case typed.Pred(_, num, strict, guard):
+            case typed.Predicate(_, num, strict, guard):
                 return self._pred(num, strict, guard, t)
             case typed.Not(_, body):
                 return _negated(self.at(body, t, not positive))
@@ -442,7 +442,7 @@ def holds(formula: typed.Formula, trace: Trace, t: int = 0) -> bool:  # noqa: C9
     match formula:
         case typed.Truth(_, value):
             return value
-        case typed.Pred(_, num, strict):
+        case typed.Predicate(_, num, strict):
             value = number(num, trace.row(t)) if trace.has(num, t) else -math.inf
             return value > 0 if strict else value >= 0
         case typed.Freeze(_, _, body):

@@ -42,7 +42,7 @@ def state(text: str, before: str = "") -> ir.Formula:
 def margin(text: str, before: str = "") -> ir.Num:
     """The number of a predicate `text > 0`."""
     found = formula(f"{text} > 0", before)
-    assert isinstance(found, typed.Pred)
+    assert isinstance(found, typed.Predicate)
     return found.num
 
 

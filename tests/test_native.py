@@ -17,9 +17,9 @@ from stlc.compile.backends.c.emit import LANES, Motion, emit
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Notice
 
-MOTION = Motion(("x",), ("u",), (), {"x": ir.Op("add", (ir.Col("x"), ir.Col("u")))}, 5, 0.1)
+MOTION = Motion(("x",), ("u",), (), {"x": ir.Op("add", (ir.Signal("x"), ir.Signal("u")))}, 5, 0.1)
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
-RULES = [ir.Over("always", ir.Window(0, None), ir.Atom(ir.Col("x")))]
+RULES = [ir.Temporal("always", ir.Window(0, None), ir.Predicate(ir.Signal("x")))]
 SMALL = "int answer(void) { return 42; }\n"
 EVIL = "int answer(void) { return 666; }\n"
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")

@@ -32,13 +32,13 @@ class Case:
     plain: Plain
 
 
-def _atom(name: str, above: float = 0.0) -> ir.Atom:
-    column = ir.Col(name)
-    return ir.Atom(ir.Op("sub", (column, ir.Lit(above))) if above else column)
+def _atom(name: str, above: float = 0.0) -> ir.Predicate:
+    column = ir.Signal(name)
+    return ir.Predicate(ir.Op("sub", (column, ir.Const(above))) if above else column)
 
 
-def _over(op: str, hi: int | None, body: ir.Formula) -> ir.Over:
-    return ir.Over("always" if op == "always" else "eventually", ir.Window(0, hi), body)
+def _over(op: str, hi: int | None, body: ir.Formula) -> ir.Temporal:
+    return ir.Temporal("always" if op == "always" else "eventually", ir.Window(0, hi), body)
 
 
 CASES = (
@@ -69,7 +69,7 @@ CASES = (
     ),
     Case(
         "p1 and ... and p10",
-        lambda _: ir.Join("and", tuple(_atom("x", above) for above in _TEN)),
+        lambda _: ir.BoolOp("and", tuple(_atom("x", above) for above in _TEN)),
         lambda x, _, __: plain.conjunction(x, _TEN),
     ),
 )

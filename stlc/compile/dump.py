@@ -15,7 +15,7 @@ from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.horizon import columns, nodes
 from stlc.compile.ir.text import show_formula, shown
-from stlc.compile.pipeline import Compiled, Rule
+from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.escape import screen
 from stlc.grammar.show.expressions import show_name
 from stlc.grammar.show.printer import show
@@ -61,7 +61,7 @@ def _both(steps: int, grid: Grid) -> str:
     return count if grid.dt is None else f"{in_words(Fraction(steps), grid)} = {count}"
 
 
-def _rules(compiled: Compiled) -> Iterator[tuple[Rule, str]]:
+def _rules(compiled: Compiled) -> Iterator[tuple[CompiledRequirement, str]]:
     """Every requirement and every assumption, with a word for what it is."""
     yield from ((rule, "") for rule in compiled.requirements)
     yield from ((rule, "assume") for rule in compiled.assumptions)
@@ -80,7 +80,7 @@ def _beside(compiled: Compiled) -> Iterator[str]:
         yield "\n".join(lines)
 
 
-def _became(rule: Rule, compiled: Compiled) -> Iterator[str]:
+def _became(rule: CompiledRequirement, compiled: Compiled) -> Iterator[str]:
     """The formula, the states that the compiler adds for it, and its intervals."""
     yield show_formula(rule.formula)
     read = columns(rule.formula)
@@ -106,7 +106,7 @@ def _cut(lines: list[str]) -> list[str]:
     return [*lines[:SHOWN], f"  … {len(lines) - SHOWN} more lines: --show ir"]
 
 
-def _name(rule: Rule, kind: str) -> str:
+def _name(rule: CompiledRequirement, kind: str) -> str:
     tags = [f"@{show_name(tag)}" for tag in sorted(rule.tags)]
     if rule.weight != 1:
         tags.append(f"@weight({rule.weight:g})")
@@ -115,7 +115,7 @@ def _name(rule: Rule, kind: str) -> str:
     return "  ".join(["", *([kind] if kind else []), show_name(rule.name), *tags]).rstrip()
 
 
-def _rule(rule: Rule, kind: str, compiled: Compiled, part: Part) -> Iterator[str]:
+def _rule(rule: CompiledRequirement, kind: str, compiled: Compiled, part: Part) -> Iterator[str]:
     yield _name(rule, kind)
     if part == "ir":
         yield f"    compiled  {show_formula(rule.formula)}"
@@ -130,16 +130,16 @@ def _added(timer: Timer) -> str:
     return f"  + {timer.kind:<6}  {shown(timer.name)}  {timer.about}".rstrip()
 
 
-def _instants(rule: Rule, grid: Grid) -> list[str]:
+def _instants(rule: CompiledRequirement, grid: Grid) -> list[str]:
     return list(_times(rule, grid)) or ["the first sample alone"]
 
 
-def _times(rule: Rule, grid: Grid) -> Iterator[str]:
+def _times(rule: CompiledRequirement, grid: Grid) -> Iterator[str]:
     """Every interval once: operator, seconds, samples."""
     seen: set[str] = set()
     for node in nodes(rule.formula):
-        if isinstance(node, (ir.Over, ir.Past, ir.Until, ir.Since)):
-            line = _interval(node.op, node.window, grid, back=isinstance(node, (ir.Past, ir.Since)))
+        if isinstance(node, (ir.Temporal, ir.PastTemporal, ir.Until, ir.Since)):
+            line = _interval(node.op, node.window, grid, back=isinstance(node, (ir.PastTemporal, ir.Since)))
             if line not in seen:
                 seen.add(line)
                 yield line

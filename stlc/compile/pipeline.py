@@ -52,7 +52,7 @@ the plan (E306).
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class CompiledRequirement:
     """A compiled requirement.
 
     Attributes:
@@ -121,8 +121,8 @@ class Compiled:
     name: str
     spec: ast.Spec = field(repr=False)
     signature: Signature
-    requirements: tuple[Rule, ...]
-    assumptions: tuple[Rule, ...]
+    requirements: tuple[CompiledRequirement, ...]
+    assumptions: tuple[CompiledRequirement, ...]
     timers: tuple[Timer, ...]
     parameters: tuple[typed.Parameter, ...]
     pull: ir.Num | None = field(repr=False)
@@ -133,7 +133,7 @@ class Compiled:
     typed: typed.Spec = field(repr=False)
 
     @property
-    def safety(self) -> tuple[Rule, ...]:
+    def safety(self) -> tuple[CompiledRequirement, ...]:
         """phi_safe: the requirements tagged `@safety`."""
         return safe_part(self.requirements)
 
@@ -213,7 +213,7 @@ class _Stage:
     ranges: Facts
     goals: list[Goal] = field(default_factory=list)
 
-    def rule(self, requirement: typed.Requirement) -> Rule:
+    def rule(self, requirement: typed.Requirement) -> CompiledRequirement:
         """One requirement, compiled."""
         written = requirement.formula
         if self.purpose == "train":
@@ -223,7 +223,7 @@ class _Stage:
             self.goals.append(rewritten.goal)
         lowered = lower(rewritten.formula, self.grid, self.sink)
         formula = simplify(lowered)
-        return Rule(
+        return CompiledRequirement(
             name=requirement.name,
             doc=requirement.doc,
             tags=requirement.tags,
@@ -262,7 +262,7 @@ def _without(interface: Interface, names: Iterable[str]) -> Interface:
     return replace(interface, signature=Signature(tuple(kept)))
 
 
-def _signature(spec: typed.Spec, rules: Iterable[Rule], timers: Iterable[Timer]) -> Signature:
+def _signature(spec: typed.Spec, rules: Iterable[CompiledRequirement], timers: Iterable[Timer]) -> Signature:
     read = frozenset().union(*(columns(rule.formula) for rule in rules))
     kept = Signature(tuple(column for column in spec.signature.columns if column.name in read))
     return kept.extended(*(timer.column for timer in timers))
@@ -274,11 +274,11 @@ def _taken(spec: typed.Spec, interface: Interface | None) -> frozenset[str]:
     return frozenset((*spec.signature.names, *offered))
 
 
-def _leaves(rule: Rule, grid: Grid) -> bool:
+def _leaves(rule: CompiledRequirement, grid: Grid) -> bool:
     return grid.horizon is not None and not defined(rule.formula, grid.horizon + 1)[0]
 
 
-def _too_far(rule: Rule, grid: Grid) -> Diagnostic:
+def _too_far(rule: CompiledRequirement, grid: Grid) -> Diagnostic:
     horizon = Fraction(grid.horizon or 0)
     need = Fraction(rule.reach)
     if reach(rule.formula).past:

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 def observed(task: Task) -> list[str]:
     """Statements that fill `seen` from the state `x`."""
     system = task.system
-    numbers = [*system.decl.policy.observe, *(ir.Col(column.name) for column in system.added)]
+    numbers = [*system.decl.policy.observe, *(ir.Signal(column.name) for column in system.added)]
     if not system.decl.policy.observe:
-        numbers = [ir.Col(name) for name in system.names]
+        numbers = [ir.Signal(name) for name in system.names]
     return _assigned("seen", numbers, {name: f"x[{i}]" for i, name in enumerate(system.names)})
 
 
@@ -36,7 +36,7 @@ def image_of_state(mirror: Mirror, task: Task) -> list[str]:
     """Statements that fill `image` from the state `x`."""
     names = task.names
     moved = {each.name: each.value for each in task.system.decl.policy.mirror}
-    numbers = [moved.get(name, ir.Col(name)) for name in names]
+    numbers = [moved.get(name, ir.Signal(name)) for name in names]
     assert mirror.side < len(names)
     return _assigned("image", numbers, {name: f"x[{i}]" for i, name in enumerate(names)})
 
@@ -45,7 +45,7 @@ def image_of_action(task: Task) -> list[str]:
     """Statements that fill `image` from the controls `u`; angles stay within a turn of their range."""
     controls = task.system.controls
     moved = {each.name: each.value for each in task.system.decl.policy.mirror}
-    numbers = [moved.get(each.name, ir.Col(each.name)) for each in controls]
+    numbers = [moved.get(each.name, ir.Signal(each.name)) for each in controls]
     lines = _assigned("image", numbers, {each.name: f"u[{i}]" for i, each in enumerate(controls)})
     for i, each in enumerate(controls):
         if each.squash == "angle":
@@ -76,7 +76,7 @@ def command(task: Task) -> list[str]:
     names, given = task.system.control_names, commands(task.system.decl)
     places = {name: f"x[{i}]" for i, name in enumerate(task.names)}
     places |= {name: f"u[{i}]" for i, name in enumerate(names)}
-    return _assigned("command", [given.get(name, ir.Col(name)) for name in names], places)
+    return _assigned("command", [given.get(name, ir.Signal(name)) for name in names], places)
 
 
 def _assigned(target: str, numbers: Sequence[ir.Num], places: Mapping[str, str]) -> list[str]:
@@ -86,7 +86,7 @@ def _assigned(target: str, numbers: Sequence[ir.Num], places: Mapping[str, str])
 
 
 def _columns(places: Mapping[str, str]) -> Callable[[Leaf], str | None]:
-    return lambda leaf: places[leaf.name] if isinstance(leaf, ir.Col) else None
+    return lambda leaf: places[leaf.name] if isinstance(leaf, ir.Signal) else None
 
 
 # ------------------------------------------------------------------------ cost
@@ -107,7 +107,7 @@ def cost(task: Task) -> list[str]:
     for promise in task.promises.items:
         lines += _promise(promise, task, at)
     if task.compiled.pull is not None:
-        lines += _mean(ir.Op("mul", (ir.Lit(PULL), task.compiled.pull)), at, task.horizon + 1)
+        lines += _mean(ir.Op("mul", (ir.Const(PULL), task.compiled.pull)), at, task.horizon + 1)
     if task.compiled.timers:
         gamma = literal(task.system.decl.objective.gamma)
         lines.append(f"cost += {literal(SHORT)} * MIN(MAX({gamma} - rho, 0.0), {gamma});")
@@ -140,12 +140,12 @@ def _promise(promise: Promise, task: Task, places: Mapping[str, str]) -> list[st
 def margin_of(formula: ir.Formula) -> ir.Num:
     """The exact robustness of a state formula as a number. Raises Untranslatable for any other formula."""
     match formula:
-        case ir.Atom(num, sign, guard=False):
+        case ir.Predicate(num, sign, guard=False):
             return num if sign > 0 else ir.Op("neg", (num,))
-        case ir.Join(op, items):
+        case ir.BoolOp(op, items):
             pick = "min" if op == "and" else "max"
             return reduce(lambda a, b: ir.Op(pick, (a, b)), map(margin_of, items))
         case ir.Truth(value):
-            return ir.Lit(float("inf") if value else float("-inf"))
+            return ir.Const(float("inf") if value else float("-inf"))
         case _:
             raise Untranslatable(type(formula).__name__)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from stlc.compile.augment.timers import Timer
     from stlc.compile.backends.c.emit import Motion
     from stlc.compile.backends.c.steps import Plan
-    from stlc.compile.pipeline import Rule
+    from stlc.compile.pipeline import CompiledRequirement
     from stlc.controller.policies.policy import PlanNetwork
     from stlc.controller.problem.task import Task
     from stlc.signature import Column
@@ -162,7 +162,7 @@ def _block(lines: Sequence[str]) -> str:
     return "\n".join(f"  {line}" for line in lines)
 
 
-def _overall(rules: Sequence[Rule], among: Sequence[Rule]) -> list[str]:
+def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequirement]) -> list[str]:
     """Statements that lower `least` to the weighed robustness of some requirements."""
     names = [rule.name for rule in among]
     return [

@@ -20,7 +20,7 @@ from stlc.export.onnx_rollout import assigned, rolled
 
 if TYPE_CHECKING:
     from stlc.compile.ir import nodes as ir
-    from stlc.compile.pipeline import Rule
+    from stlc.compile.pipeline import CompiledRequirement
 
 Columns = Mapping[str, Value]
 
@@ -77,7 +77,7 @@ def judged(task: Task, start: Columns, plans: Value) -> Verdicts:
     return Verdicts(rho, safe, each, _cost(task, states, controls, rho), states)
 
 
-def _overall(rules: Sequence[Rule], each: Columns, like: Value) -> Value:
+def _overall(rules: Sequence[CompiledRequirement], each: Columns, like: Value) -> Value:
     """The weighed minimum, (1, batch); +inf without rules."""
     if not rules:
         return like.sheet.constant([[math.inf]]).spread(1, BATCH, like=like)

@@ -67,9 +67,9 @@ def _folded(
 def _observed(task: Task, state: Mapping[str, Value]) -> Value:
     """What the network sees, (batch, k) float32."""
     system = task.system
-    numbers: list[ir.Num] = [*system.decl.policy.observe, *(ir.Col(each.name) for each in system.added)]
+    numbers: list[ir.Num] = [*system.decl.policy.observe, *(ir.Signal(each.name) for each in system.added)]
     if not system.decl.policy.observe:
-        numbers = [ir.Col(name) for name in system.names]
+        numbers = [ir.Signal(name) for name in system.names]
     seen = assigned({str(place): number for place, number in enumerate(numbers)}, state)
     like = next(iter(state.values()))
     rows = [seen[str(place)].spread(1, BATCH, like=like) for place in range(len(numbers))]

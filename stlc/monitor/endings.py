@@ -24,8 +24,8 @@ Floats: TypeAlias = NDArray[np.float64]
 SEEN = "@seen"
 """A column that is 1 at every sample."""
 
-_SEEN = ir.Atom(ir.Col(SEEN), guard=True)
-_UNSEEN = ir.Atom(ir.Col(SEEN), sign=-1, guard=True)
+_SEEN = ir.Predicate(ir.Signal(SEEN), guard=True)
+_UNSEEN = ir.Predicate(ir.Signal(SEEN), sign=-1, guard=True)
 
 
 def may_end(formula: ir.Formula, end: Literal["lower", "upper"], *, cut: bool) -> ir.Formula:
@@ -47,11 +47,11 @@ class _Ending:
     def of(self, formula: ir.Formula) -> ir.Formula:
         """The formula with what its windows may miss."""
         match formula:
-            case ir.Atom() | ir.Truth():
+            case ir.Predicate() | ir.Truth():
                 return formula
-            case ir.Join(items=items):
+            case ir.BoolOp(items=items):
                 return replace(formula, items=tuple(map(self.of, items)))
-            case ir.Over(op, window, body):
+            case ir.Temporal(op, window, body):
                 found = self._found(body, some=op == "eventually", cut=self._cuts(window))
                 return self._begun(replace(formula, body=found), window, some=op == "eventually")
             case ir.Until(op, window, left, right):
@@ -61,7 +61,7 @@ class _Ending:
             case ir.Shift(steps, body):
                 found = self._found(body, some=not formula.weak, cut=self.cut and steps > 0)
                 return replace(formula, body=found)
-            case ir.Past(body=body) | ir.Freeze(body=body) | ir.AtStart(body=body):
+            case ir.PastTemporal(body=body) | ir.Freeze(body=body) | ir.AtStart(body=body):
                 return replace(formula, body=self.of(body))
             case ir.Since(left=left, right=right):
                 return replace(formula, left=self.of(left), right=self.of(right))
@@ -85,7 +85,7 @@ class _Ending:
         """The formula, and for the greatest value its dual, where there is a sample so many steps later."""
         there = _SEEN if self.least else _UNSEEN
         then = ir.Shift(later, there) if later else there
-        return ir.Join("and" if self.least else "or", (formula, then))
+        return ir.BoolOp("and" if self.least else "or", (formula, then))
 
 
 def reads_seen(formula: ir.Formula) -> bool:
@@ -110,13 +110,13 @@ def lengthened(formula: ir.Formula, samples: int) -> ir.Formula:
 def _farthest(node: ir.Formula) -> int:
     match node:
         case (
-            ir.Over(window=window)
+            ir.Temporal(window=window)
             | ir.Until(window=window)
-            | ir.Past(window=window)
+            | ir.PastTemporal(window=window)
             | ir.Since(window=window)
         ):
             return window.lo if window.hi is None else window.hi
-        case ir.Atom(num=num):
+        case ir.Predicate(num=num):
             return sum(farthest(num))
         case _:
             return 0
@@ -124,14 +124,14 @@ def _farthest(node: ir.Formula) -> int:
 
 def _long(formula: ir.Formula, length: int) -> ir.Formula:
     match formula:
-        case ir.Join(items=items):
+        case ir.BoolOp(items=items):
             return replace(formula, items=tuple(_long(item, length) for item in items))
-        case ir.Over(window=window, body=body):
+        case ir.Temporal(window=window, body=body):
             return replace(formula, window=_longer(window, length), body=_long(body, length))
         case ir.Until(window=window, left=left, right=right):
             left, right = _long(left, length), _long(right, length)
             return replace(formula, window=_longer(window, length), left=left, right=right)
-        case ir.Past(body=body) | ir.Shift(body=body) | ir.Freeze(body=body) | ir.AtStart(body=body):
+        case ir.PastTemporal(body=body) | ir.Shift(body=body) | ir.Freeze(body=body) | ir.AtStart(body=body):
             return replace(formula, body=_long(body, length))
         case ir.Since(left=left, right=right):
             return replace(formula, left=_long(left, length), right=_long(right, length))

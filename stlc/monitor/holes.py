@@ -51,11 +51,11 @@ def unsure(formula: ir.Formula, holes: frozenset[str], *, least: bool) -> ir.For
         least: which end of what is possible.
     """
     match formula:
-        case ir.Atom(num=num):
+        case ir.Predicate(num=num):
             return _guarded(formula, _known(num, holes), least=least)
         case ir.Truth():
             return formula
-        case ir.Join(items=items):
+        case ir.BoolOp(items=items):
             return replace(formula, items=tuple(unsure(item, holes, least=least) for item in items))
         case ir.Freeze(bindings=bindings, body=body):
             known = {name: found for name, num in bindings if (found := _known(num, holes)) is not None}
@@ -63,7 +63,7 @@ def unsure(formula: ir.Formula, holes: frozenset[str], *, least: bool) -> ir.For
             inner = unsure(body, (holes - bound) | frozenset(known), least=least)
             more = tuple((KNOWN + name, num) for name, num in known.items())
             return replace(formula, bindings=(*bindings, *more), body=inner)
-        case ir.Over() | ir.Past() | ir.Shift() | ir.AtStart():
+        case ir.Temporal() | ir.PastTemporal() | ir.Shift() | ir.AtStart():
             return replace(formula, body=unsure(formula.body, holes, least=least))
         case ir.Until(left=left, right=right) | ir.Since(left=left, right=right):
             left, right = unsure(left, holes, least=least), unsure(right, holes, least=least)
@@ -76,16 +76,18 @@ def _known(num: ir.Num, holes: frozenset[str]) -> ir.Num | None:
     found = dict.fromkeys(
         replace(leaf, name=KNOWN + leaf.name)
         for leaf in leaves(num)
-        if isinstance(leaf, (ir.Col, ir.At, ir.Held)) and leaf.name in holes
+        if isinstance(leaf, (ir.Signal, ir.ShiftedSignal, ir.FrozenVar)) and leaf.name in holes
     )
     if not found:
         return None
     return next(iter(found)) if len(found) == 1 else ir.Op("min", tuple(found))
 
 
-def _guarded(atom: ir.Atom, known: ir.Num | None, *, least: bool) -> ir.Formula:
+def _guarded(atom: ir.Predicate, known: ir.Num | None, *, least: bool) -> ir.Formula:
     if known is None:
         return atom
     # outside of the trace the guard is what the predicate is: false before a negation where windows are cut
-    test = ir.Atom(known if least is (atom.sign > 0) else ir.Op("neg", (known,)), sign=atom.sign, guard=True)
-    return ir.Join("and" if least else "or", (atom, test))
+    test = ir.Predicate(
+        known if least is (atom.sign > 0) else ir.Op("neg", (known,)), sign=atom.sign, guard=True
+    )
+    return ir.BoolOp("and" if least else "or", (atom, test))

@@ -19,7 +19,7 @@ from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.namespace import Array
 from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir.defined import defined
-from stlc.compile.pipeline import Rule
+from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.schedule.schedule import End
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.monitor.holes import unsure
@@ -29,7 +29,7 @@ At: TypeAlias = int | Literal["all"] | None
 """A sample; every start at which the requirement has a value; or what the requirement itself asks for."""
 
 
-def starts_of(rule: Rule, samples: int, horizon: int | None, at: At) -> range:
+def starts_of(rule: CompiledRequirement, samples: int, horizon: int | None, at: At) -> range:
     """The instants at which a requirement is judged on a trace of so many samples.
 
     Raises:
@@ -49,13 +49,13 @@ def starts_of(rule: Rule, samples: int, horizon: int | None, at: At) -> range:
     return range(1)
 
 
-def window_of(rule: Rule, horizon: int | None) -> int | None:
+def window_of(rule: CompiledRequirement, horizon: int | None) -> int | None:
     """How many samples after its instant `end` is, where that depends on the instant."""
     return horizon if rule.windowed and rule.uses_end and not rule.absolute else None
 
 
 def rule_bounds(
-    rule: Rule, record: Record, starts: range, horizon: int | None, ends: Ends
+    rule: CompiledRequirement, record: Record, starts: range, horizon: int | None, ends: Ends
 ) -> tuple[Array, Array]:
     """Both ends of the values at the judged instants, each `(count, batch)`; one array where all is known."""
     window = window_of(rule, horizon)
@@ -64,7 +64,9 @@ def rule_bounds(
     return window_bounds(rule.under(record.semantics), record, starts, window, ends)
 
 
-def rule_known(rule: Rule, samples: int, starts: range, horizon: int | None) -> NDArray[np.bool_]:
+def rule_known(
+    rule: CompiledRequirement, samples: int, starts: range, horizon: int | None
+) -> NDArray[np.bool_]:
     """Where no value at the judged instants depends on what comes after `samples`, (count,)."""
     window = window_of(rule, horizon)
     if window is None:
@@ -73,7 +75,7 @@ def rule_known(rule: Rule, samples: int, starts: range, horizon: int | None) -> 
     return np.array([whole and start + window < samples for start in starts], dtype=bool)
 
 
-def rule_signal(rule: Rule, record: Record, horizon: int | None, end: End) -> Array:
+def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, end: End) -> Array:
     """Values at every sample, `(samples, batch)`; NaN where `end` "strict" leaves them undefined.
 
     So it is where they depend on what is not known, unless `end` is "lower" or "upper".
@@ -91,7 +93,7 @@ def rule_signal(rule: Rule, record: Record, horizon: int | None, end: End) -> Ar
     return _window_signal(rule, record, horizon or 0, end)
 
 
-def _window_signal(rule: Rule, record: Record, window: int, end: End) -> Array:
+def _window_signal(rule: CompiledRequirement, record: Record, window: int, end: End) -> Array:
     """The same where `end` moves along: windows that do not fit are NaN under "strict"."""
     whole = max(record.samples - window, 0)
     starts = range(whole if end == "strict" else record.samples)
@@ -106,7 +108,9 @@ def _window_signal(rule: Rule, record: Record, window: int, end: End) -> Array:
     return record.ops.cat(parts)
 
 
-def rules_at(rules: Sequence[Rule], record: Record, at: int, horizon: int | None, end: End) -> list[Array]:
+def rules_at(
+    rules: Sequence[CompiledRequirement], record: Record, at: int, horizon: int | None, end: End
+) -> list[Array]:
     """Values at one sample, `(1, batch)` each; NaN where `rule_signal` has it."""
     if record.holes:
         sides = [_sides(rule, record) for rule in rules]
@@ -128,7 +132,7 @@ def rules_at(rules: Sequence[Rule], record: Record, at: int, horizon: int | None
     ]
 
 
-def _sides(rule: Rule, record: Record) -> tuple[Rule, Rule]:
+def _sides(rule: CompiledRequirement, record: Record) -> tuple[CompiledRequirement, CompiledRequirement]:
     """The requirement at its least and at its most, whatever the samples are that are not known."""
     formula = rule.under(record.semantics)
     least, most = (unsure(formula, record.holes, least=least) for least in (True, False))
@@ -141,11 +145,11 @@ def _agreed(least: Array, most: Array, record: Record, end: End) -> Array:
     return record.ops.where(least == most, least, math.nan)
 
 
-def _has_value(rule: Rule, record: Record, at: int, end: End) -> bool:
+def _has_value(rule: CompiledRequirement, record: Record, at: int, end: End) -> bool:
     return end != "strict" or bool(defined(rule.formula, record.samples)[at])
 
 
-def _alone(rule: Rule, record: Record, at: int, horizon: int | None, end: End) -> Array:
+def _alone(rule: CompiledRequirement, record: Record, at: int, horizon: int | None, end: End) -> Array:
     window = window_of(rule, horizon)
     stop = None if window is None else at + window + 1
     inner = record if stop is None else record.cut(stop)
@@ -158,7 +162,7 @@ def _alone(rule: Rule, record: Record, at: int, horizon: int | None, end: End) -
     return inner.values([formula], range(at, at + 1), end, stop if going_on else None)[0]
 
 
-def check_length(rule: Rule, samples: int, starts: range, grid: Grid) -> Diagnostic | None:
+def check_length(rule: CompiledRequirement, samples: int, starts: range, grid: Grid) -> Diagnostic | None:
     """E306 where a value at `starts` needs more samples than there are."""
     window = window_of(rule, grid.horizon) or 0
     fits = starts.stop - 1 + window < samples
@@ -177,7 +181,9 @@ def check_length(rule: Rule, samples: int, starts: range, grid: Grid) -> Diagnos
     )
 
 
-def require_length(rules_and_starts: list[tuple[Rule, range]], samples: int, grid: Grid) -> None:
+def require_length(
+    rules_and_starts: list[tuple[CompiledRequirement, range]], samples: int, grid: Grid
+) -> None:
     """Raise TraceError (E306) where a requirement needs more samples than there are."""
     findings = [check_length(rule, samples, starts, grid) for rule, starts in rules_and_starts]
     found = [finding for finding in findings if finding is not None]

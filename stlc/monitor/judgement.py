@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.pipeline import Rule
+from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.prepared import Prepared
 from stlc.registry import closest
@@ -36,7 +36,7 @@ class Judgement:
         told: `low` and `high` in the semantics that was asked for; None: the exact ones.
     """
 
-    rule: Rule
+    rule: CompiledRequirement
     start: int
     low: Floats = field(repr=False)
     high: Floats = field(repr=False)

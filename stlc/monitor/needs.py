@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.horizon import columns, numbers
 from stlc.compile.ir.samples import everything
-from stlc.compile.pipeline import Compiled, Rule
+from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.grammar import ast
 from stlc.signature import Column
@@ -35,7 +35,7 @@ class Need:
     parameter: bool = False
 
 
-def needs_of(compiled: Compiled, rules: Sequence[Rule]) -> tuple[Need, ...]:
+def needs_of(compiled: Compiled, rules: Sequence[CompiledRequirement]) -> tuple[Need, ...]:
     """The signals that `rules` read, in the order of the specification.
 
     Raises:
@@ -62,7 +62,7 @@ def needs_of(compiled: Compiled, rules: Sequence[Rule]) -> tuple[Need, ...]:
     )
 
 
-def _require_functions(compiled: Compiled, rules: Sequence[Rule]) -> None:
+def _require_functions(compiled: Compiled, rules: Sequence[CompiledRequirement]) -> None:
     parts = (part for rule in rules for num in numbers(rule.formula) for part in everything(num))
     missing = dict.fromkeys(
         part.name for part in parts if isinstance(part, ir.Extern) and part.function is None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from stlc.compile.pipeline import Compiled, Rule
+from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.escape import visible
 from stlc.monitor.signals import Gap, Signals, gaps_of
 from stlc.monitor.values import Record
@@ -22,7 +22,7 @@ class Prepared:
     """
 
     compiled: Compiled
-    rules: tuple[Rule, ...]
+    rules: tuple[CompiledRequirement, ...]
     signals: Signals
     record: Record
 

@@ -150,17 +150,17 @@ def history(formula: ir.Formula) -> int:
             return 0
         case ir.AtStart():
             return _back(ir.Window(0, None))
-        case ir.Atom(num=num):
+        case ir.Predicate(num=num):
             return farthest(num).past
         case ir.Freeze(bindings=bindings, body=body):
             return max(history(body), *(farthest(num).past for _, num in bindings))
-        case ir.Join(items=items):
+        case ir.BoolOp(items=items):
             return max(map(history, items))
-        case ir.Over(window=window, body=body):
+        case ir.Temporal(window=window, body=body):
             return max(history(body) - window.lo, 0)
         case ir.Until(left=left, right=right):
             return max(history(left), history(right))
-        case ir.Past(window=window) | ir.Since(window=window):
+        case ir.PastTemporal(window=window) | ir.Since(window=window):
             return max(map(history, parts(formula))) + _back(window)
         case ir.Shift(steps=steps, body=body):
             return max(history(body) - steps, 0)
@@ -181,17 +181,17 @@ def granted(formula: ir.Formula, names: Collection[str]) -> ir.Formula:
     Names that `freeze` binds to what nobody gave are such columns, too.
     """
     match formula:
-        case ir.Atom(num=num):
+        case ir.Predicate(num=num):
             return formula if _read(num) <= set(names) else ir.Truth(True)
         case ir.Truth():
             return formula
-        case ir.Join(items=items):
+        case ir.BoolOp(items=items):
             return replace(formula, items=tuple(granted(item, names) for item in items))
         case ir.Freeze(bindings=bindings, body=body):
             known = tuple(each for each in bindings if _read(each[1]) <= set(names))
             inner = granted(body, {*names, *(name for name, _ in known)})
             return replace(formula, bindings=known, body=inner) if known else inner
-        case ir.Over() | ir.Past() | ir.Shift() | ir.AtStart():
+        case ir.Temporal() | ir.PastTemporal() | ir.Shift() | ir.AtStart():
             return replace(formula, body=granted(formula.body, names))
         case ir.Until(left=left, right=right) | ir.Since(left=left, right=right):
             return replace(formula, left=granted(left, names), right=granted(right, names))
@@ -200,7 +200,7 @@ def granted(formula: ir.Formula, names: Collection[str]) -> ir.Formula:
 
 def _read(num: ir.Num) -> set[str]:
     """The columns that a number reads, and the names that are frozen in it."""
-    return {*columns_of(num), *(part.name for part in everything(num) if isinstance(part, ir.Held))}
+    return {*columns_of(num), *(part.name for part in everything(num) if isinstance(part, ir.FrozenVar))}
 
 
 # ------------------------------------------------------------------ strict predicates
@@ -212,13 +212,13 @@ def by_truth(formula: ir.Formula) -> ir.Formula:
     `a > b` is true above 0 and `a >= b` from 0 on, without any tolerance.
     """
     match formula:
-        case ir.Atom():
+        case ir.Predicate():
             return replace(formula, guard=True)
         case ir.Truth():
             return formula
-        case ir.Join(items=items):
+        case ir.BoolOp(items=items):
             return replace(formula, items=tuple(map(by_truth, items)))
-        case ir.Over() | ir.Past() | ir.Shift() | ir.Freeze() | ir.AtStart():
+        case ir.Temporal() | ir.PastTemporal() | ir.Shift() | ir.Freeze() | ir.AtStart():
             return replace(formula, body=by_truth(formula.body))
         case ir.Until(left=left, right=right) | ir.Since(left=left, right=right):
             return replace(formula, left=by_truth(left), right=by_truth(right))

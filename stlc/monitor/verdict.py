@@ -12,7 +12,7 @@ import numpy as np
 
 from stlc.compile.backends.array.namespace import Array
 from stlc.compile.frontend.interface import Grid
-from stlc.compile.pipeline import Compiled, Rule, compile_spec
+from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_spec
 from stlc.compile.schedule.schedule import End
 from stlc.compile.semantics.semantics import TOLERANCE, Exact, Semantics, semantics_of
 from stlc.diagnostics import Diagnostic, SpecError, UsageError
@@ -289,7 +289,7 @@ def _source(spec: str | Path) -> Source:
     return Source("<text>", spec)
 
 
-def _chosen(rules: Sequence[Rule], names: Sequence[str]) -> tuple[Rule, ...]:
+def _chosen(rules: Sequence[CompiledRequirement], names: Sequence[str]) -> tuple[CompiledRequirement, ...]:
     known = [rule.name for rule in rules]
     for name in names:
         if name not in known:
@@ -304,7 +304,7 @@ def _rows(ready: Prepared, end: End, at: int | None) -> list[Array]:
     return rules_at(ready.rules, ready.record, at, ready.horizon, end)
 
 
-def _weighed(rules: Sequence[Rule], rows: Sequence[Array]) -> list[Array]:
+def _weighed(rules: Sequence[CompiledRequirement], rows: Sequence[Array]) -> list[Array]:
     return [
         row if rule.weight == rule.scale else row * (rule.weight / rule.scale)
         for rule, row in zip(rules, rows, strict=True)
@@ -319,7 +319,9 @@ def _scope(ready: Prepared, tolerance: float) -> Bools:
     return scope
 
 
-def _judge(rule: Rule, ready: Prepared, starts: range, ends: Ends, tolerance: float) -> Judgement:
+def _judge(
+    rule: CompiledRequirement, ready: Prepared, starts: range, ends: Ends, tolerance: float
+) -> Judgement:
     low, high = rule_bounds(rule, ready.record, starts, ready.horizon, ends)
     if tolerance > 0:
         holds = low >= -tolerance

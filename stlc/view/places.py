@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir import typed
-from stlc.compile.pipeline import Rule
+from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import StlcError
 from stlc.grammar import ast
 from stlc.grammar.children import descendants
@@ -147,7 +147,7 @@ class Plane:
         return xs, ys, place.depth(grid)
 
 
-def plane_of(spec: ast.Spec, rules: Iterable[Rule], trace: Trace) -> Plane | None:
+def plane_of(spec: ast.Spec, rules: Iterable[CompiledRequirement], trace: Trace) -> Plane | None:
     """The plane with most places, each region once; None where the requirements name none.
 
     Regions that move with other signals and those of more than two dimensions are left out.
@@ -201,13 +201,13 @@ def _judge_of(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | None:
 # ------------------------------------------------------------------ in requirements
 
 
-def _uses(rule: Rule, trace: Trace) -> Iterator[tuple[typed.Pred, Use]]:
+def _uses(rule: CompiledRequirement, trace: Trace) -> Iterator[tuple[typed.Predicate, Use]]:
     """Every predicate of a requirement, with its polarity and the time in which it matters."""
     stack: list[tuple[typed.Formula, Use]] = [(rule.typed.formula, Use(rule.name, negative=False))]
     while stack:
         node, use = stack.pop()
         match node:
-            case typed.Pred():
+            case typed.Predicate():
                 yield node, use
             case typed.Not(body=body):
                 stack.append((body, _turned(use)))
@@ -233,7 +233,7 @@ def _turned(use: Use) -> Use:
     return replace(use, negative=not use.negative)
 
 
-def _within(interval: typed.Interval, use: Use, rule: Rule, trace: Trace) -> Use:
+def _within(interval: typed.Interval, use: Use, rule: CompiledRequirement, trace: Trace) -> Use:
     """The use as seen by an operand, its time in seconds of the trace; unchanged where it slides."""
     slides = rule.windowed or (rule.absolute and use.window is None)
     low, high = _seconds(interval.lo, trace), _seconds(interval.hi, trace)

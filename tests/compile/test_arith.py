@@ -17,11 +17,11 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.semantics.switch import Hard, StraightThrough, Switch, Tanh
 
-X, Y, Z = (ir.Col(name) for name in NAMES)
+X, Y, Z = (ir.Signal(name) for name in NAMES)
 
 
 def op(name: str, *args: ir.Num | float) -> ir.Op:
-    return ir.Op(name, tuple(ir.Lit(arg) if isinstance(arg, float) else arg for arg in args))
+    return ir.Op(name, tuple(ir.Const(arg) if isinstance(arg, float) else arg for arg in args))
 
 
 def environment(seed: int, rows: int = 5) -> dict[str, np.ndarray]:
@@ -53,7 +53,7 @@ def test_programs_compute_what_is_written(num: ir.Num, seed: int) -> None:
 @given(state_formulas(numbers), numbers, numbers, st.integers(0, 2**32 - 1))
 def test_straight_through_steps_like_hard(cond: ir.Formula, yes: ir.Num, no: ir.Num, seed: int) -> None:
     env = tensors(environment(seed))
-    program = Program({"ind": ir.Ind(cond), "where": ir.Where(cond, yes, no)})
+    program = Program({"ind": ir.Indicator(cond), "where": ir.Where(cond, yes, no)})
     hard, soft = program(env, TORCH, Hard()), program(env, TORCH, StraightThrough(5.0))
     plain = program({name: value.numpy() for name, value in env.items()}, NUMPY, StraightThrough(5.0))
     for name in ("ind", "where"):
@@ -68,7 +68,7 @@ def test_every_function_of_the_table(name: str) -> None:
     rng = np.random.default_rng(1)
     values = [rng.uniform(0.2, 0.9, 6) for _ in range(arity)]
     env = {f"c{i}": value for i, value in enumerate(values)}
-    num = ir.Op(name, tuple(ir.Col(column) for column in env))
+    num = ir.Op(name, tuple(ir.Signal(column) for column in env))
     wanted = slow(num, env)
     fold = FUNCTIONS[name].fold
     assert fold is not None
@@ -77,9 +77,9 @@ def test_every_function_of_the_table(name: str) -> None:
     columns = tensors(env, grad=True)
     out = Program({"out": num})(columns, TORCH)["out"]
     np.testing.assert_allclose(out.detach(), wanted, rtol=1e-12)
-    constant = Program({"out": ir.Op(name, tuple(ir.Lit(float(value[0])) for value in values))})
+    constant = Program({"out": ir.Op(name, tuple(ir.Const(float(value[0])) for value in values))})
     np.testing.assert_allclose(constant(env, NUMPY)["out"], np.full(6, wanted[0]), rtol=1e-12)
-    mixed = ir.Op(name, (ir.Lit(float(values[0][0])), *num.args[1:]))
+    mixed = ir.Op(name, (ir.Const(float(values[0][0])), *num.args[1:]))
     np.testing.assert_allclose(
         Program({"out": mixed})(columns, TORCH)["out"][0].detach(), wanted[0], rtol=1e-12
     )
@@ -111,9 +111,9 @@ X_PLUS = op("add", X, op("mul", Y, 0.1))
         (op("add", X, op("sub", 1.0, 1.0)), 0),
         (op("mul", X, 1.0), 0),
         (op("min", X, X), 0),
-        (ir.Ind(ir.Atom(op("sub", X, Y))), 2),
-        (op("mul", ir.Ind(ir.Atom(op("sub", X, Y))), Z), 3),
-        (ir.Where(ir.Atom(op("sub", X, Y)), Z, X_PLUS), 3),
+        (ir.Indicator(ir.Predicate(op("sub", X, Y))), 2),
+        (op("mul", ir.Indicator(ir.Predicate(op("sub", X, Y))), Z), 3),
+        (ir.Where(ir.Predicate(op("sub", X, Y)), Z, X_PLUS), 3),
         (ir.Where(ir.Truth(True), Z, X_PLUS), 0),
     ],
 )
@@ -127,7 +127,7 @@ def test_few_operations(num: ir.Num, operations: int) -> None:
 
 def test_common_parts_are_computed_once() -> None:
     root = op("sqrt", op("add", op("square", X), op("square", Y)))
-    twin = op("sqrt", op("add", op("square", ir.Col("x")), op("square", ir.Col("y"))))
+    twin = op("sqrt", op("add", op("square", ir.Signal("x")), op("square", ir.Signal("y"))))
     assert (
         Program({"a": root, "b": op("add", twin, 1.0)}).operations() == Program({"a": root}).operations() + 1
     )
@@ -136,15 +136,15 @@ def test_common_parts_are_computed_once() -> None:
 @pytest.mark.parametrize("switch", [Hard(), StraightThrough(3.0)])
 def test_exact_conditions_respect_strictness(switch: Switch) -> None:
     env = {"x": torch.tensor([-1.0, 0.0, 1.0]), "y": torch.zeros(3)}
-    more, least = ir.Atom(X, strict=True), ir.Atom(X)
+    more, least = ir.Predicate(X, strict=True), ir.Predicate(X)
     program = Program(
         {
-            "gt": ir.Ind(more),
-            "ge": ir.Ind(least),
-            "lt": ir.Ind(ir.Atom(X, sign=-1, strict=True)),
-            "both": ir.Ind(ir.Join("and", (least, ir.Atom(op("neg", X))))),
-            "mixed": ir.Ind(ir.Join("and", (least, ir.Atom(X, sign=-1, strict=True)))),
-            "either": ir.Where(ir.Join("or", (more, ir.Atom(op("sub", Y, 1.0)))), ir.Lit(5.0), X),
+            "gt": ir.Indicator(more),
+            "ge": ir.Indicator(least),
+            "lt": ir.Indicator(ir.Predicate(X, sign=-1, strict=True)),
+            "both": ir.Indicator(ir.BoolOp("and", (least, ir.Predicate(op("neg", X))))),
+            "mixed": ir.Indicator(ir.BoolOp("and", (least, ir.Predicate(X, sign=-1, strict=True)))),
+            "either": ir.Where(ir.BoolOp("or", (more, ir.Predicate(op("sub", Y, 1.0)))), ir.Const(5.0), X),
         }
     )
     out = {name: value.tolist() for name, value in program(env, TORCH, switch).items()}
@@ -160,13 +160,13 @@ def test_exact_conditions_respect_strictness(switch: Switch) -> None:
 
 def test_tanh_is_the_papers_equation() -> None:
     rho = np.linspace(-0.02, 0.02, 9)
-    cond = ir.Join("and", (ir.Atom(X), ir.Atom(op("sub", X, Y), strict=False)))
+    cond = ir.BoolOp("and", (ir.Predicate(X), ir.Predicate(op("sub", X, Y), strict=False)))
     program = Program(
         {
-            "default": ir.Ind(cond),
-            "own": ir.Ind(cond, sharpness=20.0),
-            "mixed": ir.Ind(ir.Join("and", (ir.Atom(X, strict=True), cond)), sharpness=20.0),
-            "where": ir.Where(ir.Atom(X), ir.Lit(3.0), Y),
+            "default": ir.Indicator(cond),
+            "own": ir.Indicator(cond, sharpness=20.0),
+            "mixed": ir.Indicator(ir.BoolOp("and", (ir.Predicate(X, strict=True), cond)), sharpness=20.0),
+            "where": ir.Where(ir.Predicate(X), ir.Const(3.0), Y),
         }
     )
     out = program({"x": rho, "y": np.full(9, 0.01)}, NUMPY, Tanh(100.0))
@@ -181,7 +181,7 @@ def test_tanh_is_the_papers_equation() -> None:
 def test_straight_through_differentiates_condition_and_branch() -> None:
     x = torch.tensor([-0.1, 0.2], dtype=torch.float64, requires_grad=True)
     y = torch.tensor([2.0, 3.0], dtype=torch.float64, requires_grad=True)
-    out = Program({"out": ir.Where(ir.Atom(X), op("mul", Y, 4.0), Y)})(
+    out = Program({"out": ir.Where(ir.Predicate(X), op("mul", Y, 4.0), Y)})(
         {"x": x, "y": y}, TORCH, StraightThrough(5.0)
     )
     assert out["out"].tolist() == [2.0, 12.0]
@@ -200,8 +200,8 @@ def test_gradient_of_a_distance_at_zero_is_zero() -> None:
 
 
 def test_constants_and_floats_in_the_environment() -> None:
-    num = op("max", op("mul", ir.Col("dt"), X), ir.Col("t"))
-    program = Program({"out": num, "c": ir.Lit(2.0)}, constants={"dt": 0.5})
+    num = op("max", op("mul", ir.Signal("dt"), X), ir.Signal("t"))
+    program = Program({"out": num, "c": ir.Const(2.0)}, constants={"dt": 0.5})
     assert program.columns == {"x", "t"}
     out = program({"t": 1.0, "x": torch.tensor([0.0, 4.0])}, TORCH)
     assert out["out"].tolist() == [1.0, 2.0]
@@ -221,9 +221,9 @@ def test_functions_of_the_system() -> None:
 
 
 def test_a_temporal_formula_is_no_condition() -> None:
-    later = ir.Over("always", ir.Window(0, 1), ir.Atom(X))
+    later = ir.Temporal("always", ir.Window(0, 1), ir.Predicate(X))
     with pytest.raises(TypeError, match="not a state formula"):
-        Program({"out": ir.Ind(later)})
+        Program({"out": ir.Indicator(later)})
 
 
 def test_division_by_zero_is_quiet() -> None:

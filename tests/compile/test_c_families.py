@@ -32,7 +32,7 @@ from stlc.compile.backends.c.steps import Tabled
 from stlc.compile.ir import nodes as ir
 from stlc.native import Outcome
 
-X, Y, Z = (ir.Col(name) for name in NAMES)
+X, Y, Z = (ir.Signal(name) for name in NAMES)
 WHOLE = ir.Window(0, STEPS)
 
 compiler = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
@@ -46,7 +46,7 @@ def quickly(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def box(*sides: float) -> ir.Num:
     """The signed distance to a box of the plane: west, east, south, north."""
-    west, east, south, north = map(ir.Lit, sides)
+    west, east, south, north = map(ir.Const, sides)
     room = [
         ir.Op("min", (ir.Op("sub", (point, low)), ir.Op("sub", (high, point))))
         for point, low, high in ((X, west, east), (Y, south, north))
@@ -57,8 +57,8 @@ def box(*sides: float) -> ir.Num:
 
 
 def ball(x: float, y: float, radius: float) -> ir.Num:
-    gap = ir.Op("norm", (ir.Op("sub", (X, ir.Lit(x))), ir.Op("sub", (Y, ir.Lit(y)))))
-    return ir.Op("sub", (ir.Lit(radius), gap))
+    gap = ir.Op("norm", (ir.Op("sub", (X, ir.Const(x))), ir.Op("sub", (Y, ir.Const(y)))))
+    return ir.Op("sub", (ir.Const(radius), gap))
 
 
 def boxes(count: int, seed: int = 0) -> list[ir.Num]:
@@ -81,12 +81,12 @@ def loops(rules: Sequence[ir.Formula]) -> list[int]:
 
 def test_what_differs_is_a_table_and_the_rest_the_shape() -> None:
     both = [box(-1.0, 2.0, -float(i), 3.0) for i in range(1, 9)]
-    found = families([ir.Atom(num) for num in [*balls(3), *both]], 5)
+    found = families([ir.Predicate(num) for num in [*balls(3), *both]], 5)
     (family,) = found
     assert family.members == tuple(range(3, 11))
     assert family.table.constants == {"t5_0": tuple(-float(i) for i in range(1, 9))}
     assert family.table.columns == {}
-    assert family.shape == ir.Atom(_put(both[0], ir.Lit(-1.0), ir.Held("\0t5_0"), after=X))
+    assert family.shape == ir.Predicate(_put(both[0], ir.Const(-1.0), ir.FrozenVar("\0t5_0"), after=X))
 
 
 def _put(num: ir.Num, old: ir.Num, new: ir.Num, *, after: ir.Num) -> ir.Num:
@@ -97,32 +97,39 @@ def _put(num: ir.Num, old: ir.Num, new: ir.Num, *, after: ir.Num) -> ir.Num:
 
 
 def test_columns_are_data_too() -> None:
-    atoms = [ir.Atom(ir.Op("sub", (ir.Col(NAMES[i % 3]), ir.At(NAMES[i % 2], 2)))) for i in range(9)]
+    atoms = [
+        ir.Predicate(ir.Op("sub", (ir.Signal(NAMES[i % 3]), ir.ShiftedSignal(NAMES[i % 2], 2))))
+        for i in range(9)
+    ]
     (family,) = families(atoms, 1)
     assert list(family.table.columns.values()) == [tuple(NAMES[i % m] for i in range(9)) for m in (3, 2)]
-    other = [ir.Atom(ir.At("x", i)) for i in range(9)]  # samples are the shape
+    other = [ir.Predicate(ir.ShiftedSignal("x", i)) for i in range(9)]  # samples are the shape
     assert families(other, 1) == []
 
 
 def test_exponents_and_calls_are_the_shape() -> None:
-    powers = [ir.Atom(ir.Op("pow", (X, ir.Lit(float(i))))) for i in range(9)]
-    calls = [ir.Atom(ir.Extern("f", (ir.Lit(float(i)),))) for i in range(9)]
+    powers = [ir.Predicate(ir.Op("pow", (X, ir.Const(float(i))))) for i in range(9)]
+    calls = [ir.Predicate(ir.Extern("f", (ir.Const(float(i)),))) for i in range(9)]
     assert families([*powers, *calls], 1) == []
 
 
 def test_few_are_written_out() -> None:
-    few, many = (ir.Join("or", tuple(ir.Atom(num) for num in boxes(n))) for n in (7, 8))
+    few, many = (ir.BoolOp("or", tuple(ir.Predicate(num) for num in boxes(n))) for n in (7, 8))
     assert loops([few]) == []
     assert loops([many]) == [8]
 
 
 def test_unions_dilated_ones_and_requirements_are_loops() -> None:
     union = ir.Op("max", tuple(boxes(20)))
-    near = [ir.Op("add", (union, ir.Lit(0.5))), ir.Op("sub", (ir.Lit(0.5), union)), ir.Op("neg", (union,))]
-    assert [loops([ir.Over("always", WHOLE, ir.Atom(num))]) for num in (union, *near)] == [[20]] * 4
-    assert loops([ir.Over("always", WHOLE, ir.Atom(num, sign=-1)) for num in boxes(12)]) == [12]
-    mixed = ir.Join(
-        "or", tuple(ir.Atom(num) for pair in zip(boxes(9), balls(9), strict=True) for num in pair)
+    near = [
+        ir.Op("add", (union, ir.Const(0.5))),
+        ir.Op("sub", (ir.Const(0.5), union)),
+        ir.Op("neg", (union,)),
+    ]
+    assert [loops([ir.Temporal("always", WHOLE, ir.Predicate(num))]) for num in (union, *near)] == [[20]] * 4
+    assert loops([ir.Temporal("always", WHOLE, ir.Predicate(num, sign=-1)) for num in boxes(12)]) == [12]
+    mixed = ir.BoolOp(
+        "or", tuple(ir.Predicate(num) for pair in zip(boxes(9), balls(9), strict=True) for num in pair)
     )
     assert loops([mixed]) == [9, 9]
 
@@ -135,7 +142,7 @@ def test_texts_hardly_grow_with_the_number_of_regions() -> None:
 
 
 def _union(count: int) -> list[ir.Formula]:
-    return [ir.Over("eventually", WHOLE, ir.Atom(ir.Op("max", tuple(boxes(count)))))]
+    return [ir.Temporal("eventually", WHOLE, ir.Predicate(ir.Op("max", tuple(boxes(count)))))]
 
 
 # ---------------------------------------------------------------------- the same numbers
@@ -145,18 +152,26 @@ def _union(count: int) -> list[ir.Formula]:
 @pytest.mark.usefixtures("quickly")
 def test_regions_equal_the_evaluator() -> None:
     many = [*boxes(20), *balls(20)]
-    reach = [ir.Over("eventually", WHOLE, ir.Over("always", ir.Window(0, 0), ir.Atom(num))) for num in many]
+    reach = [
+        ir.Temporal("eventually", WHOLE, ir.Temporal("always", ir.Window(0, 0), ir.Predicate(num)))
+        for num in many
+    ]
     staying = [
-        ir.Over("eventually", ir.Window(0, 9), ir.Over("always", ir.Window(0, 4), ir.Atom(b))) for b in many
+        ir.Temporal("eventually", ir.Window(0, 9), ir.Temporal("always", ir.Window(0, 4), ir.Predicate(b)))
+        for b in many
     ]
     union = ir.Op("max", tuple(many))
     rules = [
-        ir.Over("always", WHOLE, ir.Atom(union, sign=-1)),
-        ir.Over("eventually", WHOLE, ir.Atom(ir.Op("sub", (union, ir.Lit(0.3))))),
-        ir.Join("or", tuple(reach)),
-        ir.Join("or", tuple(staying)),
-        *(ir.Over("always", ir.Window(i, STEPS), ir.Atom(num, sign=-1)) for i in (0, 3) for num in many),
-        ir.Freeze((("f", X),), ir.Join("and", tuple(_from("f", num) for num in boxes(9)))),
+        ir.Temporal("always", WHOLE, ir.Predicate(union, sign=-1)),
+        ir.Temporal("eventually", WHOLE, ir.Predicate(ir.Op("sub", (union, ir.Const(0.3))))),
+        ir.BoolOp("or", tuple(reach)),
+        ir.BoolOp("or", tuple(staying)),
+        *(
+            ir.Temporal("always", ir.Window(i, STEPS), ir.Predicate(num, sign=-1))
+            for i in (0, 3)
+            for num in many
+        ),
+        ir.Freeze((("f", X),), ir.BoolOp("and", tuple(_from("f", num) for num in boxes(9)))),
     ]
     values_agree(rules, traces_of(1, 40))
     gradients_agree(rules, traces_of(2, 40), 3)
@@ -164,7 +179,7 @@ def test_regions_equal_the_evaluator() -> None:
 
 def _from(held: str, num: ir.Num) -> ir.Formula:
     """A region seen from where a value was frozen."""
-    return ir.Over("always", ir.Window(0, 3), ir.Atom(ir.Op("add", (num, ir.Held(held)))))
+    return ir.Temporal("always", ir.Window(0, 3), ir.Predicate(ir.Op("add", (num, ir.FrozenVar(held)))))
 
 
 def _varied(formula: ir.Formula, count: int, seed: int) -> list[ir.Formula]:
@@ -172,10 +187,14 @@ def _varied(formula: ir.Formula, count: int, seed: int) -> list[ir.Formula]:
     rng = np.random.default_rng(seed)
 
     def other(leaf: c_families.Entry) -> ir.Num:
-        if isinstance(leaf, ir.Lit):
-            return ir.Lit(leaf.value + float(rng.integers(0, 3)) / 8)
+        if isinstance(leaf, ir.Const):
+            return ir.Const(leaf.value + float(rng.integers(0, 3)) / 8)
         name = leaf.name if rng.random() < 0.7 else str(rng.choice(NAMES))
-        return ir.At(name, leaf.steps, leaf.clamped) if isinstance(leaf, ir.At) else ir.Col(name)
+        return (
+            ir.ShiftedSignal(name, leaf.steps, leaf.clamped)
+            if isinstance(leaf, ir.ShiftedSignal)
+            else ir.Signal(name)
+        )
 
     return [formula, *(c_families._changed(formula, other) for _ in range(count - 1))]
 
@@ -183,7 +202,7 @@ def _varied(formula: ir.Formula, count: int, seed: int) -> list[ir.Formula]:
 def _families_of(count: int, seed: int) -> list[ir.Formula]:
     drawn = [node for node in map(planned, gathered(formulas(), count, first=seed)) if node is not None]
     several = [_varied(node, 2 + i % 3, seed + i) for i, node in enumerate(drawn)]
-    joined = [ir.Join("and" if i % 2 else "or", tuple(some)) for i, some in enumerate(several)]
+    joined = [ir.BoolOp("and" if i % 2 else "or", tuple(some)) for i, some in enumerate(several)]
     return [*joined, *(member for some in several[::4] for member in some)]
 
 
@@ -218,11 +237,16 @@ def test_many_random_families_are_the_same_written_out(seed: int, monkeypatch: p
 
 FORMS = {
     "100 boxes to reach": _union(100),
-    "100 circles to avoid": [ir.Over("always", WHOLE, ir.Atom(ir.Op("max", tuple(balls(100))), sign=-1))],
-    "50 boxes, 50 circles": [
-        ir.Join("or", tuple(ir.Over("eventually", WHOLE, ir.Atom(num)) for num in [*boxes(50), *balls(50)]))
+    "100 circles to avoid": [
+        ir.Temporal("always", WHOLE, ir.Predicate(ir.Op("max", tuple(balls(100))), sign=-1))
     ],
-    "100 requirements": [ir.Over("always", WHOLE, ir.Atom(num, sign=-1)) for num in boxes(100)],
+    "50 boxes, 50 circles": [
+        ir.BoolOp(
+            "or",
+            tuple(ir.Temporal("eventually", WHOLE, ir.Predicate(num)) for num in [*boxes(50), *balls(50)]),
+        )
+    ],
+    "100 requirements": [ir.Temporal("always", WHOLE, ir.Predicate(num, sign=-1)) for num in boxes(100)],
 }
 
 

@@ -29,7 +29,7 @@ from stlc.compile.ir.horizon import nodes
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
 
 LAST = STEPS
-X, Y, Z = (ir.Atom(ir.Col(name)) for name in NAMES)
+X, Y, Z = (ir.Predicate(ir.Signal(name)) for name in NAMES)
 
 
 @pytest.fixture(autouse=True)
@@ -47,7 +47,16 @@ def _drawn(count: int) -> list[ir.Formula]:
 def test_random_formulas_equal_the_evaluator() -> None:
     rules = _drawn(90)
     kinds = {type(node) for rule in rules for node in nodes(rule)}
-    assert kinds >= {ir.Over, ir.Past, ir.Until, ir.Since, ir.Shift, ir.Freeze, ir.Join, ir.Atom}
+    assert kinds >= {
+        ir.Temporal,
+        ir.PastTemporal,
+        ir.Until,
+        ir.Since,
+        ir.Shift,
+        ir.Freeze,
+        ir.BoolOp,
+        ir.Predicate,
+    }
     values_agree(rules, np.round(traces_of(1, 60) * 8) / 8)
 
 
@@ -76,17 +85,21 @@ def _every_window() -> list[ir.Formula]:
         around = ir.Window(0, LAST - max(wide, window.lo))
         back = ir.Window(0, LAST)
         for op in ("always", "eventually"):
-            inner = ir.Over(op, window, X)
-            found += [inner, ir.Over("always" if op == "eventually" else "eventually", around, inner)]
+            inner = ir.Temporal(op, window, X)
+            found += [inner, ir.Temporal("always" if op == "eventually" else "eventually", around, inner)]
         for op in ("until", "release"):
             inner = ir.Until(op, window, X, Y)
-            found += [inner, ir.Over("always", around, inner)]
+            found += [inner, ir.Temporal("always", around, inner)]
         for op in ("once", "historically"):
-            inner = ir.Past(op, window, X)
-            found += [inner, ir.Over("always" if op == "once" else "eventually", back, inner)]
+            inner = ir.PastTemporal(op, window, X)
+            found += [inner, ir.Temporal("always" if op == "once" else "eventually", back, inner)]
         for op in ("since", "trigger"):
             inner = ir.Since(op, window, X, Y)
-            found += [inner, ir.Over("eventually", back, inner), ir.Over("always", ir.Window(4, 11), inner)]
+            found += [
+                inner,
+                ir.Temporal("eventually", back, inner),
+                ir.Temporal("always", ir.Window(4, 11), inner),
+            ]
     return found
 
 
@@ -95,35 +108,38 @@ def test_every_operator_over_every_window() -> None:
     gradients_agree(_every_window(), traces_of(5, 40), 6)
 
 
-def _gap(name: str, held: str, most: float) -> ir.Atom:
+def _gap(name: str, held: str, most: float) -> ir.Predicate:
     """`abs(name - held) <= most`."""
-    gap = ir.Op("abs", (ir.Op("sub", (ir.Col(name), ir.Held(held))),))
-    return ir.Atom(ir.Op("sub", (ir.Lit(most), gap)))
+    gap = ir.Op("abs", (ir.Op("sub", (ir.Signal(name), ir.FrozenVar(held))),))
+    return ir.Predicate(ir.Op("sub", (ir.Const(most), gap)))
 
 
 def _frozen() -> list[ir.Formula]:
     """`freeze` under and over windows, inside of itself, over the past and on the mission clock."""
-    near = ir.Over("always", ir.Window(0, 3), _gap("x", "a", 1.0))
-    to_end = ir.Over("eventually", ir.Window(1, None), ir.Join("or", (_gap("y", "a", 0.5), Z)))
-    before = ir.Past("once", ir.Window(1, 4), _gap("x", "a", 2.0))
+    near = ir.Temporal("always", ir.Window(0, 3), _gap("x", "a", 1.0))
+    to_end = ir.Temporal("eventually", ir.Window(1, None), ir.BoolOp("or", (_gap("y", "a", 0.5), Z)))
+    before = ir.PastTemporal("once", ir.Window(1, 4), _gap("x", "a", 2.0))
     since = ir.Since("since", ir.Window(0, None), _gap("z", "a", 3.0), Y)
-    start = ir.AtStart(ir.Over("always", ir.Window(0, 2), _gap("x", "a", 1.5)))
-    edge = ir.Join("and", (_gap("x", "a", 2.5), ir.Shift(-1, _gap("y", "a", 1.0), False)))
-    both = ir.Op("sub", (ir.Op("sub", (ir.Col("x"), ir.Held("b"))), ir.Held("a")))
+    start = ir.AtStart(ir.Temporal("always", ir.Window(0, 2), _gap("x", "a", 1.5)))
+    edge = ir.BoolOp("and", (_gap("x", "a", 2.5), ir.Shift(-1, _gap("y", "a", 1.0), False)))
+    both = ir.Op("sub", (ir.Op("sub", (ir.Signal("x"), ir.FrozenVar("b"))), ir.FrozenVar("a")))
     nested = ir.Freeze(
-        (("b", ir.Op("mul", (ir.Held("a"), ir.Col("z")))),), ir.Over("always", ir.Window(0, 2), ir.Atom(both))
+        (("b", ir.Op("mul", (ir.FrozenVar("a"), ir.Signal("z")))),),
+        ir.Temporal("always", ir.Window(0, 2), ir.Predicate(both)),
     )
-    apart = ir.Join("and", (ir.Over("eventually", ir.Window(0, 2), Y), _gap("x", "a", 2.0)))
+    apart = ir.BoolOp("and", (ir.Temporal("eventually", ir.Window(0, 2), Y), _gap("x", "a", 2.0)))
     found: list[ir.Formula] = []
     for body in (near, to_end, before, since, start, edge, nested, apart, Y):
-        node = ir.Freeze((("a", ir.Col("x")),), body)
+        node = ir.Freeze((("a", ir.Signal("x")),), body)
         found += [
             node,
-            ir.Over("always", ir.Window(0, 9), node),
-            ir.Over("eventually", ir.Window(2, 9), node),
+            ir.Temporal("always", ir.Window(0, 9), node),
+            ir.Temporal("eventually", ir.Window(2, 9), node),
         ]
-    ahead = ir.Freeze((("a", ir.At("x", 2)), ("c", ir.At("y", -3, clamped=True))), _gap("x", "a", 1.0))
-    return [*found, ir.Over("always", ir.Window(0, 12), ahead)]
+    ahead = ir.Freeze(
+        (("a", ir.ShiftedSignal("x", 2)), ("c", ir.ShiftedSignal("y", -3, clamped=True))), _gap("x", "a", 1.0)
+    )
+    return [*found, ir.Temporal("always", ir.Window(0, 12), ahead)]
 
 
 def test_frozen_values() -> None:
@@ -133,28 +149,30 @@ def test_frozen_values() -> None:
 
 def test_shifts_and_the_start() -> None:
     late = ir.Shift(3, ir.Until("until", ir.Window(1, 4), X, Y))
-    rules = [late, ir.Over("always", ir.Window(2, 7), late), ir.AtStart(late)]
+    rules = [late, ir.Temporal("always", ir.Window(2, 7), late), ir.AtStart(late)]
     for outside in (True, False):
         for steps in (-1, -20, 2, 20):
-            edge = ir.Join("or", (X, ir.Shift(steps, Y, outside)))
-            rules += [edge, ir.Over("always", ir.Window(0, LAST), edge)]
-    rules += [ir.Over("eventually", ir.Window(3, 9), ir.AtStart(ir.Over("always", ir.Window(0, 4), Z)))]
+            edge = ir.BoolOp("or", (X, ir.Shift(steps, Y, outside)))
+            rules += [edge, ir.Temporal("always", ir.Window(0, LAST), edge)]
+    rules += [
+        ir.Temporal("eventually", ir.Window(3, 9), ir.AtStart(ir.Temporal("always", ir.Window(0, 4), Z)))
+    ]
     values_agree(rules, traces_of(10, 40))
     gradients_agree(rules, traces_of(11, 40), 12)
 
 
 def test_what_no_loop_changes_is_computed_outside_of_it() -> None:
-    shared = ir.Over("eventually", ir.Window(0, 2), Y)
-    node = ir.Freeze((("a", ir.Col("x")),), ir.Join("and", (shared, _gap("x", "a", 1.0))))
-    plan = plan_of([ir.Over("always", ir.Window(0, 9), node)], LAST + 1)
+    shared = ir.Temporal("eventually", ir.Window(0, 2), Y)
+    node = ir.Freeze((("a", ir.Signal("x")),), ir.BoolOp("and", (shared, _gap("x", "a", 1.0))))
+    plan = plan_of([ir.Temporal("always", ir.Window(0, 9), node)], LAST + 1)
     assert [type(step).__name__ for step in plan.steps] == ["Margin", "Extremum", "Frozen", "Extremum"]
 
 
 def test_windows_to_the_end_are_one_pass() -> None:
     """Quadratic loops over a long plan would take seconds."""
     steps = 3000
-    rule = ir.Over("always", ir.Window(0, None), ir.Over("eventually", ir.Window(0, None), X))
-    since = ir.Over("always", ir.Window(0, None), ir.Since("since", ir.Window(0, None), X, Y))
+    rule = ir.Temporal("always", ir.Window(0, None), ir.Temporal("eventually", ir.Window(0, None), X))
+    since = ir.Temporal("always", ir.Window(0, None), ir.Since("since", ir.Window(0, None), X, Y))
     rng = np.random.default_rng(1)
     trace = rng.normal(size=(steps + 1, 8, 3))
     kernel = kernel_of(follower(steps), [rule, since])
@@ -165,10 +183,12 @@ def test_windows_to_the_end_are_one_pass() -> None:
 
 def test_extrema_of_many_operands_stand_side_by_side() -> None:
     """A macro that doubles its operand, within itself 40 times, would be a text without end."""
-    columns = [ir.Op("sub", (ir.Col(NAMES[i % 3]), ir.Lit(i / 8))) for i in range(40)]
+    columns = [ir.Op("sub", (ir.Signal(NAMES[i % 3]), ir.Const(i / 8))) for i in range(40)]
     nums = [ir.Op("min", tuple(columns)), ir.Op("max", tuple(columns)), ir.Op("norminf", tuple(columns))]
-    parts = [ir.Over("always", ir.Window(0, i % 9), ir.Atom(column)) for i, column in enumerate(columns)]
-    rules = [*map(ir.Atom, nums), ir.Join("and", tuple(parts)), ir.Join("or", tuple(parts))]
+    parts = [
+        ir.Temporal("always", ir.Window(0, i % 9), ir.Predicate(column)) for i, column in enumerate(columns)
+    ]
+    rules = [*map(ir.Predicate, nums), ir.BoolOp("and", tuple(parts)), ir.BoolOp("or", tuple(parts))]
     assert max(map(_depth, emit(follower(), rules).splitlines())) <= 3
     values_agree(rules, traces_of(13, 40))
     gradients_agree(rules, traces_of(14, 40), 15)

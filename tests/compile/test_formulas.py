@@ -101,7 +101,7 @@ def test_the_negation_is_the_opposite(case, row) -> None:
 def test_the_margin_of_a_predicate(text: str, strict: bool, value: float) -> None:
     row = {"x": 2.0, "y": 1.0, "b": 1.0, "n": 1.0, "mode": 5.0, "p[0]": 3.0, "p[1]": 4.0}
     found = formula(text)
-    assert isinstance(found, typed.Pred)
+    assert isinstance(found, typed.Predicate)
     assert found.strict is strict
     assert reference.number(found.num, row) == value
 
@@ -155,7 +155,7 @@ def test_places_point_into_the_text() -> None:
 def test_a_guard_of_a_system_file() -> None:
     scope = Scope(column_entries([Column("x", parse_unit("m"))]), error=SystemFileError)
     found = resolve_state_formula(parse_expr(Source("car.yaml", "x > 8")), scope, what="a guard")
-    assert found == ir.Atom(ir.Op("sub", (ir.Col("x"), ir.Lit(8.0))), strict=True)
+    assert found == ir.Predicate(ir.Op("sub", (ir.Signal("x"), ir.Const(8.0))), strict=True)
     with pytest.raises(SystemFileError) as caught:
         resolve_state_formula(parse_expr(Source("car.yaml", "x + 1")), scope, what="a guard")
     (finding,) = caught.value.diagnostics

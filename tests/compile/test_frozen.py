@@ -96,10 +96,10 @@ def test_truth_goes_with_the_sign(formula: typed.Formula, env: Env) -> None:
 
 def _stand_by() -> typed.Formula:
     """`always (freeze p0 = x in always[0, 3 steps] abs(x - p0) <= 1)`."""
-    gap = ir.Op("abs", (ir.Op("sub", (ir.Col("x"), ir.Held("p0#0"))),))
-    near = typed.Pred(SPAN, ir.Op("sub", (ir.Lit(1.0), gap)), strict=False)
+    gap = ir.Op("abs", (ir.Op("sub", (ir.Signal("x"), ir.FrozenVar("p0#0"))),))
+    near = typed.Predicate(SPAN, ir.Op("sub", (ir.Const(1.0), gap)), strict=False)
     three = typed.Interval(typed.Time(), typed.Time(steps=Fraction(3)))
-    body = typed.Freeze(SPAN, (("p0#0", ir.Col("x")),), typed.Temporal(SPAN, "always", three, near))
+    body = typed.Freeze(SPAN, (("p0#0", ir.Signal("x")),), typed.Temporal(SPAN, "always", three, near))
     return typed.Temporal(SPAN, "always", typed.Interval(typed.Time(), typed.Time(steps=Fraction(9))), body)
 
 

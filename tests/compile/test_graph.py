@@ -24,7 +24,7 @@ from stlc.compile.semantics.semantics import Exact, LogSumExp, Semantics
 from stlc.signature import Column, Signature
 
 Env = dict[str, np.ndarray]
-PAST = (ir.Past, ir.Since)
+PAST = (ir.PastTemporal, ir.Since)
 
 
 def lowered(formula: typed.Formula) -> ir.Formula:
@@ -205,9 +205,9 @@ def operands(node: ir.Formula, samples: int) -> float:
     """Sum along the deepest path of log(number of operands): how far nested smooth operators may be off."""
     inner = max((operands(part, samples) for part in parts(node)), default=0.0)
     match node:
-        case ir.Join(_, items):
+        case ir.BoolOp(_, items):
             return inner + math.log(len(items))
-        case ir.Over() | ir.Past():
+        case ir.Temporal() | ir.PastTemporal():
             return inner + math.log(samples)
         case ir.Until() | ir.Since():
             return inner + math.log(samples) + math.log(2 * samples + 1) + 3 * math.log(2)
@@ -217,9 +217,9 @@ def operands(node: ir.Formula, samples: int) -> float:
 
 def test_smooth_operators_are_stable_and_one_sided() -> None:
     column = torch.tensor([[1000.0], [999.0], [1000.0]], requires_grad=True)
-    x = ir.Col("x")
-    top = ir.Over("eventually", ir.Window(0, 2), ir.Atom(x))
-    low = ir.Over("always", ir.Window(0, 2), ir.Atom(x))
+    x = ir.Signal("x")
+    top = ir.Temporal("eventually", ir.Window(0, 2), ir.Predicate(x))
+    low = ir.Temporal("always", ir.Window(0, 2), ir.Predicate(x))
     up, down = evaluate([top, low], {"x": column}, ops=TORCH, semantics=LogSumExp(500.0))
     assert up.dtype == torch.float32
     assert 1000.0 <= up.item() <= 1000.0 + math.log(3) / 500 + 1e-3
@@ -232,23 +232,23 @@ def test_smooth_operators_are_stable_and_one_sided() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_infinite_operands_carry_no_gradient(semantics: Exact | LogSumExp, dtype: torch.dtype) -> None:
     """A guard is +-inf; what is behind it gets a gradient, itself it gets none, and nothing is NaN."""
-    clock, x = ir.Col("clock"), ir.Col("x")
-    outside = ir.Atom(ir.Op("sub", (clock, ir.Lit(2.0))), sign=-1, strict=True, guard=True)
-    body = ir.Join("or", (outside, ir.Atom(x)))
-    held = ir.Until("until", ir.Window(0, 3), body, ir.Join("and", (body, ir.Atom(clock, guard=True))))
+    clock, x = ir.Signal("clock"), ir.Signal("x")
+    outside = ir.Predicate(ir.Op("sub", (clock, ir.Const(2.0))), sign=-1, strict=True, guard=True)
+    body = ir.BoolOp("or", (outside, ir.Predicate(x)))
+    held = ir.Until("until", ir.Window(0, 3), body, ir.BoolOp("and", (body, ir.Predicate(clock, guard=True))))
     env = {
         "clock": torch.arange(5.0, dtype=dtype)[:, None].requires_grad_(),
         "x": torch.tensor([[3.0], [1.0], [2.0], [5.0], [4.0]], dtype=dtype, requires_grad=True),
     }
-    always = ir.Over("always", ir.Window(0, 4), body)
-    values = evaluate([always, held, ir.Join("or", (always, held))], env, ops=TORCH, semantics=semantics)
+    always = ir.Temporal("always", ir.Window(0, 4), body)
+    values = evaluate([always, held, ir.BoolOp("or", (always, held))], env, ops=TORCH, semantics=semantics)
     assert values[0].item() == pytest.approx(2.0, abs=1e-3)
     torch.cat(values)[0].sum().backward()
     assert env["clock"].grad is None or not env["clock"].grad.any()
     np.testing.assert_allclose(env["x"].grad.ravel(), [0, 0, 1, 0, 0], atol=1e-6)
     for value in values[1:]:
         env["x"].grad = None
-        (again,) = evaluate([ir.Join("and", (held, always))], env, ops=TORCH, semantics=semantics)
+        (again,) = evaluate([ir.BoolOp("and", (held, always))], env, ops=TORCH, semantics=semantics)
         again.sum().backward()
         assert torch.isfinite(env["x"].grad).all()
         assert not torch.isnan(value).any()
@@ -270,21 +270,21 @@ def test_gradients_are_never_nan(formula: typed.Formula, env: Env, k: float | No
 
 
 def test_predicates_are_read_only_where_they_are_needed() -> None:
-    x, y = ir.Col("x"), ir.Col("y")
-    node = ir.Join("or", (ir.Atom(x), ir.Over("always", ir.Window(0, 25), ir.Atom(y))))
+    x, y = ir.Signal("x"), ir.Signal("y")
+    node = ir.BoolOp("or", (ir.Predicate(x), ir.Temporal("always", ir.Window(0, 25), ir.Predicate(y))))
     plan = planned((node,), Run(0, 1), Extent(51))
     assert sorted(inside.count for _, _, inside in plan.atoms.values()) == [1, 26]
     assert not plan.batches
 
 
 def test_predicates_over_one_stretch_share_a_program() -> None:
-    twice = ir.Op("mul", (ir.Col("x"), ir.Lit(2.0)))
-    more = ir.Atom(ir.Op("sub", (twice, ir.Lit(1.0))))
-    node = ir.Join(
+    twice = ir.Op("mul", (ir.Signal("x"), ir.Const(2.0)))
+    more = ir.Predicate(ir.Op("sub", (twice, ir.Const(1.0))))
+    node = ir.BoolOp(
         "or",
         (
-            ir.Atom(twice, sign=-1),
-            ir.Over("always", ir.Window(0, 25), ir.Join("and", (ir.Atom(twice), more))),
+            ir.Predicate(twice, sign=-1),
+            ir.Temporal("always", ir.Window(0, 25), ir.BoolOp("and", (ir.Predicate(twice), more))),
         ),
     )
     plan = planned((node,), Run(0, 1), Extent(51))
@@ -292,15 +292,15 @@ def test_predicates_over_one_stretch_share_a_program() -> None:
 
 
 def test_equal_parts_are_computed_once() -> None:
-    p = ir.Over("always", ir.Window(0, 3), ir.Atom(ir.Col("x")))
-    twin = ir.Over("always", ir.Window(0, 3), ir.Atom(ir.Col("x")))
-    plan = planned((p, ir.Join("or", (twin, ir.Atom(ir.Col("y"))))), Run(0, 1), Extent(5))
-    assert sum(isinstance(step.node, ir.Over) for step in plan.steps) == 1
+    p = ir.Temporal("always", ir.Window(0, 3), ir.Predicate(ir.Signal("x")))
+    twin = ir.Temporal("always", ir.Window(0, 3), ir.Predicate(ir.Signal("x")))
+    plan = planned((p, ir.BoolOp("or", (twin, ir.Predicate(ir.Signal("y"))))), Run(0, 1), Extent(5))
+    assert sum(isinstance(step.node, ir.Temporal) for step in plan.steps) == 1
 
 
 def test_long_sequential_scan_and_log_depth_agree() -> None:
     rng = np.random.default_rng(3)
-    node = ir.Until("until", ir.Window(2, None), ir.Atom(ir.Col("x")), ir.Atom(ir.Col("y")))
+    node = ir.Until("until", ir.Window(2, None), ir.Predicate(ir.Signal("x")), ir.Predicate(ir.Signal("y")))
     wide = {"x": rng.normal(1.0, 1.0, (100, 70)), "y": rng.normal(size=(100, 70))}
     whole = robustness_signal(node, wide, ops=NUMPY, end="truncate")
     single = {name: column[:, :1] for name, column in wide.items()}
@@ -323,8 +323,10 @@ SIGNATURE = Signature(tuple(Column(name) for name in NAMES))
 def test_graph_over_trajectories(dtype: type) -> None:
     x = np.random.default_rng(0).normal(size=(5, 4, 3)).astype(dtype)
     rules = [
-        Requirement(ir.Over("always", ir.Window(0, 3), ir.Atom(ir.Col("x"))), weight=2.0, scale=4.0),
-        Requirement(ir.Atom(ir.Col("z"), sign=-1)),
+        Requirement(
+            ir.Temporal("always", ir.Window(0, 3), ir.Predicate(ir.Signal("x"))), weight=2.0, scale=4.0
+        ),
+        Requirement(ir.Predicate(ir.Signal("z"), sign=-1)),
     ]
     graph = RobustnessGraph(rules, SIGNATURE)
     each = np.stack([x[:, :, 0].min(1), -x[:, 0, 2]], axis=1)
@@ -359,11 +361,13 @@ def test_graph_refuses_states_of_another_width() -> None:
 def test_graph_follows_the_device() -> None:
     """Tensors of the device "meta" do not mix with others: an array left on the CPU would show."""
     x = torch.zeros((5, 4, 3), device="meta", requires_grad=True)
-    guard = ir.Atom(ir.Op("sub", (ir.Col("y"), ir.Lit(0.5))), guard=True)
-    body = ir.Join("or", (guard, ir.Atom(ir.Op("mod", (ir.Col("x"), ir.Lit(2.0))))))
-    held = ir.Past("once", ir.Window(0, None), ir.Until("until", ir.Window(1, 2), body, ir.Atom(ir.Col("z"))))
+    guard = ir.Predicate(ir.Op("sub", (ir.Signal("y"), ir.Const(0.5))), guard=True)
+    body = ir.BoolOp("or", (guard, ir.Predicate(ir.Op("mod", (ir.Signal("x"), ir.Const(2.0))))))
+    held = ir.PastTemporal(
+        "once", ir.Window(0, None), ir.Until("until", ir.Window(1, 2), body, ir.Predicate(ir.Signal("z")))
+    )
     graph = RobustnessGraph(
-        [Requirement(body), Requirement(ir.Over("always", ir.Window(0, 1), held))], SIGNATURE
+        [Requirement(body), Requirement(ir.Temporal("always", ir.Window(0, 1), held))], SIGNATURE
     )
     for smoothing in (None, 50.0):
         value = graph.robustness(x, smoothing)

@@ -13,20 +13,20 @@ from stlc.compile.ir.defined import defined
 from stlc.compile.ir.horizon import columns, nodes, reach, uses_end
 from stlc.compile.lowering.lower import lower
 
-P, Q = ir.Atom(ir.Col("p")), ir.Atom(ir.Col("q"))
+P, Q = ir.Predicate(ir.Signal("p")), ir.Predicate(ir.Signal("q"))
 
 
 @pytest.mark.parametrize(
     ("formula", "past", "future", "end"),
     [
         (P, 0, 0, False),
-        (ir.Over("always", ir.Window(2, 5), P), 0, 5, False),
-        (ir.Over("always", ir.Window(2, 5), ir.Past("once", ir.Window(1, 9), P)), 7, 5, False),
-        (ir.Over("always", ir.Window(2, None), P), 0, 2, True),
-        (ir.Past("once", ir.Window(2, None), P), 2, 0, False),
+        (ir.Temporal("always", ir.Window(2, 5), P), 0, 5, False),
+        (ir.Temporal("always", ir.Window(2, 5), ir.PastTemporal("once", ir.Window(1, 9), P)), 7, 5, False),
+        (ir.Temporal("always", ir.Window(2, None), P), 0, 2, True),
+        (ir.PastTemporal("once", ir.Window(2, None), P), 2, 0, False),
         (ir.Until("until", ir.Window(1, 3), ir.Shift(2, P), Q), 0, 5, False),
         (ir.Since("since", ir.Window(1, 3), ir.Shift(2, P), Q), 3, 2, False),
-        (ir.Join("and", (ir.Shift(-1, P), ir.Shift(1, Q))), 1, 1, False),
+        (ir.BoolOp("and", (ir.Shift(-1, P), ir.Shift(1, Q))), 1, 1, False),
     ],
 )
 def test_reach(formula: ir.Formula, past: int, future: int, end: bool) -> None:
@@ -35,8 +35,8 @@ def test_reach(formula: ir.Formula, past: int, future: int, end: bool) -> None:
 
 
 def test_columns_of_conditions_inside_numbers() -> None:
-    num = ir.Op("add", (ir.Where(P, ir.Col("a"), ir.Lit(1.0)), ir.Ind(Q)))
-    assert columns(ir.Over("always", ir.Window(0, 1), ir.Atom(num))) == {"p", "q", "a"}
+    num = ir.Op("add", (ir.Where(P, ir.Signal("a"), ir.Const(1.0)), ir.Indicator(Q)))
+    assert columns(ir.Temporal("always", ir.Window(0, 1), ir.Predicate(num))) == {"p", "q", "a"}
 
 
 @settings(max_examples=150)
@@ -47,7 +47,7 @@ def test_nothing_beyond_the_reach_is_read(formula: typed.Formula, env: dict[str,
     samples = len(env["x"])
     past, future = reach(node)
     inside = defined(node, samples)
-    if not any(isinstance(part, (ir.Past, ir.Since, ir.Shift)) for part in nodes(node)):
+    if not any(isinstance(part, (ir.PastTemporal, ir.Since, ir.Shift)) for part in nodes(node)):
         np.testing.assert_array_equal(inside, np.arange(samples) < samples - future)
     assert inside[past : max(samples - future, 0)].all()
     changed = {name: column.copy() for name, column in env.items()}
@@ -58,7 +58,7 @@ def test_nothing_beyond_the_reach_is_read(formula: typed.Formula, env: dict[str,
         np.testing.assert_array_equal(one[0], other[0])
 
 
-SOON = ir.Over("eventually", ir.Window(0, 2), P)
+SOON = ir.Temporal("eventually", ir.Window(0, 2), P)
 BEFORE = ir.Shift(-1, P)
 
 
@@ -66,8 +66,8 @@ BEFORE = ir.Shift(-1, P)
     ("formula", "samples"),
     [
         (SOON, "1111.."),
-        (ir.Over("always", ir.Window(1, None), P), "11111."),
-        (ir.Over("always", ir.Window(0, None), SOON), "......"),
+        (ir.Temporal("always", ir.Window(1, None), P), "11111."),
+        (ir.Temporal("always", ir.Window(0, None), SOON), "......"),
         (ir.Until("until", ir.Window(0, 1), SOON, Q), "111..."),
         (ir.Until("until", ir.Window(0, 1), Q, SOON), "111..."),
         (ir.Until("release", ir.Window(1, None), Q, P), "11111."),
@@ -75,11 +75,11 @@ BEFORE = ir.Shift(-1, P)
         (BEFORE, ".11111"),
         (ir.Shift(-1, P, outside=False), "111111"),
         (ir.Shift(2, P), "1111.."),
-        (ir.Past("once", ir.Window(0, None), BEFORE), "......"),
-        (ir.Past("once", ir.Window(2, 2), BEFORE), "11.111"),
+        (ir.PastTemporal("once", ir.Window(0, None), BEFORE), "......"),
+        (ir.PastTemporal("once", ir.Window(2, 2), BEFORE), "11.111"),
         (ir.Since("since", ir.Window(1, 1), BEFORE, Q), "1.1111"),
         (ir.Since("since", ir.Window(1, 2), P, SOON), "11111."),
-        (ir.Join("and", (SOON, BEFORE)), ".111.."),
+        (ir.BoolOp("and", (SOON, BEFORE)), ".111.."),
     ],
 )
 def test_where_a_formula_is_defined(formula: ir.Formula, samples: str) -> None:

@@ -38,7 +38,7 @@ def test_a_law_keeps_the_robustness_of_many(
 def test_laws_of_the_exact_semantics_do_not_hold_under_the_others() -> None:
     """Else they could be applied there."""
     env = {name: np.array([[0.5], [1.0], [2.5], [3.0], [4.0]]) + k for k, name in enumerate("xyz")}
-    p, q, r = (typed.Pred(SPAN, ir.Col(name), strict=True) for name in "xyz")
+    p, q, r = (typed.Predicate(SPAN, ir.Signal(name), strict=True) for name in "xyz")
     twice = windowed("always", steps(0, 2), windowed("always", steps(0, 1), p))
     ends = windowed("always", steps(0, None), windowed("always", steps(0, None), p))
     sides = {

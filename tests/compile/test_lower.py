@@ -19,8 +19,8 @@ from stlc.compile.ir.text import show_formula
 from stlc.compile.lowering.lower import lower
 from stlc.diagnostics import Diagnostic
 
-X = typed.Pred(SPAN, ir.Col("x"), strict=True)
-Y = typed.Pred(SPAN, ir.Col("y"), strict=False)
+X = typed.Predicate(SPAN, ir.Signal("x"), strict=True)
+Y = typed.Predicate(SPAN, ir.Signal("y"), strict=False)
 
 
 def between(lo: str, hi: str | None, opened: str = "[]") -> typed.Interval:
@@ -80,7 +80,7 @@ def test_negation_sinks_into_predicates(formula: typed.Formula, text: str) -> No
 
 def test_shift_of_an_edge_is_false_at_the_first_sample() -> None:
     rise = lower(typed.Edge(SPAN, "rise", X), GRID, [])
-    assert isinstance(rise, ir.Join)
+    assert isinstance(rise, ir.BoolOp)
     assert isinstance(rise.items[1], ir.Shift)
     assert rise.items[1].outside is False
 

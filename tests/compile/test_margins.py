@@ -85,9 +85,9 @@ def test_a_scale_goes_along() -> None:
 
 
 numbers = st.recursive(
-    st.floats(-1e3, 1e3).map(ir.Lit)
-    | st.just(ir.Col("x"))
-    | st.just(ir.Op("mul", (ir.Col("x"), ir.Lit(1 / 3.6)))),
+    st.floats(-1e3, 1e3).map(ir.Const)
+    | st.just(ir.Signal("x"))
+    | st.just(ir.Op("mul", (ir.Signal("x"), ir.Const(1 / 3.6)))),
     lambda inner: st.builds(
         lambda name, a, b: ir.Op(name, (a, b)),
         st.sampled_from(["add", "sub", "min", "max", "mul"]),
@@ -106,7 +106,7 @@ def test_a_number_in_a_unit_is_the_number_over_its_scale(num: ir.Num, x: float) 
     unit = parse_unit("km/h")
     env = {"x": np.array([[x]])}
     plain, scaled = (
-        float(evaluate([ir.Atom(each)], env, ops=NUMPY)[0][0, 0]) for each in (num, in_unit(num, unit))
+        float(evaluate([ir.Predicate(each)], env, ops=NUMPY)[0][0, 0]) for each in (num, in_unit(num, unit))
     )
     assert math.isclose(scaled * unit.scale, plain, rel_tol=1e-9, abs_tol=1e-3)
 

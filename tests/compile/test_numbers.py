@@ -239,13 +239,13 @@ def test_values(text: str, wanted: float) -> None:
 
 def test_sharpness_is_kept() -> None:
     found = number("ind(x > 0, sharpness = 500)").num
-    assert isinstance(found, ir.Ind)
+    assert isinstance(found, ir.Indicator)
     assert found.sharpness == 500.0
 
 
 def test_neutral_elements_vanish() -> None:
     for text in ("x + 0", "0 + x", "x - 0", "1 * x", "x / 1", "x^1"):
-        assert number(text).num == ir.Col("x")
+        assert number(text).num == ir.Signal("x")
 
 
 def test_several_components() -> None:
@@ -365,11 +365,11 @@ def test_the_error_is_the_callers() -> None:
 
 def test_samplers_where_they_are_allowed() -> None:
     found = number("choice(stop, light)", COLUMNS[5], samplers=True)
-    assert found.num == ir.Op("choice", (ir.Lit(0.0), ir.Lit(1.0)))
+    assert found.num == ir.Op("choice", (ir.Const(0.0), ir.Const(1.0)))
     assert found.kind == "enum"
-    assert number("bernoulli(0.2)", COLUMNS[6], samplers=True).num == ir.Op("bernoulli", (ir.Lit(0.2),))
+    assert number("bernoulli(0.2)", COLUMNS[6], samplers=True).num == ir.Op("bernoulli", (ir.Const(0.2),))
     assert number("uniform(x, 2)", COLUMNS[0], samplers=True).num == ir.Op(
-        "uniform", (ir.Col("x"), ir.Lit(2.0))
+        "uniform", (ir.Signal("x"), ir.Const(2.0))
     )
     assert number("uniform(0, 90)", COLUMNS[2], samplers=True).unit == parse_unit("deg")
     assert codes("uniform(x, v)", samplers=True) == ["E203"]

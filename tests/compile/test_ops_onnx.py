@@ -32,7 +32,7 @@ def _env(seed: int) -> dict[str, np.ndarray]:
 
 
 def test_every_function_equals_the_evaluator() -> None:
-    columns = tuple(ir.Col(name) for name in NAMES)
+    columns = tuple(ir.Signal(name) for name in NAMES)
     numbers = {name: ir.Op(name, columns[:arity]) for name, arity in OPERATIONS.items()}
     positive = ir.Op("abs", columns[:1])
     for name in ("sqrt", "log"):
@@ -40,9 +40,12 @@ def test_every_function_equals_the_evaluator() -> None:
     numbers["pow"] = ir.Op("pow", (positive, columns[1]))
     for name in ("asin", "acos"):
         numbers[name] = ir.Op(name, (ir.Op("sin", columns[:1]),))
-    cond = ir.Join("or", (ir.Atom(columns[0], strict=True), ir.Atom(columns[1], sign=-1)))
-    numbers |= {"ind": ir.Ind(cond), "where": ir.Where(cond, columns[2], ir.Lit(0.1))}
-    numbers |= {"constant": ir.Lit(2.5), "clamp": ir.Op("clip", (columns[0], ir.Lit(-1.0), ir.Lit(0.5)))}
+    cond = ir.BoolOp("or", (ir.Predicate(columns[0], strict=True), ir.Predicate(columns[1], sign=-1)))
+    numbers |= {"ind": ir.Indicator(cond), "where": ir.Where(cond, columns[2], ir.Const(0.1))}
+    numbers |= {
+        "constant": ir.Const(2.5),
+        "clamp": ir.Op("clip", (columns[0], ir.Const(-1.0), ir.Const(0.5))),
+    }
     _agree(numbers, _env(1))
 
 
@@ -50,7 +53,10 @@ def test_angles_are_exact_at_the_edges() -> None:
     values = [0.0, -0.0, 1.0, -1.0, 1e-300, -1e300, 0.3, math.nan]
     y, x = (np.array(grid).reshape(1, -1) for grid in np.meshgrid(values, values))
     known = np.isfinite(y) & np.isfinite(x)
-    numbers = {"angle": ir.Op("atan2", (ir.Col("y"), ir.Col("x"))), "slope": ir.Op("atan", (ir.Col("y"),))}
+    numbers = {
+        "angle": ir.Op("atan2", (ir.Signal("y"), ir.Signal("x"))),
+        "slope": ir.Op("atan", (ir.Signal("y"),)),
+    }
     found = computed(Program(numbers)(columns_on(Sheet(), ("y", "x"), 1), ONNX), {"y": y, "x": x})
     np.testing.assert_allclose(found["angle"], np.where(known, np.arctan2(y, x), np.nan), rtol=1e-15)
     np.testing.assert_allclose(found["slope"], np.arctan(y), rtol=1e-15)
@@ -59,7 +65,7 @@ def test_angles_are_exact_at_the_edges() -> None:
 def test_remainders_have_the_sign_of_the_divisor() -> None:
     values = np.array([[-7.5, -2.0, -0.25, 0.0, 0.25, 2.0, 7.5, 4.0]])
     for divisor in (2.0, -2.0, 0.75):
-        number = ir.Op("mod", (ir.Col("x"), ir.Lit(divisor)))
+        number = ir.Op("mod", (ir.Signal("x"), ir.Const(divisor)))
         _agree({"rest": number}, {"x": values}, tolerance=0.0)
 
 

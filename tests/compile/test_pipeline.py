@@ -278,7 +278,7 @@ def test_a_formula_that_fills_pages_is_cut_unless_it_is_asked_for() -> None:
 
 def test_numbers_read_like_mathematics() -> None:
     (rule,) = compiled("require a: -(x + 1 m) * 2 - y / 3 ^ 2 <= -(abs(x) - 1 m)").requirements
-    assert isinstance(rule.formula, ir.Atom)
+    assert isinstance(rule.formula, ir.Predicate)
     assert "abs(x)" in show_formula(rule.formula)
 
 

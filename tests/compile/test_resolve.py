@@ -60,7 +60,7 @@ def test_the_predicates_of_traffic_are_those_of_the_paper(x, tau, sign, yielding
     rules = {r.name: r.formula for r in traffic().requirements}
 
     def value(node: typed.Formula) -> float:
-        assert isinstance(node, typed.Pred)
+        assert isinstance(node, typed.Predicate)
         return reference.number(node.num, row)
 
     collision = rules["no_collision"]
@@ -98,7 +98,7 @@ def test_vectors_become_columns() -> None:
     assert found.signature.names == ("q[0]", "q[1]", "q[2]")
     assert [(c.low, c.high, str(c.unit)) for c in found.signature.columns] == [(-90.0, 90.0, "deg")] * 3
     predicate = found.requirements[0].formula
-    assert isinstance(predicate, typed.Pred)
+    assert isinstance(predicate, typed.Predicate)
     row = {"q[0]": 3.0, "q[1]": 4.0, "q[2]": 0.0}
     assert reference.number(predicate.num, row) == pytest.approx(5 * parse_unit("deg").scale)
 
@@ -107,7 +107,7 @@ def test_a_signal_may_come_from_another_column() -> None:
     found = spec('signal speed [km/h] from "vehicle.v"\nrequire r: speed < 100\n')
     assert found.signature.names == ("vehicle.v",)
     predicate = found.requirements[0].formula
-    assert isinstance(predicate, typed.Pred)
+    assert isinstance(predicate, typed.Predicate)
     assert reference.number(predicate.num, {"vehicle.v": 90.0}) == pytest.approx(10 / 3.6)
 
 
@@ -150,8 +150,8 @@ def test_the_system_says_what_is_stored() -> None:
     assert column.high == pytest.approx(57.29577951308232)
     row = {"psi": 45.0}
     first, second = (r.formula for r in found.requirements)
-    assert isinstance(first, typed.Pred)
-    assert isinstance(second, typed.Pred)
+    assert isinstance(first, typed.Predicate)
+    assert isinstance(second, typed.Predicate)
     assert reference.number(first.num, row) == pytest.approx(0.5 - 45 * parse_unit("deg").scale)
     assert reference.number(second.num, row) == pytest.approx(-15 * parse_unit("deg").scale)
 
@@ -200,8 +200,8 @@ def test_set_changes_a_constant(name: str, text: str, value: float) -> None:
         assert always.interval.hi is not None
         assert float(always.interval.hi.seconds) == value
     else:
-        assert isinstance(always.body, typed.Pred)
-        assert always.body.num == ir.Op("sub", (ir.Col("x"), ir.Lit(value)))
+        assert isinstance(always.body, typed.Predicate)
+        assert always.body.num == ir.Op("sub", (ir.Signal("x"), ir.Const(value)))
 
 
 def test_a_mistyped_override_is_a_usage_error() -> None:
@@ -284,6 +284,6 @@ def test_vacuity_counts_enforced_ranges_alone(text: str, vacuous: bool) -> None:
 
 def test_conditional_numbers() -> None:
     predicate = formula("(if b then x else 2 * x) > 0")
-    assert isinstance(predicate, typed.Pred)
+    assert isinstance(predicate, typed.Predicate)
     assert isinstance(predicate.num, ir.Where)
     assert [reference.number(predicate.num, {"b": b, "x": 3.0}) for b in (1.0, 0.0)] == [3.0, 6.0]

@@ -7,28 +7,28 @@ import pytest
 from stlc.compile.ir import nodes as ir
 from stlc.compile.lowering.simplify import simplify
 
-P, Q, R = (ir.Atom(ir.Col(name)) for name in "pqr")
+P, Q, R = (ir.Predicate(ir.Signal(name)) for name in "pqr")
 TRUE, FALSE = ir.Truth(True), ir.Truth(False)
 
 
-def g(lo: int, hi: int | None, body: ir.Formula) -> ir.Over:
-    return ir.Over("always", ir.Window(lo, hi), body)
+def g(lo: int, hi: int | None, body: ir.Formula) -> ir.Temporal:
+    return ir.Temporal("always", ir.Window(lo, hi), body)
 
 
-def f(lo: int, hi: int | None, body: ir.Formula) -> ir.Over:
-    return ir.Over("eventually", ir.Window(lo, hi), body)
+def f(lo: int, hi: int | None, body: ir.Formula) -> ir.Temporal:
+    return ir.Temporal("eventually", ir.Window(lo, hi), body)
 
 
-def h(lo: int, hi: int | None, body: ir.Formula) -> ir.Past:
-    return ir.Past("historically", ir.Window(lo, hi), body)
+def h(lo: int, hi: int | None, body: ir.Formula) -> ir.PastTemporal:
+    return ir.PastTemporal("historically", ir.Window(lo, hi), body)
 
 
-def both(*items: ir.Formula) -> ir.Join:
-    return ir.Join("and", items)
+def both(*items: ir.Formula) -> ir.BoolOp:
+    return ir.BoolOp("and", items)
 
 
-def either(*items: ir.Formula) -> ir.Join:
-    return ir.Join("or", items)
+def either(*items: ir.Formula) -> ir.BoolOp:
+    return ir.BoolOp("or", items)
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ def along(region: str, env: dict[str, np.ndarray], shares: np.ndarray) -> np.nda
         point = "q" if "q[0]" in env else "p"
         num = _CACHE[region] = margin(f"sdist({point}, {region})")
     rows = {name: (1 - shares)[:, None] * x[0] + shares[:, None] * x[1] for name, x in env.items()}
-    (values,) = evaluate([ir.Atom(num)], rows, ops=NUMPY, count=len(shares))
+    (values,) = evaluate([ir.Predicate(num)], rows, ops=NUMPY, count=len(shares))
     return values[:, 0]
 
 
@@ -202,7 +202,7 @@ def test_negation_is_not_the_same_as_not_in() -> None:
 
 def test_the_reference_reads_it_too() -> None:
     node = formula("sweep(p) not in box([0, 0], [1, 1])")
-    assert isinstance(node, typed.Pred)
+    assert isinstance(node, typed.Predicate)
     trace = reference.Trace({"p[0]": [-1.0, 2.0], "p[1]": [0.5, 0.5]}, GRID)
     assert reference.robustness(node, trace) == (-0.5, -0.5)
     assert not math.isinf(reference.robustness(node, trace, 1)[0])

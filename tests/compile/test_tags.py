@@ -108,4 +108,4 @@ def test_what_looks_before_a_plan_is_told_so() -> None:
         warnings("require a: always[0, T] delta(x) < 1 m")
     assert warnings("require a: always[1 steps, T] delta(x) < 1 m") == []
     node = formula("always[1 steps, 3 steps] delta(x) < 1")
-    assert [columns_of(part.num) for part in nodes(node) if isinstance(part, typed.Pred)] == [{"x"}]
+    assert [columns_of(part.num) for part in nodes(node) if isinstance(part, typed.Predicate)] == [{"x"}]

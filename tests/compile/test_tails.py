@@ -16,7 +16,7 @@ from stlc.compile.semantics.semantics import SEMANTICS, semantics_of
 from stlc.diagnostics import StlcError
 
 Env = dict[str, np.ndarray]
-X, Y = ir.Atom(ir.Col("x")), ir.Atom(ir.Col("y"))
+X, Y = ir.Predicate(ir.Signal("x")), ir.Predicate(ir.Signal("y"))
 COLUMN = {"x": np.array([[1.0], [-2.0], [3.0]])}
 
 
@@ -34,9 +34,9 @@ def operators(*windows: tuple[int, int | None]) -> Iterator[Callable[[ir.Formula
     """Every operator with every window, of one part or of two."""
     for window in (ir.Window(*ends) for ends in windows):
         for op in ("always", "eventually"):
-            yield lambda one, _, op=op, window=window: ir.Over(op, window, one)
+            yield lambda one, _, op=op, window=window: ir.Temporal(op, window, one)
         for op in ("historically", "once"):
-            yield lambda one, _, op=op, window=window: ir.Past(op, window, one)
+            yield lambda one, _, op=op, window=window: ir.PastTemporal(op, window, one)
         for op in ("until", "release"):
             yield lambda one, two, op=op, window=window: ir.Until(op, window, one, two)
         for op in ("since", "trigger"):
@@ -47,7 +47,10 @@ def pairs() -> Iterator[ir.Formula]:
     """What changes beyond the trace, below what looks far beyond it."""
     inner = [make(X, Y) for make in operators((0, 3), (2, 4), (0, None), (2, None))]
     inner += [ir.Shift(steps, X) for steps in (-4, 4)]
-    inner += [ir.Join("or", (X, ir.Past("once", ir.Window(0, 2), Y))), ir.AtStart(ir.Join("and", (X, Y)))]
+    inner += [
+        ir.BoolOp("or", (X, ir.PastTemporal("once", ir.Window(0, 2), Y))),
+        ir.AtStart(ir.BoolOp("and", (X, Y))),
+    ]
     for outer in operators((3, 20)):
         yield from (outer(part, Y) for part in inner)
         yield from (outer(Y, part) for part in inner)
@@ -66,7 +69,7 @@ def nested(window: ir.Window, *ops: str) -> ir.Formula:
     """Operators around `x >= 0`, the first one outermost."""
     node: ir.Formula = X
     for op in reversed(ops):
-        kind = ir.Over if op in ("always", "eventually") else ir.Past
+        kind = ir.Temporal if op in ("always", "eventually") else ir.PastTemporal
         node = kind(op, window, node)
     return node
 
@@ -89,7 +92,7 @@ def test_a_mean_counts_every_instant() -> None:
 
 
 def test_what_is_decided_is_decided_before_a_far_deadline() -> None:
-    node = ir.Over("always", ir.Window(0, 10**12), X)
+    node = ir.Temporal("always", ir.Window(0, 10**12), X)
     (high,) = evaluate([node], COLUMN, ops=NUMPY, end="upper")
     assert high.item() == -2.0
 

@@ -16,7 +16,7 @@ from stlc.compile.backends.onnx.sheet import Sheet
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.horizon import nodes
 
-X, Y, Z = (ir.Atom(ir.Col(name)) for name in NAMES)
+X, Y, Z = (ir.Predicate(ir.Signal(name)) for name in NAMES)
 
 
 def _agree(rules: list[ir.Formula], trace: np.ndarray, count: int = 1) -> None:
@@ -36,7 +36,16 @@ def _drawn(count: int) -> list[ir.Formula]:
 def test_random_formulas_equal_the_evaluator() -> None:
     rules = _drawn(60)
     kinds = {type(node) for rule in rules for node in nodes(rule)}
-    assert kinds >= {ir.Over, ir.Past, ir.Until, ir.Since, ir.Shift, ir.Freeze, ir.Join, ir.Atom}
+    assert kinds >= {
+        ir.Temporal,
+        ir.PastTemporal,
+        ir.Until,
+        ir.Since,
+        ir.Shift,
+        ir.Freeze,
+        ir.BoolOp,
+        ir.Predicate,
+    }
     _agree(rules, np.round(traces_of(1, 40) * 8) / 8)
 
 
@@ -48,18 +57,20 @@ def test_a_thousand_random_formulas() -> None:
 
 
 def test_several_instants_and_the_mission_clock() -> None:
-    start = ir.AtStart(ir.Over("eventually", ir.Window(0, 3), X))
-    rules = [ir.Join("or", (start, Y)), ir.Until("until", ir.Window(2, 5), X, Z), ir.Truth(value=True)]
+    start = ir.AtStart(ir.Temporal("eventually", ir.Window(0, 3), X))
+    rules = [ir.BoolOp("or", (start, Y)), ir.Until("until", ir.Window(2, 5), X, Z), ir.Truth(value=True)]
     _agree(rules, traces_of(4, 30), count=4)
 
 
 @pytest.mark.parametrize(
     "rule",
     [
-        ir.Atom(ir.Extern("f", (ir.Col("x"),))),
-        ir.Atom(ir.Op("add", (ir.Lit(1.0), ir.Extern("f", (ir.Col("x"),), function=lambda x: (x,))))),
-        ir.Atom(ir.At("x", STEPS + 1)),
-        ir.Over("always", ir.Window(0, STEPS + 1), X),
+        ir.Predicate(ir.Extern("f", (ir.Signal("x"),))),
+        ir.Predicate(
+            ir.Op("add", (ir.Const(1.0), ir.Extern("f", (ir.Signal("x"),), function=lambda x: (x,))))
+        ),
+        ir.Predicate(ir.ShiftedSignal("x", STEPS + 1)),
+        ir.Temporal("always", ir.Window(0, STEPS + 1), X),
     ],
 )
 def test_what_has_no_form_is_said(rule: ir.Formula) -> None:

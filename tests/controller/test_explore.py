@@ -114,9 +114,9 @@ def test_a_training_explores_where_climbing_leads_nowhere(
 
 
 def test_pieces_are_what_a_formula_is_the_conjunction_of() -> None:
-    a, b, c = (ir.Atom(ir.Col(name)) for name in "abc")
+    a, b, c = (ir.Predicate(ir.Signal(name)) for name in "abc")
     window = ir.Window(0, 3)
-    whole = ir.Join("and", (c, ir.Over("always", window, ir.Join("and", (a, b)))))
-    assert pieces(whole) == [c, ir.Over("always", window, a), ir.Over("always", window, b)]
-    either = ir.Over("eventually", window, ir.Join("and", (a, b)))
+    whole = ir.BoolOp("and", (c, ir.Temporal("always", window, ir.BoolOp("and", (a, b)))))
+    assert pieces(whole) == [c, ir.Temporal("always", window, a), ir.Temporal("always", window, b)]
+    either = ir.Temporal("eventually", window, ir.BoolOp("and", (a, b)))
     assert pieces(either) == [either]

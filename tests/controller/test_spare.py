@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.compile.ir.nodes import Atom, Col
+from stlc.compile.ir.nodes import Predicate, Signal
 from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
 from stlc.controller.guard.guard import Guard, Mode
 from stlc.controller.guard.plan_repair import Limits
@@ -85,7 +85,7 @@ def test_robustness_is_less_by_the_margin(car_task: Task) -> None:
 
 
 def test_time_tests_stay_and_negated_predicates_are_tightened_too() -> None:
-    guard = Atom(Col("t"), guard=True)
+    guard = Predicate(Signal("t"), guard=True)
     assert tighter(guard, 1.0) is guard
     task = Task.of(parse(Source("a.stl", SPEC.replace("p <= 2", "not (p > 2)"))), task_of().plain)
     x0 = torch.tensor([[1.0, 0.0]], dtype=torch.float64)

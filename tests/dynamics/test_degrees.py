@@ -77,8 +77,8 @@ def test_a_room_moves_as_in_kelvin(make: Make, flow: dict[str, str]) -> None:
 def test_what_is_added_is_a_difference(make: Make, flow: dict[str, str]) -> None:
     noisy, winter = make(ROOM.format(unit="degC", **flow)).decl.scenarios
     assert [show_number(each.value) for each in noisy.noise] == ["normal(0, 0.1)"]
-    assert [each.value for each in noisy.disturb] == [ir.Lit(float(flow["disturb"].split()[0]))]
-    assert [each.value for each in winter.override] == [ir.Lit(-10.0)]
+    assert [each.value for each in noisy.disturb] == [ir.Const(float(flow["disturb"].split()[0]))]
+    assert [each.value for each in winter.override] == [ir.Const(-10.0)]
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ PANDA = (EXAMPLES / "panda.urdf").read_text()
 
 def computed(body: ir.Body, q: np.ndarray) -> np.ndarray:
     """The body as a program, (n, joints) -> (n, 3)."""
-    args = tuple(ir.Col(f"a{i}") for i in range(len(body.formals)))
+    args = tuple(ir.Signal(f"a{i}") for i in range(len(body.formals)))
     program = Program({str(i): ir.Extern("f", args, i, body) for i in range(3)})
     found = program({"": q[:, 0], **{arg.name: q[:, i] for i, arg in enumerate(args)}}, NUMPY)
     return np.stack([np.broadcast_to(found[str(i)], len(q)) for i in range(3)], 1)

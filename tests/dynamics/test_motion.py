@@ -204,7 +204,9 @@ def test_clocks_are_appended_and_count_whole_steps(car: System) -> None:
 
 def test_timers_follow_from_the_states_before(car: System) -> None:
     """A rollout is its steps, `added_later` is what a step does, and no gradient goes through a timer."""
-    moving = ir.Where(ir.Atom(ir.Op("sub", (ir.Col("v"), ir.Lit(2.0)))), ir.Lit(1.0), ir.Col("fast"))
+    moving = ir.Where(
+        ir.Predicate(ir.Op("sub", (ir.Signal("v"), ir.Const(2.0)))), ir.Const(1.0), ir.Signal("fast")
+    )
     fast = Timer("fast", "latch", 0.0, moving, 0.0, 1.0)
     system = car.augmented((clock_of("clock", 40), fast))
     x0 = system.sample(64, seed=5, dtype=torch.float64)

@@ -47,7 +47,7 @@ def test_the_declaration_holds_what_was_written() -> None:
     assert decl.policy.hidden == (64, 64)
     assert decl.backup.lengths == (1, 2)
     assert decl.test.events[0].every == 20
-    assert decl.test.events[0].sets[0].value == ir.Lit(1.0)
+    assert decl.test.events[0].sets[0].value == ir.Const(1.0)
     assert decl.jumps[0].sharpness == 100
     interface = decl.interface()
     assert interface.signature is decl.signature

@@ -81,16 +81,16 @@ def test_mirrors_and_angles_are_those_of_the_network(tmp_path: Path) -> None:
 @pytest.mark.parametrize("written_out", [True, False])
 def test_every_stage_of_a_step_is_rolled(written_out: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sheets, "WRITTEN_OUT", 10**9 if written_out else 0)
-    x, y, z, u = (ir.Col(name) for name in ("x", "y", "z", "u"))
+    x, y, z, u = (ir.Signal(name) for name in ("x", "y", "z", "u"))
     feeds = ir.Op("add", (ir.Op("mul", (y, z)), u))
     step = Step(
         (("gain", ir.Op("sin", (u,))), ("fed", feeds)),
         {
-            "x": ir.Op("add", (x, ir.Col("gain"))),
-            "y": ir.Op("sub", (ir.Col("fed"), ir.Op("mul", (z, ir.Lit(0.5))))),
-            "z": ir.Op("mul", (y, ir.Lit(0.25))),
+            "x": ir.Op("add", (x, ir.Signal("gain"))),
+            "y": ir.Op("sub", (ir.Signal("fed"), ir.Op("mul", (z, ir.Const(0.5))))),
+            "z": ir.Op("mul", (y, ir.Const(0.25))),
             "w": ir.Op("mul", (x, x)),
-            "c": ir.Lit(4.0),
+            "c": ir.Const(4.0),
         },
     )
     sheet = Sheet()
@@ -125,14 +125,14 @@ def test_a_graph_takes_any_number_of_agents() -> None:
 @pytest.mark.parametrize("substeps", [1, 6])
 def test_a_step_of_many_parts_is_written_once(substeps: int) -> None:
     """Written out, a plan of 40 steps of RK4 with 6 substeps would be some ten thousand nodes."""
-    angle, speed, push = (ir.Col(name) for name in ("angle", "speed", "push"))
+    angle, speed, push = (ir.Signal(name) for name in ("angle", "speed", "push"))
     pull = ir.Op("sub", (push, ir.Op("sin", (angle,))))
     state: dict[str, ir.Num] = {"angle": angle, "speed": speed}
     lets: list[tuple[str, ir.Num]] = []
     for part in range(substeps):
         moved = rk4(lambda at: {"angle": at["speed"], "speed": substitute(pull, at)}, state, 0.1 / substeps)
         lets += [(f"{name}#{part}", number) for name, number in moved.items()]
-        state = {name: ir.Col(f"{name}#{part}") for name in moved}
+        state = {name: ir.Signal(f"{name}#{part}") for name in moved}
     step = Step(tuple(lets), {name: state[name] for name in ("angle", "speed")})
     sheet = Sheet()
     start = {name: sheet.input(name, (1, BATCH)) for name in ("angle", "speed")}

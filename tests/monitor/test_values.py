@@ -33,9 +33,12 @@ def test_a_window_is_a_record_of_its_own(ends: Ends, written, trace, window) -> 
 
 
 def test_readings_of_earlier_samples_are_history() -> None:
-    earlier = ir.Atom(ir.At("x", -2, clamped=True))
+    earlier = ir.Predicate(ir.ShiftedSignal("x", -2, clamped=True))
     assert history(earlier) == 2
-    assert history(ir.Freeze((("v", ir.At("x", -3, clamped=True)),), ir.Atom(ir.Held("v")))) == 3
+    assert (
+        history(ir.Freeze((("v", ir.ShiftedSignal("x", -3, clamped=True)),), ir.Predicate(ir.FrozenVar("v"))))
+        == 3
+    )
     record = Record({"x": np.arange(8.0)[:, None]}, NUMPY)
-    low, _ = window_bounds(ir.Over("always", ir.Window(0, None), earlier), record, range(6), 2, "open")
+    low, _ = window_bounds(ir.Temporal("always", ir.Window(0, None), earlier), record, range(6), 2, "open")
     np.testing.assert_array_equal(low[:, 0], [0, 0, 0, 1, 2, 3])

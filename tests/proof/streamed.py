@@ -17,7 +17,7 @@ from proof.cases import Case
 from proof.draw import Taste
 from proof.levels import robustness
 
-from stlc.compile.pipeline import Rule
+from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import SpecError, TraceError
 from stlc.monitor.instants import window_of
 from stlc.monitor.online.online import How, Online
@@ -118,7 +118,7 @@ def check_promises(case: Case, monitor: Monitor, how: How) -> None:
 
 
 def so_far(
-    case: Case, monitor: Monitor, rule: Rule, known: dict[str, Any], *, everywhere: bool
+    case: Case, monitor: Monitor, rule: CompiledRequirement, known: dict[str, Any], *, everywhere: bool
 ) -> dict[int, tuple[float, float]] | None:
     """Start -> bounds from what came so far, None where the definition says only less or something else."""
     if rule.uses_end and window_of(rule, monitor.compiled.grid.horizon) is None:

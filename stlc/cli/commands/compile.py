@@ -14,7 +14,7 @@ from stlc.cli.framework.output import emit, emit_json, say, show_diagnostics
 if TYPE_CHECKING:
     from stlc.compile.augment.timers import Timer
     from stlc.compile.ir import typed
-    from stlc.compile.pipeline import Compiled, Rule
+    from stlc.compile.pipeline import Compiled, CompiledRequirement
     from stlc.dynamics.declaration.decl import SystemDecl
 
 Part = Literal["all", "steps", "states", "ir"]
@@ -152,7 +152,7 @@ def _added(timer: Timer) -> dict[str, Any]:
     }
 
 
-def _requirement(rule: Rule, dt: float) -> dict[str, Any]:
+def _requirement(rule: CompiledRequirement, dt: float) -> dict[str, Any]:
     return {
         "name": rule.name,
         "doc": rule.doc,
@@ -164,13 +164,13 @@ def _requirement(rule: Rule, dt: float) -> dict[str, Any]:
     }
 
 
-def _intervals(rule: Rule, dt: float) -> Iterator[dict[str, Any]]:
+def _intervals(rule: CompiledRequirement, dt: float) -> Iterator[dict[str, Any]]:
     """The windows of a compiled formula; an upper end of None is the end of the trace."""
     from stlc.compile.ir import nodes as ir
     from stlc.compile.ir.horizon import nodes
 
     for node in nodes(rule.formula):
-        if not isinstance(node, ir.Over | ir.Past | ir.Until | ir.Since):
+        if not isinstance(node, ir.Temporal | ir.PastTemporal | ir.Until | ir.Since):
             continue
         steps = (node.window.lo, node.window.hi)
         yield {

@@ -32,8 +32,8 @@ class _Room:
 
     low: float = -math.inf
     high: float = math.inf
-    low_at: typed.Pred | None = None
-    high_at: typed.Pred | None = None
+    low_at: typed.Predicate | None = None
+    high_at: typed.Predicate | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,10 +79,10 @@ def _contradiction(node: typed.Logic) -> Diagnostic | None:
     return None
 
 
-def _conjuncts(formula: typed.Formula) -> Iterator[typed.Pred]:
+def _conjuncts(formula: typed.Formula) -> Iterator[typed.Predicate]:
     """The predicates that all have to hold at one instant."""
     match formula:
-        case typed.Pred():
+        case typed.Predicate():
             yield formula
         case typed.Logic(_, "and", items):
             for item in items:
@@ -93,7 +93,7 @@ def _conjuncts(formula: typed.Formula) -> Iterator[typed.Pred]:
 
 def _linear(num: ir.Num) -> _Linear:
     match num:
-        case ir.Lit(value):
+        case ir.Const(value):
             return _Linear(constant=value)
         case ir.Op("add", (left, right)):
             return _linear(left).plus(_linear(right))
@@ -101,9 +101,9 @@ def _linear(num: ir.Num) -> _Linear:
             return _linear(left).plus(_linear(right), -1.0)
         case ir.Op("neg", (inner,)):
             return _Linear().plus(_linear(inner), -1.0)
-        case ir.Op("mul", (ir.Lit(factor), inner)) | ir.Op("mul", (inner, ir.Lit(factor))):
+        case ir.Op("mul", (ir.Const(factor), inner)) | ir.Op("mul", (inner, ir.Const(factor))):
             return _Linear().plus(_linear(inner), factor)
-        case ir.Op("div", (inner, ir.Lit(divisor))) if divisor:
+        case ir.Op("div", (inner, ir.Const(divisor))) if divisor:
             return _Linear().plus(_linear(inner), 1.0 / divisor)
         case _:
             return _Linear({num: 1.0})

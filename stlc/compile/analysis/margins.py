@@ -28,7 +28,7 @@ def as_written(requirement: typed.Requirement) -> typed.Requirement:
 
 def _one_unit(formula: typed.Formula) -> Unit | None:
     """The unit that all predicates have; None where they differ."""
-    units = [node.written for node in nodes(formula) if isinstance(node, typed.Pred) and not node.guard]
+    units = [node.written for node in nodes(formula) if isinstance(node, typed.Predicate) and not node.guard]
     first = next(iter(units), None)
     alike = first is not None and all(same_dims(u, first) and u.ratio == first.ratio for u in units)
     return first if alike else None
@@ -36,7 +36,7 @@ def _one_unit(formula: typed.Formula) -> Unit | None:
 
 def _formula(formula: typed.Formula) -> typed.Formula:
     match formula:
-        case typed.Pred(num=num, written=written):
+        case typed.Predicate(num=num, written=written):
             return replace(formula, num=in_unit(num, written), unit=written)
         case typed.Truth():
             return formula
@@ -56,16 +56,16 @@ def in_unit(num: ir.Num, unit: Unit) -> ir.Num:
     if unit.ratio == 1:
         return num
     match num:
-        case ir.Lit(value):
-            return ir.Lit(_divided(value, unit))
-        case ir.Op("mul", (inner, ir.Lit(factor))) if factor == unit.scale:
+        case ir.Const(value):
+            return ir.Const(_divided(value, unit))
+        case ir.Op("mul", (inner, ir.Const(factor))) if factor == unit.scale:
             return inner
         case ir.Op(name, args) if name in _LINEAR:
             return replace(num, args=tuple(in_unit(arg, unit) for arg in args))
         case ir.Where():
             return replace(num, yes=in_unit(num.yes, unit), no=in_unit(num.no, unit))
         case _:
-            return ir.Op("div", (num, ir.Lit(unit.scale)))
+            return ir.Op("div", (num, ir.Const(unit.scale)))
 
 
 def _divided(value: float, unit: Unit) -> float:

@@ -21,7 +21,7 @@ def jumps(formula: typed.Formula, ranges: Facts) -> Iterator[Diagnostic]:
         ranges: of columns, declared or enforced, in stored units.
     """
     for node in nodes(formula):
-        if isinstance(node, typed.Pred) and any(_jumps(num, ranges) for num in everything(node.num)):
+        if isinstance(node, typed.Predicate) and any(_jumps(num, ranges) for num in everything(node.num)):
             yield Diagnostic(
                 "W403",
                 "a modulo in a predicate that is trained for",

@@ -23,11 +23,11 @@ def bounds(num: ir.Num, facts: Facts) -> Bounds | None:
         facts: enforced ranges of columns, in stored units.
     """
     match num:
-        case ir.Lit(value):
+        case ir.Const(value):
             return (value, value)
-        case ir.Col(name) | ir.At(name) | ir.Held(name):
+        case ir.Signal(name) | ir.ShiftedSignal(name) | ir.FrozenVar(name):
             return facts.get(name)
-        case ir.Ind():
+        case ir.Indicator():
             return (0.0, 1.0)
         case ir.Where(_, yes, no):
             return _hull(bounds(yes, facts), bounds(no, facts))

@@ -18,13 +18,13 @@ _CHANGES: Mapping[str, Callable[[float, float], float]] = MappingProxyType(
 def spread(num: ir.Num) -> tuple[float, float] | None:
     """Where nearly all draws of a sampler with known arguments lie; None where nothing is known."""
     match num:
-        case ir.Lit(value):
+        case ir.Const(value):
             return value, value
-        case ir.Op("uniform" | "randint", (ir.Lit(low), ir.Lit(high))) if low <= high:
+        case ir.Op("uniform" | "randint", (ir.Const(low), ir.Const(high))) if low <= high:
             return low, high
-        case ir.Op("truncnorm", (_, _, ir.Lit(low), ir.Lit(high))) if low <= high:
+        case ir.Op("truncnorm", (_, _, ir.Const(low), ir.Const(high))) if low <= high:
             return low, high
-        case ir.Op("normal", (ir.Lit(mean), ir.Lit(deviation))):
+        case ir.Op("normal", (ir.Const(mean), ir.Const(deviation))):
             reach = _DEVIATIONS * abs(deviation)
             return mean - reach, mean + reach
         case ir.Op("bernoulli", _):
@@ -35,7 +35,7 @@ def spread(num: ir.Num) -> tuple[float, float] | None:
             if len(found) < len(known):
                 return None
             return min(low for low, _ in found), max(high for _, high in found)
-        case ir.Op("add" | "sub" | "mul" | "div" as op, (inner, ir.Lit(amount))) if amount:
+        case ir.Op("add" | "sub" | "mul" | "div" as op, (inner, ir.Const(amount))) if amount:
             ends = spread(inner)
             if ends is None:
                 return None

@@ -40,9 +40,9 @@ def truth(formula: typed.Formula, facts: Facts) -> bool | None:
     match formula:
         case typed.Truth(_, value):
             return value
-        case typed.Pred(_, num, _):
+        case typed.Predicate(_, num, _):
             reach = bounds(num, facts)
-            if reach is None or isinstance(num, ir.Lit):
+            if reach is None or isinstance(num, ir.Const):
                 return None
             return True if reach[0] > _TOLERANCE else (False if reach[1] < -_TOLERANCE else None)
         case typed.Not(_, body):
@@ -102,7 +102,7 @@ def _because(formula: typed.Formula, signature: Signature, facts: Facts) -> str:
 
 def _columns(formula: typed.Formula) -> Iterator[str]:
     match formula:
-        case typed.Pred(_, num, _):
+        case typed.Predicate(_, num, _):
             yield from _in_number(num)
         case typed.Logic(_, _, items):
             for item in items:
@@ -115,7 +115,7 @@ def _columns(formula: typed.Formula) -> Iterator[str]:
 
 def _in_number(num: ir.Num) -> Iterator[str]:
     match num:
-        case ir.Col(name) | ir.At(name):
+        case ir.Signal(name) | ir.ShiftedSignal(name):
             yield name
         case ir.Op(_, args):
             for arg in args:
@@ -150,7 +150,7 @@ def _constrains(formula: typed.Formula, *, positive: bool) -> bool:
     match formula:
         case typed.Truth():
             return False
-        case typed.Pred() | typed.Edge() | typed.Shift() | typed.Recalled():
+        case typed.Predicate() | typed.Edge() | typed.Shift() | typed.Recalled():
             return True
         case typed.Not(_, body):
             return _constrains(body, positive=not positive)

@@ -116,7 +116,7 @@ class _Goals:
         left, right = (simplify(lower(at_hand(body), self.grid, self.sink)) for body in operands)
         formula = Absolute(op, window, node.span, *operands, tolerant(left), tolerant(right), right)
         clock = self.ledger.clock(last_step(formula) + (self.grid.horizon or 0) + 1)
-        draft = Timer(self.name, "status", 0.0, ir.Lit(0.0), -1.0, 1.0, _about(formula))
+        draft = Timer(self.name, "status", 0.0, ir.Const(0.0), -1.0, 1.0, _about(formula))
         return Leaf(formula, self.ledger.add(draft, update(formula, clock)), clock)
 
 

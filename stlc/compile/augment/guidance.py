@@ -18,7 +18,7 @@ from stlc.compile.ir import nodes as ir
 
 _DONE, _LOST = 1e6, 2e6
 """Steps left of a goal that needs nothing any more, and of one that is lost."""
-_ZERO = ir.Lit(0.0)
+_ZERO = ir.Const(0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ def _draw(goal: Goal) -> _Draw | None:
             if op == "and":
                 whole = _first_due(draws)
                 most = reduce(lambda a, b: ir.Op("max", (a, b)), [draw.left for draw in draws])
-                return _Draw(whole.gap, _where(_is_lost(most), ir.Lit(_LOST), whole.left))
+                return _Draw(whole.gap, _where(_is_lost(most), ir.Const(_LOST), whole.left))
             return reduce(_nearer, draws)
         case _:
             assert_never(goal)
@@ -66,36 +66,38 @@ def _leaf(leaf: Leaf) -> _Draw | None:
     margin = _margin(formula.margin)
     if margin is None:
         return None
-    left = ir.Op("sub", (ir.Lit(float(due)), leaf.clock))
-    open_ = at_least(ir.Lit(0.5), ir.Op("abs", (leaf.status,)))
-    waiting = open_ if promise else ir.Join("and", (open_, at_least(left, ir.Lit(1.0))))
-    lost = at_least(ir.Lit(-0.5), leaf.status)
+    left = ir.Op("sub", (ir.Const(float(due)), leaf.clock))
+    open_ = at_least(ir.Const(0.5), ir.Op("abs", (leaf.status,)))
+    waiting = open_ if promise else ir.BoolOp("and", (open_, at_least(left, ir.Const(1.0))))
+    lost = at_least(ir.Const(-0.5), leaf.status)
     gap = ir.Op("relu", (ir.Op("neg", (margin,)),))
-    over = _where(lost, ir.Lit(_LOST), ir.Lit(_DONE))
+    over = _where(lost, ir.Const(_LOST), ir.Const(_DONE))
     return _Draw(_where(waiting, gap, _ZERO), _where(waiting, left, over))
 
 
 def _rounds(leaf: Leaf) -> _Draw | None:
     """Recurring goals, `always@[a, end] once[0, c] p`: p draws, and is due c after it was last there."""
     margin = leaf.formula.margin
-    parts = margin.items if isinstance(margin, ir.Join) and margin.op == "and" else (margin,)
+    parts = margin.items if isinstance(margin, ir.BoolOp) and margin.op == "and" else (margin,)
     draws = [draw for part in parts if (draw := _round(part, leaf)) is not None]
     return _first_due(draws) if draws else None
 
 
 def _round(part: ir.Formula, leaf: Leaf) -> _Draw | None:
     """Of `p or c - since >= 0`."""
-    if not isinstance(part, ir.Join) or part.op != "or":
+    if not isinstance(part, ir.BoolOp) or part.op != "or":
         return None
-    tests = [item.num for item in part.items if isinstance(item, ir.Atom) and item.guard and item.sign > 0]
+    tests = [
+        item.num for item in part.items if isinstance(item, ir.Predicate) and item.guard and item.sign > 0
+    ]
     margin = _margin(part)
     if margin is None or len(tests) != 1:
         return None
-    begins = ir.Op("sub", (ir.Lit(float(leaf.formula.window.lo)), leaf.clock))
+    begins = ir.Op("sub", (ir.Const(float(leaf.formula.window.lo)), leaf.clock))
     left = ir.Op("max", (begins, tests[0]))
-    lost = at_least(ir.Lit(-0.5), leaf.status)
+    lost = at_least(ir.Const(-0.5), leaf.status)
     gap = ir.Op("relu", (ir.Op("neg", (margin,)),))
-    return _Draw(_where(lost, _ZERO, gap), _where(lost, ir.Lit(_LOST), left))
+    return _Draw(_where(lost, _ZERO, gap), _where(lost, ir.Const(_LOST), left))
 
 
 def _first_due(draws: Sequence[_Draw]) -> _Draw:
@@ -109,22 +111,22 @@ def _first_due(draws: Sequence[_Draw]) -> _Draw:
 
 def _nearer(one: _Draw, other: _Draw) -> _Draw:
     """Of two ways the one that is met, else the nearer one that is not lost."""
-    first = ir.Join(
+    first = ir.BoolOp(
         "or",
         (
             _is_lost(other.left),
-            ir.Join("and", (_not_lost(one.left), at_least(other.gap, one.gap))),
+            ir.BoolOp("and", (_not_lost(one.left), at_least(other.gap, one.gap))),
         ),
     )
     return _Draw(_where(first, one.gap, other.gap), _where(first, one.left, other.left))
 
 
 def _is_lost(left: ir.Num) -> ir.Formula:
-    return at_least(left, ir.Lit(0.5 * (_DONE + _LOST)))
+    return at_least(left, ir.Const(0.5 * (_DONE + _LOST)))
 
 
 def _not_lost(left: ir.Num) -> ir.Formula:
-    return at_least(ir.Lit(0.5 * (_DONE + _LOST)), left)
+    return at_least(ir.Const(0.5 * (_DONE + _LOST)), left)
 
 
 def _where(condition: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
@@ -134,11 +136,11 @@ def _where(condition: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
 def _margin(formula: ir.Formula) -> ir.Num | None:
     """Robustness of a state formula as a number; None where only tests of time decide it."""
     match formula:
-        case ir.Atom(_, _, _, True) | ir.Truth():
+        case ir.Predicate(_, _, _, True) | ir.Truth():
             return None
-        case ir.Atom(num, sign):
+        case ir.Predicate(num, sign):
             return num if sign > 0 else ir.Op("neg", (num,))
-        case ir.Join(op, items):
+        case ir.BoolOp(op, items):
             parts = [part for item in items if (part := _margin(item)) is not None]
             name = "min" if op == "and" else "max"
             return reduce(lambda a, b: ir.Op(name, (a, b)), parts) if parts else None

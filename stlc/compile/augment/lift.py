@@ -21,7 +21,7 @@ def lifted(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
     if not absolute(formula):
         return formula
     match formula:
-        case typed.Truth() | typed.Pred() | typed.Recalled():
+        case typed.Truth() | typed.Predicate() | typed.Recalled():
             return formula
         case typed.Logic(_, "and" | "or", items):
             return replace(formula, items=tuple(lifted(item, sink) for item in items))
@@ -94,7 +94,7 @@ def recorded(formula: typed.Formula) -> typed.Formula:
     under another temporal operator stay: they are judged at the first sample, whenever they are asked for.
     """
     match formula:
-        case typed.Truth() | typed.Pred() | typed.Shift() | typed.Edge() | typed.Recalled():
+        case typed.Truth() | typed.Predicate() | typed.Shift() | typed.Edge() | typed.Recalled():
             return formula
         case typed.Not() | typed.Freeze():
             return replace(formula, body=recorded(formula.body))

@@ -20,8 +20,8 @@ from stlc.source import Span
 
 Op: TypeAlias = Literal["always", "eventually", "until", "release"]
 
-_OPEN, _TRUE, _FALSE = ir.Lit(OPEN), ir.Lit(TRUE), ir.Lit(FALSE)
-_KNOWN = ir.Lit(0.5)
+_OPEN, _TRUE, _FALSE = ir.Const(OPEN), ir.Const(TRUE), ir.Const(FALSE)
+_KNOWN = ir.Const(0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +54,8 @@ class Leaf:
     """An absolute formula with its columns."""
 
     formula: Absolute
-    status: ir.Col
-    clock: ir.Col
+    status: ir.Signal
+    clock: ir.Signal
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,13 +93,13 @@ def endless(goal: Goal) -> bool:
 # ----------------------------------------------------------------------------- the latch
 
 
-def update(formula: Absolute, clock: ir.Col) -> Callable[[ir.Col], ir.Num]:
+def update(formula: Absolute, clock: ir.Signal) -> Callable[[ir.Signal], ir.Num]:
     """The status one step later, from its own column: once it is known it stays."""
     later = _decided(formula, clock)
     return lambda own: choose(at_least(_KNOWN, ir.Op("abs", (own,))), later, own)
 
 
-def _decided(formula: Absolute, clock: ir.Col) -> ir.Num:
+def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
     """What an open status becomes after the sample at hand."""
     inside, left, right = _inside(formula.window, clock), formula.left_now, formula.right_now
     over = _passed(formula.window, clock)
@@ -118,17 +118,17 @@ def _decided(formula: Absolute, clock: ir.Col) -> ir.Num:
             assert_never(formula.op)
 
 
-def _inside(window: ir.Window, clock: ir.Col) -> ir.Formula:
-    begun = at_least(clock, ir.Lit(float(window.lo)))
+def _inside(window: ir.Window, clock: ir.Signal) -> ir.Formula:
+    begun = at_least(clock, ir.Const(float(window.lo)))
     if window.hi is None:
         return begun
-    not_over = at_least(ir.Lit(float(window.hi)), clock)
+    not_over = at_least(ir.Const(float(window.hi)), clock)
     return not_over if window.lo == 0 else both(begun, not_over)
 
 
-def _passed(window: ir.Window, clock: ir.Col) -> ir.Formula:
+def _passed(window: ir.Window, clock: ir.Signal) -> ir.Formula:
     """Whether the sample at hand is the last one of the window."""
-    return ir.Truth(False) if window.hi is None else at_least(clock, ir.Lit(float(window.hi)))
+    return ir.Truth(False) if window.hi is None else at_least(clock, ir.Const(float(window.hi)))
 
 
 # ------------------------------------------------------------------------- what plans do
@@ -179,26 +179,26 @@ def possible(goal: Goal) -> typed.Formula:
         case Branch(op, items, span):
             return typed.Logic(span, op, tuple(map(possible, items)))
         case Leaf(formula):
-            return guard(goal.status, ir.Lit(-0.5), formula.span)
+            return guard(goal.status, ir.Const(-0.5), formula.span)
         case _:
             assert_never(goal)
 
 
-def typed_inside(window: ir.Window, clock: ir.Col, span: Span) -> typed.Formula:
+def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formula:
     """Whether the sample at hand is in a window of the mission."""
-    begun = guard(clock, ir.Lit(float(window.lo)), span)
+    begun = guard(clock, ir.Const(float(window.lo)), span)
     if window.hi is None:
         return begun
-    not_over = guard(ir.Lit(float(window.hi)), clock, span)
+    not_over = guard(ir.Const(float(window.hi)), clock, span)
     return not_over if window.lo == 0 else typed.Logic(span, "and", (begun, not_over))
 
 
-def _beyond(formula: Absolute, clock: ir.Col, horizon: int) -> typed.Formula:
+def _beyond(formula: Absolute, clock: ir.Signal, horizon: int) -> typed.Formula:
     """Whether the end of the window lies beyond the end of the plan."""
     hi = formula.window.hi
     if hi is None or hi - horizon < 1:
         return typed.Truth(formula.span, hi is None)
-    return guard(ir.Lit(float(hi - horizon - 1)), clock, formula.span)
+    return guard(ir.Const(float(hi - horizon - 1)), clock, formula.span)
 
 
 def _all_along(body: typed.Formula) -> typed.Formula:

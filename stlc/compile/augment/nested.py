@@ -143,7 +143,14 @@ def _sum(window: ir.Window, lo: int, hi: int | None) -> ir.Window:
 def _ahead(formula: typed.Formula) -> int:
     """How many samples a formula looks ahead. Raises TooFarError where it has no end."""
     match formula:
-        case typed.Truth() | typed.Pred() | typed.Edge() | typed.Shift() | typed.Freeze() | typed.Recalled():
+        case (
+            typed.Truth()
+            | typed.Predicate()
+            | typed.Edge()
+            | typed.Shift()
+            | typed.Freeze()
+            | typed.Recalled()
+        ):
             return 0
         case typed.Logic(_, _, items):
             return max(map(_ahead, items))
@@ -329,7 +336,7 @@ class _Writer:
         """Whether the mission is at most so many samples old; always where None is said."""
         if step is None or step < 0:
             return typed.Truth(self._span, step is None)
-        return guard(ir.Lit(float(step)), self._ledger.clock(step + 1), self._span)
+        return guard(ir.Const(float(step)), self._ledger.clock(step + 1), self._span)
 
     def _on_clock(self, op: _Wide, window: ir.Window, body: typed.Formula) -> typed.Formula:
         return typed.Temporal(self._span, op, _steps(window, self._span, "start"), body)

@@ -39,7 +39,7 @@ from stlc.source import Span
 REGISTER = 64
 """Samples ago up to which states hold what a formula said then, one a sample."""
 
-_ZERO, _ONE = ir.Lit(0.0), ir.Lit(1.0)
+_ZERO, _ONE = ir.Const(0.0), ir.Const(1.0)
 _Op: TypeAlias = Literal["and", "or"]
 
 
@@ -77,10 +77,10 @@ class _Test:
         return self._since_first(self.left), self._since_first(self.right)
 
     def _since_first(self, side: ir.Num) -> ir.Num:
-        if not isinstance(side, ir.Col):
+        if not isinstance(side, ir.Signal):
             return side
         first = ir.at_first(side)
-        return ir.Op("add", (first, ir.Col(ir.ELAPSED))) if self.later else first
+        return ir.Op("add", (first, ir.Signal(ir.ELAPSED))) if self.later else first
 
 
 @final
@@ -157,7 +157,7 @@ class Past:
         about = f"steps since {_short(node.body)} last held, up to {most}"
         draft = self._draft("timer", "since", most + 1.0, most + 1.0, about)
         since = self.ledger.add(draft, lambda own: choose(condition, _ONE, _counted(own, most + 1)))
-        return _Test(ir.Lit(float(most)), since, node.span, later=1).decides()
+        return _Test(ir.Const(float(most)), since, node.span, later=1).decides()
 
     def _held(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
         """Whether `body` held at all of the `most` samples before."""
@@ -169,7 +169,7 @@ class Past:
         about = f"steps for which {_short(node.body)} has held, up to {most}"
         draft = self._draft("timer", "held", float(most), float(most), about)
         held = self.ledger.add(draft, lambda own: choose(condition, _counted(own, most), _ZERO))
-        return _Test(held, ir.Lit(float(most)), node.span, later=1).lacks()
+        return _Test(held, ir.Const(float(most)), node.span, later=1).lacks()
 
     # ------------------------------------------------------------------------------ since
 
@@ -213,13 +213,13 @@ class Past:
             begun = self.ledger.add(draft, lambda own: choose(held, choose(met, _ONE, own), _ZERO))
             test = _Test(begun, _ONE, node.span) if positive else _Test(_ZERO, begun, node.span)
             return test.decides()
-        far = ir.Lit(most + 1.0)
+        far = ir.Const(most + 1.0)
         draft = self._draft("timer", "since", far.value, far.value, f"steps since {about}, up to {most}")
         since = self.ledger.add(
             draft, lambda own: choose(held, choose(met, _ONE, _counted(own, most + 1)), far)
         )
         if positive:
-            return _Test(ir.Lit(float(most)), since, node.span, later=1).decides()
+            return _Test(ir.Const(float(most)), since, node.span, later=1).decides()
         return _Test(since, far, node.span, later=1).decides()
 
     # ------------------------------------------------------------------------- rise, fall
@@ -252,7 +252,7 @@ class Past:
             about = f"whether {known} held {ago} samples before"
             draft = self._draft("latch", "before", initial, 1.0, about)
             latch = self.ledger.add(draft, lambda _own, last=latch: last)  # type: ignore[misc]
-        begun = guard(ir.Col(ir.ELAPSED), ir.Lit(float(steps)), node.span)
+        begun = guard(ir.Signal(ir.ELAPSED), ir.Const(float(steps)), node.span)
         first = typed.Logic(node.span, "or", (begun, recalled(latch, _ONE, node.span)))
         inside = typed.Shift(node.span, -steps, body, outside=True)
         return typed.Recalled(
@@ -285,13 +285,13 @@ class Past:
         about = f"steps since the first {from_there}, up to {least}"
         draft = self._draft("timer", "lasting", 0.0, float(least), about)
 
-        def update(own: ir.Col) -> ir.Num:
+        def update(own: ir.Signal) -> ir.Num:
             running = ir.Where(at_least(own, _ONE), _counted(own, least), choose(met, _ONE, _ZERO))
             return choose(held, running, _ZERO)
 
         age = self.ledger.add(draft, update)
-        span, bound = node.span, ir.Lit(float(least))
-        first, elapsed = ir.at_first(age), ir.Col(ir.ELAPSED)
+        span, bound = node.span, ir.Const(float(least))
+        first, elapsed = ir.at_first(age), ir.Signal(ir.ELAPSED)
         after = ir.Op("add", (first, elapsed))
         whole = _back(ir.Window(0, None), span)
         inside = _since_inside(node, left, right, ir.Window(least, None), positive=positive)
@@ -302,10 +302,10 @@ class Past:
                 (
                     typed.Temporal(span, "once", whole, left),
                     guard(_ZERO, first, span),
-                    guard(ir.Lit(least - 1.0), after, span),
+                    guard(ir.Const(least - 1.0), after, span),
                 ),
             )
-            now = typed.Logic(span, "or", (left, guard(ir.Lit(least - 1.0), age, span)))
+            now = typed.Logic(span, "or", (left, guard(ir.Const(least - 1.0), age, span)))
             return typed.Recalled(span, now=now, along=typed.Logic(span, "and", (inside, none)))
         memory = typed.Logic(
             span,
@@ -316,8 +316,8 @@ class Past:
                 guard(after, bound, span),
             ),
         )
-        missing = ir.Op("min", (ir.Op("sub", (elapsed, bound)), ir.Lit(-1.0)))
-        lacks = typed.Pred(span, ir.Op("mul", (missing, ir.Lit(MISSING))), strict=False)
+        missing = ir.Op("min", (ir.Op("sub", (elapsed, bound)), ir.Const(-1.0)))
+        lacks = typed.Predicate(span, ir.Op("mul", (missing, ir.Const(MISSING))), strict=False)
         return typed.Recalled(
             span,
             now=typed.Logic(span, "and", (left, guard(age, bound, span))),
@@ -357,7 +357,7 @@ class Past:
 
 def _counted(own: ir.Num, most: int) -> ir.Num:
     """One more, up to `most`."""
-    return ir.Op("min", (ir.Op("add", (own, _ONE)), ir.Lit(float(most))))
+    return ir.Op("min", (ir.Op("add", (own, _ONE)), ir.Const(float(most))))
 
 
 def _short(formula: typed.Formula) -> str:

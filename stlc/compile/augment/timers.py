@@ -56,7 +56,7 @@ class Timer:
 
 def clock_of(name: str, high: int) -> Timer:
     """The mission clock: it counts steps, so that no rounding enters, and stops at `high`."""
-    later = ir.Op("min", (ir.Op("add", (ir.Col(name), ir.Lit(1.0))), ir.Lit(float(high))))
+    later = ir.Op("min", (ir.Op("add", (ir.Signal(name), ir.Const(1.0))), ir.Const(float(high))))
     return Timer(name, "clock", 0.0, later, 0.0, float(high), "counts the samples of the mission")
 
 
@@ -76,20 +76,20 @@ class Ledger:
         clocks = () if self._clock is None else (clock_of(self._clock, self._latest),)
         return (*clocks, *self._known.values())
 
-    def clock(self, latest: int) -> ir.Col:
+    def clock(self, latest: int) -> ir.Signal:
         """The mission clock, which tells instants apart up to step `latest`."""
         self._latest = max(self._latest, latest)
         if self._clock is None:
             self._clock = self.fresh("clock")
-        return ir.Col(self._clock)
+        return ir.Signal(self._clock)
 
-    def add(self, draft: Timer, update: Callable[[ir.Col], ir.Num]) -> ir.Col:
+    def add(self, draft: Timer, update: Callable[[ir.Signal], ir.Num]) -> ir.Signal:
         """A timer like `draft`, whose own column `update` is given; of equal ones there is one."""
-        key = (draft.kind, draft.initial, draft.high, update(ir.Col("")))
+        key = (draft.kind, draft.initial, draft.high, update(ir.Signal("")))
         if key not in self._known:
             name = self.fresh(draft.name)
-            self._known[key] = replace(draft, name=name, update=update(ir.Col(name)))
-        return ir.Col(self._known[key].name)
+            self._known[key] = replace(draft, name=name, update=update(ir.Signal(name)))
+        return ir.Signal(self._known[key].name)
 
     def fresh(self, wanted: str) -> str:
         """`wanted`, or with a number behind it where that is the name of something else."""
@@ -104,14 +104,14 @@ class Ledger:
 # ------------------------------------------------------------------------- conditions
 
 
-def at_least(left: ir.Num, right: ir.Num) -> ir.Atom:
+def at_least(left: ir.Num, right: ir.Num) -> ir.Predicate:
     """`left >= right`, between whole numbers."""
-    return ir.Atom(ir.Op("sub", (left, right)))
+    return ir.Predicate(ir.Op("sub", (left, right)))
 
 
-def guard(left: ir.Num, right: ir.Num, span: Span) -> typed.Pred:
+def guard(left: ir.Num, right: ir.Num, span: Span) -> typed.Predicate:
     """`left >= right` as a test of time: it decides truth and never limits the margin."""
-    return typed.Pred(span, ir.Op("sub", (left, right)), strict=False, guard=True)
+    return typed.Predicate(span, ir.Op("sub", (left, right)), strict=False, guard=True)
 
 
 def recalled(left: ir.Num, right: ir.Num, span: Span) -> typed.Formula:
@@ -120,8 +120,8 @@ def recalled(left: ir.Num, right: ir.Num, span: Span) -> typed.Formula:
     Each missing step counts as much as no predicate reaches, so that of several instants those are preferred
     at which a plan can do something; and it is finite, so that there is a best of plans that all fail.
     """
-    gap = ir.Op("mul", (ir.Op("sub", (left, right)), ir.Lit(MISSING)))
-    return typed.Logic(span, "or", (guard(left, right, span), typed.Pred(span, gap, strict=False)))
+    gap = ir.Op("mul", (ir.Op("sub", (left, right)), ir.Const(MISSING)))
+    return typed.Logic(span, "or", (guard(left, right, span), typed.Predicate(span, gap, strict=False)))
 
 
 def choose(condition: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
@@ -134,9 +134,9 @@ def choose(condition: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
 def tolerant(formula: ir.Formula) -> ir.Formula:
     """A state formula that is true exactly where the monitor calls it satisfied: ties count."""
     match formula:
-        case ir.Atom(num, sign, _, False):
-            return ir.Atom(ir.Op("add", (num, ir.Lit(sign * TOLERANCE))), sign)
-        case ir.Join(_, items):
+        case ir.Predicate(num, sign, _, False):
+            return ir.Predicate(ir.Op("add", (num, ir.Const(sign * TOLERANCE))), sign)
+        case ir.BoolOp(_, items):
             return replace(formula, items=tuple(map(tolerant, items)))
         case _:
             return formula
@@ -147,9 +147,9 @@ def denied(formula: ir.Formula) -> ir.Formula:
     match formula:
         case ir.Truth(value):
             return replace(formula, value=not value)
-        case ir.Atom(_, sign, strict):
+        case ir.Predicate(_, sign, strict):
             return replace(formula, sign=1 if sign < 0 else -1, strict=not strict)
-        case ir.Join(op, items):
+        case ir.BoolOp(op, items):
             return replace(formula, op="or" if op == "and" else "and", items=tuple(map(denied, items)))
         case _:
             raise TypeError(f"not a state formula: {formula!r}")
@@ -160,4 +160,4 @@ def both(*items: ir.Formula) -> ir.Formula:
     if any(isinstance(item, ir.Truth) and not item.value for item in items):
         return ir.Truth(False)
     kept = tuple(item for item in items if not isinstance(item, ir.Truth))
-    return ir.Truth(True) if not kept else kept[0] if len(kept) == 1 else ir.Join("and", kept)
+    return ir.Truth(True) if not kept else kept[0] if len(kept) == 1 else ir.BoolOp("and", kept)

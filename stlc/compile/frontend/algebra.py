@@ -82,12 +82,12 @@ def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[
         return _on_one_scale(args, what, span, scope)
     known = rigid or [arg for arg in args if not arg.bare]
     if not known:
-        return tuple(args), Number(ir.Lit(0.0), DIMENSIONLESS, True, True, span=span)
+        return tuple(args), Number(ir.Const(0.0), DIMENSIONLESS, True, True, span=span)
     unit, sense = known[0].unit, _sense(args)
     bare = next((arg for arg in args if arg.bare), None)
     if bare is not None and sense == "open":
         scope.fail(_which(bare, SYMBOLS["degC"], span))
-    blank = Number(ir.Lit(0.0), unit, not rigid, sense=sense, span=span)
+    blank = Number(ir.Const(0.0), unit, not rigid, sense=sense, span=span)
     return tuple(in_unit(arg, unit, scope) if arg.bare else arg for arg in args), blank
 
 
@@ -109,15 +109,15 @@ def rebased(number: Number, unit: Unit) -> Number:
     exact = None if number.exact is None else number.exact + shift
     num: ir.Num
     match number.num:
-        case ir.Lit():
+        case ir.Const():
             assert value is not None
-            num = ir.Lit(nearest(exact) if exact is not None else value + amount)
-        case ir.Op("add" | "sub" as name, (inner, ir.Lit(before))) if before == (
+            num = ir.Const(nearest(exact) if exact is not None else value + amount)
+        case ir.Op("add" | "sub" as name, (inner, ir.Const(before))) if before == (
             -amount if name == "add" else amount
         ):
             num = inner
         case inner:
-            num = ir.Op("add" if amount > 0 else "sub", (inner, ir.Lit(abs(amount))))
+            num = ir.Op("add" if amount > 0 else "sub", (inner, ir.Const(abs(amount))))
     return replace(number, num=num, unit=unit, exact=exact, kind="real", sense="")
 
 
@@ -156,12 +156,12 @@ def in_unit(number: Number, unit: Unit, scope: Scope) -> Number:
         return replace(number, unit=unit, bare=False, flexible=False)
     exact = None if number.exact is None else number.exact * unit.ratio
     value = number.constant
-    num: ir.Num = ir.Op("mul", (number.num, ir.Lit(unit.scale)))
+    num: ir.Num = ir.Op("mul", (number.num, ir.Const(unit.scale)))
     if value is not None:
         stored = nearest(exact) if exact is not None else value * unit.scale
         if not math.isfinite(stored):
             scope.fail(too_large(number.span))
-        num = ir.Lit(stored)
+        num = ir.Const(stored)
     return replace(number, num=num, unit=unit, exact=exact, kind="real", bare=False, flexible=False)
 
 
@@ -184,7 +184,7 @@ def _units(
     args = _in_kelvin(function, args, span, scope)
     match function.rule:
         case "ratio":
-            return agree(args, _verb(function), span, scope)[0], Number(ir.Lit(0.0), span=span)
+            return agree(args, _verb(function), span, scope)[0], Number(ir.Const(0.0), span=span)
         case "mul":
             unit = args[0].unit * args[1].unit
         case "div":
@@ -201,7 +201,7 @@ def _units(
                 _check_plain(function, args, scope)
             unit, flexible = DIMENSIONLESS, bare
     sense: Sense = "difference" if _length_or_multiple(function, args, unit) else "open" if scaled else ""
-    return tuple(args), Number(ir.Lit(0.0), unit, flexible, bare, sense=sense, span=span)
+    return tuple(args), Number(ir.Const(0.0), unit, flexible, bare, sense=sense, span=span)
 
 
 # ---------------------------------------------------------------------- points of a scale
@@ -278,7 +278,7 @@ def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -
         if bare is not None and (undecided or not unit.offset):
             scope.fail(_which(bare, points[0].unit, span))
     sense: Sense = "difference" if difference is not None else "open" if undecided and unit.offset else ""
-    blank = Number(ir.Lit(0.0), unit, sense=sense, span=span)
+    blank = Number(ir.Const(0.0), unit, sense=sense, span=span)
     return tuple(in_unit(arg, unit, scope) if arg.bare else rebased(arg, unit) for arg in args), blank
 
 
@@ -300,7 +300,7 @@ def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Sco
     if other.bare:
         other = in_unit(other, point.unit.interval, scope)
     drops = function.name == "sub" and other.constant is None and other.sense != "difference"
-    blank = Number(ir.Lit(0.0), point.unit, sense="open" if drops else point.sense, span=span)
+    blank = Number(ir.Const(0.0), point.unit, sense="open" if drops else point.sense, span=span)
     return (point, other) if first else (other, point), blank
 
 
@@ -308,9 +308,11 @@ def _less_point(left: Number, right: Number, span: Span, scope: Scope) -> Agreed
     """`left - right` of a point: a difference of two; undecided where the point is."""
     if right.sense == "open" and not left.bare and left.sense != "difference":
         sense: Sense = "open" if left.unit.offset else ""
-        return (left, absolute(right)), Number(ir.Lit(0.0), left.unit, left.flexible, sense=sense, span=span)
+        return (left, absolute(right)), Number(
+            ir.Const(0.0), left.unit, left.flexible, sense=sense, span=span
+        )
     found, _ = agree((left, right), "subtract", span, scope)
-    return found, Number(ir.Lit(0.0), right.unit.interval, sense="difference", span=span)
+    return found, Number(ir.Const(0.0), right.unit.interval, sense="difference", span=span)
 
 
 def _spread(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> Agreed:
@@ -468,13 +470,13 @@ def _op(name: str, args: Sequence[Number]) -> ir.Num:
     """The node, with neutral elements left out."""
     nums = tuple(arg.num for arg in args)
     match name, nums:
-        case ("add", (num, ir.Lit(0.0))) | ("add", (ir.Lit(0.0), num)) | ("sub", (num, ir.Lit(0.0))):
+        case ("add", (num, ir.Const(0.0))) | ("add", (ir.Const(0.0), num)) | ("sub", (num, ir.Const(0.0))):
             return num
-        case ("mul", (num, ir.Lit(1.0))) | ("mul", (ir.Lit(1.0), num)) | ("div", (num, ir.Lit(1.0))):
+        case ("mul", (num, ir.Const(1.0))) | ("mul", (ir.Const(1.0), num)) | ("div", (num, ir.Const(1.0))):
             return num
         case ("min" | "max" | "choice", (num,)):
             return num
-        case "pow", (base, ir.Lit(exponent)) if exponent in (0.5, 1.0, 2.0):
+        case "pow", (base, ir.Const(exponent)) if exponent in (0.5, 1.0, 2.0):
             return base if exponent == 1.0 else ir.Op("sqrt" if exponent == 0.5 else "square", (base,))
         case _:
             return ir.Op(name, nums)
@@ -498,7 +500,7 @@ def _fold(function: Function, args: Sequence[Number], shell: Number, scope: Scop
     if exact is not None and max(exact.numerator.bit_length(), exact.denominator.bit_length()) > _MAX_BITS:
         exact = None
     return replace(
-        shell, num=ir.Lit(value), exact=exact, kind="int" if _whole(function, args, shell) else "real"
+        shell, num=ir.Const(value), exact=exact, kind="int" if _whole(function, args, shell) else "real"
     )
 
 
@@ -564,7 +566,7 @@ def _repair(left: Number, right: Number, span: Span) -> tuple[str, ...]:
 def negated(number: Number, span: Span) -> Number:
     """The number with its sign flipped."""
     value = number.constant
-    num: ir.Num = ir.Lit(-value) if value is not None else ir.Op("neg", (number.num,))
+    num: ir.Num = ir.Const(-value) if value is not None else ir.Op("neg", (number.num,))
     exact = None if number.exact is None else -number.exact
     return replace(number, num=num, exact=exact, span=span, origin=None)
 

@@ -96,7 +96,7 @@ def _function(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) 
     function = FUNCTIONS[name]
     if name in _FLATTENING and items:
         flat = [n for item in items for n in (item.items if isinstance(item, Vector) else (item,))]
-        return apply(name, flat, call.span, scope) if flat else Number(ir.Lit(0.0), span=call.span)
+        return apply(name, flat, call.span, scope) if flat else Number(ir.Const(0.0), span=call.span)
     count_arguments(name, call, (function.least, function.most), scope)
     return broadcast(name, items, call.span, scope)
 
@@ -127,7 +127,7 @@ def _convert(name: str, angle: Number, span: Span, scope: Scope) -> Number:
     """`deg(x)`: how many degrees an angle is; `rad(x)`: the angle of so many degrees."""
     ratio = Fraction(math.pi) / 180
     factor = literal(1 / ratio if name == "deg" else ratio, span)
-    (angle, _), _ = agree((angle, Number(ir.Lit(1.0))), f"`{name}`", span, scope)
+    (angle, _), _ = agree((angle, Number(ir.Const(1.0))), f"`{name}`", span, scope)
     return replace(apply("mul", (angle, factor), span, scope), flexible=False, bare=False)
 
 
@@ -155,4 +155,4 @@ def _indicator(call: ast.Call, values: Sequence[Value], scope: Scope) -> Number:
     cond = as_state_formula(values[0], call.args[0].value, Need("`ind`", "argument 1"), scope)
     if isinstance(cond, ir.Truth):
         return replace(literal(int(cond.value), call.span), flexible=False, bare=False)
-    return Number(ir.Ind(cond, sharpness), kind="int", span=call.span)
+    return Number(ir.Indicator(cond, sharpness), kind="int", span=call.span)

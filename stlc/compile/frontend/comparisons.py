@@ -81,7 +81,7 @@ def _pair(
     return _above(big, small, op in ("<", ">"), whole, scope)
 
 
-def _above(big: Number, small: Number, strict: bool, span: Span, scope: Scope) -> typed.Pred:
+def _above(big: Number, small: Number, strict: bool, span: Span, scope: Scope) -> typed.Predicate:
     """`big > small` (`strict`) or `big >= small`; between whole numbers with half a step of margin.
 
     Whole numbers differ by one step or not at all: halfway, no rounding and no tie decides, and the margin is
@@ -95,9 +95,11 @@ def _above(big: Number, small: Number, strict: bool, span: Span, scope: Scope) -
     return _pred(span, gap(big, small, span, scope), strict=strict, written=written)
 
 
-def _pred(span: Span, margin: Number, *, strict: bool = False, written: Unit | None = None) -> typed.Pred:
+def _pred(
+    span: Span, margin: Number, *, strict: bool = False, written: Unit | None = None
+) -> typed.Predicate:
     unit = (margin.unit if written is None else written).interval
-    return typed.Pred(span, margin.num, strict, unit=unit.si, written=unit)
+    return typed.Predicate(span, margin.num, strict, unit=unit.si, written=unit)
 
 
 def _compared(*sides: Number) -> Unit:
@@ -133,7 +135,7 @@ def _equality(
     _check_labels(a, b, place, scope)
     plain = [replace(side, kind="real", labels=()) for side in (a, b)]
     apart = apply("abs", (gap(plain[0], plain[1], whole, scope),), whole, scope)
-    return typed.Pred(whole, apply("sub", (half(whole), apart), whole, scope).num, strict=False)
+    return typed.Predicate(whole, apply("sub", (half(whole), apart), whole, scope).num, strict=False)
 
 
 def _meet(side: tuple[ast.Expr, Value], other: tuple[ast.Expr, Value], scope: Scope) -> Number:
@@ -145,7 +147,7 @@ def _meet(side: tuple[ast.Expr, Value], other: tuple[ast.Expr, Value], scope: Sc
             names = ", ".join(f"`{name}`" for name, _ in labels)
             message = f"`{value.name}` is not a member of the enum of `{other[0].span.text}`"
             scope.fail(Diagnostic("E205", message, expr.span, help=(f"its members are {names}",)))
-        return Number(ir.Lit(dict(labels)[value.name]), kind="enum", labels=labels, span=expr.span)
+        return Number(ir.Const(dict(labels)[value.name]), kind="enum", labels=labels, span=expr.span)
     return loose_number(value, expr, Need("`==` compares numbers", "one side"), scope)
 
 

@@ -348,7 +348,7 @@ def _held(number: Number, name: str, expr: ast.Freeze, bindings: list[tuple[str,
         return number
     key = f"{name}#{expr.span.start}@{expr.span.source.name}"
     bindings.append((key, number.num))
-    return replace(number, num=ir.Held(key), formula=None, origin=None)
+    return replace(number, num=ir.FrozenVar(key), formula=None, origin=None)
 
 
 def _domain(expr: ast.Quantifier, scope: Scope) -> Iterator[Number]:

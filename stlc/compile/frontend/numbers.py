@@ -64,8 +64,8 @@ def stored(number: Number, unit: Unit) -> ir.Num:
         return number.num
     value = number.constant
     if value is None:
-        return ir.Op("div", (number.num, ir.Lit(unit.scale)))
-    return ir.Lit(nearest(number.exact / unit.ratio) if number.exact is not None else value / unit.scale)
+        return ir.Op("div", (number.num, ir.Const(unit.scale)))
+    return ir.Const(nearest(number.exact / unit.ratio) if number.exact is not None else value / unit.scale)
 
 
 def _code(scope: Scope) -> str:
@@ -76,7 +76,7 @@ def _expected(value: Value, expr: ast.Expr, column: Column | None, what: str, sc
     """A value as the number that a column stores."""
     if column is not None and column.kind == "bool" and isinstance(value, typed.Node) and is_state(value):
         cond = condition(value)
-        truth = ir.Lit(float(cond.value)) if isinstance(cond, ir.Truth) else ir.Ind(cond)
+        truth = ir.Const(float(cond.value)) if isinstance(cond, ir.Truth) else ir.Indicator(cond)
         return Number(truth, kind="bool", span=expr.span)
     if column is not None and column.labels and isinstance(value, Label):
         return _member(value, expr, column, scope)
@@ -97,7 +97,7 @@ def _member(value: Label, expr: ast.Expr, column: Column, scope: Scope) -> Numbe
         names = ", ".join(f"`{name}`" for name in known)
         message = f"`{value.name}` is not a member of the enum of `{column.name}`"
         scope.fail(Diagnostic("E205", message, expr.span, help=(f"its members are {names}",)))
-    return Number(ir.Lit(known[value.name]), kind="enum", labels=column.labels, span=expr.span)
+    return Number(ir.Const(known[value.name]), kind="enum", labels=column.labels, span=expr.span)
 
 
 def _fitted(number: Number, expr: ast.Expr, column: Column, scope: Scope) -> Number:

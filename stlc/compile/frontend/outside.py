@@ -36,7 +36,7 @@ def outside(entry: External, call: ast.Call, values: Sequence[Value], scope: Sco
 def _output(entry: External, index: int, args: tuple[ir.Num, ...]) -> Number:
     num: ir.Num = ir.Extern(entry.name, args, index, entry.function)
     if entry.unit.ratio != 1:
-        num = ir.Op("mul", (num, ir.Lit(entry.unit.scale)))
+        num = ir.Op("mul", (num, ir.Const(entry.unit.scale)))
     return Number(num, entry.unit, flexible=not entry.unit.text, kind=entry.kind)
 
 

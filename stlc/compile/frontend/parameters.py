@@ -75,7 +75,7 @@ def _even(
         message = f"`{decl.name}` is drawn for every trajectory: its range must have both ends"
         help_ = ("give it a finite range, or a distribution: `param r ~ normal(1, 0.1)`",)
         scope.fail(Diagnostic("E205", message, decl.name_span, help=help_))
-    numbers = tuple(ir.Lit(value) for value in values if value is not None)
+    numbers = tuple(ir.Const(value) for value in values if value is not None)
     if isinstance(decl.domain, ast.SetLiteral):
         return tuple(ir.Op("choice", numbers) for _ in columns)
     sampler = "randint" if columns[0].kind == "int" else "uniform"
@@ -114,7 +114,7 @@ def _in_column(number: Number, expr: ast.Expr, target: tuple[Column, Unit], scop
         if wanted.offset != column.unit.offset:
             return stored(in_unit(number, wanted, scope), column.unit)
         factor = wanted.scale / column.unit.scale
-        return number.num if factor == 1 else ir.Op("mul", (number.num, ir.Lit(factor)))
+        return number.num if factor == 1 else ir.Op("mul", (number.num, ir.Const(factor)))
     if not number.flexible and column.unit.text and not same_dims(number.unit, column.unit):
         message = f"`{column.name}` is in [{column.unit}], this is in [{number.unit}]"
         scope.fail(Diagnostic("E203", message, expr.span, f"[{number.unit}]"))

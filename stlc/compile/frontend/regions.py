@@ -94,7 +94,7 @@ def _polygon(point: Vector, corners: Sequence[Vector], span: Span, scope: Scope)
     edges = zip(corners, (*corners[1:], corners[0]), strict=True)
     nearest = apply("min", [to_segment(point, a, b, span, scope) for a, b in edges], span, scope)
     parts = [_left_of_all(point, triangle, span, scope) for triangle in triangles(corners)]
-    inside = parts[0] if len(parts) == 1 else ir.Join("or", tuple(parts), span)
+    inside = parts[0] if len(parts) == 1 else ir.BoolOp("or", tuple(parts), span)
     return Number(
         ir.Where(inside, nearest.num, negated(nearest, span).num), nearest.unit, nearest.flexible, span=span
     )
@@ -115,5 +115,5 @@ def _left_of_all(point: Vector, corners: Sequence[Vector], span: Span, scope: Sc
     for start, end in zip(corners, (*corners[1:], corners[0]), strict=True):
         turn = cross(minus(end, start, span, scope), minus(point, start, span, scope), span, scope)
         assert isinstance(turn, Number)
-        atoms.append(ir.Atom(turn.num, span=span))
-    return ir.Join("and", tuple(atoms), span)
+        atoms.append(ir.Predicate(turn.num, span=span))
+    return ir.BoolOp("and", tuple(atoms), span)

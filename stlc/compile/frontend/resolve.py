@@ -247,7 +247,7 @@ def _requirements(
 
 def _scale(tags: Tags, formula: typed.Formula, ranges: Facts, scope: Scope) -> float:
     """What the robustness is divided by. Raises Failed (E205) where a range is not known."""
-    if isinstance(tags.scale, ir.Lit):
+    if isinstance(tags.scale, ir.Const):
         return tags.scale.value
     place = tags.scale_span or formula.span
     if tags.scale is None:

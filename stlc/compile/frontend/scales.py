@@ -53,10 +53,10 @@ def reach_of_number(num: ir.Num, ranges: Facts, place: Span, scope: Scope) -> fl
     return scope.fail(Diagnostic("E205", message, place, help=help_))
 
 
-def _predicates(formula: typed.Formula, ranges: dict[str, Bounds]) -> Iterator[typed.Pred]:
+def _predicates(formula: typed.Formula, ranges: dict[str, Bounds]) -> Iterator[typed.Predicate]:
     """All predicates; the ranges of what `freeze` binds are added on the way."""
     for node in nodes(formula):
-        if isinstance(node, typed.Pred):
+        if isinstance(node, typed.Predicate):
             yield node
         elif isinstance(node, typed.Freeze):
             found = {name: bounds(num, ranges) for name, num in node.bindings}

@@ -187,9 +187,9 @@ class Scope:
 
 def column_value(column: Column, origin: Origin | None = None) -> Number:
     """The number that a column holds, in SI units from the zero of its unit."""
-    num: ir.Num = ir.Col(column.name)
+    num: ir.Num = ir.Signal(column.name)
     if column.unit.ratio != 1:
-        num = ir.Op("mul", (num, ir.Lit(column.unit.scale)))
+        num = ir.Op("mul", (num, ir.Const(column.unit.scale)))
     flexible = column.kind in ("real", "int") and not column.unit.text
     return Number(num, column.unit, flexible, kind=column.kind, labels=column.labels, origin=origin)
 
@@ -225,7 +225,7 @@ def constant_value(value: float, unit: Unit = DIMENSIONLESS) -> Number:
     bare = not unit.text
     exact = Fraction(repr(value)) - unit.offset
     kind: Literal["int", "real"] = "int" if bare and exact.denominator == 1 else "real"
-    return Number(ir.Lit(nearest(exact)), unit, bare, bare, exact, kind)
+    return Number(ir.Const(nearest(exact)), unit, bare, bare, exact, kind)
 
 
 def constant_entries(

@@ -58,7 +58,7 @@ def loose_number(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> Numb
         case Number():
             return value
         case typed.Truth(_, truth):
-            return Number(ir.Lit(float(truth)), kind="bool", span=expr.span)
+            return Number(ir.Const(float(truth)), kind="bool", span=expr.span)
         case _:
             return as_number(value, expr, need, scope)
 
@@ -70,7 +70,7 @@ def as_formula(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> typed.
             return formula
         case Number(kind="bool") as number:
             margin = apply("sub", (replace(number, kind="real"), half(expr.span)), expr.span, scope)
-            return typed.Pred(expr.span, margin.num, strict=False)
+            return typed.Predicate(expr.span, margin.num, strict=False)
         case typed.Node():
             return value
         case _:
@@ -102,7 +102,7 @@ def member_number(member: Member, span: Span, scope: Scope) -> Number:
         message = f"`{member.name}` is a member of several enums, with different values"
         scope.fail(Diagnostic("E101", message, span, help=("compare it with a signal of the enum you mean",)))
     labels = member.options[0]
-    return Number(ir.Lit(float(values.pop())), kind="enum", labels=labels, span=span)
+    return Number(ir.Const(float(values.pop())), kind="enum", labels=labels, span=span)
 
 
 def _number_for_formula(value: Value, expr: ast.Expr, need: Need) -> Diagnostic:

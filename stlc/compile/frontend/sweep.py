@@ -128,7 +128,7 @@ class _Sweep:
         """How deep the segment gets between the faces, or how close where it stays outside of one."""
         depth = self._depth(faces)
         close = self.apply("max", *outside)
-        return self._choose(ir.Atom(depth.num), depth, close)
+        return self._choose(ir.Predicate(depth.num), depth, close)
 
     def _depth(self, faces: Sequence[Pair]) -> Number:
         """The greatest, along the segment, of the least distance to a face; negative where there is none.
@@ -146,9 +146,9 @@ class _Sweep:
                 self.apply("mul", faces[j][0], sizes[i]),
             )
             there = self.apply("div", self.apply("add", *weighed), total)
-            opposed = ir.Atom(self.apply("mul", slopes[i], slopes[j]).num, -1, strict=True)
-            long = ir.Atom(self.apply("sub", total, literal(_SHORT, self.span)).num, strict=True)
-            meetings.append(self._choose(ir.Join("and", (opposed, long)), there, best[i]))
+            opposed = ir.Predicate(self.apply("mul", slopes[i], slopes[j]).num, -1, strict=True)
+            long = ir.Predicate(self.apply("sub", total, literal(_SHORT, self.span)).num, strict=True)
+            meetings.append(self._choose(ir.BoolOp("and", (opposed, long)), there, best[i]))
         return self.apply("min", *best, *meetings)
 
     def _approaches(self, faces: Sequence[Pair]) -> list[Number]:
@@ -165,7 +165,7 @@ class _Sweep:
             pull, stiffness = [], []
             for room, slope in zip(there, slopes, strict=True):
                 ahead = self.apply("add", room, self.apply("mul", slope, literal(_AHEAD, self.span)))
-                active = Number(ir.Ind(ir.Atom(ahead.num, -1, strict=True)))
+                active = Number(ir.Indicator(ir.Predicate(ahead.num, -1, strict=True)))
                 pull.append(self.apply("mul", active, self.apply("mul", room, slope)))
                 stiffness.append(self.apply("mul", active, self.apply("square", slope)))
             step = self._ratio(self._sum(pull), self._sum(stiffness))
@@ -214,9 +214,9 @@ class _Sweep:
             after = (index + 1) % len(corners)
             ends = [to_segment(end, start, stop, self.span, self.scope) for end in self.ends]
             gap = self.apply("min", *ends, past[index], past[after])
-            between = ir.Atom(self.apply("mul", *sides).num, -1, strict=True)
-            astride = ir.Atom(self.apply("mul", turns[index], turns[after]).num, -1, strict=True)
-            crossing = ir.Join("and", (between, astride))
+            between = ir.Predicate(self.apply("mul", *sides).num, -1, strict=True)
+            astride = ir.Predicate(self.apply("mul", turns[index], turns[after]).num, -1, strict=True)
+            crossing = ir.BoolOp("and", (between, astride))
             found.append(self._choose(crossing, self.negative(gap), gap))
         return found
 

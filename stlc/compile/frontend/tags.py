@@ -37,7 +37,7 @@ class Tags:
 
     marks: frozenset[str] = frozenset()
     weight: float = 1.0
-    scale: ir.Num | None = ir.Lit(1.0)  # noqa: RUF009 - frozen
+    scale: ir.Num | None = ir.Const(1.0)  # noqa: RUF009 - frozen
     scale_span: Span | None = None
     product: bool = False
     id: str = ""
@@ -114,7 +114,7 @@ def _text(tag: ast.Tag, scope: Scope) -> str:
 
 def _positive(tag: ast.Tag, scope: Scope) -> float:
     num = _number(tag, scope)
-    if not isinstance(num, ir.Lit):
+    if not isinstance(num, ir.Const):
         scope.fail(Diagnostic("E205", f"`@{tag.name}` takes a positive constant", tag.args[0].span))
     return num.value
 

@@ -58,7 +58,7 @@ class Number:
     @property
     def constant(self) -> float | None:
         """Its value in SI units from the zero of its unit, if it is known now."""
-        return self.num.value if isinstance(self.num, ir.Lit) else None
+        return self.num.value if isinstance(self.num, ir.Const) else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +172,7 @@ def literal(value: Fraction | float | int, span: Span | None = None) -> Number:
     """A bare number."""
     exact = Fraction(value) if isinstance(value, Fraction | int) else None
     kind: Kind = "int" if exact is not None and exact.denominator == 1 else "real"
-    return Number(ir.Lit(float(value)), flexible=True, bare=True, exact=exact, kind=kind, span=span)
+    return Number(ir.Const(float(value)), flexible=True, bare=True, exact=exact, kind=kind, span=span)
 
 
 def at(value: Value, span: Span) -> Value:

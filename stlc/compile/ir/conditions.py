@@ -14,8 +14,8 @@ def is_state(formula: typed.Formula) -> bool:
     match formula:
         case typed.Truth():
             return True
-        case typed.Pred(_, num):
-            return not any(isinstance(leaf, ir.At) for leaf in leaves(num))
+        case typed.Predicate(_, num):
+            return not any(isinstance(leaf, ir.ShiftedSignal) for leaf in leaves(num))
         case typed.Not(_, body):
             return is_state(body)
         case typed.Logic(_, _, items):
@@ -38,8 +38,8 @@ def condition(formula: typed.Formula, *, negated: bool = False) -> ir.Formula:
     match formula:
         case typed.Truth(span, value):
             return ir.Truth(value != negated, span)
-        case typed.Pred(span, num, strict):
-            return ir.Atom(num, -1 if negated else 1, strict != negated, span=span)
+        case typed.Predicate(span, num, strict):
+            return ir.Predicate(num, -1 if negated else 1, strict != negated, span=span)
         case typed.Not(_, body):
             return condition(body, negated=not negated)
         case typed.Logic(_, "and" | "or" as op, items):
@@ -81,4 +81,4 @@ def _join(op: str, items: list[ir.Formula], whole: typed.Formula) -> ir.Formula:
         return ir.Truth(not decides, whole.span)
     if len(kept) == 1:
         return kept[0]
-    return ir.Join("or" if op == "or" else "and", tuple(kept), whole.span)
+    return ir.BoolOp("or" if op == "or" else "and", tuple(kept), whole.span)

@@ -24,15 +24,15 @@ def defined(formula: ir.Formula, samples: int) -> Defined:
     match formula:
         case ir.Truth():
             return np.ones(samples, dtype=bool)
-        case ir.Atom(num):
+        case ir.Predicate(num):
             return _within(reach_of(num), samples)
         case ir.Freeze(bindings, body):
             bound = [_within(reach_of(num), samples) for _, num in bindings]
             return reduce(np.logical_and, bound, defined(body, samples))
-        case ir.Join(_, items):
+        case ir.BoolOp(_, items):
             return reduce(np.logical_and, [defined(item, samples) for item in items])
-        case ir.Over(_, window, body) | ir.Past(_, window, body):
-            seen = _future if isinstance(formula, ir.Over) else _past
+        case ir.Temporal(_, window, body) | ir.PastTemporal(_, window, body):
+            seen = _future if isinstance(formula, ir.Temporal) else _past
             return _throughout(defined(body, samples), *seen(window, samples))
         case ir.Until(_, window, left, right):
             first, last = _future(window, samples)

@@ -26,15 +26,15 @@ def _from_now(formula: ir.Formula) -> Reach:
     match formula:
         case ir.Truth() | ir.AtStart():
             return Reach(0, 0)
-        case ir.Atom(num):
+        case ir.Predicate(num):
             return reach_of(num)
         case ir.Freeze(bindings, body):
             return _furthest(_from_now(body), *(reach_of(num) for _, num in bindings))
-        case ir.Join(_, items):
+        case ir.BoolOp(_, items):
             return _furthest(*map(_from_now, items))
-        case ir.Over(_, window, body):
+        case ir.Temporal(_, window, body):
             return _ahead(_from_now(body), window)
-        case ir.Past(_, window, body):
+        case ir.PastTemporal(_, window, body):
             return _back(_from_now(body), window)
         case ir.Until(_, window, left, right):
             return _furthest(
@@ -71,9 +71,9 @@ def uses_end(formula: ir.Formula) -> bool:
 
 def _uses_end(node: ir.Formula) -> bool:
     match node:
-        case ir.Over(_, window) | ir.Until(_, window):
+        case ir.Temporal(_, window) | ir.Until(_, window):
             return window.hi is None
-        case ir.Atom(num):
+        case ir.Predicate(num):
             return looks_on(num)
         case ir.Freeze(bindings):
             return any(looks_on(num) for _, num in bindings)
@@ -91,11 +91,11 @@ def nodes(formula: ir.Formula) -> Iterator[ir.Formula]:
 def parts(formula: ir.Formula) -> tuple[ir.Formula, ...]:
     """The operands of a formula."""
     match formula:
-        case ir.Truth() | ir.Atom():
+        case ir.Truth() | ir.Predicate():
             return ()
-        case ir.Join(_, items):
+        case ir.BoolOp(_, items):
             return items
-        case ir.Over(_, _, body) | ir.Past(_, _, body) | ir.Shift(_, body) | ir.Freeze(_, body):
+        case ir.Temporal(_, _, body) | ir.PastTemporal(_, _, body) | ir.Shift(_, body) | ir.Freeze(_, body):
             return (body,)
         case ir.AtStart(body):
             return (body,)
@@ -114,7 +114,7 @@ def numbers(formula: ir.Formula) -> Iterator[ir.Num]:
     """The numbers of predicates, and those that `freeze` binds."""
     for node in nodes(formula):
         match node:
-            case ir.Atom(num):
+            case ir.Predicate(num):
                 yield num
             case ir.Freeze(bindings):
                 yield from (num for _, num in bindings)

@@ -16,21 +16,21 @@ from stlc.source import Span
 
 
 @dataclass(frozen=True, slots=True)
-class Lit:
+class Const:
     """A constant, in SI units."""
 
     value: float
 
 
 @dataclass(frozen=True, slots=True)
-class Col:
+class Signal:
     """An entry of the environment: a state, a control, `t`, or a value drawn earlier."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
-class At:
+class ShiftedSignal:
     """A column `steps` samples later (negative: earlier).
 
     Outside the trace it is undefined, and so is a predicate that reads it; a `clamped` one reads the first or
@@ -43,7 +43,7 @@ class At:
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class FrozenVar:
     """A value that a `Freeze` around binds; its name is unique among those."""
 
     name: str
@@ -58,7 +58,7 @@ class Op:
 
 
 @dataclass(frozen=True, slots=True)
-class Ind:
+class Indicator:
     """1 where a state formula holds, else 0; `stlc.compile.semantics.switch` says how in training.
 
     `sharpness` is the paper's w (Eq. 6) for this indicator; None takes the default of the switch.
@@ -106,7 +106,7 @@ class Body:
     outputs: tuple[Num, ...]
 
 
-Num: TypeAlias = Lit | Col | At | Held | Op | Ind | Where | Extern
+Num: TypeAlias = Const | Signal | ShiftedSignal | FrozenVar | Op | Indicator | Where | Extern
 
 ELAPSED = "#elapsed"
 """The column that every evaluator knows by itself: how many samples came before the one at hand."""
@@ -114,9 +114,9 @@ ELAPSED = "#elapsed"
 _LONG = 1 << 30
 
 
-def at_first(column: Col) -> At:
+def at_first(column: Signal) -> ShiftedSignal:
     """What a column holds at the first sample, wherever it is read."""
-    return At(column.name, -_LONG, clamped=True)
+    return ShiftedSignal(column.name, -_LONG, clamped=True)
 
 
 # --------------------------------------------------------------------- formulas
@@ -142,7 +142,7 @@ class Truth:
 
 
 @dataclass(frozen=True, slots=True)
-class Atom:
+class Predicate:
     """A predicate: robustness `sign * num`; true iff that is > 0 (`strict`) or >= 0.
 
     Negation sinks into `sign` (and flips `strict`), so `num` is evaluated as it was written.
@@ -157,7 +157,7 @@ class Atom:
 
 
 @dataclass(frozen=True, slots=True)
-class Join:
+class BoolOp:
     """min (`and`) or max (`or`) of at least two formulas."""
 
     op: Literal["and", "or"]
@@ -166,7 +166,7 @@ class Join:
 
 
 @dataclass(frozen=True, slots=True)
-class Over:
+class Temporal:
     """min (`always`) or max (`eventually`) over a window of the future."""
 
     op: Literal["always", "eventually"]
@@ -176,7 +176,7 @@ class Over:
 
 
 @dataclass(frozen=True, slots=True)
-class Past:
+class PastTemporal:
     """min (`historically`) or max (`once`) over a window of the past, cut at the start of the trace."""
 
     op: Literal["historically", "once"]
@@ -225,7 +225,7 @@ class Shift:
 
 @dataclass(frozen=True, slots=True)
 class Freeze:
-    """`body` now, where each `Held` name stands for its number's value of now, whenever it is read.
+    """`body` now, where each `FrozenVar` name stands for its number's value of now, whenever it is read.
 
     Where a number is undefined, so are the predicates that read its name.
     """
@@ -243,4 +243,6 @@ class AtStart:
     span: Span | None = field(default=None, compare=False, repr=False)
 
 
-Formula: TypeAlias = Truth | Atom | Join | Over | Past | Until | Since | Shift | Freeze | AtStart
+Formula: TypeAlias = (
+    Truth | Predicate | BoolOp | Temporal | PastTemporal | Until | Since | Shift | Freeze | AtStart
+)

@@ -23,17 +23,17 @@ def tail(formula: ir.Formula, samples: int, length: int) -> int | None:
     match formula:
         case ir.Truth():
             return 0
-        case ir.Atom():
+        case ir.Predicate():
             return samples
         case ir.Freeze() | ir.AtStart():
             return None
-        case ir.Join(_, items):
+        case ir.BoolOp(_, items):
             return _latest(items, samples, length)
-        case ir.Over(_, window, body):
+        case ir.Temporal(_, window, body):
             return _ahead(_latest((body,), samples, length), window, window.lo, length)
         case ir.Until(_, window, left, right):
             return _ahead(_latest((left, right), samples, length), window, 0, length)
-        case ir.Past(_, window, body):
+        case ir.PastTemporal(_, window, body):
             return _behind(_latest((body,), samples, length), window)
         case ir.Since(_, window, left, right):
             return _behind(_latest((left, right), samples, length), window)

@@ -33,13 +33,13 @@ def show_formula(formula: ir.Formula) -> str:
     match formula:
         case ir.Truth(value):
             return "true" if value else "false"
-        case ir.Atom():
+        case ir.Predicate():
             return _atom(formula)
-        case ir.Join(op, items):
+        case ir.BoolOp(op, items):
             shown_items = _without_lacks(items)
             return f" {op} ".join(map(_operand, shown_items))
-        case ir.Over(op, window, body) | ir.Past(op, window, body):
-            end = "end" if isinstance(formula, ir.Over) else "start"
+        case ir.Temporal(op, window, body) | ir.PastTemporal(op, window, body):
+            end = "end" if isinstance(formula, ir.Temporal) else "start"
             return f"{op}{show_window(window, end)} {_operand(body)}"
         case ir.Until(op, window, left, right):
             return f"{_operand(left)} {op}{show_window(window)} {_operand(right)}"
@@ -61,18 +61,18 @@ def _operand(formula: ir.Formula) -> str:
     """In parentheses where it holds two formulas."""
     text = show_formula(formula)
     several = isinstance(formula, (ir.Until, ir.Since))
-    several |= isinstance(formula, ir.Join) and len(_without_lacks(formula.items)) > 1
+    several |= isinstance(formula, ir.BoolOp) and len(_without_lacks(formula.items)) > 1
     return f"({text})" if several else text
 
 
 def _without_lacks(items: tuple[ir.Formula, ...]) -> list[ir.Formula]:
     """Without what only says by how much a test of time beside it fails (`timers.recalled`)."""
-    tests = {item.num for item in items if isinstance(item, ir.Atom) and item.guard}
+    tests = {item.num for item in items if isinstance(item, ir.Predicate) and item.guard}
     return [
         item
         for item in items
         if not (
-            isinstance(item, ir.Atom)
+            isinstance(item, ir.Predicate)
             and isinstance(item.num, ir.Op)
             and item.num.name == "mul"
             and item.num.args[0] in tests
@@ -80,11 +80,11 @@ def _without_lacks(items: tuple[ir.Formula, ...]) -> list[ir.Formula]:
     ]
 
 
-def _atom(atom: ir.Atom) -> str:
+def _atom(atom: ir.Predicate) -> str:
     """A comparison; `0.5 >= abs(s - 1)` is written from the side that varies."""
     sign = {(1, True): ">", (1, False): ">=", (-1, True): "<", (-1, False): "<="}[atom.sign, atom.strict]
     left, right = _sides(atom.num)
-    if isinstance(left, ir.Lit) and not isinstance(right, ir.Lit):
+    if isinstance(left, ir.Const) and not isinstance(right, ir.Const):
         left, right, sign = right, left, _FLIPPED[sign]
     return f"{show_number(left)} {sign} {show_number(right)}"
 
@@ -94,7 +94,7 @@ def _sides(num: ir.Num) -> tuple[ir.Num, ir.Num]:
         case ir.Op("sub", (left, right)):
             return left, right
         case _:
-            return num, ir.Lit(0.0)
+            return num, ir.Const(0.0)
 
 
 def shown(name: str) -> str:
@@ -110,17 +110,17 @@ def show_number(num: ir.Num, level: int = 0) -> str:
     return f"({text})" if own < level else text
 
 
-def _leaf(leaf: ir.Col | ir.At | ir.Held) -> str:
+def _leaf(leaf: ir.Signal | ir.ShiftedSignal | ir.FrozenVar) -> str:
     match leaf:
-        case ir.Col(ir.ELAPSED):
+        case ir.Signal(ir.ELAPSED):
             return "elapsed"
-        case ir.At(name) if leaf == ir.at_first(ir.Col(name)):
+        case ir.ShiftedSignal(name) if leaf == ir.at_first(ir.Signal(name)):
             return f"first({shown(name)})"
-        case ir.At(name, 1):
+        case ir.ShiftedSignal(name, 1):
             return f"next({shown(name)})"
-        case ir.At(name, -1):
+        case ir.ShiftedSignal(name, -1):
             return f"prev({shown(name)})"
-        case ir.At(name, steps):
+        case ir.ShiftedSignal(name, steps):
             return f"shift({shown(name)}, {steps})"
         case _:
             return shown(leaf.name)
@@ -128,13 +128,13 @@ def _leaf(leaf: ir.Col | ir.At | ir.Held) -> str:
 
 def _number(num: ir.Num) -> tuple[str, int]:
     match num:
-        case ir.Lit(value):
+        case ir.Const(value):
             return f"{value:g}", _TOP if value >= 0 else _UNARY
-        case ir.Col() | ir.At() | ir.Held():
+        case ir.Signal() | ir.ShiftedSignal() | ir.FrozenVar():
             return _leaf(num), _TOP
         case ir.Op("neg", (arg,)):
             return f"-{show_number(arg, _UNARY)}", _UNARY
-        case ir.Op("sub", (left, ir.Lit(value))) if value < 0:
+        case ir.Op("sub", (left, ir.Const(value))) if value < 0:
             return f"{show_number(left, 1)} + {-value:g}", 1
         case ir.Op("square", (arg,)):
             return f"{show_number(arg, _TOP)}^2", 4
@@ -143,7 +143,7 @@ def _number(num: ir.Num) -> tuple[str, int]:
             return f"{show_number(left, own)} {sign} {show_number(right, own + 1)}", own
         case ir.Op(name, args) | ir.Extern(name, args):
             return f"{name}({', '.join(map(show_number, args))})", _TOP
-        case ir.Ind(cond):
+        case ir.Indicator(cond):
             return f"ind({show_formula(cond)})", _TOP
         case ir.Where(cond, yes, no):
             return f"if {show_formula(cond)} then {show_number(yes)} else {show_number(no)}", 0

@@ -16,7 +16,7 @@ def thaw(formula: typed.Formula, values: Mapping[str, ir.Num]) -> typed.Formula:
     match formula:
         case typed.Truth():
             return formula
-        case typed.Pred():
+        case typed.Predicate():
             return replace(formula, num=thawed(formula.num, values))
         case typed.Not() | typed.Temporal() | typed.Shift() | typed.Edge():
             return replace(formula, body=thaw(formula.body, values))

@@ -15,7 +15,7 @@ Sign: TypeAlias = Literal[1, -1]
 def operands(formula: typed.Formula) -> tuple[typed.Formula, ...]:
     """The formulas directly below."""
     match formula:
-        case typed.Truth() | typed.Pred():
+        case typed.Truth() | typed.Predicate():
             return ()
         case typed.Logic(_, _, items):
             return items
@@ -51,7 +51,9 @@ def nodes(formula: typed.Formula) -> Iterator[typed.Formula]:
 
 def margin_unit(formula: typed.Formula) -> str:
     """The unit of a formula's robustness; "" where its predicates are not all of one."""
-    found = {node.unit.text for node in nodes(formula) if isinstance(node, typed.Pred) and not node.guard}
+    found = {
+        node.unit.text for node in nodes(formula) if isinstance(node, typed.Predicate) and not node.guard
+    }
     return found.pop() if len(found) == 1 else ""
 
 
@@ -87,7 +89,7 @@ def is_state_formula(formula: typed.Formula) -> bool:
     """Whether `formula` is about one instant alone, frozen values and other samples apart."""
     state = (typed.Truth, typed.Not, typed.Logic, typed.Recalled)
     return all(
-        isinstance(node, state) or (isinstance(node, typed.Pred) and of_now(node.num))
+        isinstance(node, state) or (isinstance(node, typed.Predicate) and of_now(node.num))
         for node in nodes(formula)
     )
 
@@ -120,7 +122,7 @@ def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
     match formula:
         case typed.Truth(span, value):
             return typed.Truth(span, value is (sign > 0))
-        case typed.Pred() | typed.Shift() | typed.Edge() | typed.Until(_, "since") | typed.Recalled():
+        case typed.Predicate() | typed.Shift() | typed.Edge() | typed.Until(_, "since") | typed.Recalled():
             return formula if sign > 0 else typed.Not(formula.span, formula)
         case typed.Not(_, body):
             return normal(body, flip(sign))

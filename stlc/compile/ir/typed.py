@@ -53,7 +53,7 @@ class Truth(Node):
 
 
 @dataclass(frozen=True, slots=True)
-class Pred(Node):
+class Predicate(Node):
     """`num > 0` (`strict`) or `num >= 0`; a `guard` decides truth and never limits the margin.
 
     `num` and `unit`, that of the margin, are in SI; `written` is the unit of what is compared. Where recorded
@@ -120,7 +120,7 @@ class Edge(Node):
 
 @dataclass(frozen=True, slots=True)
 class Freeze(Node):
-    """`freeze p0 = p in body`: each name (of an `ir.Held`) stands for the value that its number has now."""
+    """`freeze p0 = p in body`: each name, of an `ir.FrozenVar`, stands for the value of its number now."""
 
     bindings: tuple[tuple[str, ir.Num], ...]
     body: Formula
@@ -139,7 +139,7 @@ class Recalled(Node):
     along: Formula
 
 
-Formula: TypeAlias = Truth | Pred | Not | Logic | Temporal | Until | Shift | Edge | Freeze | Recalled
+Formula: TypeAlias = Truth | Predicate | Not | Logic | Temporal | Until | Shift | Edge | Freeze | Recalled
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,8 +47,8 @@ class _Lowering:
         match node:
             case typed.Truth(span, value):
                 return ir.Truth(value is (sign > 0), span)
-            case typed.Pred(span, num, strict, guard):
-                return ir.Atom(num, sign, strict is (sign > 0), guard, span)
+            case typed.Predicate(span, num, strict, guard):
+                return ir.Predicate(num, sign, strict is (sign > 0), guard, span)
             case typed.Not(_, body):
                 return self.formula(body, _flip(sign))
             case typed.Logic():
@@ -71,11 +71,11 @@ class _Lowering:
         match node.op:
             case "and" | "or":
                 items = tuple(self.formula(item, sign) for item in node.items)
-                return ir.Join("and" if (node.op == "and") is (sign > 0) else "or", items, node.span)
+                return ir.BoolOp("and" if (node.op == "and") is (sign > 0) else "or", items, node.span)
             case "->":
                 left, right = node.items
                 parts = (self.formula(left, _flip(sign)), self.formula(right, sign))
-                return ir.Join("or" if sign > 0 else "and", parts, node.span)
+                return ir.BoolOp("or" if sign > 0 else "and", parts, node.span)
             case "<->":
                 return self._equal(node, sign)
             case "xor":
@@ -87,9 +87,9 @@ class _Lowering:
         """Both implications; negated: exactly one holds."""
         left, right = node.items
         inner: Literal["and", "or"] = "or" if sign > 0 else "and"
-        one = ir.Join(inner, (self.formula(left, _flip(sign)), self.formula(right, sign)), node.span)
-        other = ir.Join(inner, (self.formula(left, sign), self.formula(right, _flip(sign))), node.span)
-        return ir.Join("and" if sign > 0 else "or", (one, other), node.span)
+        one = ir.BoolOp(inner, (self.formula(left, _flip(sign)), self.formula(right, sign)), node.span)
+        other = ir.BoolOp(inner, (self.formula(left, sign), self.formula(right, _flip(sign))), node.span)
+        return ir.BoolOp("and" if sign > 0 else "or", (one, other), node.span)
 
     def _timed(self, node: typed.Temporal | typed.Until, sign: Sign) -> ir.Formula:
         if on_clock(node):
@@ -101,10 +101,12 @@ class _Lowering:
         positive = sign > 0
         match node.op:
             case "always" | "eventually":
-                over = ir.Over("always" if (node.op == "always") is positive else "eventually", _LATER, body)
+                over = ir.Temporal(
+                    "always" if (node.op == "always") is positive else "eventually", _LATER, body
+                )
                 return replace(over, window=self._window(node.interval, over.op), span=node.span)
             case "historically" | "once":
-                past = ir.Past(
+                past = ir.PastTemporal(
                     "historically" if (node.op == "historically") is positive else "once", _LATER, body
                 )
                 return replace(past, window=self._window(node.interval, past.op), span=node.span)
@@ -139,7 +141,7 @@ class _Lowering:
         now = sign if node.op == "rise" else _flip(sign)
         before = ir.Shift(-1, self.formula(node.body, _flip(now)), sign < 0, node.span)
         parts = (self.formula(node.body, now), before)
-        return ir.Join("and" if sign > 0 else "or", parts, node.span)
+        return ir.BoolOp("and" if sign > 0 else "or", parts, node.span)
 
     def _window(self, interval: typed.Interval, op: str) -> ir.Window:
         return to_window(interval, self.grid, self.sink, outward=op in _CAUTIOUS)

@@ -32,11 +32,11 @@ def simplify(formula: ir.Formula, semantics: Semantics = _EXACT) -> ir.Formula:
         return simplify(part, semantics)
 
     match formula:
-        case ir.Truth() | ir.Atom():
+        case ir.Truth() | ir.Predicate():
             return formula
-        case ir.Join(_, items):
+        case ir.BoolOp(_, items):
             return _join(formula, [inner(item) for item in items], semantics)
-        case ir.Over() | ir.Past():
+        case ir.Temporal() | ir.PastTemporal():
             return _window(replace(formula, body=inner(formula.body)), semantics)
         case ir.Until() | ir.Since():
             return _binary(replace(formula, left=inner(formula.left), right=inner(formula.right)), semantics)
@@ -52,11 +52,11 @@ def simplify(formula: ir.Formula, semantics: Semantics = _EXACT) -> ir.Formula:
             assert_never(formula)
 
 
-def _join(whole: ir.Join, items: list[ir.Formula], semantics: Semantics) -> ir.Formula:
+def _join(whole: ir.BoolOp, items: list[ir.Formula], semantics: Semantics) -> ir.Formula:
     flat: list[ir.Formula] = []
     for item in items:
-        nested = semantics.associative and isinstance(item, ir.Join) and item.op == whole.op
-        flat += item.items if nested and isinstance(item, ir.Join) else (item,)
+        nested = semantics.associative and isinstance(item, ir.BoolOp) and item.op == whole.op
+        flat += item.items if nested and isinstance(item, ir.BoolOp) else (item,)
     if semantics.idempotent:
         flat = list(dict.fromkeys(flat))
     absorbing = whole.op == "or"
@@ -68,14 +68,14 @@ def _join(whole: ir.Join, items: list[ir.Formula], semantics: Semantics) -> ir.F
     return kept[0] if len(kept) == 1 else replace(whole, items=tuple(kept))
 
 
-def _window(node: ir.Over | ir.Past, semantics: Semantics) -> ir.Formula:
+def _window(node: ir.Temporal | ir.PastTemporal, semantics: Semantics) -> ir.Formula:
     body, window = node.body, node.window
     every = node.op in ("always", "historically")
     if isinstance(body, ir.Truth) and (body.value is every or window.lo == 0):
         return replace(body, span=node.span)
     if window == _NOW:
         return body
-    if isinstance(body, (ir.Over, ir.Past)) and body.op == node.op:
+    if isinstance(body, (ir.Temporal, ir.PastTemporal)) and body.op == node.op:
         together = _sum(window, body.window, semantics)
         if together is not None:
             return replace(node, window=together, body=body.body)
@@ -88,7 +88,7 @@ def _freeze(node: ir.Freeze) -> ir.Formula:
     kept = tuple((name, num) for name, num in node.bindings if name in read)
     if not kept:
         return node.body
-    if not isinstance(node.body, ir.Atom):
+    if not isinstance(node.body, ir.Predicate):
         return replace(node, bindings=kept)
     return replace(node.body, num=thawed(node.body.num, dict(kept)))
 
@@ -113,8 +113,8 @@ def _binary(node: ir.Until | ir.Since, semantics: Semantics) -> ir.Formula:
     if not (isinstance(node.left, ir.Truth) and node.left.value is strong):
         return node
     if isinstance(node, ir.Until):
-        later = ir.Over("eventually" if strong else "always", node.window, node.right, node.span)
+        later = ir.Temporal("eventually" if strong else "always", node.window, node.right, node.span)
         return simplify(later, semantics)
     return simplify(
-        ir.Past("once" if strong else "historically", node.window, node.right, node.span), semantics
+        ir.PastTemporal("once" if strong else "historically", node.window, node.right, node.span), semantics
     )

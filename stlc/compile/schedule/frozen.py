@@ -156,7 +156,9 @@ def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
     on_clock = any(isinstance(node, ir.AtStart) for node in nodes(body))
     if on_clock or any(map(looks_at_ends, numbers(body))):
         return math.inf, math.inf
-    back = any(isinstance(node, (ir.Past, ir.Since)) and node.window.hi is None for node in nodes(body))
+    back = any(
+        isinstance(node, (ir.PastTemporal, ir.Since)) and node.window.hi is None for node in nodes(body)
+    )
     return math.inf if back else past, math.inf if uses_end(body) else future
 
 
@@ -177,13 +179,13 @@ def without(body: ir.Formula, names: frozenset[str], extent: Extent) -> ir.Formu
     match body:
         case ir.Truth():
             return body
-        case ir.Atom(num, sign):
+        case ir.Predicate(num, sign):
             if not held_by(num) & names:
                 return body
             return ir.Truth(extent.end == "upper" if extent.open else sign < 0, body.span)
-        case ir.Join(_, items):
+        case ir.BoolOp(_, items):
             return replace(body, items=tuple(without(item, names, extent) for item in items))
-        case ir.Over() | ir.Past() | ir.Shift() | ir.AtStart():
+        case ir.Temporal() | ir.PastTemporal() | ir.Shift() | ir.AtStart():
             return replace(body, body=without(body.body, names, extent))
         case ir.Until() | ir.Since():
             left, right = without(body.left, names, extent), without(body.right, names, extent)

@@ -56,7 +56,7 @@ class Machine:
             return both  # type: ignore[no-any-return]
         return math.inf if self.extent.end == "upper" else -math.inf
 
-    def atom(self, node: ir.Atom, run: Run, inside: Run) -> Kernel:
+    def atom(self, node: ir.Predicate, run: Run, inside: Run) -> Kernel:
         """A predicate; its one part are the rows at the instants `inside`, signed, if there are any.
 
         Beyond the trace a predicate is unknown, and false where windows are cut.
@@ -88,18 +88,18 @@ class Machine:
         match node:
             case ir.Truth(value):
                 return self._constant(run.count, math.inf if value else -math.inf)
-            case ir.Join(op):
+            case ir.BoolOp(op):
                 pick, ops, join = _PICK[op], self.windows.ops, self.windows.semantics.join
                 return lambda parts, _: join(parts, pick, ops)
-            case ir.Over(op, window) | ir.Until(op, window):
+            case ir.Temporal(op, window) | ir.Until(op, window):
                 return self._future(window, run, operands, _PICK[op])
-            case ir.Past(op, window) | ir.Since(op, window):
+            case ir.PastTemporal(op, window) | ir.Since(op, window):
                 return self._past(window, run, operands, _PICK[op])
             case ir.Shift():
                 return self._shift(node, run, operands)
             case ir.AtStart():
                 return self._repeated(run.count)
-            case ir.Atom() | ir.Freeze():
+            case ir.Predicate() | ir.Freeze():
                 raise TypeError("predicates and frozen values come from programs")
             case _:
                 assert_never(node)

@@ -95,13 +95,13 @@ def upto(start: int, last: int) -> Run:
 def operands(node: ir.Formula, run: Run, extent: Extent) -> tuple[tuple[ir.Formula, Run], ...]:
     """What `node` at the instants `run` needs of its parts; runs may be empty."""
     match node:
-        case ir.Truth() | ir.Atom() | ir.Freeze():
+        case ir.Truth() | ir.Predicate() | ir.Freeze():
             return ()
-        case ir.Join(_, items):
+        case ir.BoolOp(_, items):
             return tuple((item, run) for item in items)
-        case ir.Over(_, window, body):
+        case ir.Temporal(_, window, body):
             return ((body, upto(run.start + window.lo, extent.last(window, run.last, (body,)))),)
-        case ir.Past(_, window, body):
+        case ir.PastTemporal(_, window, body):
             return ((body, upto(_first(window, run), run.last - window.lo)),)
         case ir.Until() | ir.Since():
             return _both(node, run, extent)
@@ -213,9 +213,9 @@ def _batches(
     wanted: dict[ir.Num, list[tuple[Run, int]]] = {}
     atoms: dict[int, tuple[int | None, str, Run]] = {}
     for index, step in enumerate(steps):
-        if isinstance(step.node, ir.Atom):
+        if isinstance(step.node, ir.Predicate):
             inside = within(reads(step.node.num, extent), step.run, extent)
-            if inside.count > 0 and isinstance(step.node.num, ir.Col) and step.node.sign > 0:
+            if inside.count > 0 and isinstance(step.node.num, ir.Signal) and step.node.sign > 0:
                 atoms[index] = (None, step.node.num.name, inside)
             elif inside.count > 0:
                 wanted.setdefault(_signed(step.node), []).append((inside, index))
@@ -232,7 +232,7 @@ def _batches(
     return tuple(batches), atoms
 
 
-def _signed(atom: ir.Atom) -> ir.Num:
+def _signed(atom: ir.Predicate) -> ir.Num:
     return atom.num if atom.sign > 0 else ir.Op("neg", (atom.num,))
 
 

@@ -23,7 +23,7 @@ class _Event:
     def __init__(self, decl: EventDecl) -> None:
         self.decl = decl
         self.draws = [Drawing(assign) for assign in decl.sets]
-        self.when = Program({_CONDITION: ir.Ind(decl.when)}) if decl.when is not None else None
+        self.when = Program({_CONDITION: ir.Indicator(decl.when)}) if decl.when is not None else None
         self.held: Tensor | None = None
 
     def fires(self, columns: dict[str, Tensor], step: int) -> Tensor:

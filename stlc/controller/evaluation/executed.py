@@ -21,7 +21,7 @@ from stlc.controller.deployment.batched import SURPRISE
 from stlc.controller.guard.feasibility import savable as search_safe
 
 if TYPE_CHECKING:
-    from stlc.compile.pipeline import Rule
+    from stlc.compile.pipeline import CompiledRequirement
     from stlc.controller.deployment.simulator import Recording
     from stlc.controller.problem.task import Task
 
@@ -78,7 +78,7 @@ def judge_executed(task: Task, recording: Recording, *, savable: Mask | None = N
     return replace(executed, savable=found | executed.agents(safety))
 
 
-def as_driven(rule: Rule, task: Task) -> Rule:
+def as_driven(rule: CompiledRequirement, task: Task) -> CompiledRequirement:
     """A requirement on the mission clock is judged as it was written, once, on all that was driven."""
     if not rule.absolute:
         return rule
@@ -87,7 +87,7 @@ def as_driven(rule: Rule, task: Task) -> Rule:
     return replace(rule, formula=written, lowered=lowered, reach=reach(written).future, windowed=False)
 
 
-def _held(rule: Rule, columns: Mapping[str, NDArray[Any]], horizon: int) -> Mask:
+def _held(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], horizon: int) -> Mask:
     """Whether one requirement holds, (starts, rows)."""
     samples, rows = next(iter(columns.values())).shape
     if not rule.windowed:
@@ -101,7 +101,7 @@ def _held(rule: Rule, columns: Mapping[str, NDArray[Any]], horizon: int) -> Mask
     return np.concatenate([_margin(rule, window, 1) for window in windows]) >= -TOLERANCE
 
 
-def _margin(rule: Rule, columns: Mapping[str, NDArray[Any]], count: int) -> NDArray[Any]:
+def _margin(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], count: int) -> NDArray[Any]:
     (margin,) = evaluate([rule.formula], columns, ops=NUMPY, count=count, end="truncate")
     return np.broadcast_to(margin, (count, next(iter(columns.values())).shape[1]))
 

@@ -25,11 +25,11 @@ def open_ended(formula: ir.Formula) -> ir.Formula:
     match formula:
         case ir.Truth():
             return formula
-        case ir.Atom():
-            return ir.Join("or", (formula, ir.Atom(ir.Col(BEYOND), strict=True, guard=True)))
-        case ir.Join():
+        case ir.Predicate():
+            return ir.BoolOp("or", (formula, ir.Predicate(ir.Signal(BEYOND), strict=True, guard=True)))
+        case ir.BoolOp():
             return replace(formula, items=tuple(map(open_ended, formula.items)))
-        case ir.Over() | ir.Past() | ir.Shift() | ir.Freeze() | ir.AtStart():
+        case ir.Temporal() | ir.PastTemporal() | ir.Shift() | ir.Freeze() | ir.AtStart():
             return replace(formula, body=open_ended(formula.body))
         case ir.Until() | ir.Since():
             return replace(formula, left=open_ended(formula.left), right=open_ended(formula.right))
@@ -44,9 +44,9 @@ def anchored(formula: ir.Formula) -> ir.Formula:
     b is violated, not how clearly a holds.
     """
     match formula:
-        case ir.Atom():
+        case ir.Predicate():
             return replace(formula, guard=True)
-        case ir.Join():
+        case ir.BoolOp():
             return replace(formula, items=tuple(map(anchored, formula.items)))
         case _:
             return formula

@@ -11,7 +11,7 @@ from stlc.controller.problem.task import Task
 from stlc.dynamics.model.algebra import add
 
 if TYPE_CHECKING:
-    from stlc.compile.pipeline import Rule
+    from stlc.compile.pipeline import CompiledRequirement
 
 
 Spare: TypeAlias = Mapping[str, float]
@@ -30,7 +30,7 @@ def sparing(task: Task, margin: Spare) -> Task:
     return Task(replace(task.compiled, requirements=rules), task.plain)
 
 
-def _tightened(rule: Rule, margin: float) -> Rule:
+def _tightened(rule: CompiledRequirement, margin: float) -> CompiledRequirement:
     return replace(rule, formula=tighter(rule.formula, margin), lowered=tighter(rule.lowered, margin))
 
 
@@ -39,13 +39,13 @@ def tighter(formula: ir.Formula, margin: float) -> ir.Formula:
     match formula:
         case ir.Truth():
             return formula
-        case ir.Atom():
+        case ir.Predicate():
             if formula.guard:
                 return formula
-            return replace(formula, num=add(formula.num, ir.Lit(-formula.sign * margin)))
-        case ir.Join(items=items):
+            return replace(formula, num=add(formula.num, ir.Const(-formula.sign * margin)))
+        case ir.BoolOp(items=items):
             return replace(formula, items=tuple(tighter(item, margin) for item in items))
-        case ir.Over() | ir.Past() | ir.Shift() | ir.Freeze() | ir.AtStart():
+        case ir.Temporal() | ir.PastTemporal() | ir.Shift() | ir.Freeze() | ir.AtStart():
             return replace(formula, body=tighter(formula.body, margin))
         case ir.Until(left=left, right=right) | ir.Since(left=left, right=right):
             return replace(formula, left=tighter(left, margin), right=tighter(right, margin))

@@ -25,7 +25,7 @@ from stlc.controller.problem.pending_goals import Promises
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from stlc.compile.pipeline import Compiled, Rule
+    from stlc.compile.pipeline import Compiled, CompiledRequirement
     from stlc.dynamics.model.system import System
     from stlc.grammar import ast
 
@@ -139,7 +139,7 @@ class Task:
         return self.system.horizon
 
     @property
-    def rules(self) -> tuple[Rule, ...]:
+    def rules(self) -> tuple[CompiledRequirement, ...]:
         """The compiled requirements, in order."""
         return self.compiled.requirements
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from stlc.compile.analysis.ranges import Bounds
-    from stlc.compile.pipeline import Rule
+    from stlc.compile.pipeline import CompiledRequirement
     from stlc.native import Stop
 
 STARTS = 64
@@ -61,7 +61,7 @@ def refuted(task: Task) -> bool:
     return any(_impossible(task, rule) for rule in task.rules)
 
 
-def _alone(task: Task, rules: Sequence[Rule]) -> Task:
+def _alone(task: Task, rules: Sequence[CompiledRequirement]) -> Task:
     return Task(replace(task.compiled, requirements=tuple(rules)), task.plain)
 
 
@@ -70,7 +70,7 @@ def _starts(task: Task) -> torch.Tensor:
     return task.sample(STARTS, generator=torch.Generator().manual_seed(0))
 
 
-def _climbed(task: Task, rules: Sequence[Rule], enough: Stop) -> Repaired:
+def _climbed(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> Repaired:
     """The best plans for these requirements alone."""
     alone, generator = _alone(task, rules), torch.Generator().manual_seed(0)
     x0 = _starts(task)
@@ -80,14 +80,14 @@ def _climbed(task: Task, rules: Sequence[Rule], enough: Stop) -> Repaired:
     return searcher.repair(x0, start, start[:0], tries=TRIES, stop=enough)
 
 
-def _explored(task: Task, rules: Sequence[Rule], enough: Stop) -> bool:
+def _explored(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> bool:
     """Whether exploration finds a plan for these requirements alone."""
     generator = torch.Generator().manual_seed(0)
     found = Exploration(_alone(task, rules)).solved(_starts(task)[:2], EFFORTS[0], generator, ENOUGH, enough)
     return len(found.rho) > 0
 
 
-def _told(task: Task, core: Sequence[Rule], nearest: Repaired, *, proved: bool) -> Diagnostic:
+def _told(task: Task, core: Sequence[CompiledRequirement], nearest: Repaired, *, proved: bool) -> Diagnostic:
     names = [f"`{rule.name}`" for rule in core]
     row = int(nearest.rho.argmax())
     columns = zip(task.system.signature.columns, nearest.states[row].tolist(), strict=True)
@@ -126,7 +126,7 @@ def _proof() -> str:
     )
 
 
-def _tried(core: Sequence[Rule]) -> str:
+def _tried(core: Sequence[CompiledRequirement]) -> str:
     """How hard it was searched, and that this is no proof."""
     rest = "" if len(core) == 1 else "; without one of these requirements some were found"
     return (
@@ -142,7 +142,7 @@ def _listed(names: Sequence[str]) -> str:
 # --------------------------------------------------------------------------------- proofs
 
 
-def _impossible(task: Task, rule: Rule) -> bool:
+def _impossible(task: Task, rule: CompiledRequirement) -> bool:
     """Whether bounds prove that no plan from any of the starts satisfies a requirement."""
     return all(_most(rule.formula, _reached(task, x.tolist())) < -TOLERANCE for x in _starts(task).double())
 
@@ -194,11 +194,11 @@ class _Most:
         match formula:
             case ir.Truth(value):
                 return math.inf if value else -math.inf
-            case ir.Atom():
+            case ir.Predicate():
                 return self._atom(formula, now)
-            case ir.Join(op, items):
+            case ir.BoolOp(op, items):
                 return (min if op == "and" else max)(self.at(item, now) for item in items)
-            case ir.Over(op, window, body):
+            case ir.Temporal(op, window, body):
                 values = [self.at(body, k) for k in self._instants(window, now)]
                 return (min if op == "always" else max)(values, default=math.inf)
             case ir.Until("until", window, _, right):
@@ -207,14 +207,14 @@ class _Most:
                 return self.at(body, now + steps)
             case ir.Freeze(_, body):
                 return self.at(body, now)
-            case ir.Until() | ir.Past() | ir.Since() | ir.AtStart():
+            case ir.Until() | ir.PastTemporal() | ir.Since() | ir.AtStart():
                 return math.inf
             case _:
                 assert_never(formula)
 
-    def _atom(self, atom: ir.Atom, now: int) -> float:
+    def _atom(self, atom: ir.Predicate, now: int) -> float:
         facts = self._reached[now]
-        if any(isinstance(part, ir.At) for num in numbers(atom) for part in everything(num)):
+        if any(isinstance(part, ir.ShiftedSignal) for num in numbers(atom) for part in everything(num)):
             return math.inf
         reach = bounds(atom.num, facts)
         if reach is None or any(map(math.isnan, reach)):

@@ -64,9 +64,9 @@ RAISED = 250
 def pieces(formula: ir.Formula) -> list[ir.Formula]:
     """Formulas whose conjunction it is: what can be satisfied or violated one by one."""
     match formula:
-        case ir.Join("and", items):
+        case ir.BoolOp("and", items):
             return [piece for item in items for piece in pieces(item)]
-        case ir.Over("always", _, body):
+        case ir.Temporal("always", _, body):
             return [replace(formula, body=piece) for piece in pieces(body)]
         case _:
             return [formula]

@@ -88,7 +88,7 @@ class Drawing:
             args = {str(i): self._extract(arg) for i, arg in enumerate(num.args)}
             name = f"draw#{len(self._calls)}"
             self._calls.append(_Call(name, num.name, Program(args), len(args)))
-            found: ir.Num = ir.Col(name)
+            found: ir.Num = ir.Signal(name)
         else:
             found = map_parts(num, self._extract)
         self._seen[id(num)] = found

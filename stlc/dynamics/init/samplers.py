@@ -80,7 +80,7 @@ class InitialStates:
         self._mixture = _Mixture(decl.mixture)
         self._override = tuple(Drawing(assign) for assign in decl.override)
         self._where = (
-            Program({f"{i}": ir.Ind(cond) for i, cond in enumerate(decl.where)}) if decl.where else None
+            Program({f"{i}": ir.Indicator(cond) for i, cond in enumerate(decl.where)}) if decl.where else None
         )
 
     @property

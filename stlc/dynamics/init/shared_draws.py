@@ -64,6 +64,6 @@ class _Writer:
             if id(num) in self._shared:
                 name = f"{self._prefix}#{len(self.before)}"
                 self.before.append(Assign(name, changed))
-                changed = ir.Col(name)
+                changed = ir.Signal(name)
             self._known[id(num)] = changed
         return self._known[id(num)]

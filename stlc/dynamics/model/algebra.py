@@ -12,13 +12,13 @@ from stlc.compile.ir import nodes as ir
 def names_in(num: ir.Num) -> frozenset[str]:
     """Names of all columns that a number reads."""
     match num:
-        case ir.Lit() | ir.Held():
+        case ir.Const() | ir.FrozenVar():
             return frozenset()
-        case ir.Col(name) | ir.At(name):
+        case ir.Signal(name) | ir.ShiftedSignal(name):
             return frozenset((name,))
         case ir.Op(_, args) | ir.Extern(_, args):
             return frozenset().union(*map(names_in, args))
-        case ir.Ind(cond):
+        case ir.Indicator(cond):
             return names_in_formula(cond)
         case ir.Where(cond, yes, no):
             return names_in_formula(cond) | names_in(yes) | names_in(no)
@@ -31,9 +31,9 @@ def names_in_formula(formula: ir.Formula) -> frozenset[str]:
     match formula:
         case ir.Truth():
             return frozenset()
-        case ir.Atom(num):
+        case ir.Predicate(num):
             return names_in(num)
-        case ir.Join(_, items):
+        case ir.BoolOp(_, items):
             return frozenset().union(*map(names_in_formula, items))
         case _:
             raise TypeError(f"not a state formula: {formula!r}")
@@ -47,9 +47,9 @@ def map_formula(formula: ir.Formula, rewrite: Rewrite) -> ir.Formula:
     match formula:
         case ir.Truth():
             return formula
-        case ir.Atom(num):
+        case ir.Predicate(num):
             return replace(formula, num=rewrite(num))
-        case ir.Join(_, items):
+        case ir.BoolOp(_, items):
             return replace(formula, items=tuple(map_formula(item, rewrite) for item in items))
         case _:
             raise TypeError(f"not a state formula: {formula!r}")
@@ -58,11 +58,11 @@ def map_formula(formula: ir.Formula, rewrite: Rewrite) -> ir.Formula:
 def map_parts(num: ir.Num, rewrite: Rewrite) -> ir.Num:
     """A number with its direct parts rewritten."""
     match num:
-        case ir.Lit() | ir.Col() | ir.At() | ir.Held():
+        case ir.Const() | ir.Signal() | ir.ShiftedSignal() | ir.FrozenVar():
             return num
         case ir.Op(_, args) | ir.Extern(_, args):
             return replace(num, args=tuple(map(rewrite, args)))
-        case ir.Ind(cond):
+        case ir.Indicator(cond):
             return replace(num, cond=map_formula(cond, rewrite))
         case ir.Where(cond, yes, no):
             return ir.Where(map_formula(cond, rewrite), rewrite(yes), rewrite(no))
@@ -72,16 +72,16 @@ def map_parts(num: ir.Num, rewrite: Rewrite) -> ir.Num:
 
 def substitute(num: ir.Num, table: Mapping[str, ir.Num]) -> ir.Num:
     """A number with the columns of `table` replaced."""
-    if isinstance(num, ir.Col):
+    if isinstance(num, ir.Signal):
         return table.get(num.name, num)
     return map_parts(num, lambda part: substitute(part, table))
 
 
 def blend(cond: ir.Formula, yes: ir.Num, no: ir.Num, sharpness: float | None) -> ir.Num:
     """`I yes + (1 - I) no` with the paper's I_w (Eq. 6); equal to a choice wherever I is exactly 0 or 1."""
-    weight = ir.Ind(cond, sharpness)
-    kept = multiply(ir.Op("sub", (ir.Lit(1.0), weight)), no)
-    return kept if yes == ir.Lit(0.0) else add(multiply(weight, yes), kept)
+    weight = ir.Indicator(cond, sharpness)
+    kept = multiply(ir.Op("sub", (ir.Const(1.0), weight)), no)
+    return kept if yes == ir.Const(0.0) else add(multiply(weight, yes), kept)
 
 
 def add(left: ir.Num, right: ir.Num) -> ir.Num:
@@ -127,22 +127,22 @@ class Hoist:
 
     def _steady(self, num: ir.Num) -> ir.Num:
         """A steady number, named; what is a number or a name already stays."""
-        if isinstance(num, ir.Lit | ir.Col):
+        if isinstance(num, ir.Const | ir.Signal):
             return num
         for name, known in self.early.items():
             if known == num:
-                return ir.Col(name)
+                return ir.Signal(name)
         name = f"{self.prefix}{len(self.early)}"
         self.early[name] = num
-        return ir.Col(name)
+        return ir.Signal(name)
 
     def _choice(self, cond: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
         """A choice whose condition is steady: the condition becomes a mask."""
-        if yes == ir.Lit(0.0):
-            keep = self._steady(ir.Op("sub", (ir.Lit(1.0), ir.Ind(cond))))
+        if yes == ir.Const(0.0):
+            keep = self._steady(ir.Op("sub", (ir.Const(1.0), ir.Indicator(cond))))
             return multiply(keep, self.split(no))
-        mask = self._steady(ir.Op("sub", (ir.Ind(cond), ir.Lit(0.5))))
-        return ir.Where(ir.Atom(mask), self.split(yes), self.split(no))
+        mask = self._steady(ir.Op("sub", (ir.Indicator(cond), ir.Const(0.5))))
+        return ir.Where(ir.Predicate(mask), self.split(yes), self.split(no))
 
     def _sum(self, num: ir.Num) -> ir.Num:
         """Terms of a sum, the steady ones gathered into one."""
@@ -154,7 +154,7 @@ class Hoist:
         for sign, term in moving[1:]:
             total = ir.Op("add" if sign > 0 else "sub", (total, term))
         rest = _total(steady)
-        return total if rest == ir.Lit(0.0) else add(total, self._steady(rest))
+        return total if rest == ir.Const(0.0) else add(total, self._steady(rest))
 
     def _product(self, num: ir.Num) -> ir.Num:
         """Factors of a product, the steady ones gathered into one."""
@@ -200,12 +200,12 @@ def _signed(sign: int, num: ir.Num) -> ir.Num:
 
 def _total(terms: list[tuple[int, ir.Num]]) -> ir.Num:
     """Steady terms as one number, constants folded."""
-    constant = sum(sign * term.value for sign, term in terms if isinstance(term, ir.Lit))
+    constant = sum(sign * term.value for sign, term in terms if isinstance(term, ir.Const))
     total: ir.Num | None = None
     for sign, term in sorted(
-        ((s, t) for s, t in terms if not isinstance(t, ir.Lit)), key=lambda pair: pair[0] < 0
+        ((s, t) for s, t in terms if not isinstance(t, ir.Const)), key=lambda pair: pair[0] < 0
     ):
         total = _signed(sign, term) if total is None else ir.Op("add" if sign > 0 else "sub", (total, term))
     if total is None:
-        return ir.Lit(constant)
-    return total if constant == 0.0 else add(total, ir.Lit(constant))
+        return ir.Const(constant)
+    return total if constant == 0.0 else add(total, ir.Const(constant))

@@ -19,7 +19,7 @@ INTEGRATORS: Registry[Integrator] = Registry("integrator")
 
 def _along(state: State, rate: State, length: float) -> State:
     """`state + length * rate`, for the components that move; the others stay."""
-    moved = {name: add(state[name], multiply(ir.Lit(length), slope)) for name, slope in rate.items()}
+    moved = {name: add(state[name], multiply(ir.Const(length), slope)) for name, slope in rate.items()}
     return {**state, **moved}
 
 
@@ -44,5 +44,7 @@ def rk4(rate: Rate, state: State, length: float) -> State:
     k2 = rate(_along(state, k1, length / 2))
     k3 = rate(_along(state, k2, length / 2))
     k4 = rate(_along(state, k3, length))
-    mean = {name: add(add(k1[name], k4[name]), multiply(ir.Lit(2.0), add(k2[name], k3[name]))) for name in k1}
+    mean = {
+        name: add(add(k1[name], k4[name]), multiply(ir.Const(2.0), add(k2[name], k3[name]))) for name in k1
+    }
     return _along(state, mean, length / 6)

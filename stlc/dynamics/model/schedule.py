@@ -128,7 +128,7 @@ def _increment(states: Mapping[str, str], body: Lets) -> ir.Num | None:
     (state,) = states
     (num,) = body.values()
     match num:
-        case ir.Op("add", (ir.Col(name), increment)) if name == state and state not in names_in(increment):
+        case ir.Op("add", (ir.Signal(name), increment)) if name == state and state not in names_in(increment):
             return increment
         case _:
             return None

@@ -33,11 +33,11 @@ class _Writer:
 
     def name(self, hint: str, num: ir.Num) -> ir.Num:
         """A column that holds `num`."""
-        if isinstance(num, ir.Lit | ir.Col):
+        if isinstance(num, ir.Const | ir.Signal):
             return num
         name = f"{hint}#{len(self.lets)}"
         self.lets.append((name, num))
-        return ir.Col(name)
+        return ir.Signal(name)
 
     def named(self, state: State) -> dict[str, ir.Num]:
         """Every component held by a column."""
@@ -52,7 +52,7 @@ def build_step(decl: SystemDecl, *, soft: bool) -> Step:
     and of two jumps on one component the later one wins.
     """
     writer = _Writer()
-    start: State = {name: ir.Col(name) for name in decl.signature.names}
+    start: State = {name: ir.Signal(name) for name in decl.signature.names}
     given = {name: writer.name(name, num) for name, num in commands(decl).items()}
     state = _flow(decl, writer, start, given)
     moved = {assign.name for assign in decl.flow}
@@ -75,14 +75,14 @@ def commands(decl: SystemDecl) -> dict[str, ir.Num]:
         return {}
     found: dict[str, ir.Num] = {}
     for i, each in enumerate(decl.controls):
-        back: ir.Num = ir.Lit(0.0)
+        back: ir.Num = ir.Const(0.0)
         for gain, state, at in zip(feedback.gain[i], decl.signature.names, feedback.state, strict=True):
             if gain:
-                back = add(back, multiply(ir.Lit(gain), ir.Op("sub", (ir.Lit(at), ir.Col(state)))))
+                back = add(back, multiply(ir.Const(gain), ir.Op("sub", (ir.Const(at), ir.Signal(state)))))
         most = feedback.authority[i]
-        bounded = ir.Op("clip", (back, ir.Lit(-most), ir.Lit(most)))
-        total = add(add(ir.Col(each.name), ir.Lit(feedback.control[i])), bounded)
-        found[each.name] = ir.Op("clip", (total, ir.Lit(feedback.low[i]), ir.Lit(feedback.high[i])))
+        bounded = ir.Op("clip", (back, ir.Const(-most), ir.Const(most)))
+        total = add(add(ir.Signal(each.name), ir.Const(feedback.control[i])), bounded)
+        found[each.name] = ir.Op("clip", (total, ir.Const(feedback.low[i]), ir.Const(feedback.high[i])))
     return found
 
 
@@ -128,4 +128,4 @@ def _clamped(decl: SystemDecl, name: str, num: ir.Num) -> ir.Num:
     if name not in decl.clamps:
         return num
     low, high = decl.clamps[name]
-    return ir.Op("clip", (num, ir.Lit(low), ir.Lit(high)))
+    return ir.Op("clip", (num, ir.Const(low), ir.Const(high)))

@@ -312,7 +312,7 @@ class System:
     @cached_property
     def _observation(self) -> Program | None:
         observe = self.decl.policy.observe
-        seen = (*observe, *(ir.Col(column.name) for column in self.added))
+        seen = (*observe, *(ir.Signal(column.name) for column in self.added))
         return Program({str(i): num for i, num in enumerate(seen)}) if observe else None
 
     @cached_property
@@ -384,7 +384,7 @@ class System:
         for term in self.decl.objective.terms:
             if term.weight:
                 kind = bool(names_in(term.value) & set(self.control_names))
-                value = multiply(ir.Lit(term.weight), substitute(term.value, given) if kind else term.value)
+                value = multiply(ir.Const(term.weight), substitute(term.value, given) if kind else term.value)
                 before = sums[kind]
                 sums[kind] = value if before is None else add(before, value)
         return sums[0], sums[1]

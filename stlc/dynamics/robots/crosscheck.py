@@ -90,7 +90,7 @@ def _by_library(function: FunctionDecl, q: Doubles) -> Doubles:
 
 def _by_body(body: ir.Body, q: Doubles) -> Doubles:
     """The function's numbers, (n, joints) -> (n, 3) m."""
-    args = tuple(ir.Col(f"a{index}") for index in range(q.shape[1]))
+    args = tuple(ir.Signal(f"a{index}") for index in range(q.shape[1]))
     program = Program({str(i): ir.Extern("f", args, i, body) for i in range(3)})
     found = program({"": q[:, 0], **{arg.name: q[:, i] for i, arg in enumerate(args)}}, NUMPY)
     return np.stack([np.broadcast_to(found[str(i)], len(q)) for i in range(3)], 1)

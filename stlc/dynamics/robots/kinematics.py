@@ -22,12 +22,12 @@ def position(joints: Sequence[Joint]) -> ir.Body:
     moving = [joint for joint in joints if joint.kind != "fixed"]
     formals = {joint.name: f"q{index}" for index, joint in enumerate(moving)}
     writer = _Lines()
-    point: Point = (ir.Lit(0.0), ir.Lit(0.0), ir.Lit(0.0))
+    point: Point = (ir.Const(0.0), ir.Const(0.0), ir.Const(0.0))
     for joint in reversed(joints):
         if joint.kind == "revolute":
-            point = _turned(joint.axis, point, ir.Col(formals[joint.name]), writer)
+            point = _turned(joint.axis, point, ir.Signal(formals[joint.name]), writer)
         elif joint.kind == "prismatic":
-            point = _pushed(joint.axis, point, ir.Col(formals[joint.name]), writer)
+            point = _pushed(joint.axis, point, ir.Signal(formals[joint.name]), writer)
         point = _affine(joint.rotation, joint.offset, point, writer)
     return ir.Body(tuple(formals.values()), tuple(writer.lets), point)
 
@@ -40,18 +40,18 @@ class _Lines:
 
     def name(self, num: ir.Num) -> ir.Num:
         """A column that holds `num`."""
-        if isinstance(num, ir.Lit | ir.Col):
+        if isinstance(num, ir.Const | ir.Signal):
             return num
         name = f"v{len(self.lets)}"
         self.lets.append((name, num))
-        return ir.Col(name)
+        return ir.Signal(name)
 
 
 def _turned(axis: Doubles, point: Point, angle: ir.Num, writer: _Lines) -> Point:
     """A point turned about an axis (Rodrigues): what is along it stays, the rest turns."""
     along = _linear(np.outer(axis, axis), point)
     across = tuple(writer.name(num) for num in _linear(np.eye(3) - np.outer(axis, axis), point))
-    if all(num == ir.Lit(0.0) for num in across):
+    if all(num == ir.Const(0.0) for num in across):
         return point
     x, y, z = axis
     aside = _linear(np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]), point)
@@ -66,7 +66,7 @@ def _turned(axis: Doubles, point: Point, angle: ir.Num, writer: _Lines) -> Point
 def _pushed(axis: Doubles, point: Point, length: ir.Num, writer: _Lines) -> Point:
     """A point pushed along an axis."""
     a, b, c = (
-        writer.name(_sum(part, _product(ir.Lit(float(share)), length)))
+        writer.name(_sum(part, _product(ir.Const(float(share)), length)))
         for part, share in zip(point, axis, strict=True)
     )
     return a, b, c
@@ -75,7 +75,7 @@ def _pushed(axis: Doubles, point: Point, length: ir.Num, writer: _Lines) -> Poin
 def _affine(rotation: Doubles, offset: Doubles, point: Point, writer: _Lines) -> Point:
     """`rotation @ point + offset`."""
     a, b, c = (
-        writer.name(_sum(part, ir.Lit(float(shift))))
+        writer.name(_sum(part, ir.Const(float(shift))))
         for part, shift in zip(_linear(rotation, point), offset, strict=True)
     )
     return a, b, c
@@ -85,9 +85,9 @@ def _linear(matrix: Doubles, point: Point) -> Point:
     """`matrix @ point`, constants folded."""
     rows: list[ir.Num] = []
     for row in matrix:
-        total: ir.Num = ir.Lit(0.0)
+        total: ir.Num = ir.Const(0.0)
         for factor, part in zip(row, point, strict=True):
-            total = _sum(total, _product(ir.Lit(float(factor)), part))
+            total = _sum(total, _product(ir.Const(float(factor)), part))
         rows.append(total)
     a, b, c = rows
     return a, b, c
@@ -95,9 +95,9 @@ def _linear(matrix: Doubles, point: Point) -> Point:
 
 def _sum(left: ir.Num, right: ir.Num) -> ir.Num:
     match left, right:
-        case ir.Lit(a), ir.Lit(b):
-            return ir.Lit(a + b)
-        case (ir.Lit(0.0), kept) | (kept, ir.Lit(0.0)):
+        case ir.Const(a), ir.Const(b):
+            return ir.Const(a + b)
+        case (ir.Const(0.0), kept) | (kept, ir.Const(0.0)):
             return kept
         case _, ir.Op("neg", (taken,)):
             return ir.Op("sub", (left, taken))
@@ -109,13 +109,13 @@ def _sum(left: ir.Num, right: ir.Num) -> ir.Num:
 
 def _product(left: ir.Num, right: ir.Num) -> ir.Num:
     match left, right:
-        case ir.Lit(a), ir.Lit(b):
-            return ir.Lit(a * b)
-        case (ir.Lit(0.0), _) | (_, ir.Lit(0.0)):
-            return ir.Lit(0.0)
-        case (ir.Lit(1.0), kept) | (kept, ir.Lit(1.0)):
+        case ir.Const(a), ir.Const(b):
+            return ir.Const(a * b)
+        case (ir.Const(0.0), _) | (_, ir.Const(0.0)):
+            return ir.Const(0.0)
+        case (ir.Const(1.0), kept) | (kept, ir.Const(1.0)):
             return kept
-        case (ir.Lit(-1.0), kept) | (kept, ir.Lit(-1.0)):
+        case (ir.Const(-1.0), kept) | (kept, ir.Const(-1.0)):
             return kept.args[0] if isinstance(kept, ir.Op) and kept.name == "neg" else ir.Op("neg", (kept,))
         case _, ir.Op("neg", (kept,)):
             return ir.Op("neg", (_product(left, kept),))

@@ -71,9 +71,9 @@ def loosened(decl: SystemDecl) -> Loose:
         texts |= {_place(each): each.span.text for each in seen.literals.values()}
     marked = _Marked.of(names, seen.rewritten if listed is None else _as_it_is)
     for name in chosen:
-        marked.entries[name] = _times(names.entries[name], ir.Col(_factor(name)))
+        marked.entries[name] = _times(names.entries[name], ir.Signal(_factor(name)))
     for factor in texts:
-        marked.entries[factor] = Known(Number(ir.Col(factor), flexible=True, bare=True))
+        marked.entries[factor] = Known(Number(ir.Signal(factor), flexible=True, bare=True))
     loose = _laid_over(decl, *read(marked))
     found = (Uncertain(factor, text, _readers(loose, factor)) for factor, text in texts.items())
     return Loose(loose, tuple(each for each in found if each.states))

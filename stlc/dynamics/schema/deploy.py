@@ -30,7 +30,7 @@ def read_test(node: Node | None, reader: Reader, names: Names, dt: Fraction) -> 
     """The section `test`."""
     found = reader.fields(node, "`test`", TEST_KEYS)
     default = TestDecl()
-    clock = Known(Number(ir.Col("t"), SECOND), "seconds since the start of the deployment")
+    clock = Known(Number(ir.Signal("t"), SECOND), "seconds since the start of the deployment")
     here = names.expressions(reader).extended({"t": clock} if "t" not in names.places else {}, samplers=True)
     steps = here.steps(found["steps"], "`steps`", dt) if "steps" in found else None
     metrics = [

@@ -226,10 +226,10 @@ class Expressions:
             case None:
                 return None
             case ast.Bool(_, value):
-                return ir.Lit(float(value))
+                return ir.Const(float(value))
             case ast.Compare() | ast.Not() | ast.Logic() | ast.Member():
                 formula = self.formula_of(expr)
-                return None if formula is None else ir.Ind(formula)
+                return None if formula is None else ir.Indicator(formula)
             case _:
                 return self.stored(node, where, Unit())
 
@@ -238,7 +238,7 @@ class Expressions:
         value = self.stored(node, where, unit)
         if value is None or node is None:
             return None
-        if not isinstance(value, ir.Lit):
+        if not isinstance(value, ir.Const):
             self.reader.wrong(node, where, "a constant", "use numbers and the names under `const`")
             return None
         return value.value
@@ -248,7 +248,7 @@ class Expressions:
         values = self.stored_each(node, where, unit, size)
         if values is None:
             return None
-        found = tuple(value.value for value in values if isinstance(value, ir.Lit))
+        found = tuple(value.value for value in values if isinstance(value, ir.Const))
         if len(found) < size:
             self.reader.wrong(node, where, "a constant", "use numbers and the names under `const`")
             return None

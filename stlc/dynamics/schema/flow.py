@@ -60,8 +60,8 @@ def read_jumps(node: Node | None, reader: Reader, names: Names) -> tuple[JumpDec
             continue
         if reader.flag(fields.get("once"), "`once`"):
             latch = latch_name(name)
-            guard = ir.Join("and", (guard, ir.Atom(ir.Op("sub", (ir.Lit(0.5), ir.Col(latch))))))
-            resets = (*resets, Assign(latch, ir.Lit(1.0), "true"))
+            guard = ir.BoolOp("and", (guard, ir.Predicate(ir.Op("sub", (ir.Const(0.5), ir.Signal(latch))))))
+            resets = (*resets, Assign(latch, ir.Const(1.0), "true"))
         found.append(JumpDecl(name, guard, resets, sharpness, written(fields.get("guard"))))
     return tuple(found)
 
@@ -81,7 +81,7 @@ def read_latches(node: Node | None, reader: Reader, names: Names) -> tuple[Assig
             continue
         names.places[latch] = once.span
         names.columns.append(Column(latch, Unit(), "bool", "state", 0.0, 1.0, (), fact=True))
-        found.append(Assign(latch, ir.Lit(0.0), "false"))
+        found.append(Assign(latch, ir.Const(0.0), "false"))
     return tuple(found)
 
 
@@ -111,10 +111,10 @@ def read_timers(
         if run is not None:
             rate = _running(run, direction, column.unit)
             if clock.discrete:
-                rate = add(ir.Col(column.name), multiply(ir.Lit(float(clock.dt)), rate))
+                rate = add(ir.Signal(column.name), multiply(ir.Const(float(clock.dt)), rate))
             flows.append(Assign(column.name, rate, f"timer {direction}"))
         guard = here.formula(found.get("reset_when"), f"`reset_when` of {where}")
-        value = here.stored(found["to"], where, column.unit) if "to" in found else ir.Lit(0.0)
+        value = here.stored(found["to"], where, column.unit) if "to" in found else ir.Const(0.0)
         if guard is not None and value is not None:
             jumps.append(
                 JumpDecl(
@@ -137,7 +137,7 @@ def _misplaced(found: dict[str, Node], where: str, reader: Reader) -> None:
 def _running(run: ir.Formula, direction: str, unit: Unit) -> ir.Num:
     """One second a second while `run` holds, in the unit of the timer."""
     speed = (1.0 if direction == "up" else -1.0) / unit.scale
-    return ir.Lit(speed) if run == ir.Truth(True) else ir.Op("mul", (ir.Lit(speed), ir.Ind(run)))
+    return ir.Const(speed) if run == ir.Truth(True) else ir.Op("mul", (ir.Const(speed), ir.Indicator(run)))
 
 
 def read_sets(node: Node | None, where: str, here: Expressions, names: Names) -> tuple[Assign, ...]:
@@ -196,7 +196,7 @@ def column_assign(column: Column, node: Node, here: Expressions) -> Assign | Non
     boolean = column.kind == "bool"
     value = here.truth(node, where) if boolean else here.stored(node, where, column.unit)
     allowed = {0.0: "false", 1.0: "true"} if boolean else {number: label for label, number in column.labels}
-    if allowed and isinstance(value, ir.Lit) and value.value not in allowed:
+    if allowed and isinstance(value, ir.Const) and value.value not in allowed:
         here.reader.wrong(node, where, " or ".join(f"`{label}`" for label in allowed.values()))
         return None
     return None if value is None else Assign(column.name, value, written(node))

@@ -206,7 +206,7 @@ class _Draws:
         node = self.lets.pop(name)
         self._needed(node)
         numbers = self.drawn.expressions(self.names, self.reader).numbers(node, f"`{name}`")
-        known: Number | Vector = Number(ir.Lit(0.0), flexible=True)
+        known: Number | Vector = Number(ir.Const(0.0), flexible=True)
         if numbers is not None:
             vector = len(numbers) > 1 or isinstance(node, Sequence)
             called = component_names(name, len(numbers) if vector else None)
@@ -215,7 +215,7 @@ class _Draws:
             ]
             self.found.extend(shared_draws(assigns))
             items = tuple(
-                replace(number, num=ir.Col(each), exact=None, span=None, origin=None)
+                replace(number, num=ir.Signal(each), exact=None, span=None, origin=None)
                 for each, number in zip(called, numbers, strict=True)
             )
             known = Vector(items) if vector else items[0]

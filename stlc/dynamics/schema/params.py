@@ -83,11 +83,11 @@ def _even(column: Column) -> tuple[ir.Num, str]:
     """Every value of a column equally often, and the words for it."""
     if column.labels:
         members = ", ".join(label for label, _ in column.labels)
-        return ir.Op("choice", tuple(ir.Lit(value) for _, value in column.labels)), f"choice({members})"
+        return ir.Op("choice", tuple(ir.Const(value) for _, value in column.labels)), f"choice({members})"
     if column.kind == "bool":
-        return ir.Op("bernoulli", (ir.Lit(0.5),)), "bernoulli(0.5)"
+        return ir.Op("bernoulli", (ir.Const(0.5),)), "bernoulli(0.5)"
     low, high = column.low or 0.0, column.high or 0.0
-    return ir.Op("uniform", (ir.Lit(low), ir.Lit(high))), f"uniform({low:g}, {high:g})"
+    return ir.Op("uniform", (ir.Const(low), ir.Const(high))), f"uniform({low:g}, {high:g})"
 
 
 def _ranged(column: Column, assigns: tuple[Assign, ...]) -> Column:

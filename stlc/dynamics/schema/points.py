@@ -45,9 +45,9 @@ def _values(column: Column, entry: Entry, here: Expressions) -> tuple[float, ...
     found = []
     for item in items:
         assign = column_assign(column, item, here)
-        if assign is not None and not isinstance(assign.value, ir.Lit):
+        if assign is not None and not isinstance(assign.value, ir.Const):
             here.reader.wrong(item, f"a value of `{column.name}`", "a constant", "draw it under `draw`")
-        found.append(assign.value.value if assign is not None and isinstance(assign.value, ir.Lit) else 0.0)
+        found.append(assign.value.value if assign is not None and isinstance(assign.value, ir.Const) else 0.0)
     return tuple(found) or (0.0,)
 
 

@@ -89,7 +89,7 @@ def _errors(node: Node | None, where: str, here: Expressions) -> ErrorsDecl:
 
 def _timed(here: Expressions, names: Names) -> Expressions:
     """Expressions that may draw, and know the time of the deployment."""
-    clock = Known(Number(ir.Col("t"), SECOND), "seconds since the start of the deployment")
+    clock = Known(Number(ir.Signal("t"), SECOND), "seconds since the start of the deployment")
     return here.extended({"t": clock} if "t" not in names.places else {}, samplers=True)
 
 

@@ -64,8 +64,8 @@ def read_objective(node: Node | None, reader: Reader, names: Names) -> Objective
 
 def read_terms(node: Node | None, where: str, reader: Reader, names: Names) -> tuple[Term, ...]:
     """A list of performance terms."""
-    entries = {name: Known(Number(ir.Col(name), flexible=True), about) for name, about in OUTCOME.items()}
-    entries["t"] = Known(Number(ir.Col("t"), SECOND), "seconds since the start of the plan")
+    entries = {name: Known(Number(ir.Signal(name), flexible=True), about) for name, about in OUTCOME.items()}
+    entries["t"] = Known(Number(ir.Signal("t"), SECOND), "seconds since the start of the plan")
     entries |= {
         f"{name}{START}": _first(names.entries[name]) for name in names.states if name in names.entries
     }
@@ -87,7 +87,7 @@ def _first(state: Entry) -> Known:
 
 
 def _began(number: Number) -> Number:
-    table = {name: ir.Col(name + START) for name in names_in(number.num)}
+    table = {name: ir.Signal(name + START) for name in names_in(number.num)}
     return replace(number, num=substitute(number.num, table))
 
 

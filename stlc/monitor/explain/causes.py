@@ -151,7 +151,7 @@ class _Tied:
 
 def _leaves_of(formula: ir.Formula) -> dict[ir.Formula, None]:
     """The predicates of a formula; what freezes values is one."""
-    if isinstance(formula, (ir.Atom, ir.Freeze)):
+    if isinstance(formula, (ir.Predicate, ir.Freeze)):
         return {formula: None}
     return {leaf: None for part in parts(formula) for leaf in _leaves_of(part)}
 
@@ -160,11 +160,11 @@ def _over_columns(formula: ir.Formula, names: Mapping[ir.Formula, str]) -> ir.Fo
     match formula:
         case ir.Truth():
             return formula
-        case ir.Atom() | ir.Freeze():
-            return ir.Atom(ir.Col(names[formula]))
-        case ir.Join(items=items):
+        case ir.Predicate() | ir.Freeze():
+            return ir.Predicate(ir.Signal(names[formula]))
+        case ir.BoolOp(items=items):
             return replace(formula, items=tuple(_over_columns(item, names) for item in items))
-        case ir.Over() | ir.Past() | ir.Shift() | ir.AtStart():
+        case ir.Temporal() | ir.PastTemporal() | ir.Shift() | ir.AtStart():
             return replace(formula, body=_over_columns(formula.body, names))
         case ir.Until() | ir.Since():
             left, right = _over_columns(formula.left, names), _over_columns(formula.right, names)
@@ -248,7 +248,7 @@ class Blamer:
         match formula:
             case typed.Truth() | typed.Recalled():
                 return self._node(formula, wanted, sample)
-            case typed.Pred():
+            case typed.Predicate():
                 return self._predicate(formula, sample, wanted)
             case typed.Not(span, body) if span == body.span and span.text:
                 return self._predicate(formula, sample, wanted)  # `not in`: to a reader one predicate
@@ -282,7 +282,7 @@ class Blamer:
             (leaf.name, sample + self._later(leaf, sample))
             for _, num in formula.bindings
             for leaf in leaves(num)
-            if isinstance(leaf, (ir.Col, ir.At))
+            if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))
         }
 
     def _values(self, formula: typed.Freeze, sample: int) -> dict[str, ir.Num]:
@@ -291,11 +291,11 @@ class Blamer:
         last = self.record.samples - 1
         for name, num in formula.bindings:
             given = columns_of(num) <= self.record.env.keys()
-            if given and sample <= last and defined(ir.Atom(num), last + 1)[sample]:
-                value, _ = bounds(ir.Atom(num), self.record, range(sample, sample + 1), "open")
-                values[name] = ir.Lit(float(value[0, 0]))
+            if given and sample <= last and defined(ir.Predicate(num), last + 1)[sample]:
+                value, _ = bounds(ir.Predicate(num), self.record, range(sample, sample + 1), "open")
+                values[name] = ir.Const(float(value[0, 0]))
             else:
-                values[name] = ir.At(next(iter(self.record.env)), last + 1)
+                values[name] = ir.ShiftedSignal(next(iter(self.record.env)), last + 1)
         return values
 
     def _lowered(self, formula: typed.Formula, wanted: bool) -> ir.Formula:
@@ -348,13 +348,13 @@ class Blamer:
             (leaf.name, self._later(leaf, sample))
             for num in numbers(self._lowered(formula, wanted))
             for leaf in leaves(num)
-            if isinstance(leaf, (ir.Col, ir.At)) and not leaf.name.startswith(KNOWN)
+            if isinstance(leaf, (ir.Signal, ir.ShiftedSignal)) and not leaf.name.startswith(KNOWN)
         }
         return replace(self._node(formula, wanted, sample), reads=tuple(sorted(found)))
 
-    def _later(self, leaf: ir.Col | ir.At, sample: int) -> int:
+    def _later(self, leaf: ir.Signal | ir.ShiftedSignal, sample: int) -> int:
         """How many samples after an instant a predicate reads a signal."""
-        if isinstance(leaf, ir.Col):
+        if isinstance(leaf, ir.Signal):
             return 0
         there = sample + leaf.steps
         return min(max(there, 0), self.record.samples - 1) - sample if leaf.clamped else leaf.steps
@@ -422,7 +422,7 @@ class Blamer:
         """The instants of the window of a temporal operator of which something is known, in order of time."""
         lowered = self._lowered(formula, wanted)
         match lowered:
-            case ir.Over(window=window) | ir.Until(window=window):
+            case ir.Temporal(window=window) | ir.Until(window=window):
                 last, known = self.record.samples - 1, self._stop(lowered) - 1
                 end = known if self.stop is None else min(self.stop - 1, known)
                 high = (
@@ -431,7 +431,7 @@ class Blamer:
                     else min(sample + window.hi, known)
                 )
                 return range(sample + window.lo, high + 1)
-            case ir.Past(window=window) | ir.Since(window=window):
+            case ir.PastTemporal(window=window) | ir.Since(window=window):
                 low = 0 if window.hi is None else max(sample - window.hi, 0)
                 return range(low, sample - window.lo + 1)
         raise TypeError(f"{type(lowered).__name__} has no window")

@@ -34,7 +34,7 @@ def fits(plans: Plans) -> bool:
 def _of_the_present(stream: Leaf | Latched) -> bool:
     if isinstance(stream, Latched):
         return not stream.ahead
-    return isinstance(stream.formula, ir.Atom) and not stream.back and not stream.ahead
+    return isinstance(stream.formula, ir.Predicate) and not stream.back and not stream.ahead
 
 
 @dataclass(slots=True)
@@ -111,8 +111,8 @@ class Pairs:
         self._env = {name: column[kept] for name, column in self._rows.items()}
 
     def _prepare(self) -> None:
-        whole = plan(ir.Join("and", tuple(self._formulas)))
-        assert isinstance(whole.formula, ir.Join)
+        whole = plan(ir.BoolOp("and", tuple(self._formulas)))
+        assert isinstance(whole.formula, ir.BoolOp)
         formulas = whole.formula.items
         self._plan = whole
         self._beyond = max(reach(formula).future for formula in formulas)

@@ -17,7 +17,7 @@ from stlc.monitor.online.trackers import Whole
 from stlc.monitor.values import history
 
 if TYPE_CHECKING:
-    from stlc.compile.pipeline import Rule
+    from stlc.compile.pipeline import CompiledRequirement
 
 Floats: TypeAlias = NDArray[np.float64]
 Counts: TypeAlias = NDArray[np.int64]
@@ -63,7 +63,7 @@ class _Watched:
         last: the least margins of the windows that closed with the last sample; None before there is one.
     """
 
-    rule: Rule
+    rule: CompiledRequirement
     horizon: int | None
     whole: Whole
     next: int = 0
@@ -145,7 +145,7 @@ class Margins:
         horizon: what `T` means, in steps.
     """
 
-    def __init__(self, rules: Sequence[Rule], horizon: int | None) -> None:
+    def __init__(self, rules: Sequence[CompiledRequirement], horizon: int | None) -> None:
         self._watched = [_Watched(rule, horizon, Whole(rule, horizon, "open")) for rule in rules]
         self._names = sorted({name for rule in rules for name in columns(rule.formula)})
         self._kept: dict[str, Floats] = {}

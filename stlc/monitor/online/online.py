@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias, final
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.pipeline import Compiled, Rule
+from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.monitor.explain.report import Cause
@@ -81,7 +81,7 @@ class How:
 class Watched:
     """A requirement and what is known of it so far."""
 
-    rule: Rule
+    rule: CompiledRequirement
     everywhere: bool
     values: Tracker
     truths: Tracker | None
@@ -137,7 +137,9 @@ class Online:
     that has one under a window with an end is judged on all samples, which are kept for it.
     """
 
-    def __init__(self, compiled: Compiled, rules: Sequence[Rule], how: How | None = None) -> None:
+    def __init__(
+        self, compiled: Compiled, rules: Sequence[CompiledRequirement], how: How | None = None
+    ) -> None:
         self.how = how or How()
         self.compiled = compiled
         self._needs = needs_of(compiled, [*rules, *compiled.assumptions])
@@ -149,7 +151,7 @@ class Online:
         self._scope = [self._watch(rule, once=True) for rule in compiled.assumptions]
         self._recall = Recall(compiled, self.how.t0) if self.how.reasons else None
 
-    def _watch(self, rule: Rule, *, once: bool = False) -> Watched:
+    def _watch(self, rule: CompiledRequirement, *, once: bool = False) -> Watched:
         horizon = self.compiled.grid.horizon
         begin = self.how.at if isinstance(self.how.at, int) and not once else 0
         once = once or rule.absolute or isinstance(self.how.at, int)
@@ -259,7 +261,7 @@ class Online:
         count = self._count(watched, judged)
         watched.decided = known[count:]
 
-    def _decision(self, rule: Rule, judged: Judged, start: int, i: int) -> Decision:
+    def _decision(self, rule: CompiledRequirement, judged: Judged, start: int, i: int) -> Decision:
         status: Status = "violated" if judged.fails[i] else "satisfied"
         low, high = float(judged.low[i]), float(judged.high[i])
         return Decision(rule.name, start + i, self.time(start + i), status, low, high, self.samples - 1)
@@ -299,7 +301,7 @@ class Online:
         """Names of the requirements, in order."""
         return tuple(watched.rule.name for watched in self._watched)
 
-    def rule(self, name: str) -> Rule:
+    def rule(self, name: str) -> CompiledRequirement:
         """A requirement. Raises UsageError (U101) for an unknown name."""
         return self._find(name).rule
 

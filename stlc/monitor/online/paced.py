@@ -15,7 +15,7 @@ from typing import Protocol, TypeAlias, assert_never
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.horizon import nodes, parts, reach
 from stlc.compile.ir.samples import Reach, farthest
-from stlc.compile.pipeline import Rule
+from stlc.compile.pipeline import CompiledRequirement
 from stlc.monitor.online.asked import Bounds, Floats
 from stlc.monitor.online.streams import endless
 
@@ -52,13 +52,13 @@ def span(formula: ir.Formula) -> Reach:
         max((each.future for each in inner), default=0),
     )
     match formula:
-        case ir.Over(window=window) | ir.Until(window=window):
+        case ir.Temporal(window=window) | ir.Until(window=window):
             return Reach(past, future + _width(window))
-        case ir.Past(window=window) | ir.Since(window=window):
+        case ir.PastTemporal(window=window) | ir.Since(window=window):
             return Reach(past + _width(window), future)
         case ir.Shift(steps=steps):
             return Reach(past + max(-steps, 0), future + max(steps, 0))
-        case ir.Atom(num=num):
+        case ir.Predicate(num=num):
             return farthest(num)
         case ir.Freeze(bindings=bindings):
             reads = [farthest(num) for _, num in bindings]
@@ -105,11 +105,11 @@ def work(formula: ir.Formula, instants: int, samples: int = 0) -> Work:
             return Work(own, own, formula)
         case ir.AtStart():
             instants = 1
-        case ir.Over(window=window) | ir.Past(window=window):
+        case ir.Temporal(window=window) | ir.PastTemporal(window=window):
             instants += samples if window.hi is None else window.hi - window.lo
         case ir.Until(window=window) | ir.Since(window=window):
             instants += samples if window.hi is None else window.hi
-    windows = isinstance(formula, (ir.Over, ir.Past, ir.Until, ir.Since))
+    windows = isinstance(formula, (ir.Temporal, ir.PastTemporal, ir.Until, ir.Since))
     found = Work(instants if windows else 0)
     for part in parts(formula):
         found = found.and_(work(part, instants, samples))
@@ -147,13 +147,13 @@ _Most: TypeAlias = tuple[int | None, int | None]
 def _cut(formula: ir.Formula, most: _Most) -> ir.Formula:
     ahead, back = most
     match formula:
-        case ir.Truth() | ir.Atom() | ir.Freeze() | ir.AtStart():
+        case ir.Truth() | ir.Predicate() | ir.Freeze() | ir.AtStart():
             return formula
-        case ir.Join(items=items):
+        case ir.BoolOp(items=items):
             return replace(formula, items=tuple(_cut(item, most) for item in items))
-        case ir.Over(window=window, body=body):
+        case ir.Temporal(window=window, body=body):
             return replace(formula, window=_shorter(window, ahead), body=_cut(body, most))
-        case ir.Past(window=window, body=body):
+        case ir.PastTemporal(window=window, body=body):
             return replace(formula, window=_shorter(window, back), body=_cut(body, most))
         case ir.Until(window=window, left=left, right=right):
             left, right = _cut(left, most), _cut(right, most)
@@ -222,10 +222,10 @@ def effort(formula: ir.Formula, looks: int, asking: Asking) -> Work:
 
 
 def _unbounded(node: ir.Formula) -> bool:
-    return isinstance(node, (ir.Past, ir.Since)) and node.window.hi is None
+    return isinstance(node, (ir.PastTemporal, ir.Since)) and node.window.hi is None
 
 
-Make: TypeAlias = Callable[[Rule], Inner]
+Make: TypeAlias = Callable[[CompiledRequirement], Inner]
 
 
 @dataclass(slots=True)
@@ -241,7 +241,7 @@ class Paced:
         samples: how many it has taken in.
     """
 
-    rule: Rule
+    rule: CompiledRequirement
     make: Make
     everywhere: bool
     all_kept: bool

@@ -10,7 +10,7 @@ import numpy as np
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.horizon import reach
-from stlc.compile.pipeline import Compiled, Rule
+from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.monitor.explain.report import Cause, explain
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.judgement import Judgement, Verdict
@@ -67,13 +67,13 @@ class Recall:
         """Forget the older half of the samples; causes that lie there have to be `remember`ed before."""
         self._kept.forget(self._kept.samples - _MOST // self._wide)
 
-    def remember(self, rule: Rule, worst: Worst) -> None:
+    def remember(self, rule: CompiledRequirement, worst: Worst) -> None:
         """Work out why a requirement is violated while the samples that say it are there."""
         cause = self.cause(rule, worst)
         if cause is not None:
             self._found[rule.name] = worst, cause
 
-    def cause(self, rule: Rule, worst: Worst) -> Cause | None:
+    def cause(self, rule: CompiledRequirement, worst: Worst) -> Cause | None:
         """Why a requirement is violated; None where the samples that say it are gone."""
         known = self._found.get(rule.name)
         if known is not None and known[0] == worst:
@@ -98,7 +98,7 @@ class Recall:
         time = float(sample) if step is None else self.t0 + sample * step
         return replace(cause, start=worst.start, sample=sample, time=time)
 
-    def _excerpt(self, rule: Rule, worst: Worst) -> tuple[int, int, dict[str, Floats]] | None:
+    def _excerpt(self, rule: CompiledRequirement, worst: Worst) -> tuple[int, int, dict[str, Floats]] | None:
         """The number of the first sample, that of the start from there on, and columns (samples, 1)."""
         kept = self._kept
         formula, horizon = rule.lowered, self.compiled.grid.horizon
@@ -119,10 +119,10 @@ class Recall:
         return first, worst.start - first, kept.columns(first, worst.start + reads[1] + 1)
 
 
-def _endless_always(rule: Rule, formula: ir.Formula) -> bool:
+def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
     """Whether a requirement says that something bounded holds at all samples from one on."""
     return (
-        isinstance(formula, ir.Over)
+        isinstance(formula, ir.Temporal)
         and formula.op == "always"
         and formula.window.hi is None
         and not rule.windowed
@@ -130,7 +130,7 @@ def _endless_always(rule: Rule, formula: ir.Formula) -> bool:
     )
 
 
-def _around(rule: Rule, formula: ir.Formula, horizon: int | None) -> tuple[int, int] | None:
+def _around(rule: CompiledRequirement, formula: ir.Formula, horizon: int | None) -> tuple[int, int] | None:
     """How many samples before and after a start say why it fails; None where no number does.
 
     What is explained is the requirement as it is written: where one part decides, others are told, too.

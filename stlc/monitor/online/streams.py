@@ -96,12 +96,14 @@ def read_by(stream: Stream) -> frozenset[str]:
 
 def endless(formula: ir.Formula) -> bool:
     """Whether a window of the future has no end."""
-    return any(isinstance(node, (ir.Over, ir.Until)) and node.window.hi is None for node in nodes(formula))
+    return any(
+        isinstance(node, (ir.Temporal, ir.Until)) and node.window.hi is None for node in nodes(formula)
+    )
 
 
-def column(name: str) -> ir.Atom:
+def column(name: str) -> ir.Predicate:
     """A column as a formula."""
-    return ir.Atom(ir.Col(name))
+    return ir.Predicate(ir.Signal(name))
 
 
 # ------------------------------------------------------------------------- planning
@@ -128,19 +130,19 @@ class _Planner:
         match formula:
             case ir.Truth():
                 return formula
-            case ir.Join(op, items):
-                return ir.Join(op, tuple(map(self.over_columns, items)))
-            case ir.Over(op, window, body):
-                return ir.Over(op, window, self.over_columns(body))
+            case ir.BoolOp(op, items):
+                return ir.BoolOp(op, tuple(map(self.over_columns, items)))
+            case ir.Temporal(op, window, body):
+                return ir.Temporal(op, window, self.over_columns(body))
             case ir.Until(op, window, left, right):
                 return ir.Until(op, window, self.over_columns(left), self.over_columns(right))
             case ir.Shift(steps, body, outside, _, weak):
                 return ir.Shift(steps, self.over_columns(body), outside, weak=weak)
-            case ir.Past(op, window, body):
+            case ir.PastTemporal(op, window, body):
                 return self._past(op, window, self.over_columns(body))
             case ir.Since(op, window, left, right):
                 return self._since(op, window, self.over_columns(left), self.over_columns(right))
-            case ir.Atom():
+            case ir.Predicate():
                 return self._leaf(formula)
             case ir.AtStart():
                 raise EndlessError
@@ -151,7 +153,9 @@ class _Planner:
         if formula not in self.streams:
             ahead = reach(formula).future
             ahead = (
-                max(ahead, looks_on(formula)) if isinstance(formula, ir.Atom) else ahead + looks_on(formula)
+                max(ahead, looks_on(formula))
+                if isinstance(formula, ir.Predicate)
+                else ahead + looks_on(formula)
             )
             self.streams[formula] = Leaf(f"#{len(self.streams)}", formula, history(formula), ahead)
         return column(self.streams[formula].name)
@@ -174,7 +178,7 @@ class _Planner:
 
     def _past(self, op: Literal["historically", "once"], window: ir.Window, body: ir.Formula) -> ir.Formula:
         if window.hi is not None:
-            return ir.Past(op, window, body)
+            return ir.PastTemporal(op, window, body)
         return _earlier(self._latched(op, body), window.lo, neutral=op == "historically")
 
     def _since(
@@ -187,8 +191,8 @@ class _Planner:
             return reached
         recent = ir.Window(0, window.lo - 1)
         if op == "since":
-            return ir.Join("and", (ir.Past("historically", recent, left), reached))
-        return ir.Join("or", (ir.Past("once", recent, left), reached))
+            return ir.BoolOp("and", (ir.PastTemporal("historically", recent, left), reached))
+        return ir.BoolOp("or", (ir.PastTemporal("once", recent, left), reached))
 
 
 def _earlier(formula: ir.Formula, steps: int, *, neutral: bool) -> ir.Formula:
@@ -197,7 +201,7 @@ def _earlier(formula: ir.Formula, steps: int, *, neutral: bool) -> ir.Formula:
 
 def unbounded_past(node: ir.Formula) -> bool:
     """Whether a node is a past operator that looks back to the start of the trace."""
-    return isinstance(node, (ir.Past, ir.Since)) and node.window.hi is None
+    return isinstance(node, (ir.PastTemporal, ir.Since)) and node.window.hi is None
 
 
 def looks_on(formula: ir.Formula) -> int:
@@ -206,5 +210,7 @@ def looks_on(formula: ir.Formula) -> int:
 
 
 def _offsets(formula: ir.Formula) -> list[int]:
-    found = [leaf.steps for num in numbers(formula) for leaf in readings(num) if isinstance(leaf, ir.At)]
+    found = [
+        leaf.steps for num in numbers(formula) for leaf in readings(num) if isinstance(leaf, ir.ShiftedSignal)
+    ]
     return [0, *found]

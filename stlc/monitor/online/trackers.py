@@ -11,7 +11,7 @@ import numpy as np
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.horizon import reach, uses_end
-from stlc.compile.pipeline import Rule
+from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.endings import lengthened, with_seen
 from stlc.monitor.holes import unsure
@@ -75,7 +75,7 @@ class Trackers:
     horizon: int | None
     _pairs: dict[tuple[bool, bool, int, int], Pairs] = field(default_factory=dict)
 
-    def of(self, rule: Rule, asked: Asked, *, everywhere: bool) -> Tracker:
+    def of(self, rule: CompiledRequirement, asked: Asked, *, everywhere: bool) -> Tracker:
         """The tracker of a requirement that needs the least memory.
 
         Args:
@@ -90,7 +90,7 @@ class Trackers:
         tried = alone.plain(rule, asked, everywhere=everywhere)
         window = tried.window if isinstance(tried, Windowed) else None
 
-        def make(part: Rule) -> Tracker:
+        def make(part: CompiledRequirement) -> Tracker:
             return Trackers(self.horizon).plain(part, asked, everywhere=everywhere)
 
         paced = Paced(rule, make, everywhere, isinstance(tried, Whole), window)
@@ -101,7 +101,7 @@ class Trackers:
             return paced
         return self.plain(rule, asked, everywhere=everywhere)
 
-    def plain(self, rule: Rule, asked: Asked, *, everywhere: bool) -> Tracker:
+    def plain(self, rule: CompiledRequirement, asked: Asked, *, everywhere: bool) -> Tracker:
         """The tracker that judges a requirement after every sample."""
         formula, window = rule.formula, window_of(rule, self.horizon)
         if window is not None and (bounded := without_end(formula, window)) is not None:
@@ -140,16 +140,16 @@ def without_end(formula: ir.Formula, window: int) -> ir.Formula | None:
 
 def _ended(formula: ir.Formula, window: int) -> ir.Formula | None:
     match formula:
-        case ir.Join(items=items):
+        case ir.BoolOp(items=items):
             found = [_ended(item, window) for item in items]
             return None if None in found else replace(formula, items=tuple(each for each in found if each))
-        case ir.Over(window=ir.Window(lo, None)) | ir.Until(window=ir.Window(lo, None)) if lo <= window:
+        case ir.Temporal(window=ir.Window(lo, None)) | ir.Until(window=ir.Window(lo, None)) if lo <= window:
             return replace(formula, window=ir.Window(lo, window))
         case _:
             return formula
 
 
-def _too_much(rule: Rule, found: Work) -> Diagnostic:
+def _too_much(rule: CompiledRequirement, found: Work) -> Diagnostic:
     """E313 for a formula that every instant judges on its own, on too many samples."""
     assert found.heaviest is not None
     what = "every instant keeps values of its own" if isinstance(found.heaviest, ir.Freeze) else "`end` moves"
@@ -226,7 +226,7 @@ class FromTheStart:
 class Whole:
     """A requirement that has to be judged on the whole trace: nothing is forgotten."""
 
-    rule: Rule
+    rule: CompiledRequirement
     horizon: int | None
     ending: Ending
     truth: bool = False

@@ -94,14 +94,14 @@ def _taken(formula: ir.Formula, steps: int, found: Skeleton) -> ir.Formula:
     if not endless(formula):
         return _part(formula, steps, found)
     match formula:
-        case ir.Join(op, items):
-            return ir.Join(op, tuple(_taken(item, steps, found) for item in items))
+        case ir.BoolOp(op, items):
+            return ir.BoolOp(op, tuple(_taken(item, steps, found) for item in items))
         case ir.Shift(later, body, None) if later >= 0:
             return _taken(body, steps + later, found)
-        case ir.Over(op, ir.Window(lo, None), body):
-            seen = ir.Over(op, _FOREVER, _taken(body, steps + lo, found))
+        case ir.Temporal(op, ir.Window(lo, None), body):
+            seen = ir.Temporal(op, _FOREVER, _taken(body, steps + lo, found))
             rest = _rest(Moved(formula, steps), found)
-            found.operators[rest] = ir.Join("and" if op == "always" else "or", (seen, column(rest)))
+            found.operators[rest] = ir.BoolOp("and" if op == "always" else "or", (seen, column(rest)))
             return found.operators[rest]
         case ir.Until(op, ir.Window(lo, None), left, right):
             met = _met(ir.Until(op, _FOREVER, left, right), steps + lo, found)
@@ -132,11 +132,11 @@ def _met(node: ir.Until, steps: int, found: Skeleton) -> ir.Formula:
     name = _rest(Moved(node, steps), found)
     seen, rest = ir.Until(node.op, _FOREVER, left, right), column(name)
     if node.op == "until":
-        held = ir.Join("and", (ir.Over("always", _FOREVER, left), rest))
-        found.operators[name] = ir.Join("or", (seen, held))
+        held = ir.BoolOp("and", (ir.Temporal("always", _FOREVER, left), rest))
+        found.operators[name] = ir.BoolOp("or", (seen, held))
     else:
-        freed = ir.Join("or", (ir.Over("eventually", _FOREVER, left), rest))
-        found.operators[name] = ir.Join("and", (seen, freed))
+        freed = ir.BoolOp("or", (ir.Temporal("eventually", _FOREVER, left), rest))
+        found.operators[name] = ir.BoolOp("and", (seen, freed))
     return found.operators[name]
 
 
@@ -147,8 +147,8 @@ def _held(
     formula, steps, found = left
     if endless(formula):
         raise EndlessError
-    before = ir.Over("always" if every else "eventually", window, formula)
-    return ir.Join("and" if every else "or", (_part(before, steps, found), then))
+    before = ir.Temporal("always" if every else "eventually", window, formula)
+    return ir.BoolOp("and" if every else "or", (_part(before, steps, found), then))
 
 
 def _part(formula: ir.Formula, steps: int, found: Skeleton) -> ir.Formula:
@@ -165,7 +165,7 @@ def _part(formula: ir.Formula, steps: int, found: Skeleton) -> ir.Formula:
 
 def _neutral(origin: Moved) -> float:
     """What the rest of an operator is worth where all rows are there: nothing more is met, nothing fails."""
-    assert isinstance(origin.formula, (ir.Over, ir.Until))
+    assert isinstance(origin.formula, (ir.Temporal, ir.Until))
     return math.inf if origin.formula.op in ("always", "release") else -math.inf
 
 
@@ -269,12 +269,12 @@ def _outlined(formula: ir.Formula, parts: dict[str, Moved]) -> ir.Formula:
     if not endless(formula):
         return _part(formula, 0, Skeleton(formula, parts))
     match formula:
-        case ir.Join(op, items):
-            return ir.Join(op, tuple(_outlined(item, parts) for item in items))
+        case ir.BoolOp(op, items):
+            return ir.BoolOp(op, tuple(_outlined(item, parts) for item in items))
         case ir.Shift(body=body):
             return replace(formula, body=_outlined(body, parts))
-        case ir.Over(op, window, body):
-            return ir.Over(op, window, _outlined(body, parts))
+        case ir.Temporal(op, window, body):
+            return ir.Temporal(op, window, _outlined(body, parts))
         case ir.Until(op, window, left, right):
             return ir.Until(op, window, _outlined(left, parts), _outlined(right, parts))
         case _:

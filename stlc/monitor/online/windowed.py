@@ -140,6 +140,6 @@ class Windowed:
 def _remembers(planned: Plan) -> bool:
     """Whether more than nothing is known of a column beyond the last sample."""
     return any(
-        isinstance(stream, Latched) or stream.back > 0 or not isinstance(stream.formula, ir.Atom)
+        isinstance(stream, Latched) or stream.back > 0 or not isinstance(stream.formula, ir.Predicate)
         for stream in planned.streams
     )

@@ -54,7 +54,9 @@ class Program:
         self._bound: dict[tuple[str, Switch, Hashable], _Bound] = {}
         tape, _ = self._tape(exact=True)
         self.columns = frozenset(str(i.params[0]) for i in tape.code if i.kernel == "input")
-        shifted = (leaf for num in outputs.values() for leaf in leaves(num) if isinstance(leaf, ir.At))
+        shifted = (
+            leaf for num in outputs.values() for leaf in leaves(num) if isinstance(leaf, ir.ShiftedSignal)
+        )
         self.shifted = {key_of(leaf): leaf for leaf in shifted}
 
     def __call__(self, env: Mapping[str, Array], ops: Ops, switch: Switch | None = None) -> dict[str, Array]:
@@ -190,16 +192,16 @@ class _Writer:
 
     def _number(self, num: ir.Num) -> Operand:
         match num:
-            case ir.Lit(value):
+            case ir.Const(value):
                 return float(value)
-            case ir.Col(name):
+            case ir.Signal(name):
                 known = self.bound.get(name, self._constants.get(name))
                 return self.tape.emit("input", params=(name,)) if known is None else known
-            case ir.At() | ir.Held():
+            case ir.ShiftedSignal() | ir.FrozenVar():
                 return self.tape.emit("input", params=(key_of(num),))
             case ir.Op(name, args):
                 return self._op(name, [self.number(arg) for arg in args])
-            case ir.Ind(cond, sharpness):
+            case ir.Indicator(cond, sharpness):
                 return self._indicator(cond, sharpness)
             case ir.Where(cond, yes, no):
                 return self._where(cond, self.number(yes), self.number(no))
@@ -265,10 +267,10 @@ class _Writer:
         match cond:
             case ir.Truth(value):
                 return value
-            case ir.Atom(num, sign, strict):
+            case ir.Predicate(num, sign, strict):
                 margin = self.number(num)
                 return self.tape.compare(margin if sign > 0 else self.tape.neg(margin), strict)
-            case ir.Join(op, items):
+            case ir.BoolOp(op, items):
                 return self._combine(op, [self._truth(item) for item in items])
             case _:
                 raise TypeError(f"not a state formula: {type(cond).__name__}")
@@ -301,10 +303,10 @@ class _Writer:
         match cond:
             case ir.Truth(value):
                 return float("inf") if value else float("-inf")
-            case ir.Atom(num, sign):
+            case ir.Predicate(num, sign):
                 margin = self.number(num)
                 return margin if sign > 0 else self.tape.neg(margin)
-            case ir.Join(op, items):
+            case ir.BoolOp(op, items):
                 pick = self.tape.least if op == "and" else self.tape.greatest
                 return reduce(pick, [self.margin(item) for item in items])
             case _:
@@ -313,9 +315,9 @@ class _Writer:
 
 def _strictness(cond: ir.Formula) -> set[bool]:
     match cond:
-        case ir.Atom(_, _, strict):
+        case ir.Predicate(_, _, strict):
             return {strict}
-        case ir.Join(_, items):
+        case ir.BoolOp(_, items):
             return set().union(*map(_strictness, items))
         case _:
             return set()

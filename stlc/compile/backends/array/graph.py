@@ -174,7 +174,7 @@ def _runner(plan: Schedule, index: int, machine: Machine) -> Runner:
     step = plan.steps[index]
     if isinstance(step.node, ir.Freeze):
         return _frozen(step.node, step.run, plan.extent, machine.windows)
-    if isinstance(step.node, ir.Atom):
+    if isinstance(step.node, ir.Predicate):
         return _predicate(plan, index, machine)
     kernel, parts = machine.bind(step), [part for part in step.parts if part is not None]
     if len(parts) == 1:
@@ -186,7 +186,7 @@ def _runner(plan: Schedule, index: int, machine: Machine) -> Runner:
 def _predicate(plan: Schedule, index: int, machine: Machine) -> Runner:
     """Its rows come from a program, or are those of a column."""
     step, place = plan.steps[index], plan.atoms.get(index)
-    assert isinstance(step.node, ir.Atom)
+    assert isinstance(step.node, ir.Predicate)
     if place is None:
         kernel = machine.atom(step.node, step.run, Run(step.run.start, 0))
         return lambda _, __, ___, like: kernel((), like)

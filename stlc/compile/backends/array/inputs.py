@@ -34,7 +34,7 @@ def _cut(column: Array, start: int, count: int) -> Array:
     return column if start == 0 and len(column) == count else column[start : start + count]
 
 
-def _beside(column: Array, at: ir.At, run: Run, ops: Ops) -> Array:
+def _beside(column: Array, at: ir.ShiftedSignal, run: Run, ops: Ops) -> Array:
     """The column some samples later; a clamped one repeats its first and last row beyond the ends."""
     start, count, samples = run.start + at.steps, run.count, len(column)
     before, after = min(max(-start, 0), count), min(max(start + count - samples, 0), count)

@@ -58,18 +58,18 @@ def require_numbers(nums: Iterator[ir.Num] | Sequence[ir.Num]) -> None:
 def _thawed(formula: ir.Formula, env: Columns) -> ir.Formula:
     """The formula with a new column of `env` in the place of every `freeze`."""
     match formula:
-        case ir.Truth() | ir.Atom():
+        case ir.Truth() | ir.Predicate():
             return formula
-        case ir.Join():
+        case ir.BoolOp():
             return replace(formula, items=tuple(_thawed(item, env) for item in formula.items))
-        case ir.Over() | ir.Past() | ir.Shift() | ir.AtStart():
+        case ir.Temporal() | ir.PastTemporal() | ir.Shift() | ir.AtStart():
             return replace(formula, body=_thawed(formula.body, env))
         case ir.Until() | ir.Since():
             return replace(formula, left=_thawed(formula.left, env), right=_thawed(formula.right, env))
         case ir.Freeze():
             name = f"#frozen{len(env)}"
             env[name] = _frozen(formula, env)
-            return ir.Atom(ir.Col(name))
+            return ir.Predicate(ir.Signal(name))
         case _:
             assert_never(formula)
 

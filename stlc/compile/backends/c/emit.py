@@ -162,7 +162,7 @@ def place_in_step(motion: Motion) -> Callable[[Leaf], str | None]:
     index = state_index(motion)
 
     def place(leaf: Leaf) -> str | None:
-        if not isinstance(leaf, ir.Col):
+        if not isinstance(leaf, ir.Signal):
             return None
         if leaf.name in index:
             return f"x[{index[leaf.name]}][k][j]"

@@ -16,7 +16,7 @@ from stlc.compile.ir import nodes as ir
 LEAST = 8
 """Formulas from which on a loop over a table takes the place of their text."""
 
-Entry: TypeAlias = ir.Lit | ir.Col | ir.At
+Entry: TypeAlias = ir.Const | ir.Signal | ir.ShiftedSignal
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +71,7 @@ def families(formulas: Sequence[ir.Formula], first: int) -> list[Family]:
 
 
 def _blank(leaf: Entry) -> ir.Num:
-    return ir.Lit(0.0) if isinstance(leaf, ir.Lit) else replace(leaf, name="")
+    return ir.Const(0.0) if isinstance(leaf, ir.Const) else replace(leaf, name="")
 
 
 def _family(formulas: Sequence[ir.Formula], members: Sequence[int], number: int) -> Family:
@@ -82,16 +82,16 @@ def _family(formulas: Sequence[ir.Formula], members: Sequence[int], number: int)
     entries = zip(*(_entries(formulas[member]) for member in members), strict=True)
     for rows in entries:
         first = rows[0]
-        if isinstance(first, ir.Lit):
-            numbers = tuple(row.value for row in rows if isinstance(row, ir.Lit))
+        if isinstance(first, ir.Const):
+            numbers = tuple(row.value for row in rows if isinstance(row, ir.Const))
             key = tuple(value.hex() for value in numbers)
             if len(set(key)) > 1:
                 name = constants.setdefault(key, f"t{number}_{len(constants)}")
                 values[name] = numbers
-                stands.append(ir.Held(f"{LISTED}{name}"))
+                stands.append(ir.FrozenVar(f"{LISTED}{name}"))
                 continue
         else:
-            key = tuple(row.name for row in rows if not isinstance(row, ir.Lit))
+            key = tuple(row.name for row in rows if not isinstance(row, ir.Const))
             if len(set(key)) > 1:
                 name = columns.setdefault(key, f"c{number}_{len(columns)}")
                 stands.append(replace(first, name=f"{LISTED}{name}"))
@@ -120,11 +120,11 @@ def _changed(formula: ir.Formula, change: Callable[[Entry], ir.Num]) -> ir.Formu
     match formula:
         case ir.Truth() | ir.Freeze():  # frozen values have names of their own: no other has this shape
             return formula
-        case ir.Atom(num):
+        case ir.Predicate(num):
             return replace(formula, num=_number(num, change))
-        case ir.Join(_, items):
+        case ir.BoolOp(_, items):
             return replace(formula, items=tuple(_changed(item, change) for item in items))
-        case ir.Over(_, _, body) | ir.Past(_, _, body) | ir.Shift(_, body) | ir.AtStart(body):
+        case ir.Temporal(_, _, body) | ir.PastTemporal(_, _, body) | ir.Shift(_, body) | ir.AtStart(body):
             return replace(formula, body=_changed(body, change))
         case ir.Until(_, _, left, right) | ir.Since(_, _, left, right):
             return replace(formula, left=_changed(left, change), right=_changed(right, change))
@@ -134,19 +134,21 @@ def _changed(formula: ir.Formula, change: Callable[[Entry], ir.Num]) -> ir.Formu
 
 def _number(num: ir.Num, change: Callable[[Entry], ir.Num]) -> ir.Num:
     match num:
-        case ir.Col(name) | ir.At(name) if name.startswith(LISTED):  # an entry of the table around
+        case ir.Signal(name) | ir.ShiftedSignal(name) if name.startswith(
+            LISTED
+        ):  # an entry of the table around
             return num
-        case ir.Col(ir.ELAPSED):
+        case ir.Signal(ir.ELAPSED):
             return num
-        case ir.Lit() | ir.Col() | ir.At():
+        case ir.Const() | ir.Signal() | ir.ShiftedSignal():
             return change(num)
-        case ir.Held() | ir.Extern():  # a call is computed once, for the columns that it names
+        case ir.FrozenVar() | ir.Extern():  # a call is computed once, for the columns that it names
             return num
         case ir.Op("pow", (base, exponent)):  # compilers know some exponents, and round otherwise for them
             return ir.Op("pow", (_number(base, change), exponent))
         case ir.Op(_, args):
             return replace(num, args=tuple(_number(arg, change) for arg in args))
-        case ir.Ind(cond):
+        case ir.Indicator(cond):
             return replace(num, cond=_changed(cond, change))
         case ir.Where(cond, yes, no):
             cond = _changed(cond, change)

@@ -50,24 +50,24 @@ class Sight:
     def __call__(self, leaf: Leaf) -> str | None:
         """C expression of a leaf; None for a function that is to be written out."""
         match leaf:
-            case ir.Col(name):
+            case ir.Signal(name):
                 return column(self.index, name, "k")
-            case ir.At(name, steps, clamped):
+            case ir.ShiftedSignal(name, steps, clamped):
                 return column(self.index, name, self._index(steps, clamped=clamped))
-            case ir.Held(name):
+            case ir.FrozenVar(name):
                 return self.held[name]["0"]
             case ir.Extern(_, args, output):
                 key = call_of(leaf)
                 if key is None:
                     return None
                 first = args[0]
-                index = "k" if isinstance(first, ir.Col) else self._later(first)
+                index = "k" if isinstance(first, ir.Signal) else self._later(first)
                 return self.plan.calls[key][output][index]
             case _:
                 assert_never(leaf)
 
     def _later(self, leaf: ir.Num) -> str:
-        assert isinstance(leaf, ir.At)
+        assert isinstance(leaf, ir.ShiftedSignal)
         return self._index(leaf.steps, clamped=leaf.clamped)
 
     def _index(self, steps: int, *, clamped: bool) -> str:
@@ -183,7 +183,7 @@ def column(index: Mapping[str, int], name: str, k: str) -> str:
 
 def columns(index: Mapping[str, int]) -> Callable[[Leaf], str | None]:
     """Where columns stand at sample `k`; what else there may be is written out."""
-    return lambda leaf: column(index, leaf.name, "k") if isinstance(leaf, ir.Col) else None
+    return lambda leaf: column(index, leaf.name, "k") if isinstance(leaf, ir.Signal) else None
 
 
 def table_head(step: Tabled, index: Mapping[str, int]) -> list[str]:

@@ -52,7 +52,7 @@ class Untranslatable(Exception):  # noqa: N818 - not an error: another back end 
     """The IR holds something that a back end has no form for, such as a function that the system provides."""
 
 
-Leaf: TypeAlias = ir.Col | ir.At | ir.Held | ir.Extern
+Leaf: TypeAlias = ir.Signal | ir.ShiftedSignal | ir.FrozenVar | ir.Extern
 
 
 class NumberWriter:
@@ -79,34 +79,34 @@ class NumberWriter:
 
     def assign(self, name: str, value: str) -> None:
         """From now on the environment entry `name` is the C expression `value`."""
-        self._known[ir.Col(name)] = value
+        self._known[ir.Signal(name)] = value
 
     def truth(self, cond: ir.Formula) -> str:
         """A C condition, 0 or 1: exact, every atom with its own strictness."""
         match cond:
             case ir.Truth(value):
                 return "1" if value else "0"
-            case ir.Atom(num, sign, strict):
+            case ir.Predicate(num, sign, strict):
                 op = (">" if sign > 0 else "<") + ("" if strict else "=")
                 return f"({self.number(num)} {op} 0.0)"
-            case ir.Join(op, items):
+            case ir.BoolOp(op, items):
                 return "(" + (" & " if op == "and" else " | ").join(map(self.truth, items)) + ")"
             case _:
                 raise Untranslatable(type(cond).__name__)
 
     def _number(self, num: ir.Num) -> str:
         match num:
-            case ir.Lit(value):
+            case ir.Const(value):
                 return literal(value)
             case ir.Op(name, args):
                 return self._op(name, [self.number(arg) for arg in args])
-            case ir.Ind(cond):
+            case ir.Indicator(cond):
                 return self._indicator(cond)
             case ir.Where(cond, yes, no):
                 return self._choice(cond, self.number(yes), self.number(no))
-            case ir.Held(name) if name.startswith(LISTED):
+            case ir.FrozenVar(name) if name.startswith(LISTED):
                 return name.removeprefix(LISTED)
-            case ir.Col() | ir.At() | ir.Held() | ir.Extern():
+            case ir.Signal() | ir.ShiftedSignal() | ir.FrozenVar() | ir.Extern():
                 place = self._place(num)
                 return self._written_out(num) if place is None else self._load(place)
             case _:

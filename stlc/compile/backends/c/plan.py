@@ -102,12 +102,12 @@ class _Planner:
         match formula:
             case ir.Truth(value):
                 return self._add(Fill(self._buffer(run), run, math.inf if value else -math.inf))
-            case ir.Atom():
+            case ir.Predicate():
                 self._check(formula.num, run)
                 return self._add(Margin(self._buffer(run), run, formula, self._held()))
-            case ir.Join(op, items):
+            case ir.BoolOp(op, items):
                 return self._join(PICKS[op], _operands(op, items), run)
-            case ir.Over() | ir.Past():
+            case ir.Temporal() | ir.PastTemporal():
                 return self._window(formula, run)
             case ir.Until() | ir.Since():
                 return self._meeting(formula, run)
@@ -160,8 +160,8 @@ class _Planner:
         steps, own = tuple(inner.steps), tuple(inner.own)
         return self._add(Tabled(out, run, pick, f"p{self._loops}", table, steps, own, body))
 
-    def _window(self, node: ir.Over | ir.Past, run: Stretch) -> Buffer:
-        window, back = node.window, isinstance(node, ir.Past)
+    def _window(self, node: ir.Temporal | ir.PastTemporal, run: Stretch) -> Buffer:
+        window, back = node.window, isinstance(node, ir.PastTemporal)
         if back:
             inner = Stretch(self._first(window, run), run.last.plus(-window.lo))
         else:
@@ -263,7 +263,7 @@ class _Planner:
 def _frozen_names(formula: ir.Formula) -> frozenset[str]:
     """The frozen values that a formula reads and does not bind, and its columns."""
     match formula:
-        case ir.Atom(num):
+        case ir.Predicate(num):
             return held_by(num) | columns_of(num)
         case ir.Freeze(bindings, body):
             inner = _frozen_names(body) - {name for name, _ in bindings}
@@ -278,7 +278,7 @@ LARGE = 64
 
 def _split(formula: ir.Formula) -> ir.Formula:
     """A predicate over the extremum of large numbers as a formula over predicates; anything else as it is."""
-    if not isinstance(formula, ir.Atom) or formula.guard or not isinstance(formula.num, ir.Op):
+    if not isinstance(formula, ir.Predicate) or formula.guard or not isinstance(formula.num, ir.Op):
         return formula
     if not _large(formula.num):
         return formula
@@ -291,7 +291,7 @@ def _split(formula: ir.Formula) -> ir.Formula:
     if len(args) == 1:
         return _split(replace(formula, num=args[0]))
     both = (name == "min") == (formula.sign > 0)
-    return ir.Join("and" if both else "or", tuple(replace(formula, num=arg) for arg in args), formula.span)
+    return ir.BoolOp("and" if both else "or", tuple(replace(formula, num=arg) for arg in args), formula.span)
 
 
 def _raised(num: ir.Op) -> ir.Op:
@@ -303,7 +303,7 @@ def _raised(num: ir.Op) -> ir.Op:
         if (
             isinstance(part, ir.Op)
             and part.name in ("min", "max")
-            and isinstance(other, ir.Lit | ir.Col | ir.Held)
+            and isinstance(other, ir.Const | ir.Signal | ir.FrozenVar)
         ):
             name = part.name
             if num.name == "sub" and i == 1:
@@ -317,7 +317,7 @@ def _operands(op: str, items: Sequence[ir.Formula]) -> list[ir.Formula]:
     """The operands of a join, those of joins of the same kind among them."""
     found: list[ir.Formula] = []
     for item in map(_split, items):
-        found += _operands(op, item.items) if isinstance(item, ir.Join) and item.op == op else [item]
+        found += _operands(op, item.items) if isinstance(item, ir.BoolOp) and item.op == op else [item]
     return found
 
 

@@ -79,10 +79,10 @@ class SlopeWriter(NumberWriter):
     def margin(self, cond: ir.Formula) -> str:
         """The exact robustness of a state formula."""
         match cond:
-            case ir.Atom(num, sign):
+            case ir.Predicate(num, sign):
                 value = self.number(num)
                 return value if sign > 0 else self._apply("neg", [value])
-            case ir.Join(op, items):
+            case ir.BoolOp(op, items):
                 pick = "min" if op == "and" else "max"
                 return reduce(lambda a, b: self._apply(pick, [a, b]), map(self.margin, items))
             case _:

@@ -55,7 +55,7 @@ class Margin:
 
     out: Buffer
     run: Stretch
-    atom: ir.Atom
+    atom: ir.Predicate
     held: Mapping[str, Buffer]
 
 
@@ -182,7 +182,7 @@ class Place:
 
 
 Step: TypeAlias = Fill | Margin | Joined | Extremum | Meeting | Moved | Repeated | Called | Frozen | Tabled
-CallKey: TypeAlias = tuple[str, tuple[ir.Col, ...]]
+CallKey: TypeAlias = tuple[str, tuple[ir.Signal, ...]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,11 +210,11 @@ def call_of(num: ir.Num) -> CallKey | None:
     """Under which key a number is a call whose components are computed once, at all samples."""
     if not isinstance(num, ir.Extern) or not isinstance(num.function, ir.Body):
         return None
-    leaves = [arg for arg in num.args if isinstance(arg, (ir.Col, ir.At))]
+    leaves = [arg for arg in num.args if isinstance(arg, (ir.Signal, ir.ShiftedSignal))]
     if len(leaves) < len(num.args) or len({_moved(leaf) for leaf in leaves}) > 1:
         return None
-    return num.name, tuple(ir.Col(leaf.name) for leaf in leaves)
+    return num.name, tuple(ir.Signal(leaf.name) for leaf in leaves)
 
 
-def _moved(leaf: ir.Col | ir.At) -> tuple[int, bool]:
-    return (leaf.steps, leaf.clamped) if isinstance(leaf, ir.At) else (0, False)
+def _moved(leaf: ir.Signal | ir.ShiftedSignal) -> tuple[int, bool]:
+    return (leaf.steps, leaf.clamped) if isinstance(leaf, ir.ShiftedSignal) else (0, False)

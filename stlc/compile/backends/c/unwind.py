@@ -27,7 +27,7 @@ from stlc.compile.backends.c.steps import (
     Tabled,
 )
 from stlc.compile.backends.c.windows import windowed_back
-from stlc.compile.ir.nodes import ELAPSED, Col, Num
+from stlc.compile.ir.nodes import ELAPSED, Num, Signal
 from stlc.compile.ir.samples import leaves
 
 
@@ -134,7 +134,7 @@ def _blank(step: Frozen | Tabled) -> list[str]:
 
 def _fixed(num: Num) -> bool:
     """Whether a number follows from the first sample and the count of samples: no plan changes it."""
-    return any(isinstance(leaf, Col) and leaf.name == ELAPSED for leaf in leaves(num))
+    return any(isinstance(leaf, Signal) and leaf.name == ELAPSED for leaf in leaves(num))
 
 
 def _pulled(num: Num, seed: str, sight: Sight) -> list[str]:
