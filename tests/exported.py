@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from stlc.controller.policies.policy import Mlp, PlanNetwork
+from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
@@ -64,7 +64,7 @@ def untrained(spec: Path, system: Path, folder: Path) -> Run:
         network = PlanNetwork(task, hidden=(16, 16), plans=3).eval()
     network.normalise(task.sample(200, seed=1))
     opened = open_folder(task, TrainConfig(steps=1), Launch(root=folder, name="test"))
-    return Run(opened, task, Mlp(task, network))
+    return Run(opened, task, BestOfKPolicy(task, network))
 
 
 @cache

@@ -16,9 +16,9 @@ from stlc.controller.training.config import (
     ENGINE_VERSION,
     HELD_OUT,
     HELD_OUT_SEED,
-    Engine,
+    ResolvedConfig,
     TrainConfig,
-    decide,
+    resolve_config,
 )
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.model.system import System
@@ -138,7 +138,9 @@ class Inputs:
 
         A number that engines did not have when it was made stood at what is its default now.
         """
-        known = {field.name: field.default for field in fields(Engine) if field.default is not MISSING}
+        known = {
+            field.name: field.default for field in fields(ResolvedConfig) if field.default is not MISSING
+        }
         engine = document.get("engine")
         then = {**document, "engine": {**known, **engine} if isinstance(engine, dict) else None}
         return all(then.get(key) == value for key, value in self.values.items())
@@ -152,7 +154,7 @@ def inputs_of(cell: Cell) -> Inputs:
         SpecError, SystemFileError: a file is invalid.
     """
     task = load(cell.benchmark, tuple(cell.overrides.items()))
-    engine = plain(asdict(decide(task, cell.config())))
+    engine = plain(asdict(resolve_config(task, cell.config())))
     spec = task.compiled.spec
     texts = [spec.source.text, *(f"{key}\n{text}" for key, text in sorted(library_of(spec).items()))]
     return Inputs(

@@ -21,7 +21,7 @@ from stlc.bench.measure import interleaved, one_thread
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.switch import StraightThrough
 from stlc.controller.problem.task import rank, satisfied
-from stlc.controller.training.config import TrainConfig, decide
+from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import Trainer
 from stlc.controller.training.objective import loss
 
@@ -105,7 +105,7 @@ def measured(
 
 def step_timing(name: str, task: Task, *, seconds: float, warm: int) -> StepTiming:
     """The parts of a training step of the engine."""
-    engine = decide(task, TrainConfig(seed=0, threads=1))
+    engine = resolve_config(task, TrainConfig(seed=0, threads=1))
     trainer = Trainer(task, engine, steps=MOST_STEPS, device=torch.device("cpu"))
     for _ in range(warm):
         if trainer.step >= trainer.next_look:

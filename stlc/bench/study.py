@@ -21,7 +21,7 @@ from stlc.bench.cells import (
 )
 from stlc.bench.fixed_set import training_accuracy
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.parallel.jobs import Errand, Returned, side_by_side
+from stlc.controller.parallel.jobs import Job, JobResult, side_by_side
 from stlc.controller.training.inputs import input_files
 from stlc.diagnostics import StlcError
 from stlc.files import write_atomic
@@ -121,7 +121,7 @@ def newest_run(inputs: Inputs, place: Place) -> RunDir | None:
         return None
 
 
-def _sent(errands: Sequence[Errand], place: Place, begun: Callable[[str], None]) -> Iterator[Returned]:
+def _sent(errands: Sequence[Job], place: Place, begun: Callable[[str], None]) -> Iterator[JobResult]:
     """Errands run where the place says."""
     if place.cluster is None or not errands:
         yield from side_by_side(errands, jobs=place.jobs, begun=lambda errand: begun(errand.name))
@@ -132,13 +132,13 @@ def _sent(errands: Sequence[Errand], place: Place, begun: Callable[[str], None])
     yield from on_cluster(errands, cluster, begun=lambda errand: begun(errand.name))
 
 
-def _errand(inputs: Inputs, place: Place, run: RunDir | None) -> Errand:
+def _errand(inputs: Inputs, place: Place, run: RunDir | None) -> Job:
     """A training, with what another machine needs for it."""
     arguments, runs = _arguments(inputs, place, run), runs_of(inputs, place)
     if place.cluster is None:
-        return Errand(inputs.cell.name, arguments)
+        return Job(inputs.cell.name, arguments)
     read = input_files(spec_path(inputs.cell.benchmark), overrides=inputs.cell.overrides)
-    return Errand(inputs.cell.name, arguments, read if run is None else (run.path,), runs)
+    return Job(inputs.cell.name, arguments, read if run is None else (run.path,), runs)
 
 
 def _arguments(inputs: Inputs, place: Place, run: RunDir | None) -> tuple[str, ...]:

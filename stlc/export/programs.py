@@ -28,7 +28,7 @@ class Deciding(nn.Module):
         self._task = task
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The policy's plan and its verdict, as `Mlp.plan_judged` gives them."""
+        """The policy's plan and its verdict, as `BestOfKPolicy.plan_judged` gives them."""
         plans = self.network(x).to(x.dtype)
         _, count, steps, controls = plans.shape
         starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])

@@ -19,7 +19,7 @@ from stlc.diagnostics import Diagnostic, RunError
 from stlc.export.programs import unmoved
 
 if TYPE_CHECKING:
-    from stlc.controller.policies.policy import Mlp
+    from stlc.controller.policies.policy import BestOfKPolicy
     from stlc.controller.problem.task import Task
     from stlc.runtime.graphs import Graphs, Judged
 
@@ -50,7 +50,9 @@ class Agreement:
     ties: int
 
 
-def agreement(policy: Mlp, decide: Callable[[Tensor], Answer], *, states: int, seed: int = 7) -> Agreement:
+def agreement(
+    policy: BestOfKPolicy, decide: Callable[[Tensor], Answer], *, states: int, seed: int = 7
+) -> Agreement:
     """Ask both in random states.
 
     Args:
@@ -112,7 +114,7 @@ def by_torch(path: Path) -> Callable[[Tensor], Answer]:
     return decide
 
 
-def backup_agreement(policy: Mlp, path: Path, *, states: int, seed: int = 11) -> Agreement:
+def backup_agreement(policy: BestOfKPolicy, path: Path, *, states: int, seed: int = 11) -> Agreement:
     """Ask the backup policy and the program in a file, in random states, whether they need it or not.
 
     Raises:
@@ -141,7 +143,7 @@ def _answer(judged: Judged) -> Answer:
     return plan, rho, safe, each
 
 
-def kept_agreement(policy: Mlp, graphs: Graphs, *, states: int, seed: int = 9) -> Agreement:
+def kept_agreement(policy: BestOfKPolicy, graphs: Graphs, *, states: int, seed: int = 9) -> Agreement:
     """Ask both a step later, with the plans that were begun.
 
     Raises:

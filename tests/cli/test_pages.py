@@ -223,7 +223,7 @@ def arranged(monkeypatch, machine):
             case "R301":
                 monkeypatch.setattr("stlc.view.find_spec", no_package)
             case "R402":
-                monkeypatch.setattr("stlc.controller.policies.policy.Mlp.candidates", no_number)
+                monkeypatch.setattr("stlc.controller.policies.policy.BestOfKPolicy.candidates", no_number)
             case "R105":
                 monkeypatch.setattr("stlc.export.verify.PLAN", -1.0)  # nothing agrees as well as that
             case "R404":

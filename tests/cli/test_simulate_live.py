@@ -12,7 +12,7 @@ from rich.console import Console
 from torch import Tensor
 
 from stlc.cli.simulate.live import LiveView, _fitting, _shown, _signed
-from stlc.controller.deployment.live import Oversight
+from stlc.controller.deployment.live import LiveMonitor
 from stlc.controller.deployment.simulator import Recorder, Setting, drive
 from stlc.controller.guard.guard import Guard, Mode
 from stlc.controller.problem.task import Task
@@ -73,7 +73,7 @@ def shown(
         no_color=True,
         legacy_windows=False,
     )
-    oversight, ticks = Oversight(task, setting), iter(range(10_000))
+    oversight, ticks = LiveMonitor(task, setting), iter(range(10_000))
     view = LiveView(oversight, "dot · a title", console, clock=lambda: float(next(ticks)))
 
     def watch(moment: object) -> None:

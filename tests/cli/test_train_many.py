@@ -10,7 +10,7 @@ from documents import misfits
 
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
-from stlc.controller.parallel.jobs import Errand, Returned
+from stlc.controller.parallel.jobs import Job, JobResult
 from stlc.rundir import every_run
 
 ROOT = Path(__file__).parents[2]
@@ -18,9 +18,9 @@ SPEC = str(ROOT / "specs/traffic.stl")
 QUICK = ["--batch", "8", "--held-out", "20", "--no-pictures"]
 
 
-def returned(errand: Errand, seed: int, code: int) -> Returned:
+def returned(errand: Job, seed: int, code: int) -> JobResult:
     if seed == 1:
-        return Returned(errand, code, {"result": None}, "error[R401]: training diverged", 1)
+        return JobResult(errand, code, {"result": None}, "error[R401]: training diverged", 1)
     result = {
         "run": f"runs/traffic/000{seed}-a",
         "seconds": 61.2,
@@ -30,7 +30,7 @@ def returned(errand: Errand, seed: int, code: int) -> Returned:
         "requirements": {"stop": 0.96, "go": 0.99},
         "feasible": 0.97,
     }
-    return Returned(errand, 0, {"result": result}, "", 1)
+    return JobResult(errand, 0, {"result": result}, "", 1)
 
 
 def test_every_seed_is_a_run_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from stlc.controller.training.checkpoint import load_checkpoint, restoring, save_checkpoint
-from stlc.controller.training.run import load_engine
+from stlc.controller.training.run import load_config
 from stlc.diagnostics import MissingError, RunError
 from stlc.provenance import sha256
 from stlc.rundir import RunDir
@@ -137,10 +137,10 @@ def test_what_does_not_fit_is_the_fault_of_the_checkpoint(run: RunDir) -> None:
 def test_an_engine_that_is_none(run: RunDir, name: str, value: object) -> None:
     engine = {"method": "guided", "seed": 0, "hidden": [4], "plans": 1, "batch": 2, "hard": 0, "lr": 0.1}
     (run.path / "config.resolved.yaml").write_text(json.dumps(engine))
-    assert load_engine(run).hidden == (4,)
+    assert load_config(run).hidden == (4,)
     (run.path / "config.resolved.yaml").write_text(json.dumps({**engine, name: value}))
     with pytest.raises(RunError) as caught:
-        load_engine(run)
+        load_config(run)
     assert caught.value.diagnostics[0].code == "R101"
 
 

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stlc.controller.evaluation.closed_loop import LEAST, NEAR, SEED, ClosedLoop, Share, closed_loop, reserve
-from stlc.controller.policies.policy import Mlp, network_of
+from stlc.controller.policies.policy import BestOfKPolicy, network_of
 from stlc.controller.problem.task import Task
-from stlc.controller.training.config import DRIVES, HELD_OUT_SEED, TrainConfig, decide
+from stlc.controller.training.config import DRIVES, HELD_OUT_SEED, TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import train
 from stlc.controller.training.run import Run
@@ -35,8 +35,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     folder = open_folder(task, config, Launch(root=tmp_path_factory.mktemp("runs")))
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        network = network_of(task, decide(task, config))
-    return Run(folder, task, Mlp(task, network))
+        network = network_of(task, resolve_config(task, config))
+    return Run(folder, task, BestOfKPolicy(task, network))
 
 
 def _looks(count: int) -> object:

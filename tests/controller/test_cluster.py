@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from stlc.cli.framework.app import main
-from stlc.controller.parallel.jobs import Errand
+from stlc.controller.parallel.jobs import Job
 from stlc.controller.parallel.ray_cluster import Cluster, on_cluster
 from stlc.rundir import every_run
 
@@ -53,8 +53,8 @@ def test_specifications_are_trained_for_on_a_cluster(
 @pytest.mark.filterwarnings("default")
 def test_what_is_no_longer_wanted_is_saved(tmp_path: Path) -> None:
     pytest.importorskip("ray")
-    long = Errand("long", (SPECS[0], "--steps", "100000", "--runs", str(tmp_path), *QUICK[2:]), (), tmp_path)
-    bad = Errand("bad", ("--stepps", "2"), (), tmp_path)
+    long = Job("long", (SPECS[0], "--steps", "100000", "--runs", str(tmp_path), *QUICK[2:]), (), tmp_path)
+    bad = Job("bad", ("--stepps", "2"), (), tmp_path)
     waiting = on_cluster([long, bad], Cluster("local"))
     assert next(waiting).errand.name == "bad"
     while not any(run.record().get("engine") for run in every_run(tmp_path)):

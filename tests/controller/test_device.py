@@ -14,7 +14,7 @@ from elsewhere import AWAY, Elsewhere, Far
 
 from stlc.controller.problem.task import Task
 from stlc.controller.training.checkpoint import load_checkpoint, save_checkpoint
-from stlc.controller.training.config import TrainConfig, decide
+from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import Trainer
 from stlc.dynamics.model.system import System
 from stlc.files import read_source
@@ -42,7 +42,7 @@ def _plain_adam(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _trainer(task: Task, device: torch.device) -> Trainer:
-    engine = replace(decide(task, TrainConfig(batch=8, seed=1)), pool=32, most=8, hidden=(16,))
+    engine = replace(resolve_config(task, TrainConfig(batch=8, seed=1)), pool=32, most=8, hidden=(16,))
     return Trainer(task, engine, steps=8, device=device)
 
 

@@ -26,7 +26,7 @@ from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.stats import Interval, student
 from stlc.controller.guard.feasibility import solvable
 from stlc.controller.guard.guard import Decision, Guard
-from stlc.controller.policies.policy import Mlp
+from stlc.controller.policies.policy import BestOfKPolicy
 from stlc.controller.problem.task import Task
 from stlc.controller.training.run import Run
 from stlc.diagnostics import MissingError, RunError, SystemFileError
@@ -308,7 +308,7 @@ def test_one_seed_has_no_interval() -> None:
 def test_a_trace_carries_its_decisions_and_where_it_is_from(
     car_task: Task, car_run: RunDir, recorded: Recording, tmp_path: Path
 ) -> None:
-    run = Run(car_run, car_task, Mlp(car_task, None))  # type: ignore[arg-type]
+    run = Run(car_run, car_task, BestOfKPolicy(car_task, None))  # type: ignore[arg-type]
     paths = save_trace_of(run, recorded, SETTING, tmp_path / "also.npz")
     for path in paths:
         trace = load_trace(path)

@@ -10,9 +10,9 @@ import torch
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.problem.task import Task
-from stlc.controller.training.config import TrainConfig, decide
+from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.exploration import Exploration, pieces
-from stlc.controller.training.learner import Look, Trainer
+from stlc.controller.training.learner import Trainer, Validation
 from stlc.controller.training.local_search import Searcher
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse
@@ -101,9 +101,11 @@ def test_a_training_explores_where_climbing_leads_nowhere(
 ) -> None:
     monkeypatch.setattr("stlc.controller.training.learner.MARGIN_STATES", 8)
     monkeypatch.setattr("stlc.controller.training.learner.BARREN", 2.0)  # whatever a climb solves
-    engine = replace(decide(puzzle, TrainConfig(seed=0, batch=8, threads=1)), pool=16, most=8, every=1)
+    engine = replace(
+        resolve_config(puzzle, TrainConfig(seed=0, batch=8, threads=1)), pool=16, most=8, every=1
+    )
     trainer = Trainer(puzzle, engine, steps=8, device=torch.device("cpu"))
-    looks: list[Look] = []
+    looks: list[Validation] = []
     while sum(look.explored for look in looks) == 0 and trainer.step < 6:
         trainer.advance()
         assert trainer.explore()

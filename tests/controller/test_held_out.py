@@ -8,9 +8,9 @@ import torch
 
 from stlc.controller.evaluation.held_out import save_states, score
 from stlc.controller.guard.feasibility import solvable
-from stlc.controller.policies.policy import Mlp, PlanNetwork
+from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Task, satisfied
-from stlc.controller.training.config import HELD_OUT_SEED, TrainConfig, decide
+from stlc.controller.training.config import HELD_OUT_SEED, TrainConfig, resolve_config
 from stlc.dynamics.model.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
@@ -18,10 +18,10 @@ from stlc.view.held_out import load_held_out, unsolved_text
 
 
 def test_what_is_known_is_kept_state_by_state(car_task: Task, tmp_path: Path) -> None:
-    engine = decide(car_task, TrainConfig())
+    engine = resolve_config(car_task, TrainConfig())
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        policy = Mlp(car_task, PlanNetwork(car_task, hidden=engine.hidden, plans=1))
+        policy = BestOfKPolicy(car_task, PlanNetwork(car_task, hidden=engine.hidden, plans=1))
     found = score(policy, n=60)
     good = satisfied(found.rho)
     assert 0 < int(good.sum()) < 60
@@ -41,10 +41,10 @@ def test_what_is_feasible_hardly_depends_on_the_policy() -> None:
     root = Path(__file__).parents[2]
     spec = parse(read_source(root / "specs" / "ship_track.stl"))
     task = Task.of(spec, System.load(root / "examples" / "ship_track.yaml"))
-    engine = decide(task, TrainConfig())
+    engine = resolve_config(task, TrainConfig())
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        policy = Mlp(task, PlanNetwork(task, hidden=engine.hidden, plans=1))
+        policy = BestOfKPolicy(task, PlanNetwork(task, hidden=engine.hidden, plans=1))
     found = score(policy, n=120)
     assert found.accuracy < 0.05
     states = task.sample(120, seed=HELD_OUT_SEED, dtype=torch.float64)

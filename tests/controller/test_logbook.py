@@ -8,7 +8,7 @@ import pytest
 
 from stlc.cli.framework.app import main
 from stlc.controller.training import tensorboard as logbook
-from stlc.controller.training.tensorboard import Logbook, find_writer
+from stlc.controller.training.tensorboard import TensorBoardLogger, find_writer
 from stlc.diagnostics import MissingError
 from stlc.rundir import RunDir
 
@@ -35,7 +35,7 @@ class Kept:
 
 def test_numbers_stand_under_their_names() -> None:
     kept = Kept()
-    log = Logbook(kept)
+    log = TensorBoardLogger(kept)
     log.begun({"plans": 4})
     row = {"accuracy": 0.9, "feasible": None, "loss": 0.5, "requirements": {"stop": 0.8}, "repaired": 3}
     log.row({"step": 7, **row, "failing": 4})

@@ -14,9 +14,9 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.guard.guard import Guard
-from stlc.controller.policies.policy import Mlp, PlanNetwork
+from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Judged, Task
-from stlc.controller.training.config import TrainConfig, decide
+from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import Trainer
 from stlc.controller.training.missions import GLIMPSES, POOL, ROUNDS, Missions, mission_steps, visited
 from stlc.controller.training.samplers import Draws
@@ -151,7 +151,7 @@ def test_followed_plans_carry_missions_on(task: Task) -> None:
 
 
 def test_training_with_memory_resumes_bit_for_bit(task: Task) -> None:
-    engine = decide(task, TrainConfig(batch=32))
+    engine = resolve_config(task, TrainConfig(batch=32))
 
     def trained(trainer: Trainer, until: int) -> None:
         while trainer.step < until:
@@ -173,12 +173,12 @@ def test_training_with_memory_resumes_bit_for_bit(task: Task) -> None:
 
 def test_only_memory_needs_missions(system: System) -> None:
     plain = task_of("spec p\nstate signal x [m]\nrequire a: always[0, T] x < 4 m", system)
-    trainer = Trainer(plain, decide(plain, TrainConfig(batch=8)), steps=2, device=CPU)
+    trainer = Trainer(plain, resolve_config(plain, TrainConfig(batch=8)), steps=2, device=CPU)
     assert isinstance(trainer.supply, Draws)
 
 
 def test_held_out_states_are_visited_ones(task: Task) -> None:
-    policy = Mlp(task, PlanNetwork(task, hidden=(8,), plans=2))
+    policy = BestOfKPolicy(task, PlanNetwork(task, hidden=(8,), plans=2))
     states = visited(policy, 500, seed=3)
     assert states.shape == (500, len(task.names))
     assert states.dtype == torch.float64

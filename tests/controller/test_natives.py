@@ -11,7 +11,7 @@ import torch
 from stlc import native
 from stlc.controller.problem.natives import by_torch
 from stlc.controller.problem.task import Task
-from stlc.controller.training.config import TrainConfig, decide
+from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.objective import guided_objective, loss
 from stlc.diagnostics import Notice
 from stlc.dynamics.model.system import System
@@ -38,7 +38,7 @@ def _task(extern: str, body: str) -> Task:
 
 def test_a_function_in_python_leaves_the_work_to_torch_with_the_same_results() -> None:
     outside, inside = _task(OUTSIDE, ""), _task("", INSIDE)
-    engine = decide(outside, TrainConfig())
+    engine = resolve_config(outside, TrainConfig())
     why = "the function `hand` has no C form"
     assert by_torch(outside, engine, "cpu") == dict.fromkeys(("verdicts", "search", "gradient"), why)
     assert not any(by_torch(inside, engine, "cpu").values())
@@ -56,7 +56,7 @@ def test_a_function_in_python_leaves_the_work_to_torch_with_the_same_results() -
 def test_the_paper_s_objective_a_device_and_a_missing_compiler(
     car_task: Task, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    engine = decide(car_task, TrainConfig())
+    engine = resolve_config(car_task, TrainConfig())
     assert by_torch(car_task, engine, "cpu") == {"verdicts": "", "search": "", "gradient": ""}
     smooth = by_torch(car_task, replace(engine, method="gradient"), "cpu")
     assert smooth == {"verdicts": "", "gradient": "the paper's objective is smooth"}

@@ -199,8 +199,8 @@ TINY = {"pool": 32, "every": 10, "most": 8, "hidden": (8,)}
 def ticking(monkeypatch: pytest.MonkeyPatch) -> None:
     from stlc.controller.training import loop as module
 
-    decided = module.decide
-    monkeypatch.setattr(module, "decide", lambda task, config: replace(decided(task, config), **TINY))
+    decided = module.resolve_config
+    monkeypatch.setattr(module, "resolve_config", lambda task, config: replace(decided(task, config), **TINY))
     monkeypatch.setattr("stlc.controller.training.learner.MARGIN_STATES", 8)
     monkeypatch.setattr(module, "clock_of", lambda _name: Ticks())
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from stlc.controller.parallel.bundle import Delivery, bring_home, carry, claimed, pack, unpack, wrap
-from stlc.controller.parallel.jobs import Errand, core_shares
+from stlc.controller.parallel.bundle import BundleResult, bring_home, carry, claimed, pack, unpack, wrap
+from stlc.controller.parallel.jobs import Job, core_shares
 from stlc.controller.training.inputs import input_files
 from stlc.rundir import RunDir, every_run
 
@@ -34,10 +34,10 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return home
 
 
-def errand(*more: str, runs: Path = Path("runs")) -> Errand:
+def errand(*more: str, runs: Path = Path("runs")) -> Job:
     spec = Path("specs/drive.stl")
     words = (str(spec), "--steps", "2", "--runs", str(runs), *QUICK, *more)
-    return Errand("one", words, input_files(spec), runs)
+    return Job("one", words, input_files(spec), runs)
 
 
 def test_what_a_training_reads(project: Path) -> None:
@@ -84,11 +84,11 @@ def test_a_worker_that_sees_the_folders_leaves_the_run_there() -> None:
 def test_a_run_that_was_sent_is_written_over(project: Path) -> None:
     run = RunDir.create(Path("runs"), "drive", "old")
     run.update({"status": "interrupted"})
-    going = Errand("on", ("--resume", str(run.path)), (run.path,), Path("runs"))
+    going = Job("on", ("--resume", str(run.path)), (run.path,), Path("runs"))
     sent = wrap(going, 1)
     (project / "later.json").write_text('{"status": "finished"}')
     files = pack({"run.json": project / "later.json"})
-    bring_home(going, sent, Delivery(0, "", "", 1, str(project.resolve() / run.path), files))
+    bring_home(going, sent, BundleResult(0, "", "", 1, str(project.resolve() / run.path), files))
     assert [(each.name, each.status) for each in every_run(Path("runs"))] == [("0001-old", "finished")]
 
 

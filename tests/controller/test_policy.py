@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import torch
 
-from stlc.controller.policies.policy import Mlp, PlanNetwork
+from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Task, rank
 
 
-def _policy(task: Task, plans: int) -> Mlp:
+def _policy(task: Task, plans: int) -> BestOfKPolicy:
     torch.manual_seed(0)
     network = PlanNetwork(task, hidden=(16, 16), plans=plans)
     network.normalise(task.sample(500, seed=1))
-    return Mlp(task, network)
+    return BestOfKPolicy(task, network)
 
 
 def test_the_choice_is_the_best_of_the_candidates(car_task: Task) -> None:

@@ -42,8 +42,8 @@ def tiny(monkeypatch: pytest.MonkeyPatch, car_task: Task) -> Task:
     """Traffic, and an engine that is through in a moment."""
     from stlc.controller.training import loop as module
 
-    decided = module.decide
-    monkeypatch.setattr(module, "decide", lambda task, config: replace(decided(task, config), **TINY))
+    decided = module.resolve_config
+    monkeypatch.setattr(module, "resolve_config", lambda task, config: replace(decided(task, config), **TINY))
     monkeypatch.setattr("stlc.controller.training.learner.MARGIN_STATES", 8)
     # what takes long is done before the ranks are forked
     importlib.import_module("torch._dynamo")

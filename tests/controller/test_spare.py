@@ -14,7 +14,7 @@ from stlc.controller.guard.guard import Guard, Mode
 from stlc.controller.guard.plan_repair import Limits
 from stlc.controller.guard.safe_prefix import prefix_robustness, robustness_until
 from stlc.controller.guard.tightened import sparing, tighter
-from stlc.controller.policies.policy import Mlp, PlanNetwork
+from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.dynamics.model.system import System
@@ -122,7 +122,7 @@ def test_a_network_chooses_among_its_plans_by_what_they_spare() -> None:
             return torch.cat((fast, slow), 1).to(x0)
 
     x = torch.tensor([[1.2, 0.0]], dtype=torch.float64)
-    guard = Guard(task, Mlp(task, Two()), "paper", limits=Limits(margin={"clear": 0.4}))
+    guard = Guard(task, BestOfKPolicy(task, Two()), "paper", limits=Limits(margin={"clear": 0.4}))
     assert guard.strict.judge(x, guard.policy.plan(x)).safe >= 0
 
 

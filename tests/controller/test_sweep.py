@@ -8,7 +8,7 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.controller.parallel.jobs import Errand, core_shares, side_by_side
+from stlc.controller.parallel.jobs import Job, core_shares, side_by_side
 from stlc.rundir import every_run
 
 ROOT = Path(__file__).parents[2]
@@ -29,7 +29,7 @@ def test_every_job_has_cores_and_no_core_is_left_out(jobs: int) -> None:
 
 def test_what_breaks_off_is_told() -> None:
     begun: list[str] = []
-    bad = [Errand(name, ("--stepps", "2")) for name in ("a", "b")]
+    bad = [Job(name, ("--stepps", "2")) for name in ("a", "b")]
     found = list(side_by_side(bad, jobs=1, begun=lambda errand: begun.append(errand.name)))
     assert begun == [back.errand.name for back in found] == ["a", "b"]
     assert all((back.code, back.result) == (2, {}) for back in found)
@@ -38,8 +38,8 @@ def test_what_breaks_off_is_told() -> None:
 
 
 def test_what_is_no_longer_wanted_is_saved(tmp_path: Path) -> None:
-    long = Errand("long", (SPEC, "--steps", "100000", "--runs", str(tmp_path), *QUICK))
-    bad = Errand("bad", ("--stepps", "2"))
+    long = Job("long", (SPEC, "--steps", "100000", "--runs", str(tmp_path), *QUICK))
+    bad = Job("bad", ("--stepps", "2"))
     waiting = side_by_side([long, bad], jobs=2)
     assert next(waiting).errand.name == "bad"
     deadline = time.monotonic() + 60

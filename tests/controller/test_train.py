@@ -12,7 +12,7 @@ import torch
 from stlc.controller.evaluation.held_out import score, wilson
 from stlc.controller.problem.task import Task
 from stlc.controller.training.checkpoint import load_checkpoint
-from stlc.controller.training.config import TrainConfig, decide
+from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.learner import Trainer
 from stlc.controller.training.loop import Watch, resume, train
@@ -37,7 +37,7 @@ def _saved(run: RunDir) -> dict[str, torch.Tensor]:
 
 
 def test_a_fixed_training_set(car_task: Task) -> None:
-    engine = replace(decide(car_task, TrainConfig(method="gradient", batch=16)), samples=40)
+    engine = replace(resolve_config(car_task, TrainConfig(method="gradient", batch=16)), samples=40)
     trainer, again = (Trainer(car_task, engine, steps=9, device=torch.device("cpu")) for _ in range(2))
     for _ in range(5):
         trainer.advance()
@@ -54,8 +54,8 @@ def test_a_fixed_training_set(car_task: Task) -> None:
 def test_the_system_file_may_ask_for_a_training_set() -> None:
     system = System.load(ROOT / "examples" / "car.yaml", {"train.samples": "500"})
     task = Task.of(parse(read_source(ROOT / "specs" / "traffic.stl")), system)
-    assert decide(task, TrainConfig(method="gradient")).samples == 500
-    assert decide(task, TrainConfig(method="guided")).samples == 0
+    assert resolve_config(task, TrainConfig(method="gradient")).samples == 500
+    assert resolve_config(task, TrainConfig(method="guided")).samples == 0
 
 
 @pytest.mark.parametrize("method", ["guided", pytest.param("gradient", marks=pytest.mark.slow)])
@@ -111,8 +111,8 @@ def test_the_system_file_chooses_the_method_unless_told() -> None:
     spec = parse(read_source(ROOT / "specs/traffic.stl"))
     system = System.load(ROOT / "examples/car.yaml", {"train.method": "gradient"})
     task = Task.of(spec, system)
-    assert decide(task, TrainConfig()).method == "gradient"
-    assert decide(task, TrainConfig(method="guided")).method == "guided"
+    assert resolve_config(task, TrainConfig()).method == "gradient"
+    assert resolve_config(task, TrainConfig(method="guided")).method == "guided"
 
 
 def test_a_slow_run_is_saved_by_the_clock(
@@ -242,7 +242,7 @@ def test_a_run_that_was_interrupted_before_its_first_checkpoint_begins_again(
 
 
 def test_a_checkpoint_keeps_a_search_that_goes_on(car_task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
-    engine = decide(car_task, TrainConfig(batch=16, seed=1))
+    engine = resolve_config(car_task, TrainConfig(batch=16, seed=1))
     trainer, again = (Trainer(car_task, engine, steps=9, device=torch.device("cpu")) for _ in range(2))
     trainer.advance()
     trainer.look()
@@ -272,7 +272,7 @@ def test_without_a_compiler_torch_judges_in_parts(car_task: Task, monkeypatch: p
 
 
 def test_the_verdict_ends_when_its_time_is_over(car_task: Task) -> None:
-    engine = decide(car_task, TrainConfig(batch=16, seed=1))
+    engine = resolve_config(car_task, TrainConfig(batch=16, seed=1))
     trainer = Trainer(car_task, engine, steps=9, device=torch.device("cpu"))
     found = score(trainer.policy, n=1200, enough=lambda: True)
     assert len(found.states) == 500

@@ -20,7 +20,7 @@ from stlc.controller.guard.guard import SOURCES
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from stlc.controller.deployment.live import Oversight
+    from stlc.controller.deployment.live import LiveMonitor
     from stlc.monitor.online.margins import Margin
     from stlc.signature import Column
 
@@ -48,7 +48,7 @@ class LiveView:
 
     def __init__(
         self,
-        oversight: Oversight,
+        oversight: LiveMonitor,
         title: str,
         console: Console,
         *,

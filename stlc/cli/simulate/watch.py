@@ -13,7 +13,7 @@ from stlc.diagnostics import Diagnostic, MissingError
 from stlc.escape import visible
 
 if TYPE_CHECKING:
-    from stlc.controller.deployment.live import Oversight
+    from stlc.controller.deployment.live import LiveMonitor
     from stlc.controller.deployment.simulator import Moment, Setting, Watch
     from stlc.controller.problem.task import Task
 
@@ -41,9 +41,9 @@ class Watching:
             with _bar(self.title) as watch:
                 yield watch
             return
-        from stlc.controller.deployment.live import Oversight
+        from stlc.controller.deployment.live import LiveMonitor
 
-        oversight = Oversight(task, setting)
+        oversight = LiveMonitor(task, setting)
         with ExitStack() as stack:
             listeners: list[Callable[[], None]] = []
             if self.margins is not None:
@@ -69,7 +69,7 @@ class Watching:
             yield watch
 
 
-def _present(oversight: Oversight) -> Moment:
+def _present(oversight: LiveMonitor) -> Moment:
     assert oversight.moment is not None
     return oversight.moment
 
@@ -98,7 +98,7 @@ def _opened(where: str) -> TextIO:
         raise MissingError(Diagnostic("R201", f"cannot write `{where}`: {reason}")) from error
 
 
-def _write(oversight: Oversight, stream: TextIO) -> None:
+def _write(oversight: LiveMonitor, stream: TextIO) -> None:
     """One object an agent, a line each."""
     from stlc.cli.framework.output import tolerate_closed
     from stlc.jsontext import dumps

@@ -14,7 +14,7 @@ from stlc.cli.framework.output import emit, emit_json, say, table
 from stlc.escape import operand
 
 if TYPE_CHECKING:
-    from stlc.controller.parallel.jobs import Errand, Returned
+    from stlc.controller.parallel.jobs import Job, JobResult
     from stlc.controller.training.config import TrainConfig
     from stlc.controller.training.launch import Launch
 
@@ -72,9 +72,9 @@ class Many:
         words = [] if len(self.specs) == 1 and part.seed is not None else [str(part.spec)]
         return " ".join(words + ([] if part.seed is None else [f"seed {part.seed}"]))
 
-    def errand(self, part: Part) -> Errand:
+    def errand(self, part: Part) -> Job:
         """The command line of one run."""
-        from stlc.controller.parallel.jobs import Errand
+        from stlc.controller.parallel.jobs import Job
 
         config, launch = self.config, self.launch
         threads = config.threads or (1 if self.jobs > 1 or self.cluster is not None else None)
@@ -103,16 +103,16 @@ class Many:
         drawn = () if self.pictures else ("--no-pictures",)
         arguments = (operand(str(part.spec)), *given, *changed, *drawn)
         if self.cluster is None:
-            return Errand(self.name(part), arguments)
+            return Job(self.name(part), arguments)
         from stlc.controller.training.inputs import input_files
 
         read = input_files(part.spec, self.system, launch.overrides)
-        return Errand(self.name(part), arguments, read, launch.root)
+        return Job(self.name(part), arguments, read, launch.root)
 
 
 def train_many(many: Many, *, json: bool) -> NoReturn:
     """Train all, and print a table or the JSON document; raises `typer.Exit` with the exit code."""
-    found: dict[str, Returned] = {}
+    found: dict[str, JobResult] = {}
     sent = "begins" if many.cluster is None else "is sent"
     try:
         for back in _backs(many, lambda errand: say(f"{errand.name} {sent}")):
@@ -132,7 +132,7 @@ def train_many(many: Many, *, json: bool) -> NoReturn:
     raise typer.Exit(code)
 
 
-def _backs(many: Many, begun: Callable[[Errand], None]) -> Iterator[Returned]:
+def _backs(many: Many, begun: Callable[[Job], None]) -> Iterator[JobResult]:
     """The runs as they end: of processes here, or of a cluster."""
     errands = [many.errand(part) for part in many.parts]
     if many.cluster is None:
@@ -146,7 +146,7 @@ def _backs(many: Many, begun: Callable[[Errand], None]) -> Iterator[Returned]:
     return on_cluster(errands, cluster, begun=begun)
 
 
-def _table(many: Many, ordered: Mapping[Part, Returned]) -> str:
+def _table(many: Many, ordered: Mapping[Part, JobResult]) -> str:
     """A line for every run, and one for the mean of each specification's."""
     rows: list[tuple[str, ...]] = []
     several = len(many.specs) > 1
@@ -157,7 +157,7 @@ def _table(many: Many, ordered: Mapping[Part, Returned]) -> str:
     return table(rows, header=("specification", *HEADER) if several else HEADER, indent="")
 
 
-def _line(back: Returned) -> str:
+def _line(back: JobResult) -> str:
     """What is said as a run ends."""
     accuracy = back.result.get("accuracy")
     if accuracy is None:
@@ -165,7 +165,7 @@ def _line(back: Returned) -> str:
     return f"{back.errand.name} done: accuracy {accuracy:.4f}  {back.result['run']}"
 
 
-def _cells(part: Part, back: Returned) -> tuple[str, ...]:
+def _cells(part: Part, back: JobResult) -> tuple[str, ...]:
     result, seed = back.result, "" if part.seed is None else str(part.seed)
     if result.get("accuracy") is None:
         return (seed, "", f"exit code {back.code}")
@@ -182,7 +182,7 @@ def _share(result: Mapping[str, Any]) -> str:
     return f"{100 * result['accuracy'] / result['feasible']:.1f} %" if result["feasible"] else ""
 
 
-def _mean(backs: Sequence[Returned]) -> list[tuple[str, ...]]:
+def _mean(backs: Sequence[JobResult]) -> list[tuple[str, ...]]:
     """The last line, where there are several runs that ended well."""
     results = [back.result for back in backs if back.result.get("accuracy") is not None]
     if len(results) < 2:
@@ -194,7 +194,7 @@ def _mean(backs: Sequence[Returned]) -> list[tuple[str, ...]]:
     return [("mean", f"{mean['accuracy']:.4f}", spread, f"{feasible:.4f}", _share(mean))]
 
 
-def _entry(part: Part, back: Returned) -> dict[str, Any]:
+def _entry(part: Part, back: JobResult) -> dict[str, Any]:
     seed = {} if part.seed is None else {"seed": part.seed}
     why = {"why": back.why} if back.result.get("accuracy") is None else {}
     return {"spec": str(part.spec), **seed, "exit_code": back.code, **why, **back.result}

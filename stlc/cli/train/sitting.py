@@ -23,7 +23,7 @@ from stlc.view.learning import Commands, Learning, driven_lines, learning_of_run
 if TYPE_CHECKING:
     from types import FrameType, TracebackType
 
-    from stlc.controller.training.tensorboard import Logbook, Opener
+    from stlc.controller.training.tensorboard import Opener, TensorBoardLogger
     from stlc.rundir import RunDir
 
 BESIDE = 10.0
@@ -53,7 +53,7 @@ class Sitting:
     progress: Progress = field(default_factory=Progress)
     logbook: Opener | None = None
     keeps: bool = True
-    _log: Logbook | None = None
+    _log: TensorBoardLogger | None = None
     _asked: list[int] = field(default_factory=list)
     _deferring: bool = False
     _before_it: float = 0.0

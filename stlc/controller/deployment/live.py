@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
 
-class Oversight:
+class LiveMonitor:
     """What the monitor says of all agents while they are driven; requirements are those of `stlc check`.
 
     Taking a moment in is cheap; what is asked of it costs.

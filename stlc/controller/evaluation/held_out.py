@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from stlc.controller.policies.policy import Mlp
+    from stlc.controller.policies.policy import BestOfKPolicy
     from stlc.controller.problem.task import Task
     from stlc.native import Stop
 
@@ -87,7 +87,7 @@ class Score:
 
 
 def score(
-    policy: Mlp,
+    policy: BestOfKPolicy,
     *,
     n: int = HELD_OUT,
     seed: int = HELD_OUT_SEED,
@@ -145,7 +145,7 @@ def score(
     )
 
 
-def _judged(policy: Mlp, states: Tensor, enough: Stop) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _judged(policy: BestOfKPolicy, states: Tensor, enough: Stop) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """States (k, dim), the plans that are followed from there, their robustness, and that of requirements.
 
     All states, or as many as are judged before `enough` is said, the first ones in any case.

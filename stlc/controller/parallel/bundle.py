@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stlc.cache import Unusable, private
-from stlc.controller.parallel.jobs import TAIL, Errand, Returned, document_of, start
+from stlc.controller.parallel.jobs import TAIL, Job, JobResult, document_of, start
 from stlc.files import atomic_path, write_atomic
 from stlc.rundir import RECORD, RUNS, RunDir, every_run
 from stlc.version import __version__
@@ -28,7 +28,7 @@ _OTHER_VERSION = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Parcel:
+class JobBundle:
     """An errand on its way to a worker.
 
     Attributes:
@@ -64,7 +64,7 @@ class Parcel:
 
 
 @dataclass(frozen=True, slots=True)
-class Delivery:
+class BundleResult:
     """What a worker sends back.
 
     Attributes:
@@ -87,14 +87,14 @@ class Delivery:
 # ---------------------------------------------------------------------- the caller
 
 
-def wrap(errand: Errand, cores: int) -> Parcel:
+def wrap(errand: Job, cores: int) -> JobBundle:
     """Make an errand ready to travel. Raises MissingError (R201) where its runs cannot be written."""
     folder, runs = Path.cwd(), _absolute(errand.runs or RUNS)
     inputs = tuple(dict.fromkeys(map(_absolute, errand.inputs)))
     probe = runs / f".probe-{secrets.token_hex(8)}"
     with atomic_path(probe) as written:
         written.touch()
-    return Parcel(
+    return JobBundle(
         errand.arguments,
         str(folder),
         str(runs),
@@ -111,7 +111,7 @@ def _absolute(path: Path) -> Path:
     return Path(os.path.normpath(Path.cwd() / path))
 
 
-def bring_home(errand: Errand, parcel: Parcel, delivery: Delivery) -> Returned:
+def bring_home(errand: Job, parcel: JobBundle, delivery: BundleResult) -> JobResult:
     """Enter the run that a worker sent into the caller's runs, under the next free number.
 
     A run that was sent to be gone on with is written over.
@@ -127,17 +127,17 @@ def bring_home(errand: Errand, parcel: Parcel, delivery: Delivery) -> Returned:
         unpack(delivery.files, home.path)
         if document is not None and isinstance(document.get("result"), dict):
             document["result"]["run"] = home.shown
-    return Returned(errand, delivery.code, document, delivery.said, delivery.cores)
+    return JobResult(errand, delivery.code, document, delivery.said, delivery.cores)
 
 
 # ---------------------------------------------------------------------- the worker
 
 
-def carry(parcel: Parcel) -> Delivery:
+def carry(parcel: JobBundle) -> BundleResult:
     """Run an errand on this machine, in the caller's folders or in a mirror of them."""
     if parcel.version != __version__:
         said = f"{socket.gethostname()} has stlc {__version__}; {parcel.version} is needed"
-        return Delivery(_OTHER_VERSION, "", said, 0)
+        return BundleResult(_OTHER_VERSION, "", said, 0)
     with claimed(parcel.cores) as share:
         if parcel.shared:
             return _ran(parcel.arguments, Path(parcel.folder), share, Path(parcel.probe))
@@ -145,7 +145,7 @@ def carry(parcel: Parcel) -> Delivery:
             return _ran_in_mirror(parcel, Path(temporary).resolve(), share)
 
 
-def _ran_in_mirror(parcel: Parcel, root: Path, share: frozenset[int]) -> Delivery:
+def _ran_in_mirror(parcel: JobBundle, root: Path, share: frozenset[int]) -> BundleResult:
     unpack(parcel.files, root)
     folder, runs = mirrored(root, parcel.folder), mirrored(root, parcel.runs)
     folder.mkdir(parents=True, exist_ok=True)
@@ -161,12 +161,12 @@ def _ran_in_mirror(parcel: Parcel, root: Path, share: frozenset[int]) -> Deliver
     write_atomic(run / RECORD, text.replace(f"{root}{os.sep}", "/"))  # paths as the caller knows them
     first, *rest = sorted(run.iterdir(), key=lambda path: path.name == RECORD, reverse=True)
     files = pack({path.name: path for path in (*rest, first)})  # a folder becomes a run with its record
-    return Delivery(back.code, back.out, back.said, back.cores, f"/{run.relative_to(root)}", files)
+    return BundleResult(back.code, back.out, back.said, back.cores, f"/{run.relative_to(root)}", files)
 
 
 def _ran(
     arguments: Sequence[str], folder: Path, share: frozenset[int], probe: Path | None = None
-) -> Delivery:
+) -> BundleResult:
     """Train in a process of its own; one that is called off, or whose probe is gone, may save."""
     process = start(arguments, share, folder)
     try:
@@ -175,7 +175,7 @@ def _ran(
         process.terminate()  # workers of Ray ignore SIGINT, and so would the process
         out, said = process.communicate()
     tail = "\n".join(said.splitlines()[-TAIL:])
-    return Delivery(process.returncode, out, tail, len(share))
+    return BundleResult(process.returncode, out, tail, len(share))
 
 
 def _awaited(process: subprocess.Popen[str], probe: Path | None) -> tuple[str, str]:

@@ -23,7 +23,7 @@ TAIL = 12
 
 
 @dataclass(frozen=True, slots=True)
-class Errand:
+class Job:
     """One run.
 
     Attributes:
@@ -40,7 +40,7 @@ class Errand:
 
 
 @dataclass(frozen=True, slots=True)
-class Returned:
+class JobResult:
     """What came of an errand.
 
     Attributes:
@@ -51,7 +51,7 @@ class Returned:
         cores: that it had to itself.
     """
 
-    errand: Errand
+    errand: Job
     code: int
     document: dict[str, Any] | None
     said: str
@@ -71,8 +71,8 @@ class Returned:
 
 
 def side_by_side(
-    errands: Sequence[Errand], *, jobs: int, begun: Callable[[Errand], None] = lambda _: None
-) -> Iterator[Returned]:
+    errands: Sequence[Job], *, jobs: int, begun: Callable[[Job], None] = lambda _: None
+) -> Iterator[JobResult]:
     """Run errands, `jobs` at a time, and give each as it ends.
 
     With several jobs every process keeps to its own share of the cores. When the caller is interrupted, or
@@ -110,13 +110,13 @@ class _Crew:
         for share in core_shares(self.jobs):
             self.shares.put(share)
 
-    def send(self, errand: Errand, begun: Callable[[Errand], None]) -> Returned:
+    def send(self, errand: Job, begun: Callable[[Job], None]) -> JobResult:
         """Run one errand from beginning to end."""
         share = self.shares.get()
         try:
             process = self._start(errand, share)
             if process is None:
-                return Returned(errand, -signal.SIGINT, None, "", len(share))
+                return JobResult(errand, -signal.SIGINT, None, "", len(share))
             begun(errand)
             out, said = process.communicate()
             with self.lock:
@@ -124,9 +124,9 @@ class _Crew:
         finally:
             self.shares.put(share)
         tail = "\n".join(said.splitlines()[-TAIL:])
-        return Returned(errand, process.returncode, document_of(out), tail, len(share))
+        return JobResult(errand, process.returncode, document_of(out), tail, len(share))
 
-    def _start(self, errand: Errand, share: frozenset[int]) -> subprocess.Popen[str] | None:
+    def _start(self, errand: Job, share: frozenset[int]) -> subprocess.Popen[str] | None:
         """The process, on its share of the cores; None once everything is to stop."""
         with self.lock:
             if self.stopped:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
-from stlc.controller.parallel.bundle import Parcel, bring_home, carry, wrap
-from stlc.controller.parallel.jobs import Errand, Returned
+from stlc.controller.parallel.bundle import JobBundle, bring_home, carry, wrap
+from stlc.controller.parallel.jobs import Job, JobResult
 from stlc.diagnostics import Diagnostic, MissingError
 
 LOST = -signal.SIGKILL
@@ -38,8 +38,8 @@ class Cluster:
 
 
 def on_cluster(
-    errands: Sequence[Errand], cluster: Cluster, *, begun: Callable[[Errand], None] = lambda _: None
-) -> Iterator[Returned]:
+    errands: Sequence[Job], cluster: Cluster, *, begun: Callable[[Job], None] = lambda _: None
+) -> Iterator[JobResult]:
     """Run errands on a cluster, as many at a time as it has processors for, and give each as it ends.
 
     When the caller is interrupted, or wants no more, every errand is asked to save and stop, and what it
@@ -54,7 +54,7 @@ def on_cluster(
         MissingError: R301, Ray is not installed; R302, there is no such cluster.
     """
     ray = _connected(cluster.address)
-    going: dict[Any, tuple[Errand, Parcel]] = {}
+    going: dict[Any, tuple[Job, JobBundle]] = {}
     try:
         task = ray.remote(carry).options(num_cpus=cluster.cores, num_gpus=cluster.gpus, max_retries=0)
         for errand in errands:
@@ -96,19 +96,19 @@ def _connected(address: str) -> Any:
     return ray
 
 
-def _received(ray: Any, done: Any, errand: Errand, parcel: Parcel) -> Returned:
+def _received(ray: Any, done: Any, errand: Job, parcel: JobBundle) -> JobResult:
     """What came of an errand, with its run among those of the caller."""
     try:
         delivery = ray.get(done)
     except ray.exceptions.RayError as error:
         said = str(error).strip().splitlines()[-1:]
-        return Returned(errand, LOST, None, "".join(said), 0)
+        return JobResult(errand, LOST, None, "".join(said), 0)
     finally:
         parcel.close()
     return bring_home(errand, parcel, delivery)
 
 
-def _call_back(ray: Any, going: dict[Any, tuple[Errand, Parcel]]) -> None:
+def _call_back(ray: Any, going: dict[Any, tuple[Job, JobBundle]]) -> None:
     """Ask every errand to save and stop, and bring back what it saved."""
     for each, (_, parcel) in going.items():
         parcel.close()

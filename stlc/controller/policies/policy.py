@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.config import Engine
+    from stlc.controller.training.config import ResolvedConfig
     from stlc.dynamics.model.mirror import Mirror
 
 
@@ -90,13 +90,13 @@ class PlanNetwork(nn.Module):
         return (x0, None) if self.mirror is None else self.mirror.fold(x0)
 
 
-def network_of(task: Task, engine: Engine) -> PlanNetwork:
+def network_of(task: Task, engine: ResolvedConfig) -> PlanNetwork:
     """The network that an engine trains; the paper's own method does without a mirror."""
     guided = engine.method == "guided"
     return PlanNetwork(task, hidden=engine.hidden, plans=engine.plans, mirrored=guided)
 
 
-class Mlp:
+class BestOfKPolicy:
     """The trained policy: the network's plans, and the monitor's choice among them.
 
     Among plans that satisfy the specification the one with the least performance cost is taken, otherwise the
@@ -128,6 +128,9 @@ class Mlp:
         best = rank(judged.rho, self.task.cost(judged), judged.safe).view(batch, count).argmax(1)
         index = rows * count + best
         return plans[rows, best], select(judged, index)
+
+
+Mlp = BestOfKPolicy
 
 
 def select(judged: Judged, index: Tensor) -> Judged:

@@ -14,10 +14,10 @@ from stlc.toolchain import compiler
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.config import Engine
+    from stlc.controller.training.config import ResolvedConfig
 
 
-def by_torch(task: Task, engine: Engine, device: str) -> Mapping[str, str]:
+def by_torch(task: Task, engine: ResolvedConfig, device: str) -> Mapping[str, str]:
     """Why torch does the work: for each part of training a reason, or "" where it runs as C.
 
     The parts are `verdicts` of plans, `search` for better ones and the `gradient` of robustness.

@@ -65,7 +65,7 @@ class TrainConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Engine:
+class ResolvedConfig:
     """The numbers of a run, all of them decided. They are saved with it.
 
     Attributes:
@@ -131,10 +131,10 @@ _MOST = {
 _POSITIVE = ("hidden", "plans", "batch", "pool", "every", "ranks")
 
 
-def checked_engine(engine: Engine) -> Engine:
+def checked_config(engine: ResolvedConfig) -> ResolvedConfig:
     """The same engine. Raises ValueError where a number is of another kind than it must be, or too large."""
     words = {"method": get_args(Method), "clock": get_args(Clock)}
-    for field in fields(Engine):
+    for field in fields(ResolvedConfig):
         value = getattr(engine, field.name)
         if field.name in words:
             fits = value in words[field.name]
@@ -153,7 +153,7 @@ def _is_number(value: object, kinds: tuple[type, ...]) -> bool:
     return isinstance(value, kinds) and not isinstance(value, bool)
 
 
-def decide(task: Task, config: TrainConfig) -> Engine:
+def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:
     """The engine's numbers for a task: the user's words, then the system file's, then defaults."""
     declared = task.system.decl.train
     method: Method = "gradient" if (config.method or declared.method) == "gradient" else "guided"
@@ -161,7 +161,7 @@ def decide(task: Task, config: TrainConfig) -> Engine:
     mission = bool(task.compiled.timers)
     batch = config.batch or declared.batch or (256 if guided else 512)
     plans = config.plans or (4 if guided else 1)
-    return Engine(
+    return ResolvedConfig(
         method=method,
         seed=declared.seed if config.seed is None else config.seed,
         hidden=task.system.decl.policy.hidden,

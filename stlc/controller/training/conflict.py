@@ -19,7 +19,7 @@ from stlc.compile.ir.samples import everything
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.controller.training.exploration import EFFORTS, Exploration
-from stlc.controller.training.local_search import Repaired, Searcher
+from stlc.controller.training.local_search import Searcher, SearchResult
 from stlc.diagnostics import Diagnostic, Label
 from stlc.native import never
 
@@ -70,7 +70,7 @@ def _starts(task: Task) -> torch.Tensor:
     return task.sample(STARTS, generator=torch.Generator().manual_seed(0))
 
 
-def _climbed(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> Repaired:
+def _climbed(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> SearchResult:
     """The best plans for these requirements alone."""
     alone, generator = _alone(task, rules), torch.Generator().manual_seed(0)
     x0 = _starts(task)
@@ -87,7 +87,9 @@ def _explored(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) ->
     return len(found.rho) > 0
 
 
-def _told(task: Task, core: Sequence[CompiledRequirement], nearest: Repaired, *, proved: bool) -> Diagnostic:
+def _told(
+    task: Task, core: Sequence[CompiledRequirement], nearest: SearchResult, *, proved: bool
+) -> Diagnostic:
     names = [f"`{rule.name}`" for rule in core]
     row = int(nearest.rho.argmax())
     columns = zip(task.system.signature.columns, nearest.states[row].tolist(), strict=True)

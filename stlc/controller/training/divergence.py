@@ -55,7 +55,7 @@ class Step:
         return cls(task, objective, x0.repeat_interleave(plans.shape[1], 0), plans.flatten(0, 1), number)
 
 
-def autopsy(step: Step) -> StlcError:
+def diagnose(step: Step) -> StlcError:
     """The first of what a training step needs that is no number, and where."""
     for look in (_plans, _motion, _robustness, _cost):
         found = look(step)

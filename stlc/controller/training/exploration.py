@@ -25,7 +25,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.horizon import columns
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.problem.kernel import Effort
-from stlc.controller.training.local_search import Repaired
+from stlc.controller.training.local_search import SearchResult
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -184,7 +184,7 @@ class Exploration:
         generator: torch.Generator,
         spare: float,
         enough: Callable[[], bool] = lambda: False,
-    ) -> Repaired:
+    ) -> SearchResult:
         """Plans that were found from some of the starts (k, n), and what is left of them on their way.
 
         Every start has its turn while there is effort left. Where the specification has memory, states on the
@@ -198,7 +198,9 @@ class Exploration:
             enough: asked now and then; True ends it.
         """
         sweeps = max(math.ceil(sweeps * min(1.0, (USUAL / self.task.horizon) ** 2)), 2)
-        found = [Repaired(starts[:0], starts.new_zeros(0, self.task.horizon, len(self._low)), starts[:0, 0])]
+        found = [
+            SearchResult(starts[:0], starts.new_zeros(0, self.task.horizon, len(self._low)), starts[:0, 0])
+        ]
         for x in starts:
             if sweeps <= 0 or (len(found) > 1 and enough()):
                 break
@@ -206,7 +208,9 @@ class Exploration:
             sweeps -= tried.sweeps
             if tried.plan is not None:
                 found.append(self._on_its_way(x, self._raised(x, tried.plan.to(x.dtype), spare)))
-        return Repaired(*(torch.cat([getattr(part, name) for part in found]) for name in Repaired.__slots__))
+        return SearchResult(
+            *(torch.cat([getattr(part, name) for part in found]) for name in SearchResult.__slots__)
+        )
 
     # ------------------------------------------------------------------ plans that were found
 
@@ -217,7 +221,7 @@ class Exploration:
         effort = Effort(RAISED, spare, 0)
         return self.task.native.climb(x[None], plan[None], plan[None], effort)[0][0]
 
-    def _on_its_way(self, x: Tensor, plan: Tensor) -> Repaired:
+    def _on_its_way(self, x: Tensor, plan: Tensor) -> SearchResult:
         """The start with its plan, and those states on its way whose rest of the plan solves them."""
         states, plans = [x], [plan]
         if self.task.compiled.timers:
@@ -226,9 +230,9 @@ class Exploration:
                 states.append(path[step])
                 plans.append(torch.cat((plan[step:], plan[-1:].expand(step, -1))))
         x0, u = torch.stack(states), torch.stack(plans)
-        judged = Repaired(x0, u, self.task.judge(x0, u, states=False).rho)
+        judged = SearchResult(x0, u, self.task.judge(x0, u, states=False).rho)
         good = judged.solved
-        return Repaired(judged.states[good], judged.plans[good], judged.rho[good])
+        return SearchResult(judged.states[good], judged.plans[good], judged.rho[good])
 
     def _best(self, x: Tensor, layer: Layer) -> Tensor:
         plans = torch.from_numpy(layer.plans)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from stlc.compile.dump import dump
 from stlc.compile.frontend.modules import library_of
 from stlc.controller.evaluation.rules import keep_rules
-from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, decide
+from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, resolve_config
 from stlc.controller.training.loop import train
 from stlc.controller.training.run import SPEC, SYSTEM, Run, save_library, spec_hash, system_hash
 from stlc.dynamics.robots.functions import function_files
@@ -67,10 +67,10 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
             "system": task.system.name,
             "system_path": str(decl.path),
             "overrides": dict(launch.overrides),
-            "seed": decide(task, config).seed,
+            "seed": resolve_config(task, config).seed,
             "budget": config.budget,
             "device": config.device,
-            "threads": decide(task, config).threads,
+            "threads": resolve_config(task, config).threads,
             "options": asdict(replace(config, steps=None)) | {"steps": config.steps and str(config.steps)},
             "engine_version": ENGINE_VERSION,
             "versions": versions(),

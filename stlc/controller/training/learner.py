@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from stlc.controller.parallel.ddp import ALONE, Ranks
-from stlc.controller.policies.policy import Mlp, PlanNetwork, network_of
+from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork, network_of
 from stlc.controller.problem.task import rank, satisfied
 from stlc.controller.training.exploration import EFFORTS, Exploration
-from stlc.controller.training.local_search import THOROUGH, Repaired, Search, Searcher
+from stlc.controller.training.local_search import THOROUGH, Search, Searcher, SearchResult
 from stlc.controller.training.missions import Missions
 from stlc.controller.training.objective import Objective, guided_objective, loss, paper_objective
 from stlc.controller.training.replay import Buffer
@@ -28,7 +28,7 @@ from stlc.native import never
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.config import Engine
+    from stlc.controller.training.config import ResolvedConfig
     from stlc.native import Stop
 
 MARGIN_STATES = 128
@@ -47,7 +47,7 @@ RISE = 30
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class Validation:
     """What a search round saw on fresh states, of all ranks.
 
     Attributes:
@@ -71,7 +71,7 @@ class Trainer:
     """Everything that changes while training. Same seed and steps: same weights on the same machine."""
 
     def __init__(
-        self, task: Task, engine: Engine, *, steps: int, device: torch.device, ranks: Ranks = ALONE
+        self, task: Task, engine: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks = ALONE
     ) -> None:
         self.task = task
         self.engine = engine
@@ -133,13 +133,13 @@ class Trainer:
         return engine.lr * rise * 0.5 * (1.0 + math.cos(math.pi * fallen))
 
     @property
-    def policy(self) -> Mlp:
+    def policy(self) -> BestOfKPolicy:
         """The policy that is handed out: the averaged weights."""
-        return Mlp(self.task, self.average)
+        return BestOfKPolicy(self.task, self.average)
 
     @torch.no_grad()
     def explore(self, stop: Stop = never) -> bool:
-        """Look for plans by exploration, where the round before has shown that climbing leads nowhere.
+        """Validation for plans by exploration, where the round before has shown that climbing leads nowhere.
 
         The effort grows with every time that nothing is found. False where `stop` came first; then nothing
         has changed.
@@ -167,19 +167,19 @@ class Trainer:
         return self.effort >= len(EFFORTS)
 
     @torch.no_grad()
-    def look(self) -> Look:
+    def look(self) -> Validation:
         """Judge fresh states; with the guided method also repair what fails.
 
         The repair goes on beside the training steps; the next look takes what it has found.
         """
         x0 = self.supply.take(self.engine.pool)
-        plans, judged = Mlp(self.task, self.network).plan_judged(x0)
+        plans, judged = BestOfKPolicy(self.task, self.network).plan_judged(x0)
         good = satisfied(judged.rho)
         shares = tuple(float(share) for share in satisfied(judged.requirements).double().mean(0))
         accuracy = float(good.double().mean())
         self.next_look = self.step + self.engine.every
         if self.engine.method != "guided":
-            return self._of_all(Look(accuracy, shares, None, 0, 0))
+            return self._of_all(Validation(accuracy, shares, None, 0, 0))
         failing, repaired, before = self._take_repaired()
         feasible = None if before is None else max(before, accuracy)
         bad = (~good).nonzero()[:, 0][: self._effort[0]]
@@ -187,7 +187,7 @@ class Trainer:
         self.accuracy = accuracy
         self.barren = repaired < BARREN * failing and accuracy < LEARNT and not self.exhausted
         explored, self.explored = self.explored, 0
-        return self._of_all(Look(accuracy, shares, feasible, failing, repaired, explored))
+        return self._of_all(Validation(accuracy, shares, feasible, failing, repaired, explored))
 
     def _begin(self, x0: Tensor, plans: Tensor, seed: int | None = None) -> Search:
         """A search beside the steps until the next round."""
@@ -205,13 +205,13 @@ class Trainer:
         if self.repairing is not None:
             self.repairing.cancel()
 
-    def _of_all(self, look: Look) -> Look:
+    def _of_all(self, look: Validation) -> Validation:
         """What the ranks saw together."""
         counts = (look.failing, look.repaired, look.explored)
         own = (look.feasible or 0.0, *counts, look.accuracy, *look.requirements)
         feasible, failing, repaired, explored, accuracy, *shares = self.ranks.mean(own)
         size = self.ranks.size
-        return Look(
+        return Validation(
             accuracy,
             tuple(shares),
             None if look.feasible is None else feasible,
@@ -303,7 +303,7 @@ class Trainer:
         """States that missions pass through where the specification has memory, else independent ones."""
         if not self.task.compiled.timers:
             return Draws(self.task, self.generator, self.device)
-        policy = Mlp(self.task, self.network)
+        policy = BestOfKPolicy(self.task, self.network)
         return Missions(self.task, self.generator, self.device, lambda x0: policy.plan_judged(x0)[1])
 
     def _objective(self) -> Objective:
@@ -390,7 +390,7 @@ class Trainer:
             self.training.restore(_below(tensors, "training"))
         self.generator.set_state(tensors["generator"].cpu())
         if known := _below(tensors, "repairing"):
-            self.repairing = Search.of(Repaired(**known))
+            self.repairing = Search.of(SearchResult(**known))
         elif begun := _below(tensors, "searching"):
             states, plans = begun["states"].to(self.device), begun["plans"].to(self.device)
             self.repairing = self._begin(states, plans, int(begun["seed"]))
@@ -409,7 +409,7 @@ class Trainer:
         return common | own, {**facts, "accuracy": accuracy, **counts}
 
 
-def _network(task: Task, engine: Engine, device: torch.device) -> PlanNetwork:
+def _network(task: Task, engine: ResolvedConfig, device: torch.device) -> PlanNetwork:
     """A network whose first weights depend on the seed alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(engine.seed)

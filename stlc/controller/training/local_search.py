@@ -40,7 +40,7 @@ LOOK = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Repaired:
+class SearchResult:
     """What a search found.
 
     Attributes:
@@ -58,9 +58,9 @@ class Repaired:
         """Where the plan satisfies the specification with a little to spare, (B,)."""
         return self.rho >= FLOAT32_SLACK
 
-    def to(self, device: torch.device) -> Repaired:
+    def to(self, device: torch.device) -> SearchResult:
         """The same on another device."""
-        return Repaired(self.states.to(device), self.plans.to(device), self.rho.to(device))
+        return SearchResult(self.states.to(device), self.plans.to(device), self.rho.to(device))
 
 
 class Search:
@@ -80,16 +80,16 @@ class Search:
         self._cancelled = Event()
         self._climb: _TorchClimb | None = None
         self._share = 1
-        self._found: Future[Repaired] = Future()
+        self._found: Future[SearchResult] = Future()
 
     @classmethod
-    def of(cls, found: Repaired) -> Search:
+    def of(cls, found: SearchResult) -> Search:
         """A search that has come to its end."""
         search = cls(found.states, found.plans, 0)
         search._found.set_result(found)
         return search
 
-    def on_thread(self, pool: ThreadPoolExecutor, climb: Callable[[Stop], Repaired]) -> Search:
+    def on_thread(self, pool: ThreadPoolExecutor, climb: Callable[[Stop], SearchResult]) -> Search:
         """This search, begun on a thread."""
         self._found = pool.submit(climb, self._cancelled.is_set)
         return self
@@ -111,7 +111,7 @@ class Search:
                     self._found.set_result(self._climb.found)
                     break
 
-    def result(self, stop: Stop = never) -> Repaired | None:
+    def result(self, stop: Stop = never) -> SearchResult | None:
         """What was found once it has come to its end; None where `stop` says first not to wait any longer."""
         while not self.done():
             if stop():
@@ -152,7 +152,7 @@ class Searcher:
     @torch.no_grad()
     def repair(
         self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH, stop: Stop = never
-    ) -> Repaired:
+    ) -> SearchResult:
         """Improve plans until they satisfy the specification or the effort is spent.
 
         Args:
@@ -188,7 +188,7 @@ class Searcher:
         return search.by_steps(self._climb(x0, plans, bank, tries, seed), steps)
 
     @torch.no_grad()
-    def at_once(self, x0: Tensor, plans: Tensor, *, tries: int) -> Repaired:
+    def at_once(self, x0: Tensor, plans: Tensor, *, tries: int) -> SearchResult:
         """`repair` without a bank on the caller's own thread, as many threads of the kernel as torch has."""
         bank = plans.new_zeros(0, *plans.shape[1:])
         if self.task.native is None:
@@ -200,23 +200,23 @@ class Searcher:
 
     def _climbing(
         self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int, threads: int, seed: int
-    ) -> Callable[[Stop], Repaired]:
+    ) -> Callable[[Stop], SearchResult]:
         """A native climb that is ready to go; it has its own copies and its own random numbers."""
         native = self.task.native
         assert native is not None
         x0, plans, bank = (part.to("cpu", copy=True) for part in (x0, plans, bank))
 
-        def climb(stop: Stop) -> Repaired:
+        def climb(stop: Stop) -> SearchResult:
             effort = Effort(-(-tries // LANES), self.enough, seed, threads, stop)
             best, _ = native.climb(x0, plans, bank, effort)
             rho = self.task.judge(x0, best, states=False).rho
-            return Repaired(x0, best, rho)
+            return SearchResult(x0, best, rho)
 
         return climb
 
     def _climb(self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int, seed: int) -> _TorchClimb:
         rho = self.task.judge(x0, plans, states=False).rho.clone()
-        found = Repaired(x0.clone(), plans.clone(), rho)
+        found = SearchResult(x0.clone(), plans.clone(), rho)
         generator = torch.Generator().manual_seed(seed)
         return _TorchClimb(self.task, found, bank.clone(), -(-tries // TRIES), self.enough, generator)
 
@@ -232,7 +232,7 @@ class _TorchClimb:
     def __init__(
         self,
         task: Task,
-        found: Repaired,
+        found: SearchResult,
         bank: Tensor,
         generations: int,
         enough: float,
@@ -256,7 +256,7 @@ class _TorchClimb:
             self._keep_better(part, self._proposals(self.found.plans[part], TRIES, self.bank))
         return self.left > 0
 
-    def finish(self, stop: Stop = never) -> Repaired:
+    def finish(self, stop: Stop = never) -> SearchResult:
         """What was found at the end."""
         while not stop() and self.generation(stop):
             pass

@@ -18,12 +18,12 @@ from stlc.controller.problem.natives import by_torch
 from stlc.controller.problem.symmetry import check_mirror
 from stlc.controller.training.budget import PROVISIONAL, Pace, StepSchedule, clock_of, verdict_reserve
 from stlc.controller.training.checkpoint import load_checkpoint, never_saved, restoring
-from stlc.controller.training.config import Engine, TrainConfig, decide
+from stlc.controller.training.config import ResolvedConfig, TrainConfig, resolve_config
 from stlc.controller.training.conflict import conflict, refuted
-from stlc.controller.training.divergence import Step, autopsy
-from stlc.controller.training.learner import Look, Trainer
-from stlc.controller.training.run import Run, load_engine, load_task, spec_hash, system_hash
-from stlc.controller.training.run_writer import Journal
+from stlc.controller.training.divergence import Step, diagnose
+from stlc.controller.training.learner import Trainer, Validation
+from stlc.controller.training.run import Run, load_config, load_task, spec_hash, system_hash
+from stlc.controller.training.run_writer import RunWriter
 from stlc.diagnostics import Diagnostic, MissingError, RunError, StlcError, UsageError
 from stlc.dynamics.model.memory import keep_freed_memory
 from stlc.native import never
@@ -126,12 +126,12 @@ def train(
     """
     begun = clock_of(config.clock)()
     keep_freed_memory()
-    engine = replace(decide(task, config), ranks=ranks.size)
+    engine = replace(resolve_config(task, config), ranks=ranks.size)
     declared = task.system.decl.train
     told = config.steps or (declared.steps if config.budget is None else None)
     budget = 0.0 if told is not None else config.budget or declared.budget or DEFAULT_BUDGET
     schedule = told if isinstance(told, StepSchedule) else StepSchedule.of(told or PROVISIONAL)
-    journal = Journal(folder, writes=ranks.first)
+    journal = RunWriter(folder, writes=ranks.first)
     journal.engine(engine)
     journal.note({"engine": asdict(engine), "schedule": str(schedule), "seconds_allowed": budget or None})
     task.system.initial.require_many()
@@ -168,7 +168,7 @@ def resume(
         UsageError: R104, the run was trained by another number of ranks.
     """
     keep_freed_memory()
-    engine: Engine = load_engine(folder)
+    engine: ResolvedConfig = load_config(folder)
     _require_as_many(engine.ranks, ranks.size)
     begun = clock_of(engine.clock)()
     task = load_task(folder)
@@ -204,7 +204,7 @@ def resume(
                 help=(f"stlc train --resume {folder.name} --budget 60s goes on",),
             )
         )
-    journal = Journal(folder, writes=ranks.first)
+    journal = RunWriter(folder, writes=ranks.first)
     journal.before(trainer.next_look)
     journal.note({"status": "running", "seconds_allowed": allowed or None})
     return _Session(journal, trainer, watch or Watch(), begun - before, schedule, allowed).finish()
@@ -250,7 +250,7 @@ class _Session:
 
     def __init__(
         self,
-        journal: Journal,
+        journal: RunWriter,
         trainer: Trainer,
         watch: Watch,
         begun: float,
@@ -456,7 +456,7 @@ class _Session:
         self.journal.checkpoint(self.trainer.tensors(), facts, step=self.trainer.step)
         self.pace.saved(self.now() - began)
 
-    def _row(self, look: Look) -> None:
+    def _row(self, look: Validation) -> None:
         trainer = self.trainer
         rest = max(1, trainer.steps - trainer.step)
         names = [rule.name for rule in trainer.task.rules]
@@ -487,7 +487,7 @@ class _Session:
         if good:
             self._save()
         self.journal.close("failed")
-        error = autopsy(step)
+        error = diagnose(step)
         kept = (
             "the run keeps the weights before that step" if good else "the last checkpoint of the run is kept"
         )

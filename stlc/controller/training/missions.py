@@ -19,7 +19,7 @@ from stlc.controller.problem.task import satisfied
 from stlc.native import never
 
 if TYPE_CHECKING:
-    from stlc.controller.policies.policy import Mlp
+    from stlc.controller.policies.policy import BestOfKPolicy
     from stlc.controller.problem.task import Judged, Task
     from stlc.native import Stop
 
@@ -136,7 +136,7 @@ def mission_steps(task: Task) -> int:
 
 
 @torch.no_grad()
-def visited(policy: Mlp, n: int, seed: int, enough: Stop = never) -> Tensor:
+def visited(policy: BestOfKPolicy, n: int, seed: int, enough: Stop = never) -> Tensor:
     """`n` states that missions pass through when the policy drives them, (n, dim) float64.
 
     Missions are driven no further once `enough` says so.

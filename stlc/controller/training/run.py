@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from stlc.compile.frontend.modules import file_of
-from stlc.controller.policies.policy import Mlp, network_of
+from stlc.controller.policies.policy import BestOfKPolicy, network_of
 from stlc.controller.problem.task import Task
 from stlc.controller.training.checkpoint import load_checkpoint, weights
-from stlc.controller.training.config import Engine, checked_engine
+from stlc.controller.training.config import ResolvedConfig, checked_config
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.dynamics.model.system import System
 from stlc.dynamics.scenarios.scenario import scenario_constants
@@ -46,7 +46,7 @@ class Run:
 
     dir: RunDir
     task: Task
-    policy: Mlp
+    policy: BestOfKPolicy
 
     @classmethod
     def open(
@@ -70,7 +70,7 @@ class Run:
         """
         folder = RunDir.open(where, root)
         task = load_task(folder, overrides, scenario)
-        engine = load_engine(folder)
+        engine = load_config(folder)
         saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=_trained_on(folder))
         network = network_of(task, engine)
         try:
@@ -81,7 +81,7 @@ class Run:
                     "R101", f"the checkpoint of `{folder.shown}` does not fit its network", note=(str(error),)
                 )
             ) from error
-        return cls(folder, task, Mlp(task, network.to(torch.device(device)).eval()))
+        return cls(folder, task, BestOfKPolicy(task, network.to(torch.device(device)).eval()))
 
 
 def load_task(
@@ -150,18 +150,18 @@ def read_library(folder: RunDir, below: str = LIB) -> dict[str, str]:
     return {key: read_source(folder.path / below / name).text for key, name in index.items()}
 
 
-def save_engine(folder: RunDir, engine: Engine) -> None:
+def save_config(folder: RunDir, engine: ResolvedConfig) -> None:
     """Write what the engine decided; JSON is YAML too."""
     write_atomic(folder.path / CONFIG, json.dumps(asdict(engine), indent=1) + "\n")
 
 
-def load_engine(folder: RunDir) -> Engine:
+def load_config(folder: RunDir) -> ResolvedConfig:
     """Read what the engine decided. Raises RunError R101 when that is damaged."""
     try:
         values: dict[str, Any] = json.loads((folder.path / CONFIG).read_text())
-        known = {field.name for field in fields(Engine)}
+        known = {field.name for field in fields(ResolvedConfig)}
         engine = {key: value for key, value in values.items() if key in known}
-        return checked_engine(Engine(**{**engine, "hidden": tuple(engine["hidden"])}))
+        return checked_config(ResolvedConfig(**{**engine, "hidden": tuple(engine["hidden"])}))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise RunError(
             Diagnostic("R101", f"`{folder.shown}/{CONFIG}` is missing or damaged: {error}")

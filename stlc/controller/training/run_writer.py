@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from stlc.controller.evaluation.held_out import Score, save_states
 from stlc.controller.training.checkpoint import save_checkpoint
-from stlc.controller.training.run import save_engine, spec_hash, system_hash
+from stlc.controller.training.run import save_config, spec_hash, system_hash
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.config import Engine
+    from stlc.controller.training.config import ResolvedConfig
     from stlc.rundir import RunDir, Status
 
 
 @dataclass(frozen=True, slots=True)
-class Journal:
+class RunWriter:
     """A run's folder while its training goes on.
 
     Attributes:
@@ -31,10 +31,10 @@ class Journal:
     folder: RunDir
     writes: bool = True
 
-    def engine(self, engine: Engine) -> None:
+    def engine(self, engine: ResolvedConfig) -> None:
         """Keep what the engine decided."""
         if self.writes:
-            save_engine(self.folder, engine)
+            save_config(self.folder, engine)
 
     def note(self, facts: Mapping[str, object]) -> None:
         """Enter facts into `run.json`."""

@@ -30,11 +30,11 @@ class Writer(Protocol):
         """Write all that is left."""
 
 
-Opener: TypeAlias = "Callable[[Path], Logbook]"
+Opener: TypeAlias = "Callable[[Path], TensorBoardLogger]"
 """The folder of a run -> its log."""
 
 
-class Logbook:
+class TensorBoardLogger:
     """Events of one run."""
 
     def __init__(self, writer: Writer) -> None:
@@ -79,4 +79,4 @@ def find_writer() -> Opener:
                 help=("pip install 'stlc[log]'",),
             )
         )
-    return lambda run: Logbook(import_module(module).SummaryWriter(str(run / FOLDER)))
+    return lambda run: TensorBoardLogger(import_module(module).SummaryWriter(str(run / FOLDER)))
