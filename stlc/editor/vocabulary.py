@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from stlc.compile.ir.functions import FUNCTIONS as TABLE
+
 TEMPORAL: Mapping[str, str] = MappingProxyType(
     {
         "always": "`always[a, b] p`: p holds at every sample from a to b ahead.",
@@ -40,28 +42,7 @@ TAGS: Mapping[str, str] = MappingProxyType(
 
 FUNCTIONS: Mapping[str, str] = MappingProxyType(
     {
-        "abs": "`abs(x)`: without its sign.",
-        "min": "`min(a, b, …)`: the least.",
-        "max": "`max(a, b, …)`: the greatest.",
-        "clip": "`clip(x, low, high)`: x, kept between low and high.",
-        "relu": "`relu(x)`: x where it is positive, else 0.",
-        "floor": "`floor(x)`: the next whole number below.",
-        "ceil": "`ceil(x)`: the next whole number above.",
-        "round": "`round(x)`: the nearest whole number.",
-        "sign": "`sign(x)`: -1, 0 or 1.",
-        "sqrt": "`sqrt(x)`: the square root; of a unit too.",
-        "exp": "`exp(x)` of a plain number.",
-        "log": "`log(x)`: the natural logarithm of a plain number.",
-        "sin": "`sin(x)` of an angle.",
-        "cos": "`cos(x)` of an angle.",
-        "tan": "`tan(x)` of an angle.",
-        "asin": "`asin(x)`: an angle.",
-        "acos": "`acos(x)`: an angle.",
-        "atan": "`atan(x)`: an angle.",
-        "atan2": "`atan2(y, x)`: the angle of the vector [x, y].",
-        "norm": "`norm(v)`: the Euclidean length.",
-        "norm1": "`norm1(v)`: the sum of the absolute values.",
-        "norminf": "`norminf(v)`: the greatest absolute value.",
+        **{function.name: function.doc for function in TABLE.values() if function.doc},
         "dot": "`dot(a, b)`: the scalar product.",
         "cross": "`cross(a, b)`: the vector product; a number in the plane.",
         "dist": "`dist(a, b)`: the Euclidean distance of two points.",

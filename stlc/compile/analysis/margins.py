@@ -12,11 +12,9 @@ from typing import assert_never
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.ir.traverse import nodes
 from stlc.units import Unit, same_dims
-
-_LINEAR = ("add", "sub", "neg", "abs", "min", "max", "relu", "norm", "norm1", "norminf")
-"""Functions that are scaled by scaling all their arguments."""
 
 
 def as_written(requirement: typed.Requirement) -> typed.Requirement:
@@ -60,7 +58,7 @@ def in_unit(num: ir.Num, unit: Unit) -> ir.Num:
             return ir.Const(_divided(value, unit))
         case ir.Op("mul", (inner, ir.Const(factor))) if factor == unit.scale:
             return inner
-        case ir.Op(name, args) if name in _LINEAR:
+        case ir.Op(name, args) if FUNCTIONS[name].linear:
             return replace(num, args=tuple(in_unit(arg, unit) for arg in args))
         case ir.Where():
             return replace(num, yes=in_unit(num.yes, unit), no=in_unit(num.no, unit))

@@ -21,8 +21,6 @@ from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.source import Span
 
-_FLATTENING = ("min", "max", "norm", "norm1", "norminf")
-
 
 def builtin(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
     """`name(values)` for a built-in function. Raises Failed; E101 where there is no such function."""
@@ -94,7 +92,7 @@ def _function(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) 
         else:
             items.append(as_number(value, arg.value, need, scope))
     function = FUNCTIONS[name]
-    if name in _FLATTENING and items:
+    if function.most is None and function.kind == "function" and items:
         flat = [n for item in items for n in (item.items if isinstance(item, Vector) else (item,))]
         return apply(name, flat, call.span, scope) if flat else Number(ir.Const(0.0), span=call.span)
     count_arguments(name, call, (function.least, function.most), scope)

@@ -10,9 +10,10 @@ from stlc.compile.frontend.declare import Declared, declare
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.modules import Module
 from stlc.compile.frontend.parameters import parameters
-from stlc.compile.frontend.scope import Bounds, Failed, Scope
+from stlc.compile.frontend.scope import Failed, Scope
 from stlc.compile.frontend.signals import ranged
 from stlc.compile.ir import typed
+from stlc.compile.ir.functions import Bounds
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
 from stlc.signature import Column, Signature

@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 
-from stlc.compile.analysis.ranges import Bounds, Facts, bounds
+from stlc.compile.analysis.ranges import Facts, bounds
 from stlc.compile.frontend.scope import Scope
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.functions import Bounds
 from stlc.compile.ir.samples import columns_of
 from stlc.compile.ir.traverse import nodes
 from stlc.diagnostics import Diagnostic

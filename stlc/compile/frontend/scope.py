@@ -12,7 +12,7 @@ from stlc.compile.frontend.interface import Grid
 from stlc.compile.frontend.meter import Cost, Meter
 from stlc.compile.frontend.values import Label, Number, Origin, Value, Vector
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.functions import callable_names, sampler_names
+from stlc.compile.ir.functions import Bounds, callable_names, sampler_names
 from stlc.diagnostics import Diagnostic, Findings, SpecError, StlcError, SystemFileError, tell
 from stlc.grammar import ast
 from stlc.registry import closest
@@ -99,7 +99,6 @@ class External:
 
 
 Entry: TypeAlias = Known | Definition | External
-Bounds: TypeAlias = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,21 +1,32 @@
-"""The function table: arity, unit rule, and the meaning on plain numbers that constant folding uses.
+"""The built-in functions: one entry each, with everything that any part of the compiler needs to know of it.
 
-The names are those of `stlc.compile.ir.nodes.Op`; `stlc.compile.backends.array.arith` evaluates them on
-arrays. `dot cross dist deg rad sdist ind` never become an `Op`: `stlc.compile.frontend.calls` rewrites them.
+An entry says how many arguments a function takes, which units they have, what it means on plain numbers, on
+arrays and in C, its derivative, and its range. A function that is added here is known to the resolver, the
+array back ends, the emitted C with its gradients, interval arithmetic and the editors.
+
+The names are those of `stlc.compile.ir.nodes.Op`. `dot cross dist deg rad sdist ind` never become an `Op`:
+the front end rewrites them.
 """
 
 from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import reduce
+from itertools import product
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Final, Literal, TypeAlias
 
-Rule = Literal["same", "mul", "div", "pow", "sqrt", "square", "plain", "ratio", "sign"]
-Kind = Literal["operator", "function", "sampler"]
+UnitRule: TypeAlias = Literal["same", "mul", "div", "pow", "sqrt", "square", "plain", "ratio", "sign"]
+Kind: TypeAlias = Literal["operator", "function", "sampler"]
+Bounds: TypeAlias = tuple[float, float]
+RangeRule: TypeAlias = Callable[[Sequence[Bounds]], Bounds]
+
+SHARED: Final = "shared"
+"""Derivative of `min`, `max` and `clip`: operands that are equal share it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,26 +40,48 @@ class Function:
         rule: units of arguments and result. `same`: all agree, the result too; `plain`: no dimensions;
             `ratio`: arguments agree, the result has no dimensions; `sign`: any argument, no dimensions.
         kind: operators are written with a sign; samplers are only for initial sets and events.
+        doc: one sentence for editors; "" for operators.
         fold: the value for numbers (`Fraction`s stay exact where `exact`); None for samplers.
+        array: writes the function on a tape of array operations, from the tape and the operands; None calls
+            the kernel of the same name of the array library.
+        numpy: name of that kernel in NumPy; "" where `NumpyOps` defines it itself.
+        torch: name of that kernel in torch; "" where `TorchOps` defines it itself.
+        c: C expressions of the arguments -> C expression of the result; extrema are taken pair by pair.
+        slopes: C expression of the result, then those of the arguments -> C expressions of the derivative by
+            each argument. `SHARED` for extrema.
+        of_each: two functions, of which the first is applied to every argument and the second joins them;
+            such an entry has no `c` and no `slopes` of its own.
+        bounds: the range of the result, whatever the arguments are, or the rule by which it follows from
+            their ranges; ValueError, OverflowError or ZeroDivisionError where it has none.
         exact: rational arguments give a rational result.
         whole: whole arguments give a whole result.
         integral: every argument gives a whole result.
+        linear: scaling all arguments by a positive factor scales the result.
         symbol: how an operator is written.
     """
 
     name: str
     least: int
     most: int | None
-    rule: Rule
+    rule: UnitRule
     kind: Kind = "function"
+    doc: str = ""
     fold: Callable[..., Any] | None = None
+    array: Callable[..., Any] | None = None
+    numpy: str = ""
+    torch: str = ""
+    c: Callable[..., str] | None = None
+    slopes: Callable[..., Sequence[str]] | Literal["shared"] | None = None
+    of_each: tuple[str, str] | None = None
+    bounds: RangeRule | Bounds | None = None
     exact: bool = False
     whole: bool = False
     integral: bool = False
+    linear: bool = False
     symbol: str = ""
 
 
-_INTEGRAL = ("floor", "ceil", "round", "sign")
+# ----------------------------------------------------------------------- meanings on numbers
 
 
 def _sign(x: Any) -> int:
@@ -68,65 +101,384 @@ def _pow(base: Any, exponent: Any) -> Any:
     return math.pow(base, exponent)
 
 
-def _build() -> Mapping[str, Function]:
-    table: dict[str, Function] = {}
+# ------------------------------------------------------------------------------------ ranges
 
-    def operators(*rows: tuple[str, str, int, Rule, Callable[..., Any], bool]) -> None:
-        for name, symbol, arity, rule, fold, whole in rows:
-            table[name] = Function(name, arity, arity, rule, "operator", fold, True, whole, symbol=symbol)
 
-    def functions(*rows: tuple[str, int, int | None, Rule, Callable[..., Any], bool, bool]) -> None:
-        for name, least, most, rule, fold, exact, whole in rows:
-            table[name] = Function(name, least, most, rule, "function", fold, exact, whole, name in _INTEGRAL)
+def _corners(fold: Callable[..., Any]) -> RangeRule:
+    """The range of a function that is monotone in each argument: the extremes lie at corners."""
 
-    operators(
-        ("add", "+", 2, "same", operator.add, True),
-        ("sub", "-", 2, "same", operator.sub, True),
-        ("mul", "*", 2, "mul", operator.mul, True),
-        ("div", "/", 2, "div", operator.truediv, False),
-        ("mod", "%", 2, "same", operator.mod, True),
-        ("pow", "^", 2, "pow", _pow, False),
-        ("neg", "-", 1, "same", operator.neg, True),
-        ("square", "^", 1, "square", lambda x: x * x, True),
+    def rule(args: Sequence[Bounds]) -> Bounds:
+        values = [float(fold(*corner)) for corner in product(*args)]
+        return (min(values), max(values))
+
+    return rule
+
+
+def _quotient(args: Sequence[Bounds]) -> Bounds:
+    low, high = args[1]
+    if low <= 0 <= high:
+        return (-math.inf, math.inf)
+    return _corners(operator.truediv)(args)
+
+
+def _even(args: Sequence[Bounds]) -> Bounds:
+    low, high = args[0]
+    top = max(abs(low), abs(high))
+    return (0.0 if low <= 0 <= high else min(abs(low), abs(high)), top)
+
+
+def _squared(args: Sequence[Bounds]) -> Bounds:
+    low, high = _even(args)
+    return (low * low, high * high)
+
+
+def _modulo(args: Sequence[Bounds]) -> Bounds:
+    low, high = args[1]
+    return (min(low, 0.0), max(high, 0.0))
+
+
+def _lengths(combine: Callable[[Sequence[float]], float]) -> RangeRule:
+    """The range of a norm, from the least and the greatest size of every component."""
+
+    def rule(args: Sequence[Bounds]) -> Bounds:
+        sides = [_even([arg]) for arg in args]
+        return (combine([side[0] for side in sides]), combine([side[1] for side in sides]))
+
+    return rule
+
+
+def _powers(args: Sequence[Bounds]) -> Bounds:
+    """Of positive numbers, whose powers are monotone in both arguments."""
+    if args[0][0] <= 0:
+        raise ValueError("not monotone")
+    return _corners(math.pow)(args)
+
+
+# --------------------------------------------------------------------------------- the table
+
+
+def _flat(_result: str, *args: str) -> list[str]:
+    """The derivative of a step function: 0 wherever there is one."""
+    return ["0.0"] * len(args)
+
+
+def _operator(name: str, symbol: str, arity: int, rule: UnitRule, **rest: Any) -> Function:
+    return Function(name, arity, arity, rule, "operator", exact=True, symbol=symbol, **rest)
+
+
+def _step(name: str, doc: str, fold: Callable[..., Any], kernel: str, c: str, rule: UnitRule) -> Function:
+    """A function whose values are whole numbers."""
+    return Function(
+        name,
+        1,
+        1,
+        rule,
+        doc=doc,
+        fold=fold,
+        numpy=kernel,
+        torch=name,
+        c=c.format,
+        slopes=_flat,
+        bounds=_corners(fold),
+        exact=True,
+        whole=True,
+        integral=True,
     )
-    functions(
-        ("abs", 1, 1, "same", abs, True, True),
-        ("min", 1, None, "same", lambda *xs: min(xs), True, True),
-        ("max", 1, None, "same", lambda *xs: max(xs), True, True),
-        ("clip", 3, 3, "same", lambda x, low, high: min(max(x, low), high), True, True),
-        ("relu", 1, 1, "same", lambda x: max(x, 0), True, True),
-        ("floor", 1, 1, "same", math.floor, True, True),
-        ("ceil", 1, 1, "same", math.ceil, True, True),
-        ("round", 1, 1, "same", round, True, True),
-        ("sign", 1, 1, "sign", _sign, True, True),
-        ("sqrt", 1, 1, "sqrt", math.sqrt, False, False),
-        ("exp", 1, 1, "plain", math.exp, False, False),
-        ("log", 1, 1, "plain", math.log, False, False),
-        ("sin", 1, 1, "plain", math.sin, False, False),
-        ("cos", 1, 1, "plain", math.cos, False, False),
-        ("tan", 1, 1, "plain", math.tan, False, False),
-        ("asin", 1, 1, "plain", math.asin, False, False),
-        ("acos", 1, 1, "plain", math.acos, False, False),
-        ("atan", 1, 1, "plain", math.atan, False, False),
-        ("atan2", 2, 2, "ratio", math.atan2, False, False),
-        ("norm", 1, None, "same", _norm, False, False),
-        ("norm1", 1, None, "same", lambda *xs: sum(abs(x) for x in xs), True, True),
-        ("norminf", 1, None, "same", lambda *xs: max(abs(x) for x in xs), True, True),
-    )
-    samplers: tuple[tuple[str, int, int | None, Rule, bool], ...] = (
-        ("uniform", 2, 2, "same", False),
-        ("normal", 2, 2, "same", False),
-        ("truncnorm", 4, 4, "same", False),
-        ("bernoulli", 1, 1, "plain", True),
-        ("choice", 1, None, "same", True),
-        ("randint", 2, 2, "same", True),
-    )
-    for name, least, most, rule, whole in samplers:
-        table[name] = Function(name, least, most, rule, "sampler", whole=whole)
-    return MappingProxyType(table)
 
 
-FUNCTIONS: Mapping[str, Function] = _build()
+def _smooth(name: str, doc: str, slope: str, bounds: Bounds | None, kernel: str = "") -> Function:
+    """A smooth function of a plain number; `slope` is its derivative in C, of `{0}` and the result `{r}`."""
+    fold = getattr(math, name)
+    return Function(
+        name,
+        1,
+        1,
+        "plain",
+        doc=doc,
+        fold=fold,
+        numpy=kernel or name,
+        torch=name,
+        c=f"{name}({{0}})".format,
+        slopes=lambda r, x: [slope.format(x, r=r)],
+        bounds=bounds or _corners(fold),
+    )
+
+
+def _sampler(
+    name: str, least: int, most: int | None, rule: UnitRule = "same", *, whole: bool = False
+) -> Function:
+    return Function(name, least, most, rule, "sampler", whole=whole)
+
+
+_OPERATORS = (
+    _operator(
+        "add",
+        "+",
+        2,
+        "same",
+        fold=operator.add,
+        array=lambda tape, *xs: tape.add(*xs),
+        c="({0} + {1})".format,
+        slopes=lambda _r, _a, _b: ["1.0", "1.0"],
+        bounds=_corners(operator.add),
+        whole=True,
+        linear=True,
+    ),
+    _operator(
+        "sub",
+        "-",
+        2,
+        "same",
+        fold=operator.sub,
+        array=lambda tape, *xs: tape.sub(*xs),
+        c="({0} - {1})".format,
+        slopes=lambda _r, _a, _b: ["1.0", "(-1.0)"],
+        bounds=_corners(operator.sub),
+        whole=True,
+        linear=True,
+    ),
+    _operator(
+        "mul",
+        "*",
+        2,
+        "mul",
+        fold=operator.mul,
+        array=lambda tape, *xs: tape.mul(*xs),
+        c="({0} * {1})".format,
+        slopes=lambda _r, a, b: [b, a],
+        bounds=_corners(operator.mul),
+        whole=True,
+    ),
+    _operator(
+        "div",
+        "/",
+        2,
+        "div",
+        fold=operator.truediv,
+        array=lambda tape, *xs: tape.div(*xs),
+        c="({0} / {1})".format,
+        slopes=lambda r, _a, b: [f"(1.0 / {b})", f"(-{r} / {b})"],
+        bounds=_quotient,
+    ),
+    _operator(
+        "mod",
+        "%",
+        2,
+        "same",
+        fold=operator.mod,
+        numpy="mod",
+        torch="remainder",
+        c="floored_mod({0}, {1})".format,
+        slopes=lambda _r, a, b: ["1.0", f"(-floor({a} / {b}))"],
+        bounds=_modulo,
+        whole=True,
+    ),
+    _operator(
+        "pow",
+        "^",
+        2,
+        "pow",
+        fold=_pow,
+        array=lambda tape, *xs: tape.pow(*xs),
+        c="pow({0}, {1})".format,
+        slopes=lambda r, a, b: [f"({b} * pow({a}, {b} - 1.0))", f"({a} > 0.0 ? {r} * log({a}) : 0.0)"],
+        bounds=_powers,
+    ),
+    _operator(
+        "neg",
+        "-",
+        1,
+        "same",
+        fold=operator.neg,
+        array=lambda tape, x: tape.neg(x),
+        c="(-{0})".format,
+        slopes=lambda _r, _x: ["(-1.0)"],
+        bounds=_corners(operator.neg),
+        whole=True,
+        linear=True,
+    ),
+    _operator(
+        "square",
+        "^",
+        1,
+        "square",
+        fold=lambda x: x * x,
+        numpy="square",
+        torch="square",
+        c="({0} * {0})".format,
+        slopes=lambda _r, x: [f"(2.0 * {x})"],
+        bounds=_squared,
+        whole=True,
+    ),
+)
+
+_FUNCTIONS = (
+    Function(
+        "abs",
+        1,
+        1,
+        "same",
+        doc="`abs(x)`: without its sign.",
+        fold=abs,
+        numpy="abs",
+        torch="abs",
+        c="fabs({0})".format,
+        slopes=lambda _r, x: [f"(double)(({x} > 0.0) - ({x} < 0.0))"],
+        bounds=_even,
+        exact=True,
+        whole=True,
+        linear=True,
+    ),
+    Function(
+        "min",
+        1,
+        None,
+        "same",
+        doc="`min(a, b, …)`: the least.",
+        fold=lambda *xs: min(xs),
+        array=lambda tape, *xs: reduce(tape.least, xs),
+        c="LEAST({0}, {1})".format,
+        slopes=SHARED,
+        bounds=_corners(lambda *xs: min(xs)),
+        exact=True,
+        whole=True,
+        linear=True,
+    ),
+    Function(
+        "max",
+        1,
+        None,
+        "same",
+        doc="`max(a, b, …)`: the greatest.",
+        fold=lambda *xs: max(xs),
+        array=lambda tape, *xs: reduce(tape.greatest, xs),
+        c="MOST({0}, {1})".format,
+        slopes=SHARED,
+        bounds=_corners(lambda *xs: max(xs)),
+        exact=True,
+        whole=True,
+        linear=True,
+    ),
+    Function(
+        "clip",
+        3,
+        3,
+        "same",
+        doc="`clip(x, low, high)`: x, kept between low and high.",
+        fold=lambda x, low, high: min(max(x, low), high),
+        array=lambda tape, x, low, high: tape.least(tape.greatest(x, low), high),
+        c="LEAST(MOST({0}, {1}), {2})".format,
+        slopes=SHARED,
+        bounds=_corners(lambda x, low, high: min(max(x, low), high)),
+        exact=True,
+        whole=True,
+    ),
+    Function(
+        "relu",
+        1,
+        1,
+        "same",
+        doc="`relu(x)`: x where it is positive, else 0.",
+        fold=lambda x: max(x, 0),
+        array=lambda tape, x: tape.greatest(x, 0.0),
+        c="MAX({0}, 0.0)".format,
+        slopes=lambda _r, x: [f"(double)({x} >= 0.0)"],
+        bounds=_corners(lambda x: max(x, 0)),
+        exact=True,
+        whole=True,
+        linear=True,
+    ),
+    _step("floor", "`floor(x)`: the next whole number below.", math.floor, "floor", "floor({0})", "same"),
+    _step("ceil", "`ceil(x)`: the next whole number above.", math.ceil, "ceil", "ceil({0})", "same"),
+    _step("round", "`round(x)`: the nearest whole number.", round, "rint", "rint({0})", "same"),
+    _step("sign", "`sign(x)`: -1, 0 or 1.", _sign, "sign", "(double)(({0} > 0.0) - ({0} < 0.0))", "sign"),
+    Function(
+        "sqrt",
+        1,
+        1,
+        "sqrt",
+        doc="`sqrt(x)`: the square root; of a unit too.",
+        fold=math.sqrt,
+        numpy="sqrt",
+        c="sqrt({0})".format,
+        slopes=lambda r, _x: [f"({r} > 0.0 ? 0.5 / {r} : 0.0)"],
+        bounds=_corners(math.sqrt),
+    ),
+    _smooth("exp", "`exp(x)` of a plain number.", "{r}", None),
+    _smooth("log", "`log(x)`: the natural logarithm of a plain number.", "(1.0 / {0})", None),
+    _smooth("sin", "`sin(x)` of an angle.", "cos({0})", (-1.0, 1.0)),
+    _smooth("cos", "`cos(x)` of an angle.", "(-sin({0}))", (-1.0, 1.0)),
+    _smooth("tan", "`tan(x)` of an angle.", "(1.0 + {r} * {r})", (-math.inf, math.inf)),
+    _smooth("asin", "`asin(x)`: an angle.", "(1.0 / sqrt(1.0 - {0} * {0}))", None, "arcsin"),
+    _smooth("acos", "`acos(x)`: an angle.", "(-1.0 / sqrt(1.0 - {0} * {0}))", None, "arccos"),
+    _smooth("atan", "`atan(x)`: an angle.", "(1.0 / (1.0 + {0} * {0}))", None, "arctan"),
+    Function(
+        "atan2",
+        2,
+        2,
+        "ratio",
+        doc="`atan2(y, x)`: the angle of the vector [x, y].",
+        fold=math.atan2,
+        numpy="arctan2",
+        c="atan2({0}, {1})".format,
+        slopes=lambda _r, y, x: [f"({x} / ({y} * {y} + {x} * {x}))", f"(-{y} / ({y} * {y} + {x} * {x}))"],
+        bounds=(-math.pi, math.pi),
+    ),
+    Function(
+        "norm",
+        1,
+        None,
+        "same",
+        doc="`norm(v)`: the Euclidean length.",
+        fold=_norm,
+        array=lambda tape, *xs: tape.norm(*xs),
+        c=lambda *xs: "sqrt(" + " + ".join(f"{x} * {x}" for x in xs) + ")",
+        slopes=lambda r, *xs: [f"({r} > 0.0 ? {x} / {r} : 0.0)" for x in xs],
+        bounds=_lengths(lambda sides: math.hypot(*sides)),
+        linear=True,
+    ),
+    Function(
+        "norm1",
+        1,
+        None,
+        "same",
+        doc="`norm1(v)`: the sum of the absolute values.",
+        fold=lambda *xs: sum(abs(x) for x in xs),
+        array=lambda tape, *xs: reduce(tape.add, [tape.call("abs", x) for x in xs]),
+        of_each=("abs", "add"),
+        bounds=_lengths(math.fsum),
+        exact=True,
+        whole=True,
+        linear=True,
+    ),
+    Function(
+        "norminf",
+        1,
+        None,
+        "same",
+        doc="`norminf(v)`: the greatest absolute value.",
+        fold=lambda *xs: max(abs(x) for x in xs),
+        array=lambda tape, *xs: reduce(tape.greatest, [tape.call("abs", x) for x in xs]),
+        of_each=("abs", "max"),
+        bounds=_lengths(max),
+        exact=True,
+        whole=True,
+        linear=True,
+    ),
+)
+
+_SAMPLERS = (
+    _sampler("uniform", 2, 2),
+    _sampler("normal", 2, 2),
+    _sampler("truncnorm", 4, 4),
+    _sampler("bernoulli", 1, 1, "plain", whole=True),
+    _sampler("choice", 1, None, whole=True),
+    _sampler("randint", 2, 2, whole=True),
+)
+
+FUNCTIONS: Mapping[str, Function] = MappingProxyType(
+    {function.name: function for function in (*_OPERATORS, *_FUNCTIONS, *_SAMPLERS)}
+)
 """Every `ir.Op` by name."""
 
 REWRITTEN: Mapping[str, tuple[int, int | None]] = MappingProxyType(

@@ -26,7 +26,7 @@ from stlc.native import never
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from stlc.compile.analysis.ranges import Bounds
+    from stlc.compile.ir.functions import Bounds
     from stlc.compile.pipeline import CompiledRequirement
     from stlc.native import Stop
 

@@ -15,6 +15,7 @@ from typing import Any, TypeAlias, assert_never
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.array.tape import Instr, Operand, Tape
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.ir.samples import key_of, leaves
 from stlc.compile.semantics.switch import Hard, Switch
 
@@ -222,27 +223,11 @@ class _Writer:
         return inner.number(body.outputs[output])
 
     def _op(self, name: str, args: list[Operand]) -> Operand:
-        tape = self.tape
-        match name:
-            case "add" | "sub" | "mul" | "div" | "pow" | "neg":
-                method: Callable[..., Operand] = getattr(tape, name)
-                return method(*args)
-            case "min":
-                return reduce(tape.least, args)
-            case "max":
-                return reduce(tape.greatest, args)
-            case "relu":
-                return tape.greatest(args[0], 0.0)
-            case "clip":
-                return tape.least(tape.greatest(args[0], args[1]), args[2])
-            case "norm":
-                return tape.norm(*args)
-            case "norm1":
-                return reduce(tape.add, [tape.call("abs", arg) for arg in args])
-            case "norminf":
-                return reduce(tape.greatest, [tape.call("abs", arg) for arg in args])
-            case _:
-                return tape.call(name, *args)
+        function = FUNCTIONS[name]
+        if function.array is None:
+            return self.tape.call(name, *args)
+        written: Operand = function.array(self.tape, *args)
+        return written
 
     # ------------------------------------------------------------- conditions
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from stlc.compile.backends.array import sliding
 from stlc.compile.backends.array.extremum import Pick, Sliding
 from stlc.compile.backends.array.namespace import Array, Mask, Ops
+from stlc.compile.ir.functions import FUNCTIONS
 
 _WIDE = 8
 """From so many columns on sliding windows beat putting pairs together,"""
@@ -32,28 +33,11 @@ class NumpyOps:
     sub = staticmethod(operator.sub)
     mul = staticmethod(operator.mul)
     div = staticmethod(np.true_divide)
-    abs = staticmethod(np.abs)
-    exp = staticmethod(np.exp)
     expm1 = staticmethod(np.expm1)
-    log = staticmethod(np.log)
     log1p = staticmethod(np.log1p)
-    sin = staticmethod(np.sin)
-    cos = staticmethod(np.cos)
-    tan = staticmethod(np.tan)
-    asin = staticmethod(np.arcsin)
-    acos = staticmethod(np.arccos)
-    atan = staticmethod(np.arctan)
-    sign = staticmethod(np.sign)
-    floor = staticmethod(np.floor)
-    ceil = staticmethod(np.ceil)
-    round = staticmethod(np.rint)
-    square = staticmethod(np.square)
     minimum = staticmethod(np.minimum)
     maximum = staticmethod(np.maximum)
-    sqrt = staticmethod(np.sqrt)
     pow = staticmethod(np.power)
-    mod = staticmethod(np.mod)
-    atan2 = staticmethod(np.arctan2)
     gt = staticmethod(operator.gt)
     ge = staticmethod(operator.ge)
     both = staticmethod(operator.and_)
@@ -209,5 +193,9 @@ def _doubling(x: Array, pair: np.ufunc, window: Sliding) -> Array:
     x = pair(x[:-rest], x[rest:]) if rest else x
     return x[: window.count]
 
+
+for _function in FUNCTIONS.values():
+    if _function.numpy:
+        setattr(NumpyOps, _function.name, staticmethod(getattr(np, _function.numpy)))
 
 NUMPY: Ops = cast("Ops", NumpyOps())

@@ -12,38 +12,8 @@ from functools import reduce
 from typing import TypeAlias, assert_never
 
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.functions import FUNCTIONS, SHARED
 
-UNARY = {
-    "neg": "(-{0})",
-    "abs": "fabs({0})",
-    "square": "({0} * {0})",
-    "relu": "MAX({0}, 0.0)",
-    "sign": "(double)(({0} > 0.0) - ({0} < 0.0))",
-    "floor": "floor({0})",
-    "ceil": "ceil({0})",
-    "round": "rint({0})",
-    "sqrt": "sqrt({0})",
-    "exp": "exp({0})",
-    "log": "log({0})",
-    "sin": "sin({0})",
-    "cos": "cos({0})",
-    "tan": "tan({0})",
-    "asin": "asin({0})",
-    "acos": "acos({0})",
-    "atan": "atan({0})",
-}
-BINARY = {
-    "add": "({0} + {1})",
-    "sub": "({0} - {1})",
-    "mul": "({0} * {1})",
-    "div": "({0} / {1})",
-    "mod": "floored_mod({0}, {1})",
-    "pow": "pow({0}, {1})",
-    "atan2": "atan2({0}, {1})",
-    "min": "LEAST({0}, {1})",
-    "max": "MOST({0}, {1})",
-}
-CLIP = "LEAST(MOST({0}, {1}), {2})"
 LISTED = "\0"
 """How names of frozen values and columns begin that are entries of a table; their C names follow."""
 
@@ -146,24 +116,20 @@ class NumberWriter:
         return inner
 
     def _op(self, name: str, args: list[str]) -> str:
-        if name in ("min", "max") and len(args) == 1:
-            return args[0]
-        if name in BINARY:
+        function = FUNCTIONS[name]
+        if function.of_each is not None:
+            name, args = function.of_each[1], [self._apply(function.of_each[0], [arg]) for arg in args]
             return reduce(lambda a, b: self._apply(name, [a, b]), args)
-        if name in ("norm1", "norminf"):
-            sizes = [self._apply("abs", [arg]) for arg in args]
-            pick = "add" if name == "norm1" else "max"
-            return reduce(lambda a, b: self._apply(pick, [a, b]), sizes)
+        if function.most is None and function.slopes == SHARED:
+            return reduce(lambda a, b: self._apply(name, [a, b]), args)
         return self._apply(name, args)
 
     def _apply(self, name: str, args: list[str]) -> str:
-        """One function of the tables, or `clip` or `norm`, in a register."""
-        if name == "norm":
-            return self._register("sqrt(" + " + ".join(f"{arg} * {arg}" for arg in args) + ")")
-        form = CLIP if name == "clip" else UNARY.get(name) or BINARY.get(name)
+        """One function of the table, in a register; of an extremum, two arguments."""
+        form = FUNCTIONS[name].c
         if form is None:
             raise Untranslatable(name)
-        return self._register(form.format(*args))
+        return self._register(form(*args))
 
     def _register(self, text: str) -> str:
         known = self._texts.get(text)

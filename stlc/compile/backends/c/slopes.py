@@ -11,35 +11,13 @@ from functools import reduce
 
 from stlc.compile.backends.c.numbers import Leaf, NumberWriter
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.functions import FUNCTIONS
 
 Slope = tuple[str, str]
 """A register, and the derivative by it."""
 
-UNARY_SLOPES = {
-    "neg": "(-1.0)",
-    "abs": "(double)(({0} > 0.0) - ({0} < 0.0))",
-    "square": "(2.0 * {0})",
-    "relu": "(double)({0} >= 0.0)",
-    "sqrt": "({r} > 0.0 ? 0.5 / {r} : 0.0)",
-    "exp": "{r}",
-    "log": "(1.0 / {0})",
-    "sin": "cos({0})",
-    "cos": "(-sin({0}))",
-    "tan": "(1.0 + {r} * {r})",
-    "asin": "(1.0 / sqrt(1.0 - {0} * {0}))",
-    "acos": "(-1.0 / sqrt(1.0 - {0} * {0}))",
-    "atan": "(1.0 / (1.0 + {0} * {0}))",
-}
-"""What is not here is flat: `sign floor ceil round`."""
-BINARY_SLOPES = {
-    "add": ("1.0", "1.0"),
-    "sub": ("1.0", "(-1.0)"),
-    "mul": ("{1}", "{0}"),
-    "div": ("(1.0 / {1})", "(-{r} / {1})"),
-    "mod": ("1.0", "(-floor({0} / {1}))"),
-    "pow": ("({1} * pow({0}, {1} - 1.0))", "({0} > 0.0 ? {r} * log({0}) : 0.0)"),
-    "atan2": ("({1} / ({0} * {0} + {1} * {1}))", "(-{0} / ({0} * {0} + {1} * {1}))"),
-}
+FLAT = "0.0"
+"""The derivative of a step function."""
 LESS = {"min": "<", "max": ">"}
 """Of which operand an extremum is."""
 
@@ -118,17 +96,13 @@ class SlopeWriter(NumberWriter):
         register = super()._apply(name, args)
         if not any(map(self._varies, args)):
             self._constants.add(register)
-        if name == "norm":
-            slopes = [(arg, f"({register} > 0.0 ? {arg} / {register} : 0.0)") for arg in args]
-        elif name in LESS:
-            slopes = list(zip(args, self._shares(name, args[0], args[1]), strict=True))
-        elif name == "clip":
+        derivative = FUNCTIONS[name].slopes
+        if name == "clip":
             slopes = self._clipped(*args)
-        elif name in BINARY_SLOPES:
-            forms = BINARY_SLOPES[name]
-            slopes = [(arg, form.format(*args, r=register)) for arg, form in zip(args, forms, strict=True)]
+        elif callable(derivative):
+            slopes = [each for each in zip(args, derivative(register, *args), strict=True) if each[1] != FLAT]
         else:
-            slopes = [(args[0], UNARY_SLOPES[name].format(*args, r=register))] if name in UNARY_SLOPES else []
+            slopes = list(zip(args, self._shares(name, args[0], args[1]), strict=True))
         self._remember(register, slopes)
         return register
 

@@ -22,6 +22,7 @@ from stlc.compile.backends.torch.choice import choice, reduction
 from stlc.compile.backends.torch.kernel import by_kernel
 from stlc.compile.backends.torch.small import block_extrema, is_small, small_extrema, small_until
 from stlc.compile.backends.torch.windows import SlidingExtremum, SlidingUntil
+from stlc.compile.ir.functions import FUNCTIONS
 
 _LARGE, _LARGE_FEW, _LARGE_BLOCK, _LARGE_UNTIL = 1 << 13, 1 << 17, 1 << 16, 1 << 12
 """From so many numbers on, on a processor, scans in place beat what torch's own operations can do: for
@@ -139,24 +140,9 @@ class TorchOps:
     mul = staticmethod(operator.mul)
     div = staticmethod(operator.truediv)
     pow = staticmethod(operator.pow)
-    abs = staticmethod(torch.abs)
-    exp = staticmethod(torch.exp)
     expm1 = staticmethod(torch.expm1)
-    log = staticmethod(torch.log)
     log1p = staticmethod(torch.log1p)
-    sin = staticmethod(torch.sin)
-    cos = staticmethod(torch.cos)
-    tan = staticmethod(torch.tan)
-    asin = staticmethod(torch.asin)
-    acos = staticmethod(torch.acos)
-    atan = staticmethod(torch.atan)
     sigmoid = staticmethod(torch.sigmoid)
-    sign = staticmethod(torch.sign)
-    floor = staticmethod(torch.floor)
-    ceil = staticmethod(torch.ceil)
-    round = staticmethod(torch.round)
-    square = staticmethod(torch.square)
-    mod = staticmethod(torch.remainder)
     minimum = staticmethod(torch.minimum)
     maximum = staticmethod(torch.maximum)
     gt = staticmethod(operator.gt)
@@ -343,5 +329,9 @@ class TorchOps:
         """Torch does not warn."""
         return nullcontext()
 
+
+for _function in FUNCTIONS.values():
+    if _function.torch:
+        setattr(TorchOps, _function.name, staticmethod(getattr(torch, _function.torch)))
 
 TORCH: Ops = cast("Ops", TorchOps())
