@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.safe_prefix import prefix_robustness
-from stlc.controller.guard.shooting import best, finite, grid_of
+from stlc.controller.guard.shooting import best, eligible, finite, grid_of
 from stlc.export.programs import Deciding, judged_openly, unmoved
 from stlc.runtime.prefixes import Grid
 
@@ -60,7 +60,7 @@ class Guarding(nn.Module):
         self._prefixes = [torch.from_numpy(self.grid.prefixes(length)) for length in self.grid.lengths]
 
     def forward(self, x: Tensor, plan: Tensor) -> tuple[Tensor, ...]:
-        """Choose as `stlc.controller.guard.shooting.Backup.search` does."""
+        """Choose as `stlc.controller.guard.shooting.Backup.search` does where no plan was followed before."""
         own = finite(plan, self._task)
         nobody = torch.zeros_like(x[:, 0])
         if not self._prefixes:
@@ -70,10 +70,9 @@ class Guarding(nn.Module):
         for length, prefixes in zip(self.grid.lengths, self._prefixes, strict=True):
             last = length == self.grid.lengths[-1]
             tried = self._tried(x, own, prefixes, falls=last)
-            good = tried.rho >= -TOLERANCE
-            eligible = torch.where(good.any(1, keepdim=True), good, tried.safe >= -TOLERANCE)
-            done = eligible.any(1)
-            pick = best(eligible, (tried.rho, -tried.cost))
+            allowed = eligible(tried.rho, tried.safe >= -TOLERANCE, guarded=bool(self._formulas))
+            done = allowed.any(1)
+            pick = best(allowed, (tried.rho, -tried.cost))
             if tried.falls is not None:
                 pick = torch.where(done, pick, _safest(tried, tried.falls))
             here = (*_picked(tried, pick), torch.where(done, 1, 2), torch.full_like(pick, length))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.runtime.facts import Quantity
+from stlc.runtime.facts import FALL, Quantity
 from stlc.runtime.graphs import Graphs, Judged, Numbers, joined
 
 POLICY, BACKUP, SAFEST = range(3)
@@ -25,27 +25,33 @@ class Found:
     t0: int
 
 
-def search(graphs: Graphs, x: Numbers, plan: Numbers) -> Found:
+def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = None) -> Found:
     """A better plan for a state whose own one was found wanting.
 
     T0 grows until a plan satisfies phi, or else phi_safe; where none does the longest safe prefix decides.
+    Where no plan satisfies phi and the policy's own beginning is safe, it stays.
 
     Args:
         graphs: of the controller.
         x: (n,).
         plan: (T, m), what the policy would do; entries that are not finite are replaced.
+        rest: (T, m), what is left of the plan that was followed until now.
 
     Returns:
         The plan, in one row.
     """
     own, grid = finite(plan, graphs.facts.controls), graphs.facts.grid
+    begun = [] if rest is None else [graphs.judged(x[None], finite(rest, graphs.facts.controls)[None])[0]]
+    guarded = FALL in graphs.facts.graphs
     candidates = None
     for length in grid.lengths:
-        candidates = _candidates(graphs, x, own, length)
-        good = candidates.rho >= -TOLERANCE
-        eligible = good if good.any() else candidates.safe >= -TOLERANCE
-        if eligible.any():
-            pick = best(eligible, (candidates.rho, -candidates.cost))
+        candidates = joined([_candidates(graphs, x, own, length), *begun])
+        good, safe = candidates.rho >= -TOLERANCE, candidates.safe >= -TOLERANCE
+        allowed = good if good.any() else safe
+        if guarded and safe[0] and not good.any():
+            allowed = np.arange(len(safe)) == 0
+        if allowed.any():
+            pick = best(allowed, (candidates.rho, -candidates.cost))
             return Found(candidates.of([pick]), BACKUP, length)
     if candidates is None:
         nothing = np.full(1, -np.inf)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.diagnostics import Diagnostic, RunError, UsageError
-from stlc.runtime.backup import POLICY, search
+from stlc.runtime.backup import POLICY, Found, search
 from stlc.runtime.facts import Facts, read_facts
 from stlc.runtime.graphs import Graphs, Judged, Numbers
 
@@ -56,6 +56,12 @@ class _Followed:
     source: NDArray[np.int64]
     t0: NDArray[np.int64]
     kept: NDArray[np.bool_]
+
+    def put(self, row: int, found: Found) -> None:
+        """The backup's plan for one agent in place of its own."""
+        for name in ("plan", "rho", "safe", "cost", "each"):
+            getattr(self.judged, name)[row] = getattr(found.judged, name)[0]
+        self.source[row], self.t0[row], self.kept[row] = found.source, found.t0, False
 
 
 class Controller:
@@ -144,12 +150,16 @@ class Controller:
         x, single = self._read(state, elapsed)
         if self._begun is not None and len(self._begun.source) != len(x):
             raise _misfit(f"{len(x)} agents where {len(self._begun.source)} were", "`reset` begins anew")
+        before = self._begun
         followed, said = self._followed(x, elapsed)
         fresh = said.get("policy_plan", said["plan"])
         policy_rho = said.get("policy_rho", said["rho"]).copy()
         if self.guard == "paper":
+            rest = None if before is None else _later(before.judged.plan, elapsed)
             for row in np.flatnonzero(~(followed.judged.rho >= -TOLERANCE)):
-                self._search(followed, x[row], fresh[row], int(row))
+                left = None if rest is None else rest[row]
+                found = search(self._graphs, x[row], fresh[row], left)
+                followed.put(int(row), found)
         if not np.isfinite(followed.judged.plan[:, 0]).all():
             raise RunError(Diagnostic("R402", "the policy's plan is not a number"))
         self._begun = followed
@@ -224,13 +234,6 @@ class Controller:
         kept = said["kept"].astype(bool)
         source, t0 = np.where(kept, before.source, POLICY), np.where(kept, before.t0, 0)
         return _Followed(judged, source, t0, kept), said
-
-    def _search(self, followed: _Followed, x: Numbers, plan: Numbers, row: int) -> None:
-        """Ask the backup policy for one agent."""
-        found = search(self._graphs, x, plan)
-        for name in ("plan", "rho", "safe", "cost", "each"):
-            getattr(followed.judged, name)[row] = getattr(found.judged, name)[0]
-        followed.source[row], followed.t0[row], followed.kept[row] = found.source, found.t0, False
 
     def _decision(
         self, followed: _Followed, control: Numbers, policy_rho: Numbers, *, single: bool

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import product
 
 import pytest
@@ -44,13 +45,15 @@ def failing(task: Task, action: float, n: int = 400, seed: int = 0) -> tuple[Ten
 
 
 def slow_choice(task: Task, x: Tensor, action: float, g: Grid) -> tuple[int, float, bool]:
-    """Paper, word for word, for one state: (T0, rho, whether phi or phi_safe was met)."""
+    """Choice for one state, plan by plan: (T0, rho, whether phi or phi_safe was met)."""
     for length in g.lengths:
         heads = [(action,) * length, *product(g.values[0], repeat=length)]
         plans = torch.tensor([[*head, *[action] * (task.horizon - length)] for head in heads], dtype=F64)
         judged = task.judge(x.expand(len(heads), -1), plans[..., None])
         good = [float(r) for r in judged.rho if r >= -1e-6]
         safe = [float(r) for r, s in zip(judged.rho, judged.safe, strict=True) if s >= -1e-6]
+        if not good and judged.safe[0] >= -1e-6:
+            return length, float(judged.rho[0]), True
         if good or safe:
             return length, max(good or safe), True
     return g.lengths[-1], float("nan"), False
@@ -109,16 +112,46 @@ def test_a_decision_without_time_takes_the_best_of_what_it_has(car_task: Task) -
     assert torch.equal(calm.plan, whole.plan)
 
 
+QUEUE = {"x": -6.0, "v": 0.0, "sign": 0.0, "tau": 0.0, "dx": 4.0, "v_lead": 0.0, "yielding": 1.0}
+"""Behind a car that stands at a stop sign: no plan meets the deadline, so robustness is flat."""
+
+
+def at(task: Task, state: Mapping[str, float]) -> torch.Tensor:
+    return torch.tensor([[state[name] for name in task.names]], dtype=F64)
+
+
+@pytest.mark.parametrize("action", [-10.0, 0.0])
+def test_a_safe_beginning_of_the_policy_stays_where_nothing_satisfies(car_task: Task, action: float) -> None:
+    """Others are no better for the specification; the guard has nothing to gain."""
+    x = at(car_task, QUEUE)
+    plan = torch.full((1, car_task.horizon, 1), action, dtype=F64)
+    found = Backup(car_task, Constant(car_task, action), grid=grid()).search(x, plan)
+    assert bool(found.safe[0])
+    assert float(found.rho[0]) < 0
+    assert float(found.plan[0, 0, 0]) == action
+
+
 def test_flat_robustness_does_not_make_a_car_brake_for_ever(car_task: Task) -> None:
-    """In a queue before a stop sign the deadline cannot be met; the car moves up all the same."""
-    names = car_task.names
-    state = {"x": -6.0, "v": 0.0, "sign": 0.0, "tau": 0.0, "dx": 4.0, "v_lead": 0.0, "yielding": 1.0}
-    x = torch.tensor([[state[name] for name in names]], dtype=F64)
-    plan = torch.full((1, car_task.horizon, 1), -10.0, dtype=F64)
+    """The policy's own plan runs into the leader; of the safe ones the one that moves up is taken."""
+    x = at(car_task, QUEUE)
+    plan = torch.full((1, car_task.horizon, 1), 10.0, dtype=F64)
     found = Backup(car_task, Constant(car_task, -10.0), grid=grid()).search(x, plan)
     assert bool(found.safe[0])
     assert float(found.rho[0]) < 0
     assert float(found.plan[0, 0, 0]) > 0
+
+
+def test_a_safe_plan_that_was_begun_is_not_lost(car_task: Task) -> None:
+    """Fast behind a car at rest: only braking at once and for long is safe, longer than prefixes are."""
+    state = {"x": -6.0, "v": 7.0, "sign": 0.0, "tau": 0.0, "dx": 3.9, "v_lead": 0.0, "yielding": 1.0}
+    x = at(car_task, state)
+    fast = torch.full((1, car_task.horizon, 1), 10.0, dtype=F64)
+    brake = torch.full((1, car_task.horizon, 1), -10.0, dtype=F64)
+    backup = Backup(car_task, Constant(car_task, 10.0), grid=grid())
+    assert not bool(backup.search(x, fast).safe[0])
+    found = backup.search(x, fast, brake)
+    assert bool(found.safe[0])
+    assert torch.equal(found.plan, brake)
 
 
 def test_an_unavoidable_collision_is_met_braking(car_task: Task) -> None:

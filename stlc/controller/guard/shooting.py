@@ -3,7 +3,9 @@
 For T0 = 1, 2, … every sequence of T0 actions on a grid of L values a control, M = L^(m T0), or a sample of
 them where they are too many, is followed from the state at hand, and the policy plans on from where it ends.
 The first T0 with a plan that satisfies phi, or else phi_safe, decides; where none has, the plan with the
-longest safe prefix at the last T0.
+longest safe prefix at the last T0. Two things go beyond the paper (decision 37): where no plan satisfies phi
+and the policy's own beginning is safe, it stays; and what is left of the plan followed before is one more
+choice, so that a safe plan is not lost because its first action was taken.
 """
 
 from __future__ import annotations
@@ -76,6 +78,12 @@ class Candidates:
     safe: Tensor
     cost: Tensor
 
+    def with_one_more(self, plans: tuple[Tensor, Tensor, Tensor, Tensor]) -> Candidates:
+        """These, and behind them one more choice an agent: plan, robustness, whether it is safe, cost."""
+        mine = (self.plans, self.rho, self.safe, self.cost)
+        pairs = zip(mine, plans, strict=True)
+        return Candidates(*(torch.cat((old, new[:, None]), 1) for old, new in pairs))
+
 
 class Clock:
     """When the time of a decision for some agents is over; never without a limit."""
@@ -107,7 +115,7 @@ class Backup:
         self._formulas = [rule.formula for rule in task.compiled.safety]
 
     @torch.no_grad()
-    def search(self, x: Tensor, plan: Tensor, _rest: Tensor | None = None) -> Found:
+    def search(self, x: Tensor, plan: Tensor, rest: Tensor | None = None) -> Found:
         """Better plans for states whose own plan was found wanting.
 
         Among plans of the same rank robustness decides, then the performance terms of the objective, because
@@ -116,12 +124,14 @@ class Backup:
         Args:
             x: (agents, n) float64.
             plan: (agents, T, m), what the policy would do; entries that are not finite are replaced.
+            rest: (agents, T, m), what is left of the plans that were followed until now.
 
         Returns:
             One plan an agent; `found.source` says by which rank.
         """
         clock = Clock(self.seconds, len(x))
         plan = finite(plan.to(x.dtype), self.task)
+        rest = None if rest is None else finite(rest.to(x.dtype), self.task)
         found = nothing(plan)
         todo = torch.arange(len(x), device=x.device)
         for length in self.grid.lengths:
@@ -130,6 +140,8 @@ class Backup:
             for group in _pieces(todo, max(self.grid.batch // (len(prefixes) + 1), 1)):
                 tried = prefixes[:0] if clock.over else prefixes
                 candidates = self.candidates(x[group], plan[group], tried, clock)
+                if rest is not None:
+                    candidates = candidates.with_one_more(self._judged(x[group], rest[group]))
                 done = self._enter(found, candidates, group, length)
                 last = clock.over or length == self.grid.lengths[-1]
                 if last and not bool(done.all()):
@@ -161,6 +173,10 @@ class Backup:
         reached = self.task.rollout(x, head)[:, -1]
         tail = finite(self.policy.plan(reached).to(x.dtype), self.task)
         plans = torch.cat((head, tail[:, : self.task.horizon - head.shape[1]]), 1)
+        return self._judged(x, plans)
+
+    def _judged(self, x: Tensor, plans: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Plans (B, T, m), their robustness, whether they are safe, and their cost."""
         judged = self.task.judge(x, plans)
         return plans, judged.rho, judged.safe >= -TOLERANCE, self.task.cost(judged)
 
@@ -169,11 +185,10 @@ class Backup:
 
     def _enter(self, found: Found, candidates: Candidates, group: Tensor, length: int) -> Tensor:
         """Take the best plan where one satisfies phi, or else phi_safe; returns where that was so."""
-        good = candidates.rho >= -TOLERANCE
-        eligible = torch.where(good.any(1, keepdim=True), good, candidates.safe)
-        done = eligible.any(1)
+        allowed = eligible(candidates.rho, candidates.safe, guarded=bool(self._formulas))
+        done = allowed.any(1)
         chosen = _at(candidates, done)
-        _take(found, chosen, best(eligible[done], (chosen.rho, -chosen.cost)), group[done], (1, length))
+        _take(found, chosen, best(allowed[done], (chosen.rho, -chosen.cost)), group[done], (1, length))
         return done
 
     def _enter_safest(
@@ -204,6 +219,23 @@ def finite(plan: Tensor, task: Task) -> Tensor:
     """Plans (B, T, m) with every entry that is no number replaced by the control's value nearest to 0."""
     low, high = task.system.control_low.to(plan), task.system.control_high.to(plan)
     return torch.where(torch.isfinite(plan), plan, torch.zeros_like(plan).clamp(low, high))
+
+
+def eligible(rho: Tensor, safe: Tensor, *, guarded: bool) -> Tensor:
+    """Choices that may decide: those that satisfy phi, else the policy's own if safe, else all safe ones.
+
+    Args:
+        rho: (agents, choices), robustness; choice 0 begins as the policy's own plan does.
+        safe: (agents, choices), whether phi_safe holds.
+        guarded: whether there are safety requirements; without any robustness alone decides.
+
+    Returns:
+        (agents, choices) booleans; none in a row where nothing is even safe.
+    """
+    good = rho >= -TOLERANCE
+    own = safe & (torch.arange(safe.shape[1], device=safe.device) == 0) & guarded
+    fallback = torch.where(own.any(1, keepdim=True), own, safe)
+    return torch.where(good.any(1, keepdim=True), good, fallback)
 
 
 def best(allowed: Tensor, keys: Sequence[Tensor]) -> Tensor:
