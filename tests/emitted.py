@@ -20,8 +20,8 @@ from stlc.compile.backends.c.emit import Motion, emit
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.defined import defined
-from stlc.compile.ir.samples import everything, leaves
+from stlc.compile.ir.support import defined
+from stlc.compile.ir.traverse import leaves, subexpressions
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.compile.semantics.switch import StraightThrough
@@ -103,7 +103,7 @@ def choosing(count: int, first: int) -> list[ir.Num]:
 
 
 def _is_folded(num: ir.Num) -> bool:
-    for part in everything(num):
+    for part in subexpressions(num):
         constant = all(isinstance(leaf, ir.Const) for leaf in leaves(part))
         if constant and not isinstance(part, ir.Const):
             return False

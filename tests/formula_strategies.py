@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.horizon import reach, uses_end
+from stlc.compile.ir.support import reach, uses_end
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source, Span

@@ -8,7 +8,7 @@ from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.resolve import resolve
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.conditions import condition
+from stlc.compile.ir.normal_form import condition
 from stlc.diagnostics import Diagnostic, StlcError
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source

@@ -13,8 +13,9 @@ from stlc.compile.augment.timers import Timer
 from stlc.compile.frontend.bounds import in_words
 from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import columns, nodes
+from stlc.compile.ir.support import columns
 from stlc.compile.ir.text import show_formula, shown
+from stlc.compile.ir.traverse import nodes
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.escape import screen
 from stlc.grammar.show.expressions import show_name

@@ -30,8 +30,7 @@ from stlc.compile.frontend.resolve import resolve
 from stlc.compile.frontend.scales import nominal
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.defined import defined
-from stlc.compile.ir.horizon import columns, reach, uses_end
+from stlc.compile.ir.support import columns, defined, reach, uses_end
 from stlc.compile.ir.traverse import absolute, margin_unit, mentions_horizon
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.safety import safe_part

@@ -15,8 +15,8 @@ from stlc.compile.frontend.scope import Definition, Failed, Known, Scope
 from stlc.compile.frontend.signals import ranged
 from stlc.compile.frontend.values import Value
 from stlc.compile.ir import typed
-from stlc.compile.ir.horizon import reach
 from stlc.compile.ir.nodes import Window
+from stlc.compile.ir.support import reach
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import Diagnostic

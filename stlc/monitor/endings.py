@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import columns, nodes
-from stlc.compile.ir.samples import farthest
+from stlc.compile.ir.support import columns, farthest
+from stlc.compile.ir.traverse import nodes
 
 Floats: TypeAlias = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.samples import leaves
+from stlc.compile.ir.traverse import leaves
 
 Floats: TypeAlias = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import columns, numbers
-from stlc.compile.ir.samples import everything
+from stlc.compile.ir.support import columns
+from stlc.compile.ir.traverse import numbers, subexpressions
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.grammar import ast
@@ -63,7 +63,7 @@ def needs_of(compiled: Compiled, rules: Sequence[CompiledRequirement]) -> tuple[
 
 
 def _require_functions(compiled: Compiled, rules: Sequence[CompiledRequirement]) -> None:
-    parts = (part for rule in rules for num in numbers(rule.formula) for part in everything(num))
+    parts = (part for rule in rules for num in numbers(rule.formula) for part in subexpressions(num))
     missing = dict.fromkeys(
         part.name for part in parts if isinstance(part, ir.Extern) and part.function is None
     )

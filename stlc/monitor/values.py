@@ -12,9 +12,8 @@ from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.defined import defined
-from stlc.compile.ir.horizon import parts
-from stlc.compile.ir.samples import columns_of, everything, farthest
+from stlc.compile.ir.support import columns_of, defined, farthest
+from stlc.compile.ir.traverse import operands, subexpressions
 from stlc.compile.schedule.schedule import End
 from stlc.compile.semantics.semantics import Exact, Semantics
 from stlc.monitor.holes import holes_in, unsure, without_holes
@@ -161,7 +160,7 @@ def history(formula: ir.Formula) -> int:
         case ir.Until(left=left, right=right):
             return max(history(left), history(right))
         case ir.PastTemporal(window=window) | ir.Since(window=window):
-            return max(map(history, parts(formula))) + _back(window)
+            return max(map(history, operands(formula))) + _back(window)
         case ir.Shift(steps=steps, body=body):
             return max(history(body) - steps, 0)
     assert_never(formula)
@@ -200,7 +199,7 @@ def granted(formula: ir.Formula, names: Collection[str]) -> ir.Formula:
 
 def _read(num: ir.Num) -> set[str]:
     """The columns that a number reads, and the names that are frozen in it."""
-    return {*columns_of(num), *(part.name for part in everything(num) if isinstance(part, ir.FrozenVar))}
+    return {*columns_of(num), *(part.name for part in subexpressions(num) if isinstance(part, ir.FrozenVar))}
 
 
 # ------------------------------------------------------------------ strict predicates

@@ -24,7 +24,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.c.emit import emit
 from stlc.compile.backends.c.plan import plan_of
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import nodes
+from stlc.compile.ir.traverse import nodes
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
 

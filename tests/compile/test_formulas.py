@@ -10,7 +10,7 @@ from stlc.compile.frontend.formulas import resolve_state_formula
 from stlc.compile.frontend.scope import Scope, column_entries
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.conditions import condition
+from stlc.compile.ir.normal_form import condition
 from stlc.diagnostics import SystemFileError
 from stlc.grammar.parse.parser import parse_expr
 from stlc.signature import Column

@@ -16,7 +16,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.horizon import nodes, parts
+from stlc.compile.ir.traverse import nodes, operands
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.compile.schedule.schedule import Extent, Run
@@ -195,15 +195,15 @@ def test_smooth_is_near_exact(formula: typed.Formula, env: Env, k: float) -> Non
     node = lowered(formula)
     exact = robustness_signal(node, env, ops=NUMPY, end="truncate")
     smooth = robustness_signal(node, env, ops=NUMPY, semantics=LogSumExp(k), end="truncate")
-    slack = operands(node, len(exact)) / k
+    slack = looseness(node, len(exact)) / k
     finite = np.isfinite(exact)
     assert (np.abs(smooth[finite] - exact[finite]) <= slack + 1e-9).all()
     np.testing.assert_array_equal(smooth[~finite], exact[~finite])
 
 
-def operands(node: ir.Formula, samples: int) -> float:
+def looseness(node: ir.Formula, samples: int) -> float:
     """Sum along the deepest path of log(number of operands): how far nested smooth operators may be off."""
-    inner = max((operands(part, samples) for part in parts(node)), default=0.0)
+    inner = max((looseness(part, samples) for part in operands(node)), default=0.0)
     match node:
         case ir.BoolOp(_, items):
             return inner + math.log(len(items))

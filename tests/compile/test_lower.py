@@ -13,8 +13,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.defined import defined
-from stlc.compile.ir.horizon import reach
+from stlc.compile.ir.support import defined, reach
 from stlc.compile.ir.text import show_formula
 from stlc.compile.lowering.lower import lower
 from stlc.diagnostics import Diagnostic

@@ -14,7 +14,7 @@ from stlc.compile.backends.array.unrolled import written
 from stlc.compile.backends.c.numbers import Untranslatable
 from stlc.compile.backends.onnx.sheet import Sheet
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import nodes
+from stlc.compile.ir.traverse import nodes
 
 X, Y, Z = (ir.Predicate(ir.Signal(name)) for name in NAMES)
 

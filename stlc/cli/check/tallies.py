@@ -13,7 +13,7 @@ from stlc.cli.check.outcome import WORDS, Outcome, Row
 from stlc.cli.check.text import in_unit, percent, signed
 from stlc.cli.framework.output import table
 from stlc.cli.framework.render import render_place
-from stlc.compile.ir.horizon import columns
+from stlc.compile.ir.support import columns
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.escape import visible
 from stlc.monitor.prepared import beside, gap_text

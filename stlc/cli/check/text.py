@@ -12,7 +12,7 @@ from stlc.cli.check.checked import Checked
 from stlc.cli.check.outcome import WORDS, Row
 from stlc.cli.framework.output import table
 from stlc.cli.framework.render import render_place
-from stlc.compile.ir.horizon import columns
+from stlc.compile.ir.support import columns
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.escape import operand, shell, visible
 from stlc.monitor.explain.report import Cause

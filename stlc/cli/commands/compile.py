@@ -167,7 +167,7 @@ def _requirement(rule: CompiledRequirement, dt: float) -> dict[str, Any]:
 def _intervals(rule: CompiledRequirement, dt: float) -> Iterator[dict[str, Any]]:
     """The windows of a compiled formula; an upper end of None is the end of the trace."""
     from stlc.compile.ir import nodes as ir
-    from stlc.compile.ir.horizon import nodes
+    from stlc.compile.ir.traverse import nodes
 
     for node in nodes(rule.formula):
         if not isinstance(node, ir.Temporal | ir.PastTemporal | ir.Until | ir.Since):

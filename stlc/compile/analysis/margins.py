@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import assert_never
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.functions import FUNCTIONS
-from stlc.compile.ir.traverse import nodes
+from stlc.compile.ir.traverse import map_children, nodes
 from stlc.units import Unit, same_dims
 
 
@@ -33,20 +32,9 @@ def _one_unit(formula: typed.Formula) -> Unit | None:
 
 
 def _formula(formula: typed.Formula) -> typed.Formula:
-    match formula:
-        case typed.Predicate(num=num, written=written):
-            return replace(formula, num=in_unit(num, written), unit=written)
-        case typed.Truth():
-            return formula
-        case typed.Logic(items=items):
-            return replace(formula, items=tuple(map(_formula, items)))
-        case typed.Until(left=left, right=right):
-            return replace(formula, left=_formula(left), right=_formula(right))
-        case typed.Not() | typed.Shift() | typed.Edge() | typed.Temporal() | typed.Freeze():
-            return replace(formula, body=_formula(formula.body))
-        case typed.Recalled():
-            return formula  # of training, which comes later
-    assert_never(formula)
+    if isinstance(formula, typed.Predicate):
+        return replace(formula, num=in_unit(formula.num, formula.written), unit=formula.written)
+    return map_children(formula, formulas=_formula)
 
 
 def in_unit(num: ir.Num, unit: Unit) -> ir.Num:

@@ -8,8 +8,7 @@ from collections.abc import Iterator
 from stlc.compile.analysis.ranges import Facts, bounds
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.samples import everything
-from stlc.compile.ir.traverse import nodes
+from stlc.compile.ir.traverse import nodes, subexpressions
 from stlc.diagnostics import Diagnostic
 
 
@@ -21,7 +20,7 @@ def jumps(formula: typed.Formula, ranges: Facts) -> Iterator[Diagnostic]:
         ranges: of columns, declared or enforced, in stored units.
     """
     for node in nodes(formula):
-        if isinstance(node, typed.Predicate) and any(_jumps(num, ranges) for num in everything(node.num)):
+        if isinstance(node, typed.Predicate) and any(_jumps(num, ranges) for num in subexpressions(node.num)):
             yield Diagnostic(
                 "W403",
                 "a modulo in a predicate that is trained for",

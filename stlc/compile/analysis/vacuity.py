@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import assert_never
 
 from stlc.compile.analysis.ranges import Facts, bounds
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.normal_form import normal
+from stlc.compile.ir.traverse import leaves, numbers
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
 from stlc.signature import Signature
@@ -37,41 +38,28 @@ def vacuous(formula: typed.Formula, signature: Signature, facts: Facts) -> Itera
 
 def truth(formula: typed.Formula, facts: Facts) -> bool | None:
     """What enforced ranges say: True or False at every instant of every trace, or None."""
+    return _truth(normal(formula), facts)
+
+
+def _truth(formula: typed.Formula, facts: Facts) -> bool | None:
     match formula:
         case typed.Truth(_, value):
             return value
-        case typed.Predicate(_, num, _):
+        case typed.Predicate(_, num):
             reach = bounds(num, facts)
             if reach is None or isinstance(num, ir.Const):
                 return None
             return True if reach[0] > _TOLERANCE else (False if reach[1] < -_TOLERANCE else None)
         case typed.Not(_, body):
-            inner = truth(body, facts)
+            inner = _truth(body, facts)
             return None if inner is None else not inner
-        case typed.Logic():
-            return _logic(formula, facts)
+        case typed.Logic(_, op, items):
+            values, decisive = [_truth(item, facts) for item in items], op == "or"
+            return decisive if decisive in values else None if None in values else not decisive
         case typed.Temporal(_, "always" | "eventually", _, body) | typed.Freeze(_, _, body):
-            return truth(body, facts)
-        case typed.Temporal() | typed.Until() | typed.Shift() | typed.Edge() | typed.Recalled():
-            return None
+            return _truth(body, facts)
         case _:
-            assert_never(formula)
-
-
-def _logic(formula: typed.Logic, facts: Facts) -> bool | None:
-    values = [truth(item, facts) for item in formula.items]
-    op = formula.op
-    if op == "->":
-        values[0] = None if values[0] is None else not values[0]
-        op = "or"
-    if op in ("and", "or"):
-        decisive = op == "or"
-        if decisive in values:
-            return decisive
-        return None if None in values else not decisive
-    if None in values:
-        return None
-    return (values[0] == values[1]) == (op == "<->")
+            return None
 
 
 def _antecedents(formula: typed.Formula) -> Iterator[typed.Formula]:
@@ -92,7 +80,8 @@ def _antecedents(formula: typed.Formula) -> Iterator[typed.Formula]:
 def _because(formula: typed.Formula, signature: Signature, facts: Facts) -> str:
     """`: x is in [0, 5]`, for the columns with an enforced range that decide it."""
     parts = []
-    for name in dict.fromkeys(_columns(formula)):
+    read = (leaf for num in numbers(formula) for leaf in leaves(num))
+    for name in dict.fromkeys(leaf.name for leaf in read if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))):
         if name in facts and name in signature:
             low, high = facts[name]
             unit = signature[name].unit
@@ -100,38 +89,15 @@ def _because(formula: typed.Formula, signature: Signature, facts: Facts) -> str:
     return f": {', '.join(parts)}" if parts else ""
 
 
-def _columns(formula: typed.Formula) -> Iterator[str]:
-    match formula:
-        case typed.Predicate(_, num, _):
-            yield from _in_number(num)
-        case typed.Logic(_, _, items):
-            for item in items:
-                yield from _columns(item)
-        case typed.Not(_, body) | typed.Temporal(_, _, _, body) | typed.Freeze(_, _, body):
-            yield from _columns(body)
-        case _:
-            return
-
-
-def _in_number(num: ir.Num) -> Iterator[str]:
-    match num:
-        case ir.Signal(name) | ir.ShiftedSignal(name):
-            yield name
-        case ir.Op(_, args):
-            for arg in args:
-                yield from _in_number(arg)
-        case _:
-            return
-
-
 # ----------------------------------------------------------------------- safety
 
 
 def toothless(requirement: typed.Requirement, tag: ast.Tag | None) -> Diagnostic | None:
     """W502 for a `@safety` requirement that no finite prefix can violate."""
-    if "safety" not in requirement.tags or _constrains(requirement.formula, positive=True):
+    formula = normal(requirement.formula)
+    if "safety" not in requirement.tags or _constrains(formula):
         return None
-    culprit = _promise(requirement.formula, positive=True)
+    culprit = _promise(formula)
     labels = () if tag is None else (Label(tag.span, "puts it into phi_safe"),)
     return Diagnostic(
         "W502",
@@ -145,35 +111,23 @@ def toothless(requirement: typed.Requirement, tag: ast.Tag | None) -> Diagnostic
     )
 
 
-def _constrains(formula: typed.Formula, *, positive: bool) -> bool:
-    """Whether some finite prefix, shorter than the horizon, can violate it (`positive`) or its negation."""
+def _constrains(formula: typed.Formula) -> bool:
+    """Whether some finite prefix, shorter than the horizon, can violate a formula in negation normal form."""
     match formula:
         case typed.Truth():
             return False
-        case typed.Predicate() | typed.Edge() | typed.Shift() | typed.Recalled():
-            return True
-        case typed.Not(_, body):
-            return _constrains(body, positive=not positive)
-        case typed.Freeze(_, _, body):
-            return _constrains(body, positive=positive)
         case typed.Logic(_, op, items):
-            if op == "->":
-                sides = [
-                    _constrains(items[0], positive=not positive),
-                    _constrains(items[1], positive=positive),
-                ]
-                return all(sides) if positive else any(sides)
-            every = (op == "or") == positive if op in ("and", "or") else False
-            inner = [_constrains(item, positive=positive) for item in items]
-            return all(inner) if every else any(inner)
+            return (all if op == "or" else any)(map(_constrains, items))
         case typed.Temporal(_, op, window, body):
-            promise = op == ("eventually" if positive else "always")
-            return _constrains(body, positive=positive) and not (promise and _open(window))
+            return _constrains(body) and not (op == "eventually" and _open(window))
+        case typed.Freeze(_, _, body):
+            return _constrains(body)
         case typed.Until(_, op, window, left, right):
-            side = left if (op in ("until", "since")) == positive else right
-            return _constrains(side, positive=positive) or not _open(window)
+            return _constrains(left if op in ("until", "since") else right) or not _open(window)
+        case typed.Not(_, typed.Until(_, _, window, _, right)):
+            return _constrains(normal(right, -1)) or not _open(window)
         case _:
-            assert_never(formula)
+            return True
 
 
 def _open(window: typed.Interval) -> bool:
@@ -181,21 +135,10 @@ def _open(window: typed.Interval) -> bool:
     return window.hi is None or window.hi.horizons > 0
 
 
-def _promise(formula: typed.Formula, *, positive: bool) -> Span:
-    """Where the part stands that only promises."""
-    match formula:
-        case typed.Not(_, body):
-            return _promise(body, positive=not positive)
-        case typed.Freeze(_, _, body):
-            return _promise(body, positive=positive)
-        case typed.Logic(_, "->", (left, right)):
-            if not _constrains(right, positive=positive):
-                return _promise(right, positive=positive)
-            return _promise(left, positive=not positive)
-        case typed.Logic(_, _, items):
-            for item in items:
-                if not _constrains(item, positive=positive):
-                    return _promise(item, positive=positive)
-            return formula.span
-        case _:
-            return formula.span
+def _promise(formula: typed.Formula) -> Span:
+    """The place of the part that only promises."""
+    if isinstance(formula, typed.Freeze):
+        return _promise(formula.body)
+    if isinstance(formula, typed.Logic):
+        return next((_promise(item) for item in formula.items if not _constrains(item)), formula.span)
+    return formula.span

@@ -24,7 +24,8 @@ from stlc.compile.frontend.bounds import report, to_window
 from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.traverse import absolute, at_hand, is_state_formula, looks_back, normal
+from stlc.compile.ir.normal_form import normal
+from stlc.compile.ir.traverse import absolute, at_hand, is_state, looks_back
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import Diagnostic
@@ -88,7 +89,7 @@ class _Goals:
 
         What is not absolute is asked of the start of the mission: there now and the mission clock agree.
         """
-        if is_state_formula(node):
+        if is_state(node, augmented=True):
             return self._leaf(node, ("always", ir.Window(0, 0)), (typed.Truth(node.span, True), node))
         match node:
             case typed.Logic(span, "and" | "or" as op, items):
@@ -108,7 +109,7 @@ class _Goals:
     ) -> Goal:
         op, window = how
         for body in operands:
-            if not is_state_formula(body):
+            if not is_state(body, augmented=True):
                 report(self.sink, _looks_ahead(body.span))
                 return self.of(typed.Truth(node.span, True))
         if window.hi is None and op in ("eventually", "until"):

@@ -7,11 +7,11 @@ training; on recorded traces every one is judged where it stands.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal, assert_never
+from typing import Literal
 
 from stlc.compile.frontend.bounds import report
 from stlc.compile.ir import typed
-from stlc.compile.ir.traverse import absolute, from_now, nodes, on_clock
+from stlc.compile.ir.traverse import absolute, from_now, map_children, nodes, on_clock, operands
 from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
@@ -21,22 +21,16 @@ def lifted(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
     if not absolute(formula):
         return formula
     match formula:
-        case typed.Truth() | typed.Predicate() | typed.Recalled():
-            return formula
-        case typed.Logic(_, "and" | "or", items):
-            return replace(formula, items=tuple(lifted(item, sink) for item in items))
+        case typed.Logic(_, "and" | "or"):
+            return map_children(formula, formulas=lambda item: lifted(item, sink))
         case typed.Temporal(_, _, interval, body) if absolute(body):
             if not _reaches_now(interval, formula):
                 return _stuck(formula, sink)
             return _out_of(formula, lifted(body, sink), sink)
-        case typed.Temporal():
+        case typed.Temporal() | typed.Until() if not any(map(absolute, operands(formula))):
             return formula
-        case typed.Until(_, _, _, left, right) if not absolute(left) and not absolute(right):
-            return formula
-        case typed.Until() | typed.Shift() | typed.Edge() | typed.Not() | typed.Logic() | typed.Freeze():
-            return _stuck(formula, sink)
         case _:
-            assert_never(formula)
+            return _stuck(formula, sink)
 
 
 def _reaches_now(interval: typed.Interval, node: typed.Temporal) -> bool:
@@ -93,14 +87,8 @@ def recorded(formula: typed.Formula) -> typed.Formula:
     There the mission clock and the time from now agree, so absolute intervals become relative ones. Those
     under another temporal operator stay: they are judged at the first sample, whenever they are asked for.
     """
-    match formula:
-        case typed.Truth() | typed.Predicate() | typed.Shift() | typed.Edge() | typed.Recalled():
-            return formula
-        case typed.Not() | typed.Freeze():
-            return replace(formula, body=recorded(formula.body))
-        case typed.Logic():
-            return replace(formula, items=tuple(map(recorded, formula.items)))
-        case typed.Temporal() | typed.Until():
-            return from_now(formula)
-        case _:
-            assert_never(formula)
+    if isinstance(formula, (typed.Temporal, typed.Until)):
+        return from_now(formula)
+    if isinstance(formula, (typed.Shift, typed.Edge)):
+        return formula
+    return map_children(formula, formulas=recorded)

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal, TypeAlias, assert_never
 
-from stlc.compile.augment.timers import FALSE, OPEN, TRUE, at_least, both, choose, denied, guard
+from stlc.compile.augment.timers import FALSE, OPEN, TRUE, at_least, both, choose, guard
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.normal_form import negate
 from stlc.source import Span
 
 Op: TypeAlias = Literal["always", "eventually", "until", "release"]
@@ -105,14 +106,14 @@ def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
     over = _passed(formula.window, clock)
     match formula.op:
         case "always":
-            return choose(both(inside, denied(right)), _FALSE, choose(over, _TRUE, _OPEN))
+            return choose(both(inside, negate(right)), _FALSE, choose(over, _TRUE, _OPEN))
         case "eventually":
-            return choose(both(inside, right), _TRUE, choose(denied(over), _OPEN, _FALSE))
+            return choose(both(inside, right), _TRUE, choose(negate(over), _OPEN, _FALSE))
         case "until":
-            met = choose(both(inside, right), _TRUE, choose(denied(over), _OPEN, _FALSE))
-            return choose(denied(left), _FALSE, met)
+            met = choose(both(inside, right), _TRUE, choose(negate(over), _OPEN, _FALSE))
+            return choose(negate(left), _FALSE, met)
         case "release":
-            failed = choose(both(inside, denied(right)), _FALSE, choose(over, _TRUE, _OPEN))
+            failed = choose(both(inside, negate(right)), _FALSE, choose(over, _TRUE, _OPEN))
             return choose(left, _TRUE, failed)
         case _:
             assert_never(formula.op)

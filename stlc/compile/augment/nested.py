@@ -21,7 +21,8 @@ from stlc.compile.frontend.bounds import to_window
 from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.traverse import nodes, normal
+from stlc.compile.ir.normal_form import normal
+from stlc.compile.ir.traverse import nodes, operands
 from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
@@ -141,25 +142,15 @@ def _sum(window: ir.Window, lo: int, hi: int | None) -> ir.Window:
 
 
 def _ahead(formula: typed.Formula) -> int:
-    """How many samples a formula looks ahead. Raises TooFarError where it has no end."""
+    """The samples that a formula looks ahead. Raises TooFarError where it has no end."""
+    inner = max(map(_ahead, operands(formula)), default=0)
     match formula:
-        case (
-            typed.Truth()
-            | typed.Predicate()
-            | typed.Edge()
-            | typed.Shift()
-            | typed.Freeze()
-            | typed.Recalled()
-        ):
+        case typed.Temporal(_, "always" | "eventually") | typed.Until(_, "until" | "release" | "unless"):
+            return inner + _end(formula)
+        case typed.Shift() | typed.Edge() | typed.Freeze() | typed.Recalled():
             return 0
-        case typed.Logic(_, _, items):
-            return max(map(_ahead, items))
-        case typed.Not(_, body):
-            return _ahead(body)
-        case typed.Temporal(_, op, _, body):
-            return _ahead(body) + (_end(formula) if op in ("always", "eventually") else 0)
-        case typed.Until(_, op, _, left, right):
-            return max(_ahead(left), _ahead(right)) + (0 if op == "since" else _end(formula))
+        case _:
+            return inner
 
 
 def _end(node: typed.Temporal | typed.Until) -> int:

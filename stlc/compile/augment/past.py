@@ -21,7 +21,6 @@ from stlc.compile.augment.timers import (
     Timer,
     at_least,
     choose,
-    denied,
     guard,
     recalled,
     tolerant,
@@ -30,7 +29,8 @@ from stlc.compile.frontend.bounds import report, to_window
 from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.traverse import Sign, at_hand, flip, is_state_formula, looks_back, normal
+from stlc.compile.ir.normal_form import Sign, flip, negate, normal
+from stlc.compile.ir.traverse import at_hand, is_state, looks_back
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import Diagnostic
@@ -206,7 +206,7 @@ class Past:
     ) -> typed.Recalled:
         """Whether q held at one of the samples before, and p from there on up to now; or its contrary."""
         most, positive = how
-        held, met = (left, right) if positive else (denied(left), denied(right))
+        held, met = (left, right) if positive else (negate(left), negate(right))
         about = f"{_short(node.right)}, and {_short(node.left)} from there on"
         if most is None:
             draft = self._draft("latch", "since", 0.0, 1.0, f"whether there was {about}")
@@ -280,7 +280,7 @@ class Past:
         """`p since[a, end] q`: how long ago the first q was from which on p has held; or its dual."""
         least, positive = how
         p, q = self._condition(left), self._condition(right)
-        held, met = (p, q) if positive else (denied(p), denied(q))
+        held, met = (p, q) if positive else (negate(p), negate(q))
         from_there = f"{_short(node.right)} with {_short(node.left)} from there on"
         about = f"steps since the first {from_there}, up to {least}"
         draft = self._draft("timer", "lasting", 0.0, float(least), about)
@@ -335,7 +335,7 @@ class Past:
     def _body(self, body: typed.Formula) -> typed.Formula | None:
         """A body without operators of the past, if it is about one instant alone by then."""
         rewritten = self.rewrite(body)
-        if is_state_formula(rewritten):
+        if is_state(rewritten, augmented=True):
             return rewritten
         self._refused(body.span, "over a formula that looks ahead")
         return None

@@ -13,6 +13,8 @@ from typing import Literal, TypeAlias
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.normal_form import joined
+from stlc.compile.ir.traverse import map_children
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.signature import Column
 from stlc.source import Span
@@ -133,31 +135,11 @@ def choose(condition: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
 
 def tolerant(formula: ir.Formula) -> ir.Formula:
     """A state formula that is true exactly where the monitor calls it satisfied: ties count."""
-    match formula:
-        case ir.Predicate(num, sign, _, False):
-            return ir.Predicate(ir.Op("add", (num, ir.Const(sign * TOLERANCE))), sign)
-        case ir.BoolOp(_, items):
-            return replace(formula, items=tuple(map(tolerant, items)))
-        case _:
-            return formula
-
-
-def denied(formula: ir.Formula) -> ir.Formula:
-    """The exact complement of a state formula."""
-    match formula:
-        case ir.Truth(value):
-            return replace(formula, value=not value)
-        case ir.Predicate(_, sign, strict):
-            return replace(formula, sign=1 if sign < 0 else -1, strict=not strict)
-        case ir.BoolOp(op, items):
-            return replace(formula, op="or" if op == "and" else "and", items=tuple(map(denied, items)))
-        case _:
-            raise TypeError(f"not a state formula: {formula!r}")
+    if isinstance(formula, ir.Predicate) and not formula.guard:
+        return ir.Predicate(ir.Op("add", (formula.num, ir.Const(formula.sign * TOLERANCE))), formula.sign)
+    return map_children(formula, formulas=tolerant)
 
 
 def both(*items: ir.Formula) -> ir.Formula:
-    """Their conjunction, constants folded."""
-    if any(isinstance(item, ir.Truth) and not item.value for item in items):
-        return ir.Truth(False)
-    kept = tuple(item for item in items if not isinstance(item, ir.Truth))
-    return ir.Truth(True) if not kept else kept[0] if len(kept) == 1 else ir.BoolOp("and", kept)
+    """The conjunction of formulas, constants folded."""
+    return joined("and", items, ir.Truth(True))

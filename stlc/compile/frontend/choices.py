@@ -10,7 +10,7 @@ from stlc.compile.frontend.sorts import Need, as_formula, as_state_formula, loos
 from stlc.compile.frontend.values import Number, Value, Vector
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.conditions import is_state
+from stlc.compile.ir.traverse import is_state
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.signature import Kind

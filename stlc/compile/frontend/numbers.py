@@ -11,7 +11,8 @@ from stlc.compile.frontend.sorts import Need, loose_number
 from stlc.compile.frontend.values import Label, Number, Value, Vector, noun
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.conditions import condition, is_state
+from stlc.compile.ir.normal_form import condition
+from stlc.compile.ir.traverse import is_state
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.signature import Column

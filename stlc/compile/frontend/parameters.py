@@ -16,7 +16,7 @@ from stlc.compile.frontend.sorts import Need, loose_number
 from stlc.compile.frontend.values import Number, Vector
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.samples import columns_of
+from stlc.compile.ir.support import columns_of
 from stlc.diagnostics import Diagnostic, Label, SpecError, UsageError
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse_expr

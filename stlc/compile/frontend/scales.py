@@ -14,7 +14,7 @@ from stlc.compile.frontend.scope import Scope
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.functions import Bounds
-from stlc.compile.ir.samples import columns_of
+from stlc.compile.ir.support import columns_of
 from stlc.compile.ir.traverse import nodes
 from stlc.diagnostics import Diagnostic
 from stlc.signature import Column

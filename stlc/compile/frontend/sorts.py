@@ -11,7 +11,8 @@ from stlc.compile.frontend.values import Label as Member
 from stlc.compile.frontend.values import Moment, Number, Value, Vector, describe, noun
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.conditions import condition, is_state
+from stlc.compile.ir.normal_form import condition
+from stlc.compile.ir.traverse import is_state
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
 from stlc.source import Span

@@ -14,7 +14,7 @@ from stlc.compile.frontend.sorts import Need, as_formula, as_number
 from stlc.compile.frontend.values import Moment, Number, Swept, Value, Vector
 from stlc.compile.frontend.vectors import broadcast
 from stlc.compile.ir import typed
-from stlc.compile.ir.samples import later
+from stlc.compile.ir.traverse import shifted
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.source import Span
@@ -48,7 +48,7 @@ def _shifted(value: Value, steps: int, places: tuple[ast.Expr, Span], name: str,
     expr, span = places
     match value:
         case Number() if value.kind != "bool":
-            return replace(value, num=later(value.num, steps), origin=None)
+            return replace(value, num=shifted(value.num, steps), origin=None)
         case Vector(items):
             return Vector(tuple(_later(item, steps, span) for item in items), span)
         case _:
@@ -58,7 +58,7 @@ def _shifted(value: Value, steps: int, places: tuple[ast.Expr, Span], name: str,
 def _later(number: Number, steps: int, span: Span) -> Number:
     """A component `steps` samples later; of a choice between bools the formula as well."""
     formula = None if number.formula is None else typed.Shift(span, steps, number.formula)
-    return replace(number, num=later(number.num, steps), formula=formula)
+    return replace(number, num=shifted(number.num, steps), formula=formula)
 
 
 def _delta(value: Value, expr: ast.Expr, span: Span, scope: Scope) -> Value:

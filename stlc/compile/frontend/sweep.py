@@ -33,7 +33,7 @@ from stlc.compile.frontend.values import (
 )
 from stlc.compile.frontend.vectors import cross, dot, minus, norm
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.samples import later
+from stlc.compile.ir.traverse import shifted
 from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
@@ -289,7 +289,7 @@ def _both(number: Number) -> tuple[Number, ...]:
 
 
 def _number_later(number: Number) -> Number:
-    return replace(number, num=later(number.num, 1, clamped=True))
+    return replace(number, num=shifted(number.num, 1, clamped=True))
 
 
 def _vector_later(vector: Vector) -> Vector:

@@ -1,52 +1,208 @@
-"""Typed formulas: their parts, what they are made of, and negation normal form before time is rewritten."""
+"""Traversal and rewriting of formulas and numbers, typed ones and those of the IR alike.
+
+A node's children are those of its fields that are declared as formulas or numbers, so that a class that is
+added to `stlc.compile.ir.nodes` or `stlc.compile.ir.typed` is walked through and rewritten like all others.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
-from typing import Literal, TypeAlias, TypeGuard, assert_never
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields, replace
+from typing import Any, Literal, TypeAlias, TypeGuard, TypeVar, get_args, overload
 
+from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.samples import of_now
 
-Sign: TypeAlias = Literal[1, -1]
+Node: TypeAlias = ir.Formula | ir.Num | typed.Formula
+Leaf: TypeAlias = ir.Const | ir.Signal | ir.ShiftedSignal | ir.FrozenVar
+LEAVES = (ir.Const, ir.Signal, ir.ShiftedSignal, ir.FrozenVar)
+"""Numbers without parts."""
+_NUMBERS = get_args(ir.Num)
 
+N = TypeVar("N", bound=Any)
 
-def operands(formula: typed.Formula) -> tuple[typed.Formula, ...]:
-    """The formulas directly below."""
-    match formula:
-        case typed.Truth() | typed.Predicate():
-            return ()
-        case typed.Logic(_, _, items):
-            return items
-        case typed.Until(_, _, _, left, right):
-            return (left, right)
-        case typed.Not() | typed.Shift() | typed.Edge() | typed.Temporal() | typed.Freeze():
-            return (formula.body,)
-        case typed.Recalled(_, now):
-            return (now,)
-        case _:
-            assert_never(formula)
+_Sort: TypeAlias = Literal["formula", "formulas", "number", "numbers", "bindings"]
+_SORTS: Mapping[str, _Sort] = {
+    "Formula": "formula",
+    "tuple[Formula, ...]": "formulas",
+    "Num": "number",
+    "tuple[Num, ...]": "numbers",
+    "tuple[tuple[str, Num], ...]": "bindings",
+}
+"""Declared type of a field -> what its value holds."""
 
 
-def at_hand(formula: typed.Formula) -> typed.Formula:
-    """A state formula with what it recalls told by timers alone."""
-    match formula:
-        case typed.Recalled(_, now):
-            return at_hand(now)
-        case typed.Logic(_, _, items):
-            return replace(formula, items=tuple(map(at_hand, items)))
-        case typed.Not(_, body):
-            return replace(formula, body=at_hand(body))
-        case _:
-            return formula
+_SHAPES: dict[type, tuple[tuple[str, _Sort], ...]] = {}
 
 
-def nodes(formula: typed.Formula) -> Iterator[typed.Formula]:
-    """All formulas in `formula`, itself first."""
+def _shape(node: Any) -> tuple[tuple[str, _Sort], ...]:
+    """The fields of a node's class that hold children, in order."""
+    found = _SHAPES.get(type(node))
+    if found is None:
+        declared = ((part.name, str(part.type).replace("ir.", "")) for part in fields(node))
+        found = _SHAPES[type(node)] = tuple((name, _SORTS[text]) for name, text in declared if text in _SORTS)
+    return found
+
+
+# ----------------------------------------------------------------------------- one step down
+
+
+def children(node: Node) -> Iterator[Any]:
+    """The formulas and numbers directly below a node, in the order of its fields."""
+    for name, sort in _shape(node):
+        value = getattr(node, name)
+        match sort:
+            case "formula" | "number":
+                yield value
+            case "formulas" | "numbers":
+                yield from value
+            case "bindings":
+                yield from (num for _, num in value)
+
+
+def map_children(
+    node: N,
+    *,
+    formulas: Callable[[Any], Any] | None = None,
+    numbers: Callable[[ir.Num], ir.Num] | None = None,
+) -> N:
+    """A node with its children replaced; the node itself where all of them stay the same objects.
+
+    Args:
+        node: a formula or a number.
+        formulas: child -> what stands in its place, for children that are formulas; None leaves them.
+        numbers: the same for children that are numbers.
+    """
+    changed: dict[str, Any] = {}
+    for name, sort in _shape(node):
+        change: Callable[[Any], Any] | None = formulas if sort.startswith("formula") else numbers
+        if change is None:
+            continue
+        value = getattr(node, name)
+        if sort in ("formula", "number"):
+            new = change(value)
+            same = new is value
+        elif sort == "bindings":
+            new = tuple((bound, change(num)) for bound, num in value)
+            same = all(a is b for (_, a), (_, b) in zip(new, value, strict=True))
+        else:
+            new = tuple(map(change, value))
+            same = all(a is b for a, b in zip(new, value, strict=True))
+        if not same:
+            changed[name] = new
+    return replace(node, **changed) if changed else node
+
+
+@overload
+def operands(formula: ir.Formula) -> tuple[ir.Formula, ...]: ...
+@overload
+def operands(formula: typed.Formula) -> tuple[typed.Formula, ...]: ...
+def operands(formula: Any) -> tuple[Any, ...]:
+    """The formulas directly below a formula; of what is recalled the one about the instant at hand."""
+    if isinstance(formula, typed.Recalled):
+        return (formula.now,)
+    found: list[Any] = []
+    for name, sort in _shape(formula):
+        if sort == "formula":
+            found.append(getattr(formula, name))
+        elif sort == "formulas":
+            found.extend(getattr(formula, name))
+    return tuple(found)
+
+
+# ---------------------------------------------------------------------------- all the way down
+
+
+@overload
+def nodes(formula: ir.Formula) -> Iterator[ir.Formula]: ...
+@overload
+def nodes(formula: typed.Formula) -> Iterator[typed.Formula]: ...
+def nodes(formula: Any) -> Iterator[Any]:
+    """All formulas in a formula, itself first; conditions inside of numbers are not among them."""
     yield formula
     for part in operands(formula):
         yield from nodes(part)
+
+
+def numbers(formula: ir.Formula | typed.Formula) -> Iterator[ir.Num]:
+    """The numbers of predicates, and those that `freeze` binds."""
+    for node in nodes(formula):
+        yield from (child for child in children(node) if isinstance(child, _NUMBERS))
+
+
+def subexpressions(num: ir.Num) -> Iterator[ir.Num]:
+    """A number and all numbers in it, those of its conditions too."""
+    if isinstance(num, _NUMBERS):
+        yield num
+    for child in children(num):
+        yield from subexpressions(child)
+
+
+def leaves(num: ir.Num) -> Iterator[Leaf]:
+    """The parts of a number without parts of their own, those of its conditions too."""
+    for part in subexpressions(num):
+        if isinstance(part, LEAVES):
+            yield part
+
+
+def map_leaves(node: N, change: Callable[[ir.Num], ir.Num]) -> N:
+    """A number or a formula with every leaf of its numbers replaced."""
+    if isinstance(node, LEAVES):
+        return change(node)  # type: ignore[return-value]
+
+    def below(child: Any) -> Any:
+        return map_leaves(child, change)
+
+    return map_children(node, formulas=below, numbers=below)
+
+
+# ---------------------------------------------------------------------------------- numbers
+
+
+def key_of(leaf: ir.Signal | ir.ShiftedSignal | ir.FrozenVar) -> str:
+    """The name of a leaf among the inputs of a program."""
+    if isinstance(leaf, ir.ShiftedSignal):
+        return f"{leaf.name}\0{leaf.steps}{'!' * leaf.clamped}"
+    return leaf.name
+
+
+def frozen_in(num: ir.Num) -> frozenset[str]:
+    """Names of the frozen values that a number reads."""
+    return frozenset(leaf.name for leaf in leaves(num) if isinstance(leaf, ir.FrozenVar))
+
+
+def shifted(num: ir.Num, steps: int, *, clamped: bool = False) -> ir.Num:
+    """The value of a number `steps` samples later; `clamped`: the first or last sample beyond the ends."""
+
+    def moved(leaf: ir.Num) -> ir.Num:
+        match leaf:
+            case ir.Signal(name):
+                return ir.ShiftedSignal(name, steps, clamped) if steps else leaf
+            case ir.ShiftedSignal(name, before, end):
+                there = before + steps
+                return ir.ShiftedSignal(name, there, clamped or end) if there else ir.Signal(name)
+            case _:
+                return leaf
+
+    return map_leaves(num, moved)
+
+
+def substitute_frozen(node: N, values: Mapping[str, ir.Num]) -> N:
+    """A number or a formula with frozen values replaced; a `freeze` inside keeps the names that it binds."""
+    if isinstance(node, ir.FrozenVar):
+        return values.get(node.name, node)  # type: ignore[return-value]
+
+    def below(child: Any) -> Any:
+        return substitute_frozen(child, values)
+
+    if not isinstance(node, (ir.Freeze, typed.Freeze)):
+        return map_children(node, formulas=below, numbers=below)
+    own = {name for name, _ in node.bindings}
+    outer = {name: value for name, value in values.items() if name not in own}
+    return map_children(node, formulas=lambda body: substitute_frozen(body, outer), numbers=below)
+
+
+# --------------------------------------------------------------------------- typed formulas
 
 
 def margin_unit(formula: typed.Formula) -> str:
@@ -63,119 +219,47 @@ def on_clock(node: typed.Formula) -> TypeGuard[typed.Temporal | typed.Until]:
 
 
 def from_now(node: typed.Temporal | typed.Until) -> typed.Temporal | typed.Until:
-    """The operator with its interval measured from now: what it means at the first sample."""
+    """The operator with its interval measured from now: its meaning at the first sample."""
     return replace(node, interval=replace(node.interval, clock="now"))
 
 
 def absolute(formula: typed.Formula) -> bool:
-    """Whether an interval of `formula` is on the mission clock."""
+    """Whether an interval of a formula is on the mission clock."""
     return any(map(on_clock, nodes(formula)))
 
 
 def looks_back(formula: typed.Formula) -> bool:
-    """Whether `formula` has an operator of the past."""
-    return any(map(_backwards, nodes(formula)))
+    """Whether a formula has an operator of the past."""
+    past = ("once", "historically", "since")
+    timed = (node.op for node in nodes(formula) if isinstance(node, (typed.Temporal, typed.Until)))
+    return any(op in past for op in timed) or any(isinstance(node, typed.Edge) for node in nodes(formula))
 
 
-def _backwards(node: typed.Formula) -> bool:
-    match node:
-        case typed.Temporal(_, "once" | "historically") | typed.Until(_, "since") | typed.Edge():
-            return True
-        case _:
-            return False
+def is_state(formula: typed.Formula, *, augmented: bool = False) -> bool:
+    """Whether the truth of a formula depends on one instant alone, with the values that are frozen around it.
 
-
-def is_state_formula(formula: typed.Formula) -> bool:
-    """Whether `formula` is about one instant alone, frozen values and other samples apart."""
-    state = (typed.Truth, typed.Not, typed.Logic, typed.Recalled)
-    return all(
-        isinstance(node, state) or (isinstance(node, typed.Predicate) and of_now(node.num))
-        for node in nodes(formula)
+    Args:
+        formula: as typed.
+        augmented: whether it is made for training, where what is recalled is held by timers, and frozen
+            values count as other instants.
+    """
+    state: tuple[type, ...] = (typed.Truth, typed.Predicate, typed.Not, typed.Logic)
+    elsewhere: tuple[type, ...] = (ir.ShiftedSignal,)
+    if augmented:
+        state, elsewhere = (*state, typed.Recalled), (ir.ShiftedSignal, ir.FrozenVar)
+    return all(isinstance(node, state) for node in nodes(formula)) and not any(
+        isinstance(leaf, elsewhere) for num in numbers(formula) for leaf in leaves(num)
     )
 
 
 def mentions_horizon(formula: typed.Formula) -> bool:
-    """Whether a bound of `formula` is written with `T`."""
-    temporal = (node for node in nodes(formula) if isinstance(node, (typed.Temporal, typed.Until)))
-    return any(_with_horizon(node.interval.lo) or _with_horizon(node.interval.hi) for node in temporal)
+    """Whether a bound of a formula is written with `T`."""
+    timed = (node.interval for node in nodes(formula) if isinstance(node, (typed.Temporal, typed.Until)))
+    return any(end is not None and end.horizons != 0 for each in timed for end in (each.lo, each.hi))
 
 
-def _with_horizon(time: typed.Time | None) -> bool:
-    return time is not None and time.horizons != 0
-
-
-# ------------------------------------------------------------------ negation normal form
-
-_DUAL: dict[str, Literal["always", "eventually", "once", "historically"]] = {
-    "always": "eventually",
-    "eventually": "always",
-    "once": "historically",
-    "historically": "once",
-}
-
-
-def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
-    """`formula` for `sign` 1, its negation for -1, made of `and`, `or` and temporal operators.
-
-    `not` is left before predicates, `since`, `rise`, `fall`, `prev` and `next`.
-    """
-    match formula:
-        case typed.Truth(span, value):
-            return typed.Truth(span, value is (sign > 0))
-        case typed.Predicate() | typed.Shift() | typed.Edge() | typed.Until(_, "since") | typed.Recalled():
-            return formula if sign > 0 else typed.Not(formula.span, formula)
-        case typed.Not(_, body):
-            return normal(body, flip(sign))
-        case typed.Logic():
-            return _logic(formula, sign)
-        case typed.Freeze():
-            return replace(formula, body=normal(formula.body, sign))
-        case typed.Temporal(_, op):
-            return replace(formula, op=op if sign > 0 else _DUAL[op], body=normal(formula.body, sign))
-        case typed.Until():
-            return _until(formula, sign)
-        case _:
-            assert_never(formula)
-
-
-def flip(sign: Sign) -> Sign:
-    """The other sign."""
-    return -1 if sign > 0 else 1
-
-
-def _logic(node: typed.Logic, sign: Sign) -> typed.Formula:
-    match node.op:
-        case "and" | "or":
-            op: Literal["and", "or"] = "and" if (node.op == "and") is (sign > 0) else "or"
-            return typed.Logic(node.span, op, tuple(normal(item, sign) for item in node.items))
-        case "->":
-            left, right = node.items
-            parts = (normal(left, flip(sign)), normal(right, sign))
-            return typed.Logic(node.span, "or" if sign > 0 else "and", parts)
-        case "<->" | "xor":
-            return _equal(node, sign if node.op == "<->" else flip(sign))
-        case _:
-            assert_never(node.op)
-
-
-def _equal(node: typed.Logic, sign: Sign) -> typed.Formula:
-    """Both implications; negated: exactly one holds."""
-    left, right = node.items
-    inner: Literal["and", "or"] = "or" if sign > 0 else "and"
-    one = typed.Logic(node.span, inner, (normal(left, flip(sign)), normal(right, sign)))
-    other = typed.Logic(node.span, inner, (normal(left, sign), normal(right, flip(sign))))
-    return typed.Logic(node.span, "and" if sign > 0 else "or", (one, other))
-
-
-def _until(node: typed.Until, sign: Sign) -> typed.Formula:
-    if node.op == "unless":
-        return normal(unless(node), sign)
-    op: Literal["until", "release"] = "until" if (node.op == "until") is (sign > 0) else "release"
-    return replace(node, op=op, left=normal(node.left, sign), right=normal(node.right, sign))
-
-
-def unless(node: typed.Until) -> typed.Formula:
-    """`left unless[a, b] right` is `always[0, b] left or left until[a, b] right`."""
-    whole = replace(node.interval, lo=typed.Time(), lo_open=False)
-    held = typed.Temporal(node.span, "always", whole, node.left)
-    return typed.Logic(node.span, "or", (held, replace(node, op="until")))
+def at_hand(formula: typed.Formula) -> typed.Formula:
+    """A state formula with what it recalls told by timers alone."""
+    if isinstance(formula, typed.Recalled):
+        return at_hand(formula.now)
+    return map_children(formula, formulas=at_hand)

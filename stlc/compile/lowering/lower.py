@@ -1,22 +1,23 @@
-"""typed -> IR: negation normal form, and time in whole steps.
+"""From typed formulas to the IR: time in whole steps.
 
-De Morgan is the whole trick: `sign` says whether the formula or its negation is wanted, and flipping it swaps
-`and` with `or`, `always` with `eventually`, `until` with `release`. It ends in the sign of a predicate.
+Formulas are brought into negation normal form first, so that bounds are rounded for the operator that is
+judged in the end: `not always[0, b] p` is `eventually[0, b] not p`, which does not reach beyond its bound.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias, assert_never, final
+from types import MappingProxyType
+from typing import final
 
 from stlc.compile.frontend.bounds import to_window
 from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.traverse import from_now, on_clock
+from stlc.compile.ir.normal_form import DUAL, Sign, flip, literal, normal
+from stlc.compile.ir.traverse import from_now, on_clock, operands
 from stlc.diagnostics import Diagnostic
-
-Sign: TypeAlias = Literal[1, -1]
 
 _CAUTIOUS = frozenset({"always", "historically", "release", "trigger"})
 """Operators that ask something of every sample: a bound off the grid is rounded outwards."""
@@ -25,15 +26,11 @@ _CAUTIOUS = frozenset({"always", "historically", "release", "trigger"})
 def lower(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> ir.Formula:
     """`formula` in negation normal form and steps.
 
-    Absolute intervals are judged from the first sample on; what trains has none any more
+    Absolute intervals are judged from the first sample on; formulas for training have none any more
     (`stlc.compile.augment.timers`). Findings (E301, E302, E305, E311, W304) go to
     `sink`; where it holds an error afterwards, the formula is not meant to be used.
     """
-    return _Lowering(grid, sink).formula(formula, 1)
-
-
-def _flip(sign: Sign) -> Sign:
-    return -1 if sign > 0 else 1
+    return _Lowering(grid, sink).formula(normal(formula))
 
 
 @final
@@ -42,109 +39,69 @@ class _Lowering:
     grid: Grid
     sink: list[Diagnostic]
 
-    def formula(self, node: typed.Formula, sign: Sign) -> ir.Formula:
-        """`node` for `sign` 1, its negation for -1."""
+    def formula(self, node: typed.Formula) -> ir.Formula:
+        """A formula in negation normal form."""
         match node:
             case typed.Truth(span, value):
-                return ir.Truth(value is (sign > 0), span)
-            case typed.Predicate(span, num, strict, guard):
-                return ir.Predicate(num, sign, strict is (sign > 0), guard, span)
+                return ir.Truth(value, span)
+            case typed.Predicate() | typed.Not(_, typed.Predicate()):
+                return literal(node)
             case typed.Not(_, body):
-                return self.formula(body, _flip(sign))
-            case typed.Logic():
-                return self._logic(node, sign)
+                return self._negated(body)
+            case typed.Logic(span, "and" | "or" as op, items):
+                return ir.BoolOp(op, tuple(map(self.formula, items)), span)
             case typed.Temporal() | typed.Until():
-                return self._timed(node, sign)
-            case typed.Shift(span, steps, body):
-                outside = node.outside if sign > 0 or node.outside is None else not node.outside
-                return ir.Shift(steps, self.formula(body, sign), outside, span, weak=sign < 0)
+                return self._timed(node, node.op)
+            case typed.Shift(span, steps, body, outside):
+                return ir.Shift(steps, self.formula(body), outside, span)
             case typed.Edge():
-                return self._edge(node, sign)
+                return self._edge(node, holds=True)
             case typed.Freeze(span, bindings, body):
-                return ir.Freeze(bindings, self.formula(body, sign), span)
+                return ir.Freeze(bindings, self.formula(body), span)
             case typed.Recalled(_, _, along):
-                return self.formula(along, sign)
+                return self.formula(along)
             case _:
-                assert_never(node)
+                raise AssertionError("not in negation normal form")
 
-    def _logic(self, node: typed.Logic, sign: Sign) -> ir.Formula:
-        match node.op:
-            case "and" | "or":
-                items = tuple(self.formula(item, sign) for item in node.items)
-                return ir.BoolOp("and" if (node.op == "and") is (sign > 0) else "or", items, node.span)
-            case "->":
-                left, right = node.items
-                parts = (self.formula(left, _flip(sign)), self.formula(right, sign))
-                return ir.BoolOp("or" if sign > 0 else "and", parts, node.span)
-            case "<->":
-                return self._equal(node, sign)
-            case "xor":
-                return self._equal(node, _flip(sign))
+    def _negated(self, node: typed.Formula) -> ir.Formula:
+        """The negation of an operator that `normal` leaves a `not` before."""
+        match node:
+            case typed.Until(_, op):
+                return self._timed(
+                    replace(node, left=normal(node.left, -1), right=normal(node.right, -1)), DUAL[op]
+                )
+            case typed.Shift(span, steps, body, outside):
+                filled = None if outside is None else not outside
+                return ir.Shift(steps, self.formula(normal(body, -1)), filled, span, weak=True)
+            case typed.Edge():
+                return self._edge(node, holds=False)
+            case typed.Recalled(_, _, along):
+                return self.formula(normal(along, -1))
             case _:
-                assert_never(node.op)
+                raise AssertionError("not in negation normal form")
 
-    def _equal(self, node: typed.Logic, sign: Sign) -> ir.Formula:
-        """Both implications; negated: exactly one holds."""
-        left, right = node.items
-        inner: Literal["and", "or"] = "or" if sign > 0 else "and"
-        one = ir.BoolOp(inner, (self.formula(left, _flip(sign)), self.formula(right, sign)), node.span)
-        other = ir.BoolOp(inner, (self.formula(left, sign), self.formula(right, _flip(sign))), node.span)
-        return ir.BoolOp("and" if sign > 0 else "or", (one, other), node.span)
-
-    def _timed(self, node: typed.Temporal | typed.Until, sign: Sign) -> ir.Formula:
+    def _timed(self, node: typed.Temporal | typed.Until, op: str) -> ir.Formula:
+        """A temporal operator as `op`."""
         if on_clock(node):
-            return ir.AtStart(self._timed(from_now(node), sign), node.span)
-        return self._temporal(node, sign) if isinstance(node, typed.Temporal) else self._until(node, sign)
+            return ir.AtStart(self._timed(from_now(node), op), node.span)
+        parts = [self.formula(part) for part in operands(node)]
+        window = to_window(node.interval, self.grid, self.sink, outward=op in _CAUTIOUS)
+        return _MAKE[op](op, window, *parts, node.span)
 
-    def _temporal(self, node: typed.Temporal, sign: Sign) -> ir.Formula:
-        body = self.formula(node.body, sign)
-        positive = sign > 0
-        match node.op:
-            case "always" | "eventually":
-                over = ir.Temporal(
-                    "always" if (node.op == "always") is positive else "eventually", _LATER, body
-                )
-                return replace(over, window=self._window(node.interval, over.op), span=node.span)
-            case "historically" | "once":
-                past = ir.PastTemporal(
-                    "historically" if (node.op == "historically") is positive else "once", _LATER, body
-                )
-                return replace(past, window=self._window(node.interval, past.op), span=node.span)
-            case _:
-                assert_never(node.op)
-
-    def _until(self, node: typed.Until, sign: Sign) -> ir.Formula:
-        if node.op == "unless":
-            return self._unless(node, sign)
-        left, right = self.formula(node.left, sign), self.formula(node.right, sign)
-        match node.op:
-            case "until" | "release":
-                until = ir.Until(
-                    "until" if (node.op == "until") is (sign > 0) else "release", _LATER, left, right
-                )
-                return replace(until, window=self._window(node.interval, until.op), span=node.span)
-            case "since":
-                since = ir.Since("since" if sign > 0 else "trigger", _LATER, left, right)
-                return replace(since, window=self._window(node.interval, since.op), span=node.span)
-            case _:
-                assert_never(node.op)
-
-    def _unless(self, node: typed.Until, sign: Sign) -> ir.Formula:
-        """`always[0, b] left or left until[a, b] right`."""
-        whole = replace(node.interval, lo=typed.Time(), lo_open=False)
-        held = typed.Temporal(node.span, "always", whole, node.left)
-        met = typed.Until(node.span, "until", node.interval, node.left, node.right)
-        return self.formula(typed.Logic(node.span, "or", (held, met)), sign)
-
-    def _edge(self, node: typed.Edge, sign: Sign) -> ir.Formula:
+    def _edge(self, node: typed.Edge, *, holds: bool) -> ir.Formula:
         """`rise`: now and not before; `fall`: before and not now; false at the first sample."""
-        now = sign if node.op == "rise" else _flip(sign)
-        before = ir.Shift(-1, self.formula(node.body, _flip(now)), sign < 0, node.span)
-        parts = (self.formula(node.body, now), before)
-        return ir.BoolOp("and" if sign > 0 else "or", parts, node.span)
-
-    def _window(self, interval: typed.Interval, op: str) -> ir.Window:
-        return to_window(interval, self.grid, self.sink, outward=op in _CAUTIOUS)
+        now: Sign = 1 if (node.op == "rise") is holds else -1
+        before = ir.Shift(-1, self.formula(normal(node.body, flip(now))), not holds, node.span)
+        parts = (self.formula(normal(node.body, now)), before)
+        return ir.BoolOp("and" if holds else "or", parts, node.span)
 
 
-_LATER = ir.Window(0, None)
+_MAKE: Mapping[str, Callable[..., ir.Formula]] = MappingProxyType(
+    {
+        **dict.fromkeys(("always", "eventually"), ir.Temporal),
+        **dict.fromkeys(("historically", "once"), ir.PastTemporal),
+        **dict.fromkeys(("until", "release"), ir.Until),
+        **dict.fromkeys(("since", "trigger"), ir.Since),
+    }
+)
+"""Operator -> its class of nodes."""

@@ -12,8 +12,7 @@ from dataclasses import replace
 from typing import assert_never
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import numbers
-from stlc.compile.ir.samples import held_by, thawed
+from stlc.compile.ir.traverse import frozen_in, numbers, substitute_frozen
 from stlc.compile.semantics.semantics import Exact, Semantics
 
 _EXACT = Exact()
@@ -84,13 +83,13 @@ def _window(node: ir.Temporal | ir.PastTemporal, semantics: Semantics) -> ir.For
 
 def _freeze(node: ir.Freeze) -> ir.Formula:
     """Without what nobody reads; a predicate of this very instant reads the number itself."""
-    read = frozenset().union(*map(held_by, numbers(node.body)))
+    read = frozenset().union(*map(frozen_in, numbers(node.body)))
     kept = tuple((name, num) for name, num in node.bindings if name in read)
     if not kept:
         return node.body
     if not isinstance(node.body, ir.Predicate):
         return replace(node, bindings=kept)
-    return replace(node.body, num=thawed(node.body.num, dict(kept)))
+    return replace(node.body, num=substitute_frozen(node.body.num, dict(kept)))
 
 
 def _sum(outer: ir.Window, inner: ir.Window, semantics: Semantics) -> ir.Window | None:

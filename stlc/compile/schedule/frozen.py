@@ -19,8 +19,8 @@ from stlc.compile.backends.array.arith import Program
 from stlc.compile.backends.array.inputs import inputs
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import columns, nodes, numbers, reach, uses_end
-from stlc.compile.ir.samples import Reach, held_by, looks_at_ends
+from stlc.compile.ir.support import Reach, columns, looks_at_ends, reach, uses_end
+from stlc.compile.ir.traverse import frozen_in, nodes, numbers
 from stlc.compile.schedule.schedule import Extent, Run, reads, upto, within
 
 Env: TypeAlias = Mapping[str, Array]
@@ -133,7 +133,7 @@ class Freezer:
     def _read(self, node: ir.Freeze) -> dict[str, Array]:
         """The columns that the body reads, and what is frozen around; at least one."""
         own = {name for name, _ in node.bindings}
-        names = set(columns(node.body)).union(*map(held_by, numbers(node.body))) - own
+        names = set(columns(node.body)).union(*map(frozen_in, numbers(node.body))) - own
         return {name: self.env[name] for name in names & self.env.keys() or list(self.env)[:1]}
 
     @property
@@ -180,7 +180,7 @@ def without(body: ir.Formula, names: frozenset[str], extent: Extent) -> ir.Formu
         case ir.Truth():
             return body
         case ir.Predicate(num, sign):
-            if not held_by(num) & names:
+            if not frozen_in(num) & names:
                 return body
             return ir.Truth(extent.end == "upper" if extent.open else sign < 0, body.span)
         case ir.BoolOp(_, items):
@@ -191,7 +191,7 @@ def without(body: ir.Formula, names: frozenset[str], extent: Extent) -> ir.Formu
             left, right = without(body.left, names, extent), without(body.right, names, extent)
             return replace(body, left=left, right=right)
         case ir.Freeze(bindings, inner):
-            lost = {name for name, num in bindings if held_by(num) & names}
+            lost = {name for name, num in bindings if frozen_in(num) & names}
             inner = without(inner, names - {name for name, _ in bindings} | lost, extent)
             kept = tuple((name, num) for name, num in bindings if name not in lost)
             return replace(body, bindings=kept, body=inner) if kept else inner

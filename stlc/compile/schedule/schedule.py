@@ -14,8 +14,7 @@ from typing import Literal, TypeAlias, assert_never
 from stlc.compile.backends.array.arith import Program
 from stlc.compile.backends.array.namespace import Array
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.samples import Reach, farthest, reach_of
-from stlc.compile.ir.tails import tail
+from stlc.compile.ir.support import Reach, farthest, reach_of, tail
 
 End: TypeAlias = Literal["strict", "truncate", "lower", "upper", "both"]
 """What stands beyond the last sample.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stlc.compile.augment.lift import recorded
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.ir.horizon import reach
+from stlc.compile.ir.support import reach
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.compile.semantics.semantics import TOLERANCE

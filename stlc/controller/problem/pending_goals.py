@@ -17,7 +17,7 @@ from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.horizon import Reach, reach
+from stlc.compile.ir.support import Reach, reach
 from stlc.compile.lowering.lower import lower
 
 if TYPE_CHECKING:

@@ -14,8 +14,7 @@ import torch
 
 from stlc.compile.analysis.ranges import bounds
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import numbers
-from stlc.compile.ir.samples import everything
+from stlc.compile.ir.traverse import numbers, subexpressions
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.controller.training.exploration import EFFORTS, Exploration
@@ -216,7 +215,7 @@ class _Most:
 
     def _atom(self, atom: ir.Predicate, now: int) -> float:
         facts = self._reached[now]
-        if any(isinstance(part, ir.ShiftedSignal) for num in numbers(atom) for part in everything(num)):
+        if any(isinstance(part, ir.ShiftedSignal) for num in numbers(atom) for part in subexpressions(num)):
             return math.inf
         reach = bounds(atom.num, facts)
         if reach is None or any(map(math.isnan, reach)):

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import columns
+from stlc.compile.ir.support import columns
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.problem.kernel import Effort
 from stlc.controller.training.local_search import SearchResult

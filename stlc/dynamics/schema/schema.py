@@ -10,8 +10,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TypeAlias
 
-from stlc.compile.ir.horizon import columns as columns_of_formula
-from stlc.compile.ir.samples import columns_of
+from stlc.compile.ir.support import columns as columns_of_formula
+from stlc.compile.ir.support import columns_of
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.model import Assign, FunctionDecl, JumpDecl

@@ -19,11 +19,8 @@ from stlc.compile.backends.array.graph import evaluate_parts
 from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.defined import defined
-from stlc.compile.ir.horizon import numbers, parts
-from stlc.compile.ir.samples import columns_of, leaves
-from stlc.compile.ir.thaw import thaw
-from stlc.compile.ir.traverse import from_now, on_clock
+from stlc.compile.ir.support import columns_of, defined
+from stlc.compile.ir.traverse import from_now, leaves, numbers, on_clock, operands, substitute_frozen
 from stlc.compile.lowering.lower import lower
 from stlc.monitor.holes import KNOWN, unsure
 from stlc.monitor.values import Record, bounds, granted, history
@@ -153,7 +150,7 @@ def _leaves_of(formula: ir.Formula) -> dict[ir.Formula, None]:
     """The predicates of a formula; what freezes values is one."""
     if isinstance(formula, (ir.Predicate, ir.Freeze)):
         return {formula: None}
-    return {leaf: None for part in parts(formula) for leaf in _leaves_of(part)}
+    return {leaf: None for part in operands(formula) for leaf in _leaves_of(part)}
 
 
 def _over_columns(formula: ir.Formula, names: Mapping[ir.Formula, str]) -> ir.Formula:
@@ -268,7 +265,7 @@ class Blamer:
             case typed.Edge():
                 return self._edge(formula, sample, wanted)
             case typed.Freeze(_, _, body):
-                thawed = thaw(body, self._values(formula, sample))
+                thawed = substitute_frozen(body, self._values(formula, sample))
                 inner = replace(self, cache={}, known={}, tied=None)
                 tree, alone = inner.why(thawed, sample, wanted=wanted)
                 return replace(tree, moves=alone and not self._frozen(formula, sample) & tree.leaf.instants)
@@ -438,7 +435,7 @@ class Blamer:
 
     def _stop(self, lowered: ir.Formula) -> int:
         """The first instant after the last sample at which nothing is known of the parts of a formula."""
-        return self.record.samples + min(max(map(history, parts(lowered))), _MOST_LATER)
+        return self.record.samples + min(max(map(history, operands(lowered))), _MOST_LATER)
 
     def _timed(self, formula: typed.Temporal | typed.Until, sample: int, wanted: bool) -> Blame:
         if on_clock(formula):

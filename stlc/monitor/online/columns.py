@@ -17,7 +17,7 @@ from stlc.compile.backends.array.graph import execute
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import columns as names_of_columns
+from stlc.compile.ir.support import columns as names_of_columns
 from stlc.compile.schedule.schedule import Extent, Run, Schedule, schedule
 from stlc.compile.semantics.semantics import Exact
 from stlc.monitor.endings import reads_seen, with_seen

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import reach
+from stlc.compile.ir.support import reach
 from stlc.monitor.online.asked import Bounds, Floats, Plans
 from stlc.monitor.online.columns import NOTHING, Reader, continued
 from stlc.monitor.online.streams import Latched, Leaf, Plan, plan

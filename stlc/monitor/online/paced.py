@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Protocol, TypeAlias, assert_never
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import nodes, parts, reach
-from stlc.compile.ir.samples import Reach, farthest
+from stlc.compile.ir.support import Reach, farthest, reach
+from stlc.compile.ir.traverse import nodes, operands
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.monitor.online.asked import Bounds, Floats
 from stlc.monitor.online.streams import endless
@@ -46,7 +46,7 @@ _FROZEN = 500
 
 def span(formula: ir.Formula) -> Reach:
     """How many samples before and after its instant the windows of a formula look where they have an end."""
-    inner = [span(part) for part in parts(formula)]
+    inner = [span(part) for part in operands(formula)]
     past, future = (
         max((each.past for each in inner), default=0),
         max((each.future for each in inner), default=0),
@@ -111,7 +111,7 @@ def work(formula: ir.Formula, instants: int, samples: int = 0) -> Work:
             instants += samples if window.hi is None else window.hi
     windows = isinstance(formula, (ir.Temporal, ir.PastTemporal, ir.Until, ir.Since))
     found = Work(instants if windows else 0)
-    for part in parts(formula):
+    for part in operands(formula):
         found = found.and_(work(part, instants, samples))
     return found
 

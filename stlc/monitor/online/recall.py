@@ -9,7 +9,7 @@ import numpy as np
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import reach
+from stlc.compile.ir.support import reach
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.monitor.explain.report import Cause, explain
 from stlc.monitor.instants import rule_bounds, window_of

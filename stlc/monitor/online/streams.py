@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import columns as names_of_columns
-from stlc.compile.ir.horizon import nodes, numbers, reach
-from stlc.compile.ir.samples import leaves as readings
+from stlc.compile.ir.support import columns as names_of_columns
+from stlc.compile.ir.support import reach
+from stlc.compile.ir.traverse import leaves as readings
+from stlc.compile.ir.traverse import nodes, numbers
 from stlc.monitor.values import history
 
 Latch: TypeAlias = Literal["once", "historically", "since", "trigger"]

@@ -10,7 +10,7 @@ import numpy as np
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import reach, uses_end
+from stlc.compile.ir.support import reach, uses_end
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.endings import lengthened, with_seen

@@ -9,7 +9,7 @@ import numpy as np
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import reach
+from stlc.compile.ir.support import reach
 from stlc.monitor.online.asked import (
     Asked,
     Bounds,

@@ -16,7 +16,7 @@ from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.array.tape import Instr, Operand, Tape
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
-from stlc.compile.ir.samples import key_of, leaves
+from stlc.compile.ir.traverse import key_of, leaves
 from stlc.compile.semantics.switch import Hard, Switch
 
 ExternFunction: TypeAlias = Callable[..., Sequence[Array]]

@@ -19,7 +19,7 @@ from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.defined import defined
+from stlc.compile.ir.support import defined
 from stlc.compile.schedule.frozen import Freezer
 from stlc.compile.schedule.machine import Machine
 from stlc.compile.schedule.schedule import End, Extent, Run, Runner, Schedule, schedule

@@ -14,9 +14,8 @@ from stlc.compile.backends.c.numbers import Untranslatable
 from stlc.compile.backends.onnx.ops import ONNX
 from stlc.compile.backends.onnx.sheet import Value
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.defined import defined
-from stlc.compile.ir.horizon import numbers
-from stlc.compile.ir.samples import everything
+from stlc.compile.ir.support import defined
+from stlc.compile.ir.traverse import numbers, subexpressions
 from stlc.compile.schedule.schedule import Run
 
 Columns = dict[str, Value]
@@ -50,7 +49,7 @@ def written(formulas: Sequence[ir.Formula], columns: Mapping[str, Value], *, cou
 def require_numbers(nums: Iterator[ir.Num] | Sequence[ir.Num]) -> None:
     """Raise Untranslatable where a number calls a function of which only Python knows what it computes."""
     for num in nums:
-        for part in everything(num):
+        for part in subexpressions(num):
             if isinstance(part, ir.Extern) and not isinstance(part.function, ir.Body):
                 raise Untranslatable(f"the function `{part.name}`")
 

@@ -37,8 +37,8 @@ from stlc.compile.backends.c.steps import (
     call_of,
 )
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.horizon import parts
-from stlc.compile.ir.samples import columns_of, everything, held_by, reach_of
+from stlc.compile.ir.support import columns_of, reach_of
+from stlc.compile.ir.traverse import frozen_in, operands, subexpressions
 
 
 def plan_of(formulas: Sequence[ir.Formula], samples: int) -> Plan:
@@ -230,7 +230,7 @@ class _Planner:
         past, future = reach_of(num)
         if run.first.low < past or run.last.high + future >= self.samples:
             raise Untranslatable("a sample outside of the plan")
-        for part in everything(num):
+        for part in subexpressions(num):
             key = call_of(part)
             if key is not None and key not in self.calls:
                 self._call(key, part)
@@ -264,12 +264,12 @@ def _frozen_names(formula: ir.Formula) -> frozenset[str]:
     """The frozen values that a formula reads and does not bind, and its columns."""
     match formula:
         case ir.Predicate(num):
-            return held_by(num) | columns_of(num)
+            return frozen_in(num) | columns_of(num)
         case ir.Freeze(bindings, body):
             inner = _frozen_names(body) - {name for name, _ in bindings}
-            return inner.union(*(held_by(num) | columns_of(num) for _, num in bindings))
+            return inner.union(*(frozen_in(num) | columns_of(num) for _, num in bindings))
         case _:
-            return frozenset().union(*map(_frozen_names, parts(formula)))
+            return frozenset().union(*map(_frozen_names, operands(formula)))
 
 
 LARGE = 64
@@ -322,4 +322,4 @@ def _operands(op: str, items: Sequence[ir.Formula]) -> list[ir.Formula]:
 
 
 def _large(num: ir.Num) -> bool:
-    return next(islice(everything(num), LARGE, None), None) is not None
+    return next(islice(subexpressions(num), LARGE, None), None) is not None

@@ -28,7 +28,7 @@ from stlc.compile.backends.c.steps import (
 )
 from stlc.compile.backends.c.windows import windowed_back
 from stlc.compile.ir.nodes import ELAPSED, Num, Signal
-from stlc.compile.ir.samples import leaves
+from stlc.compile.ir.traverse import leaves
 
 
 @dataclass(frozen=True, slots=True)

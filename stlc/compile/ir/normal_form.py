@@ -1,0 +1,138 @@
+"""Negation normal form: the one expansion of `not`, `->`, `<->`, `xor` and `unless`.
+
+De Morgan's laws push a negation down to the leaves: it swaps `and` with `or`, `always` with `eventually`,
+`once` with `historically`, `until` with `release`, `since` with `trigger`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any, Literal, TypeAlias, assert_never
+
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.traverse import map_children
+
+Sign: TypeAlias = Literal[1, -1]
+
+DUAL: dict[str, Any] = {
+    "and": "or",
+    "always": "eventually",
+    "once": "historically",
+    "until": "release",
+    "since": "trigger",
+}
+DUAL |= {dual: op for op, dual in DUAL.items()}
+"""Operator -> the operator of its negation."""
+
+
+def flip(sign: Sign) -> Sign:
+    """The other sign."""
+    return -1 if sign > 0 else 1
+
+
+def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
+    """`formula` for `sign` 1, its negation for -1, made of `and`, `or` and temporal operators.
+
+    `not` is left before predicates, `since`, `rise`, `fall`, `prev`, `next` and what is recalled.
+    """
+    match formula:
+        case typed.Truth(_, value):
+            return formula if sign > 0 else replace(formula, value=not value)
+        case typed.Predicate() | typed.Shift() | typed.Edge() | typed.Until(_, "since") | typed.Recalled():
+            inner = map_children(formula, formulas=normal)
+            return inner if sign > 0 else typed.Not(formula.span, inner)
+        case typed.Not(_, body):
+            return normal(body, flip(sign))
+        case typed.Until(_, "unless"):
+            return normal(_unless(formula), sign)
+        case typed.Logic(_, "->" | "<->" | "xor"):
+            return _implication(formula, sign)
+        case typed.Logic() | typed.Temporal() | typed.Until():
+            signed = formula if sign > 0 else replace(formula, op=DUAL[formula.op])
+            return map_children(signed, formulas=lambda part: normal(part, sign))
+        case typed.Freeze():
+            return map_children(formula, formulas=lambda part: normal(part, sign))
+        case _:
+            assert_never(formula)
+
+
+def _implication(node: typed.Logic, sign: Sign) -> typed.Formula:
+    """`a -> b`; `a <-> b` is both implications, `a xor b` its negation."""
+    left, right = node.items
+    if node.op == "xor":
+        sign = flip(sign)
+    inner: Literal["and", "or"] = "or" if sign > 0 else "and"
+    there = typed.Logic(node.span, inner, (normal(left, flip(sign)), normal(right, sign)))
+    if node.op == "->":
+        return there
+    back = typed.Logic(node.span, inner, (normal(left, sign), normal(right, flip(sign))))
+    return typed.Logic(node.span, DUAL[inner], (there, back))
+
+
+def _unless(node: typed.Until) -> typed.Formula:
+    """`left unless[a, b] right` is `always[0, b] left or left until[a, b] right`."""
+    whole = replace(node.interval, lo=typed.Time(), lo_open=False)
+    held = typed.Temporal(node.span, "always", whole, node.left)
+    return typed.Logic(node.span, "or", (held, replace(node, op="until")))
+
+
+# ---------------------------------------------------------------------------- state formulas
+
+
+def condition(formula: typed.Formula, *, negated: bool = False) -> ir.Formula:
+    """A state formula as a condition of the IR, constants folded.
+
+    Args:
+        formula: one for which `is_state` holds.
+        negated: take its negation.
+    """
+    return _folded(normal(formula, -1 if negated else 1))
+
+
+def _folded(formula: typed.Formula) -> ir.Formula:
+    match formula:
+        case typed.Truth(span, value):
+            return ir.Truth(value, span)
+        case typed.Predicate() | typed.Not(_, typed.Predicate()):
+            return replace(literal(formula), guard=False)
+        case typed.Logic(span, "and" | "or" as op, items):
+            return joined(op, map(_folded, items), ir.Truth(op == "and", span))
+        case _:
+            raise AssertionError("not a state formula")
+
+
+def literal(formula: typed.Predicate | typed.Not) -> ir.Predicate:
+    """A predicate, or its negation, in the IR."""
+    if isinstance(formula, typed.Predicate):
+        return ir.Predicate(formula.num, 1, formula.strict, formula.guard, formula.span)
+    assert isinstance(formula.body, typed.Predicate)
+    negated: ir.Predicate = negate(literal(formula.body))
+    return negated
+
+
+def joined(op: Literal["and", "or"], items: Iterable[ir.Formula], neutral: ir.Truth) -> ir.Formula:
+    """`and` or `or` of formulas without constants; `neutral` is its value where nothing is left."""
+    kept: list[ir.Formula] = []
+    for item in items:
+        if not isinstance(item, ir.Truth):
+            kept.append(item)
+        elif item.value is not neutral.value:
+            return replace(neutral, value=item.value)
+    if len(kept) < 2:
+        return kept[0] if kept else neutral
+    return ir.BoolOp(op, tuple(kept), neutral.span)
+
+
+def negate(formula: Any) -> Any:
+    """The exact complement of a state formula of the IR."""
+    match formula:
+        case ir.Truth(value):
+            return replace(formula, value=not value)
+        case ir.Predicate(_, sign, strict):
+            return replace(formula, sign=flip(sign), strict=not strict)
+        case ir.BoolOp(op):
+            return map_children(replace(formula, op=DUAL[op]), formulas=negate)
+        case _:
+            raise TypeError(f"not a state formula: {formula!r}")
