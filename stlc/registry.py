@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from difflib import SequenceMatcher
-from typing import Generic, TypeVar
+from importlib import import_module
+from importlib.util import find_spec
+from pkgutil import iter_modules
+from typing import Any, Generic, TypeVar
 
 from stlc.diagnostics import Diagnostic, UsageError
 
@@ -77,15 +80,15 @@ class Registry(Generic[T]):
 
     def get(self, name: str) -> T:
         """The entry `name`. Raises UsageError (U101) that names the nearest entry and all others."""
-        if name not in self._entries:
+        if name not in self:
             finding = Diagnostic("U101", f"unknown {self.kind} `{name}`", help=(self.suggest(name),))
             raise UsageError(finding)
         return self._entries[name]
 
     def suggest(self, name: str) -> str:
         """One line of help for somebody who wrote `name`."""
-        known = f"{self.kind}s: {', '.join(self.names)}" if self._entries else f"there is no {self.kind}"
-        near = closest(name, self._entries)
+        known = f"{self.kind}s: {', '.join(self.names)}" if self.names else f"there is no {self.kind}"
+        near = closest(name, self.names)
         return known if near is None else f"did you mean `{near}`?  {known}"
 
     @property
@@ -94,10 +97,48 @@ class Registry(Generic[T]):
         return tuple(self._entries)
 
     def __contains__(self, name: object) -> bool:
-        return name in self._entries
+        return name in self.names
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._entries)
+        return iter(self.names)
 
     def __len__(self) -> int:
-        return len(self._entries)
+        return len(self.names)
+
+
+class PackageRegistry(Registry[T]):
+    """A table whose entries are the modules of a package: a plugin is one file, `NAME.py`.
+
+    The names are known without an import. Modules whose names begin with `_` are no entries.
+
+    Args:
+        kind: what one entry is, in the singular and in the user's terms.
+        package: the dotted name of the package.
+        attribute: the name under which a module holds its entry.
+        default: the entry that is taken where none is named; first of the names.
+    """
+
+    def __init__(self, kind: str, package: str, attribute: str, *, default: str) -> None:
+        super().__init__(kind)
+        self.default = default
+        self._package, self._attribute = package, attribute
+
+    def get(self, name: str) -> T:
+        """The entry `name`, its module imported. Raises UsageError (U101) as `Registry.get` does."""
+        if name in self and name not in self._entries:
+            self._entries[name] = getattr(import_module(f"{self._package}.{name}"), self._attribute)
+        return super().get(name)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The default, then the others in alphabetical order."""
+        package = find_spec(self._package)
+        folders = package.submodule_search_locations if package is not None else None
+        found = sorted(module.name for module in iter_modules(folders) if not module.name.startswith("_"))
+        return tuple(sorted(found, key=lambda name: name != self.default))
+
+
+METHODS: PackageRegistry[Any] = PackageRegistry(
+    "method", "stlc.controller.methods", "METHOD", default="guided"
+)
+"""Ways to a policy, `stlc.controller.methods.Method` each: what `--method` and `train: {method: …}` name."""

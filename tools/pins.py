@@ -69,7 +69,7 @@ from stlc.compile.backends.c.adjoint import emit_adjoint
 from stlc.compile.backends.c.emit import emit
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.plan_repair import Limits
-from stlc.controller.problem.kernel import motion_of
+from stlc.controller.problem.native import motion_of
 
 NO_LIMIT = Limits(seconds=None, paper=None)
 """Of a guard's decision: time plays no part."""

@@ -29,7 +29,7 @@ from stlc.jsontext import dumps, plain
 from stlc.provenance import sha256
 
 if TYPE_CHECKING:
-    from stlc.controller.training.config import Clock, Method
+    from stlc.controller.training.config import Clock
 
 Study: TypeAlias = Literal["paper", "ablation", "family"]
 
@@ -87,7 +87,7 @@ class Cell:
     """
 
     benchmark: str
-    method: Method
+    method: str
     seed: int
     length: Length
     held_out: int = HELD_OUT

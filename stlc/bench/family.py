@@ -133,8 +133,8 @@ def _verdict(run: RunDir, family: Family, value: float, held_out: int) -> dict[s
     from stlc.controller.evaluation.held_out import score
     from stlc.controller.training.run import Run
 
-    policy = Run.open(run.path, overrides={family.parameter: f"{value}{family.unit}"}).policy
-    return score(policy, n=held_out).summary()
+    opened = Run.open(run.path, overrides={family.parameter: f"{value}{family.unit}"})
+    return score(opened.task, opened.policy, n=held_out).summary()
 
 
 # ----------------------------------------------------------------------- what is kept

@@ -21,5 +21,5 @@ def training_accuracy(folder: RunDir) -> float | None:
     states = saved.tensors.get("training.states")
     if states is None:
         return None
-    _, judged = Run.open(folder.path).policy.plan_judged(states.double())
+    _, judged = Run.open(folder.path).plan_judged(states.double())
     return float(satisfied(judged.rho).double().mean())

@@ -115,7 +115,7 @@ def _alone(run: Run, recording: Recording, places: NDArray[np.int64]) -> list[fl
     for row, step in (*places[:WARM], *places):
         x = torch.from_numpy(recording.states[row, step])[None]
         begin = perf_counter()
-        run.policy.plan_judged(x)
+        run.plan_judged(x)
         found.append(perf_counter() - begin)
     return found[min(WARM, len(places)) :]
 

@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from stlc.bench.cells import BENCHMARKS, Cell, Length, length_of
 from stlc.controller.training.config import HELD_OUT
-
-if TYPE_CHECKING:
-    from stlc.controller.training.config import Method
+from stlc.registry import METHODS
 
 LENGTHS = (Length(60.0), Length(300.0))
-METHODS: tuple[Method, ...] = ("guided", "gradient")
 SEEDS = (0, 1, 2)
 
 
@@ -31,7 +28,7 @@ class Extent:
     """
 
     benchmarks: Sequence[str] = BENCHMARKS
-    methods: Sequence[Method] = METHODS
+    methods: Sequence[str] = METHODS.names
     seeds: Sequence[int] = SEEDS
     lengths: Sequence[Length] = LENGTHS
     held_out: int = HELD_OUT
@@ -105,7 +102,7 @@ def paper_rows(documents: Iterable[Mapping[str, Any]], ceilings: Mapping[str, fl
 
 def _place(row: Row) -> tuple[int, str, int, float]:
     known = BENCHMARKS.index(row.benchmark) if row.benchmark in BENCHMARKS else len(BENCHMARKS)
-    return known, row.benchmark, METHODS.index(row.method), row.seconds
+    return known, row.benchmark, METHODS.names.index(row.method), row.seconds
 
 
 def _row(key: tuple[str, str, str], group: Sequence[Mapping[str, Any]], ceiling: float | None) -> Row:

@@ -108,8 +108,8 @@ def step_timing(name: str, task: Task, *, seconds: float, warm: int) -> StepTimi
     engine = resolve_config(task, TrainConfig(seed=0, threads=1))
     trainer = Trainer(task, engine, steps=MOST_STEPS, device=torch.device("cpu"))
     for _ in range(warm):
-        if trainer.step >= trainer.next_look:
-            trainer.look()
+        if trainer.step >= trainer.next_validation:
+            trainer.validate()
         trainer.advance()
     if trainer.repairing is not None:
         trainer.repairing.result()
@@ -128,7 +128,7 @@ def step_timing(name: str, task: Task, *, seconds: float, warm: int) -> StepTimi
 
 def _parts(trainer: Trainer, x0: Tensor) -> Sequence[Callable[[], object]]:
     """Forward; verdict; gradient; forward and backward; optimiser."""
-    task, network, count = trainer.task, trainer.network, trainer.engine.plans
+    task, network, count = trainer.task, trainer.network, trainer.config.plans
     plans = network(x0).detach()
     direction = torch.ones_like(plans)
     chosen = plans[:, 0].clone().requires_grad_()
@@ -148,7 +148,7 @@ def _parts(trainer: Trainer, x0: Tensor) -> Sequence[Callable[[], object]]:
         network(x0).backward(direction)
 
     def optimise() -> None:
-        torch.nn.utils.clip_grad_norm_(network.parameters(), trainer.engine.clip)
+        torch.nn.utils.clip_grad_norm_(network.parameters(), trainer.config.clip)
         trainer.optimizer.step()
         with torch.no_grad():
             for averaged, current in zip(trainer.average.parameters(), network.parameters(), strict=True):
@@ -160,9 +160,9 @@ def _parts(trainer: Trainer, x0: Tensor) -> Sequence[Callable[[], object]]:
 def _searched(trainer: Trainer) -> float:
     """Milliseconds of a round of search for the states on which the network fails."""
     with torch.no_grad():
-        x0 = trainer.supply.take(trainer.engine.pool)
+        x0 = trainer.supply.take(trainer.config.pool)
         plans, judged = trainer.policy.plan_judged(x0)
-        bad = (~satisfied(judged.rho)).nonzero()[:, 0][: trainer.engine.most]
+        bad = (~satisfied(judged.rho)).nonzero()[:, 0][: trainer.config.most]
     states, start, bank = x0[bad], plans[bad], trainer.buffer.bank
     before = time.process_time()
     trainer.searcher.repair(states, start, bank)

@@ -14,7 +14,7 @@ from stlc.compile.backends.c.parts import declared, in_parts
 from stlc.compile.backends.c.plan import plan_of
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
 from stlc.controller.guard.shooting import grid_of
-from stlc.controller.problem.kernel import motion_of
+from stlc.controller.problem.native import motion_of
 from stlc.dynamics.model.controls import raw_width
 from stlc.escape import c_comment, c_string
 from stlc.export import c_numbers, c_weights

@@ -50,8 +50,8 @@ def write_onnx(run: Run, folder: Path) -> None:
     require_onnx()
     task, facts = run.task, _facts(run)
     graphs: dict[str, Callable[[], dict[str, Value]]] = {
-        DECIDE: lambda: deciding(task, run.policy.network),
-        FOLLOW: lambda: following(task, run.policy.network),
+        DECIDE: lambda: deciding(task, run.network),
+        FOLLOW: lambda: following(task, run.network),
         JUDGE: lambda: judging(task),
     }
     if task.compiled.safety:

@@ -104,11 +104,11 @@ Checked: TypeAlias = tuple[Agreement | None, Latency | None]
 def _torch(run: Run, folder: Path) -> Checked:
     """`decide.pt2`, `backup.pt2`, and `controller.json` that says what goes in and comes out."""
     path, backup = folder / "decide.pt2", folder / "backup.pt2"
-    torch.export.save(recorded(run.task, run.policy.network), path)
-    torch.export.save(recorded_guard(run.task, run.policy.network), backup)
+    torch.export.save(recorded(run.task, run.network), path)
+    torch.export.save(recorded_guard(run.task, run.network), backup)
     (folder / "controller.json").write_text(dumps(_facts(run)) + "\n", encoding="utf-8")
-    fresh = agreement(run.policy, by_torch(path), states=STATES)
-    guarded = backup_agreement(run.policy, backup, states=STATES // 16)
+    fresh = agreement(run.network_policy, by_torch(path), states=STATES)
+    guarded = backup_agreement(run.network_policy, backup, states=STATES // 16)
     off = max(fresh.rho, guarded.rho)
     return Agreement(STATES, max(fresh.plan, guarded.plan), off, fresh.ties + guarded.ties), None
 
@@ -117,8 +117,8 @@ def _onnx(run: Run, folder: Path) -> Checked:
     """The graphs of `stlc.export.onnx_graphs`, and `controller.json`."""
     write_onnx(run, folder)
     graphs = Graphs(read_facts(folder))
-    fresh = agreement(run.policy, by_onnx(graphs), states=STATES)
-    kept = kept_agreement(run.policy, graphs, states=STATES)
+    fresh = agreement(run.network_policy, by_onnx(graphs), states=STATES)
+    kept = kept_agreement(run.network_policy, graphs, states=STATES)
     off = max(fresh.rho, kept.rho, same_verdicts(run.task, graphs, states=STATES // 4))
     found = Agreement(STATES, max(fresh.plan, kept.plan), off, fresh.ties + kept.ties)
     return found, timed(run.task, folder)
@@ -127,11 +127,11 @@ def _onnx(run: Run, folder: Path) -> Checked:
 def _c(run: Run, folder: Path) -> Checked:
     """A header, its weights, an example program and its Makefile."""
     try:
-        text = emit.header(run.task, run.policy.network)
+        text = emit.header(run.task, run.network)
     except Untranslatable as error:
         finding = Diagnostic("U101", f"this task has no C form: {error}", help=("take --to torch instead",))
         raise UsageError(finding) from error
-    headers = {"stlc_controller.h": text, "stlc_weights.h": c_weights.weights(run.policy.network)}
+    headers = {"stlc_controller.h": text, "stlc_weights.h": c_weights.weights(run.network)}
     texts = {
         **public(headers, "STLC_CONTROLLER_H"),
         "main.c": emit.main_of(run.task),
@@ -140,7 +140,7 @@ def _c(run: Run, folder: Path) -> Checked:
     for name, content in texts.items():
         (folder / name).write_text(content, encoding="utf-8")
     decide = by_c(folder, run.task, folder / BUILT)
-    return agreement(run.policy, decide, states=STATES), None
+    return agreement(run.network_policy, decide, states=STATES), None
 
 
 _WRITERS: Mapping[Target, Callable[[Run, Path], Checked]] = {"torch": _torch, "c": _c, "onnx": _onnx}

@@ -122,7 +122,7 @@ def test_a_finished_run_is_collected_and_then_kept(tmp_path: Path, monkeypatch: 
     assert cell_of(document) == cell
     assert misfits(document, schema_of("cell")) == []
     states = load("traffic").sample(30, seed=HELD_OUT_SEED, dtype=torch.float64)
-    good = satisfied(run.policy.plan_judged(states)[1].rho)
+    good = satisfied(run.plan_judged(states)[1].rho)
     assert unpack(document["solved"], 30) == good.tolist()
     assert document["accuracy"] == pytest.approx(float(good.double().mean()))
     assert 0.0 <= document["training_accuracy"] <= 1.0

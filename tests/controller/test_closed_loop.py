@@ -10,9 +10,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.controller.evaluation.closed_loop import LEAST, NEAR, SEED, ClosedLoop, Share, closed_loop, reserve
-from stlc.controller.policies.policy import BestOfKPolicy, network_of
+from stlc.controller.evaluation.closed_loop import LEAST, NEAR, SEED, ClosedLoop, Share, closed_loop
+from stlc.controller.policies.policy import BestOfKPolicy
 from stlc.controller.problem.task import Task
+from stlc.controller.training.budget import simulation_reserve
 from stlc.controller.training.config import DRIVES, HELD_OUT_SEED, TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import train
@@ -20,6 +21,7 @@ from stlc.controller.training.run import Run
 from stlc.dynamics.model.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
+from stlc.registry import METHODS
 from stlc.view.learning import Commands, driven_lines, recommended
 
 ROOT = Path(__file__).parents[2]
@@ -35,7 +37,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     folder = open_folder(task, config, Launch(root=tmp_path_factory.mktemp("runs")))
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        network = network_of(task, resolve_config(task, config))
+        resolved = resolve_config(task, config)
+        network = METHODS.get(resolved.method).network(task, resolved)
     return Run(folder, task, BestOfKPolicy(task, network))
 
 
@@ -157,4 +160,4 @@ def test_the_next_command_has_the_guard_that_is_recommended(guard: str, words: s
 
 def test_drives_have_a_share_of_the_budget() -> None:
     for seconds in (5.0, 60.0, 300.0, 3600.0):
-        assert 0.08 * seconds <= reserve(seconds) <= 0.15 * seconds
+        assert 0.08 * seconds <= simulation_reserve(seconds) <= 0.15 * seconds

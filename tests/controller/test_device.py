@@ -49,7 +49,7 @@ def _trainer(task: Task, device: torch.device) -> Trainer:
 def _trained(trainer: Trainer) -> list[float]:
     seen: list[float] = []
     for _ in range(2):
-        look = trainer.look()
+        look = trainer.validate()
         seen += [look.accuracy, *look.requirements, float(look.repaired), trainer.advance()]
     return seen
 
@@ -72,11 +72,11 @@ def test_training_elsewhere_gives_the_same(spec: str, system: str, tmp_path: Pat
         saved = load_checkpoint(folder, **HASHES)
         again = _trainer(task, AWAY)
         again.restore(saved.tensors, saved.facts)
-        ahead = [trainer.advance(), trainer.look().accuracy]
-        assert [again.advance(), again.look().accuracy] == ahead
+        ahead = [trainer.advance(), trainer.validate().accuracy]
+        assert [again.advance(), again.validate().accuracy] == ahead
     moved = _trainer(task, CPU)
     moved.restore(saved.tensors, saved.facts)
-    assert [moved.advance(), moved.look().accuracy] == pytest.approx(ahead, rel=1e-3)
+    assert [moved.advance(), moved.validate().accuracy] == pytest.approx(ahead, rel=1e-3)
 
 
 def test_two_devices_do_not_mix() -> None:

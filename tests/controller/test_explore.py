@@ -109,7 +109,7 @@ def test_a_training_explores_where_climbing_leads_nowhere(
     while sum(look.explored for look in looks) == 0 and trainer.step < 6:
         trainer.advance()
         assert trainer.explore()
-        looks.append(trainer.look())
+        looks.append(trainer.validate())
     assert [look.explored for look in looks[:2]] == [0, 0]  # climbing is tried first
     assert looks[-1].explored > 0
     assert trainer.buffer.count >= looks[-1].explored

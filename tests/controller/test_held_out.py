@@ -22,7 +22,7 @@ def test_what_is_known_is_kept_state_by_state(car_task: Task, tmp_path: Path) ->
     with torch.random.fork_rng():
         torch.manual_seed(0)
         policy = BestOfKPolicy(car_task, PlanNetwork(car_task, hidden=engine.hidden, plans=1))
-    found = score(policy, n=60)
+    found = score(car_task, policy, n=60)
     good = satisfied(found.rho)
     assert 0 < int(good.sum()) < 60
     assert bool(found.known[good].all())
@@ -45,7 +45,7 @@ def test_what_is_feasible_hardly_depends_on_the_policy() -> None:
     with torch.random.fork_rng():
         torch.manual_seed(0)
         policy = BestOfKPolicy(task, PlanNetwork(task, hidden=engine.hidden, plans=1))
-    found = score(policy, n=120)
+    found = score(task, policy, n=120)
     assert found.accuracy < 0.05
     states = task.sample(120, seed=HELD_OUT_SEED, dtype=torch.float64)
     assert found.feasible >= 0.85 * float(solvable(task, states).double().mean())

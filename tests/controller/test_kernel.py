@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from stlc import native
-from stlc.controller.problem.kernel import NativeJudge
+from stlc.controller.problem.native import NativeJudge
 from stlc.controller.problem.task import Judged, Task
 from stlc.dynamics.model.system import System
 

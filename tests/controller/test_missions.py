@@ -156,7 +156,7 @@ def test_training_with_memory_resumes_bit_for_bit(task: Task) -> None:
     def trained(trainer: Trainer, until: int) -> None:
         while trainer.step < until:
             if trainer.step % 4 == 0:
-                trainer.look()
+                trainer.validate()
             trainer.advance()
 
     whole = Trainer(task, engine, steps=12, device=CPU)
@@ -179,11 +179,11 @@ def test_only_memory_needs_missions(system: System) -> None:
 
 def test_held_out_states_are_visited_ones(task: Task) -> None:
     policy = BestOfKPolicy(task, PlanNetwork(task, hidden=(8,), plans=2))
-    states = visited(policy, 500, seed=3)
+    states = visited(task, policy, 500, seed=3)
     assert states.shape == (500, len(task.names))
     assert states.dtype == torch.float64
     assert bool(task.alive(states).all())
-    assert torch.equal(states, visited(policy, 500, seed=3))
+    assert torch.equal(states, visited(task, policy, 500, seed=3))
     assert len(states[:, task.names.index("clock")].unique()) > 3
 
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from stlc import native
-from stlc.controller.problem.natives import by_torch
+from stlc.controller.problem.native import torch_reasons
 from stlc.controller.problem.task import Task
-from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.objective import guided_objective, loss
 from stlc.diagnostics import Notice
 from stlc.dynamics.model.system import System
@@ -28,6 +26,7 @@ def tip = hand([a, b])
 require clear: always[0, T] norm(tip - [1 m, 1 m]) > 0.5 m
 require seen: once[0, 0.3 s] a > 0.1 rad
 """
+EXACT = {"searches": True, "smooth": False}
 OUTSIDE = "extern fn hand(q: real[2]) -> real[2] [m]"
 INSIDE = "def hand(q) = [q[0] * 2 m - q[0]^3 / 6 * 1 m, q[1] * 2 m - q[1]^3 / 6 * 1 m]"
 
@@ -38,10 +37,9 @@ def _task(extern: str, body: str) -> Task:
 
 def test_a_function_in_python_leaves_the_work_to_torch_with_the_same_results() -> None:
     outside, inside = _task(OUTSIDE, ""), _task("", INSIDE)
-    engine = resolve_config(outside, TrainConfig())
     why = "the function `hand` has no C form"
-    assert by_torch(outside, engine, "cpu") == dict.fromkeys(("verdicts", "search", "gradient"), why)
-    assert not any(by_torch(inside, engine, "cpu").values())
+    assert torch_reasons(outside, "cpu", **EXACT) == dict.fromkeys(("verdicts", "search", "gradient"), why)
+    assert not any(torch_reasons(inside, "cpu", **EXACT).values())
     x0 = outside.sample(50, seed=1, dtype=torch.float64)
     results = []
     for task in (outside, inside):
@@ -56,15 +54,14 @@ def test_a_function_in_python_leaves_the_work_to_torch_with_the_same_results() -
 def test_the_paper_s_objective_a_device_and_a_missing_compiler(
     car_task: Task, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    engine = resolve_config(car_task, TrainConfig())
-    assert by_torch(car_task, engine, "cpu") == {"verdicts": "", "search": "", "gradient": ""}
-    smooth = by_torch(car_task, replace(engine, method="gradient"), "cpu")
+    assert torch_reasons(car_task, "cpu", **EXACT) == {"verdicts": "", "search": "", "gradient": ""}
+    smooth = torch_reasons(car_task, "cpu", searches=False, smooth=True)
     assert smooth == {"verdicts": "", "gradient": "the paper's objective is smooth"}
-    assert set(by_torch(car_task, engine, "cuda").values()) == {"the device is cuda"}
+    assert set(torch_reasons(car_task, "cuda", **EXACT).values()) == {"the device is cuda"}
     fresh = Task(car_task.compiled, System(car_task.system.decl))
     monkeypatch.setattr(native, "compiler", lambda: None)
-    monkeypatch.setattr("stlc.controller.problem.natives.compiler", lambda: None)
-    assert set(by_torch(fresh, engine, "cpu").values()) == {"there is no C compiler"}
+    monkeypatch.setattr("stlc.controller.problem.native.compiler", lambda: None)
+    assert set(torch_reasons(fresh, "cpu", **EXACT).values()) == {"there is no C compiler"}
     monkeypatch.undo()
     fresh = Task(car_task.compiled, System(car_task.system.decl))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -73,5 +70,5 @@ def test_the_paper_s_objective_a_device_and_a_missing_compiler(
     compiler.chmod(0o755)
     monkeypatch.setenv("CC", str(compiler))
     with pytest.warns(Notice, match="W702: the C compiler `.*/cc` fails with exit code 4"):
-        reasons = by_torch(fresh, engine, "cpu")
+        reasons = torch_reasons(fresh, "cpu", **EXACT)
     assert set(reasons.values()) == {"the C compiler fails with exit code 4: fatal error: no room"}

@@ -92,7 +92,7 @@ def test_two_train_one_policy_from_states_of_their_own(tiny: Task, tmp_path: Pat
         seen: list[dict[str, object]] = []
         place = folder if ranks.first else RunDir(tmp_path / "nowhere")
         outcome = train(tiny, CONFIG, place, Watch(row=seen.append), ranks=ranks)
-        state = torch.cat([part.flatten() for part in outcome.run.policy.network.state_dict().values()])
+        state = torch.cat([part.flatten() for part in outcome.run.network.state_dict().values()])
         return state.tolist(), outcome.score is not None, [row["accuracy"] for row in seen]
 
     (weights, judged, rows), (same, other, rows_too) = together(work)

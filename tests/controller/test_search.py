@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from stlc import native
-from stlc.controller.problem.kernel import Effort
+from stlc.controller.problem.native import Effort
 from stlc.controller.problem.task import Task
 from stlc.controller.training.local_search import Searcher
 from stlc.controller.training.replay import CAPACITY, Buffer

@@ -212,7 +212,7 @@ def test_a_device_that_is_not_there(car_task: Task, tmp_path: Path) -> None:
 def test_held_out_states_are_always_the_same(car_task: Task, tmp_path: Path) -> None:
     config = TrainConfig(held_out=200, steps=5, batch=32)
     policy = train(car_task, config, _folder(car_task, tmp_path, config)).run.policy
-    first, second = score(policy, n=200), score(policy, n=200)
+    first, second = score(car_task, policy, n=200), score(car_task, policy, n=200)
     assert torch.equal(first.states, second.states)
     assert first.accuracy == second.accuracy
     assert first.states.dtype == torch.float64
@@ -245,7 +245,7 @@ def test_a_checkpoint_keeps_a_search_that_goes_on(car_task: Task, monkeypatch: p
     engine = resolve_config(car_task, TrainConfig(batch=16, seed=1))
     trainer, again = (Trainer(car_task, engine, steps=9, device=torch.device("cpu")) for _ in range(2))
     trainer.advance()
-    trainer.look()
+    trainer.validate()
     assert trainer.repairing is not None
     search = trainer.repairing
     with monkeypatch.context() as patch:
@@ -274,6 +274,6 @@ def test_without_a_compiler_torch_judges_in_parts(car_task: Task, monkeypatch: p
 def test_the_verdict_ends_when_its_time_is_over(car_task: Task) -> None:
     engine = resolve_config(car_task, TrainConfig(batch=16, seed=1))
     trainer = Trainer(car_task, engine, steps=9, device=torch.device("cpu"))
-    found = score(trainer.policy, n=1200, enough=lambda: True)
+    found = score(trainer.task, trainer.policy, n=1200, enough=lambda: True)
     assert len(found.states) == 500
     assert found.accuracy <= found.feasible

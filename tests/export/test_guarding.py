@@ -25,7 +25,7 @@ def test_every_rule_of_the_backup(at_once: int, tmp_path: Path, monkeypatch: pyt
     assert {1, 2} <= set(wanted.source.tolist())
     assert {1, 2, 3} <= set(wanted.t0.tolist())
     with torch.no_grad():
-        mine, rho, safe, each, source, t0 = Guarding(run.task, run.policy.network).eval()(x, plan)
+        mine, rho, safe, each, source, t0 = Guarding(run.task, run.network).eval()(x, plan)
     assert (source.tolist(), t0.tolist()) == (wanted.source.tolist(), wanted.t0.tolist())
     torch.testing.assert_close(mine, wanted.plan, rtol=0.0, atol=1e-6)
     judged = run.task.judge(x, mine)
@@ -41,7 +41,7 @@ def test_a_grid_without_lengths_hands_the_plan_back(tmp_path: Path) -> None:
     grid = Grid(grid_of(run.task).values, (), 10)
     wanted = Backup(run.task, run.policy, grid=grid).search(x, plan)
     with torch.no_grad():
-        mine, rho, *_, source, t0 = Guarding(run.task, run.policy.network, grid)(x, plan)
+        mine, rho, *_, source, t0 = Guarding(run.task, run.network, grid)(x, plan)
     assert torch.equal(mine, wanted.plan)
     assert torch.equal(rho, wanted.rho)
     assert (source.tolist(), t0.tolist()) == (wanted.source.tolist(), wanted.t0.tolist())

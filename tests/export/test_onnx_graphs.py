@@ -70,8 +70,8 @@ def test_mirrors_and_angles_are_those_of_the_network(tmp_path: Path) -> None:
     run = untrained(tmp_path / "near.stl", tmp_path / "cart.yaml", tmp_path / "runs")
     x = run.task.sample(60, seed=3, dtype=torch.float64)
     assert set((x[:, 0] < 0).tolist()) == {True, False}
-    wanted, verdict = run.policy.plan_judged(x)
-    found = computed(deciding(run.task, run.policy.network), {"state": x.numpy()})
+    wanted, verdict = run.plan_judged(x)
+    found = computed(deciding(run.task, run.network), {"state": x.numpy()})
     np.testing.assert_allclose(found["plan"], wanted, rtol=0.0, atol=2e-6)
     np.testing.assert_allclose(found["rho"], verdict.rho, rtol=0.0, atol=1e-6)
     np.testing.assert_array_equal(found["safe"], np.full(60, np.inf))

@@ -148,7 +148,7 @@ def test_the_torch_program_needs_nothing_of_stlc(tmp_path: Path) -> None:
         backup = torch.export.load(done.folder / "backup.pt2").module()
     for count in (1, 70):
         x = run.task.sample(count, seed=9, dtype=torch.float64)
-        plan, judged = run.policy.plan_judged(x)
+        plan, judged = run.plan_judged(x)
         mine, rho, _, each = module(x)
         torch.testing.assert_close(mine, plan, rtol=0.0, atol=1e-5)
         torch.testing.assert_close(rho, judged.rho, rtol=0.0, atol=1e-5)
@@ -181,7 +181,7 @@ def test_what_disagrees_is_not_handed_out(tmp_path: Path) -> None:
     run = run_of("traffic", "car", tmp_path)
 
     def proud(x: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        plan, judged = run.policy.plan_judged(x)
+        plan, judged = run.plan_judged(x)
         return plan, judged.rho + 1e-3, judged.safe, judged.requirements
 
     with pytest.raises(RunError, match="does not do what the run does"):

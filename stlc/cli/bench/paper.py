@@ -28,6 +28,7 @@ from stlc.cli.bench.options import (
 from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.output import emit, emit_json, say, table
 from stlc.cli.framework.ranges import parse_seeds
+from stlc.registry import METHODS
 
 if TYPE_CHECKING:
     from stlc.bench.ceilings import Ceiling
@@ -65,12 +66,12 @@ def paper(
 ) -> None:
     """Fill the table, search for the ceilings, and write the page; 60 s and 300 s if no budget is given."""
     from stlc.bench.cells import BENCHMARKS
-    from stlc.bench.paper import LENGTHS, METHODS, Extent, paper_cells, paper_rows
+    from stlc.bench.paper import LENGTHS, Extent, paper_cells, paper_rows
     from stlc.bench.study import Place
 
     extent = Extent(
         chosen(only, BENCHMARKS, "benchmark"),
-        [method for method in METHODS if method in chosen(methods, METHODS, "method")],
+        [method for method in METHODS if method in chosen(methods, METHODS.names, "method")],
         parse_seeds(seeds),
         lengths_of(budget, steps, LENGTHS, clock),
         held_out,

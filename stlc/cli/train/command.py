@@ -17,6 +17,7 @@ from stlc.cli.framework.ranges import parse_clock, parse_count, parse_seconds, p
 from stlc.cli.train import options as o
 from stlc.cli.train.many import Many, train_many
 from stlc.diagnostics import Diagnostic, UsageError
+from stlc.registry import METHODS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -24,11 +25,9 @@ if TYPE_CHECKING:
     from stlc.cli.train.sitting import Sitting
     from stlc.controller.problem.task import Task
     from stlc.controller.training.budget import StepSchedule
-    from stlc.controller.training.config import Method, TrainConfig
+    from stlc.controller.training.config import TrainConfig
     from stlc.controller.training.launch import Launch
     from stlc.controller.training.tensorboard import Opener
-
-METHODS: tuple[Method, ...] = ("guided", "gradient")
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,11 +165,11 @@ def _logbook(name: str | None) -> Opener | None:
     return find_writer()
 
 
-def _method(name: str) -> Method:
-    for method in METHODS:
-        if name == method:
-            return method
-    raise UsageError(Diagnostic("U101", f"there is no method `{name}`", help=(" or ".join(METHODS),)))
+def _method(name: str) -> str:
+    """A method by its name. Raises UsageError (U101) where there is none."""
+    if name not in METHODS:
+        raise UsageError(Diagnostic("U101", f"there is no method `{name}`", help=(METHODS.suggest(name),)))
+    return name
 
 
 def _steps(text: str) -> int | StepSchedule:

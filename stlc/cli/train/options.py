@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from stlc.cli.framework.completion import run_names
+from stlc.registry import METHODS
 
 SpecsArgument = Annotated[
     list[Path] | None,
@@ -49,7 +50,7 @@ ClusterOption = Annotated[
 MethodOption = Annotated[
     str | None,
     typer.Option(
-        metavar="guided|gradient",
+        metavar="|".join(METHODS),
         help="Search and distil, or the paper's plain gradient; guided unless the system says otherwise.",
     ),
 ]

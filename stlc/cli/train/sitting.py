@@ -14,7 +14,8 @@ import typer
 from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
 from stlc.cli.framework.output import console, emit_json, say, show_diagnostics
 from stlc.cli.train.progress import Progress, RunInfo, Summary
-from stlc.controller.training.loop import Outcome, Watch
+from stlc.controller.training.final_evaluation import Outcome
+from stlc.controller.training.loop import Watch
 from stlc.diagnostics import StlcError
 from stlc.rundir import LATEST, RUNS
 from stlc.stopping import age, leaving

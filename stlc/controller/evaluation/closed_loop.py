@@ -328,8 +328,3 @@ class _Trial:
                 )
             )
         return tuple(shares)
-
-
-def reserve(seconds: float) -> float:
-    """Seconds of a budget that are kept for drives."""
-    return min(0.15 * seconds, 3.0 + 0.08 * seconds)

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from stlc.controller.guard.feasibility import Hunt
+from stlc.controller.policies.policy import plan_judged
 from stlc.controller.problem.task import satisfied
 from stlc.controller.training.config import HELD_OUT, HELD_OUT_SEED
 from stlc.controller.training.exploration import EFFORTS, Exploration
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from stlc.controller.policies.policy import BestOfKPolicy
+    from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
     from stlc.native import Stop
 
@@ -87,7 +88,8 @@ class Score:
 
 
 def score(
-    policy: BestOfKPolicy,
+    task: Task,
+    policy: Policy,
     *,
     n: int = HELD_OUT,
     seed: int = HELD_OUT_SEED,
@@ -101,12 +103,11 @@ def score(
     hardly depends on how well the policy is trained. States that were searched while the time ran out do not
     count as searched, unless they are the first. Where `enough` is said even before, fewer states are judged.
     """
-    task = policy.task
     if task.compiled.timers:
-        states = visited(policy, n, seed, enough)
+        states = visited(task, policy, n, seed, enough)
     else:
         states = task.sample(n, seed=seed, dtype=torch.float64)
-    states, plans, rho, each = _judged(policy, states, enough)
+    states, plans, rho, each = _judged(task, policy, states, enough)
     n, good = len(states), satisfied(rho)
     shares = satisfied(each).double().mean(0)
     generator = torch.Generator().manual_seed(HELD_OUT_SEED + 1)
@@ -145,7 +146,9 @@ def score(
     )
 
 
-def _judged(policy: BestOfKPolicy, states: Tensor, enough: Stop) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _judged(
+    task: Task, policy: Policy, states: Tensor, enough: Stop
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """States (k, dim), the plans that are followed from there, their robustness, and that of requirements.
 
     All states, or as many as are judged before `enough` is said, the first ones in any case.
@@ -156,7 +159,7 @@ def _judged(policy: BestOfKPolicy, states: Tensor, enough: Stop) -> tuple[Tensor
     for part in torch.split(states, JUDGED):
         if rho and enough():
             break
-        followed, judged = policy.plan_judged(part)
+        followed, judged = plan_judged(task, policy, part)
         plans.append(followed)
         rho.append(judged.rho)
         each.append(judged.requirements)

@@ -26,7 +26,7 @@ from stlc.controller.guard.feasibility import extremes
 from stlc.native import Outcome
 
 if TYPE_CHECKING:
-    from stlc.controller.problem.gradient import NativeGradient
+    from stlc.controller.problem.native import NativeGradient
     from stlc.controller.problem.task import Task
 
 NEAR = 8

@@ -7,7 +7,7 @@ plans exactly costs well under a millisecond.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -16,18 +16,56 @@ from stlc.controller.problem.task import Judged, rank
 from stlc.dynamics.model.controls import raw_width, squash
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.config import ResolvedConfig
     from stlc.dynamics.model.mirror import Mirror
 
 
 class Policy(Protocol):
-    """Anything that plans: a trained network, or a baseline that searches."""
+    """Anything that plans: a trained network, or a planner."""
 
     def plan(self, x0: Tensor) -> Tensor:
         """Plans in physical units: (B, n) -> (B, T, m)."""
+
+
+@runtime_checkable
+class SelfJudging(Protocol):
+    """A policy that judges its plan while it chooses it."""
+
+    def plan_judged(self, x0: Tensor) -> tuple[Tensor, Judged]:
+        """The plan to follow and its verdict: (B, n) -> (B, T, m), verdicts over (B,)."""
+
+
+def plan_judged(task: Task, policy: Policy, x0: Tensor) -> tuple[Tensor, Judged]:
+    """The plans of a policy from states (B, n) in their dtype, (B, T, m), and their verdicts."""
+    if isinstance(policy, SelfJudging):
+        return policy.plan_judged(x0)
+    plans = policy.plan(x0).to(x0.dtype)
+    return plans, task.judge(x0, plans)
+
+
+class ModelRollout:
+    """A policy out of an actor, which gives one action a step: its plan is what it does along the model.
+
+    Args:
+        actor: states (B, n), timers included, -> actions (B, m) in physical units.
+        task: specification and system.
+    """
+
+    def __init__(self, actor: Callable[[Tensor], Tensor], task: Task) -> None:
+        self.actor, self.task = actor, task
+
+    @torch.no_grad()
+    def plan(self, x0: Tensor) -> Tensor:
+        """Plans in physical units: (B, n) -> (B, T, m)."""
+        x, actions = x0, []
+        for _ in range(self.task.horizon):
+            actions.append(self.actor(x))
+            x = self.task.system.step(x, actions[-1])
+        return torch.stack(actions, 1)
+
+    __call__ = plan
 
 
 class PlanNetwork(nn.Module):
@@ -88,12 +126,6 @@ class PlanNetwork(nn.Module):
     def _folded(self, x0: Tensor) -> tuple[Tensor, Tensor | None]:
         """States on the mirror's side, and which of them are images, (B,); as they are without a mirror."""
         return (x0, None) if self.mirror is None else self.mirror.fold(x0)
-
-
-def network_of(task: Task, engine: ResolvedConfig) -> PlanNetwork:
-    """The network that an engine trains; the paper's own method does without a mirror."""
-    guided = engine.method == "guided"
-    return PlanNetwork(task, hidden=engine.hidden, plans=engine.plans, mirrored=guided)
 
 
 class BestOfKPolicy:

@@ -18,8 +18,7 @@ from stlc.compile.ir.traverse import nodes
 from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.compile.semantics.switch import Hard, Switch
-from stlc.controller.problem.gradient import NativeGradient
-from stlc.controller.problem.kernel import NativeJudge
+from stlc.controller.problem.native import NativeGradient, NativeJudge
 from stlc.controller.problem.pending_goals import Promises
 
 if TYPE_CHECKING:

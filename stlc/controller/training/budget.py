@@ -63,6 +63,45 @@ def verdict_reserve(seconds: float) -> float:
     return min(0.08 * seconds, 3.0 + 0.02 * seconds)
 
 
+def simulation_reserve(seconds: float) -> float:
+    """Seconds of a budget that are kept for closed-loop simulations."""
+    return min(0.15 * seconds, 3.0 + 0.08 * seconds)
+
+
+@dataclass(frozen=True, slots=True)
+class TimeBudget:
+    """Time of a training by its clock.
+
+    Attributes:
+        now: the clock, in seconds.
+        begun: its reading at the beginning; earlier sessions of the run count.
+        allowed: seconds that the user allows; 0: any number.
+        seconds: of these, those that the training is planned with.
+    """
+
+    now: Callable[[], float]
+    begun: float
+    allowed: float
+    seconds: float
+
+    @classmethod
+    def of(
+        cls,
+        now: Callable[[], float],
+        begun: float,
+        allowed: float,
+        late: Callable[[float], float] | None = None,
+    ) -> TimeBudget:
+        """Leave room for the seconds, `late`, by which what surrounds the training exceeds its budget."""
+        over = late(allowed) if allowed and late is not None else 0.0
+        return cls(now, begun, allowed, min(allowed, max(allowed - over, 0.5 * allowed)))
+
+    @property
+    def spent(self) -> float:
+        """Seconds since the beginning."""
+        return self.now() - self.begun
+
+
 @dataclass(frozen=True, slots=True)
 class Planned:
     """A planning: from `step` on, the run is meant to have `steps` steps."""

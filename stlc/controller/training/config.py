@@ -1,18 +1,19 @@
-"""Everything that a training run was told, and what the engine chose by itself."""
+"""Options of a training, and the numbers that a method makes of them."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
 import torch
+
+from stlc.registry import METHODS
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
     from stlc.controller.training.budget import StepSchedule
 
-Method = Literal["guided", "gradient"]
 Clock = Literal["wall", "processor"]
 """What a budget counts: time that passes, or processor time as it would pass on an idle machine."""
 
@@ -36,7 +37,7 @@ class TrainConfig:
     """What the user may say; None leaves the choice to the system file, then to the engine.
 
     Attributes:
-        method: `guided` (the default) searches and distils; `gradient` is the paper's.
+        method: a name of `stlc.registry.METHODS`.
         budget: seconds, the verdict included; planned as steps again and again.
         clock: of the budget.
         steps: of the optimiser, or the schedule of a run with a budget; wins over `budget`.
@@ -50,7 +51,7 @@ class TrainConfig:
         drives: after the training, under one guard at most; 0: none.
     """
 
-    method: Method | None = None
+    method: str | None = None
     budget: float | None = None
     steps: int | StepSchedule | None = None
     seed: int | None = None
@@ -66,7 +67,7 @@ class TrainConfig:
 
 @dataclass(frozen=True, slots=True)
 class ResolvedConfig:
-    """The numbers of a run, all of them decided. They are saved with it.
+    """All numbers of a run. They are saved with it.
 
     Attributes:
         method: as told.
@@ -95,7 +96,7 @@ class ResolvedConfig:
         drives: after the training, under one guard at most; 0: none.
     """
 
-    method: Method
+    method: str
     seed: int
     hidden: tuple[int, ...]
     plans: int
@@ -131,22 +132,23 @@ _MOST = {
 _POSITIVE = ("hidden", "plans", "batch", "pool", "every", "ranks")
 
 
-def checked_config(engine: ResolvedConfig) -> ResolvedConfig:
-    """The same engine. Raises ValueError where a number is of another kind than it must be, or too large."""
-    words = {"method": get_args(Method), "clock": get_args(Clock)}
+def checked_config(config: ResolvedConfig) -> ResolvedConfig:
+    """The same numbers. Raises ValueError where one is of another kind than it must be, or too large."""
+    words = {"method": METHODS.names, "clock": get_args(Clock)}
     for field in fields(ResolvedConfig):
-        value = getattr(engine, field.name)
+        value = getattr(config, field.name)
         if field.name in words:
-            fits = value in words[field.name]
-        else:
-            kinds = (int, float) if field.type == "float" else (int,)
-            most = _MOST.get(field.name, 1e12)
-            each = value if field.name == "hidden" else (value,)
-            least = 1 if field.name in _POSITIVE else 0
-            fits = all(_is_number(number, kinds) and least <= number <= most for number in each)
-        if not fits:
+            if value not in words[field.name]:
+                known = ", ".join(words[field.name])
+                raise ValueError(f"`{field.name}` is {value!r:.40}, none of {known}")
+            continue
+        kinds = (int, float) if field.type == "float" else (int,)
+        most = _MOST.get(field.name, 1e12)
+        each = value if field.name == "hidden" else (value,)
+        least = 1 if field.name in _POSITIVE else 0
+        if not all(_is_number(number, kinds) and least <= number <= most for number in each):
             raise ValueError(f"`{field.name}` is {value!r:.40}")
-    return engine
+    return config
 
 
 def _is_number(value: object, kinds: tuple[type, ...]) -> bool:
@@ -154,28 +156,44 @@ def _is_number(value: object, kinds: tuple[type, ...]) -> bool:
 
 
 def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:
-    """The engine's numbers for a task: the user's words, then the system file's, then defaults."""
+    """The numbers of a run: the user's words, then the system file's, then those of the method.
+
+    Raises:
+        UsageError: U101, there is no such method.
+    """
+    name = config.method or task.system.decl.train.method or METHODS.default
+    found: ResolvedConfig = METHODS.get(name).resolve(task, config)
+    return replace(found, method=name)
+
+
+def base_config(
+    task: Task, config: TrainConfig, *, batch: int = 1, plans: int = 1, searches: bool = False
+) -> ResolvedConfig:
+    """The numbers that do not depend on the method.
+
+    Args:
+        task: what is trained for.
+        config: what the user said.
+        batch: fresh states a step, by default.
+        plans: number of plans of the network, by default.
+        searches: whether a search goes on beside the steps: torch leaves a core to it.
+    """
     declared = task.system.decl.train
-    method: Method = "gradient" if (config.method or declared.method) == "gradient" else "guided"
-    guided = method == "guided"
     mission = bool(task.compiled.timers)
-    batch = config.batch or declared.batch or (256 if guided else 512)
-    plans = config.plans or (4 if guided else 1)
+    plans = config.plans or plans
     return ResolvedConfig(
-        method=method,
+        method="",
         seed=declared.seed if config.seed is None else config.seed,
         hidden=task.system.decl.policy.hidden,
         plans=plans,
-        batch=batch,
-        hard=batch if guided else 0,
+        batch=config.batch or declared.batch or batch,
+        hard=0,
         lr=config.lr or declared.lr or 1e-3,
         hold=MISSION_HOLD if mission else 0.0,
         most=MISSION_MOST if mission else 768,
         share=0.05 if plans > 1 else 0.0,
-        performance=0.3 if guided else 1.0,
         held_out=config.held_out,
-        threads=config.threads or _threads(searching=guided and config.device == "cpu"),
-        samples=0 if guided else declared.samples or 0,
+        threads=config.threads or _threads(searching=searches and config.device == "cpu"),
         clock=config.clock,
         drives=config.drives,
     )

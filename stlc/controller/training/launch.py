@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.config import Method
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +97,7 @@ def train_here(
     budget: float | None = None,
     steps: int | None = None,
     seed: int | None = None,
-    method: Method | None = None,
+    method: str | None = None,
 ) -> Run:
     """Train a policy in a new folder below `runs/` and return the run.
 

@@ -1,4 +1,4 @@
-"""The training loop's state and its three moves: a gradient step, a search round, a look at the clock.
+"""State of a training of a plan network, and its moves: a gradient step, an exploration, a validation.
 
 Search and distil: every few dozen steps fresh states are judged, the failing ones are repaired by search that
 starts at the policy's own plan, and repaired plans are imitated for as long as their state still fails. Each
@@ -9,6 +9,7 @@ gradient step mixes fresh states with such hard ones. Of the network's plans the
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,19 +17,26 @@ import torch
 from torch import Tensor
 
 from stlc.controller.parallel.ddp import ALONE, Ranks
-from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork, network_of
+from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
+from stlc.controller.problem.native import torch_reasons
 from stlc.controller.problem.task import rank, satisfied
+from stlc.controller.training.divergence import Step, diagnose
 from stlc.controller.training.exploration import EFFORTS, Exploration
 from stlc.controller.training.local_search import THOROUGH, Search, Searcher, SearchResult
 from stlc.controller.training.missions import Missions
-from stlc.controller.training.objective import Objective, guided_objective, loss, paper_objective
+from stlc.controller.training.objective import loss
 from stlc.controller.training.replay import Buffer
 from stlc.controller.training.samplers import Draws, Fixed, Supply
 from stlc.native import never
+from stlc.registry import METHODS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from stlc.controller.methods._network import NetworkMethod
     from stlc.controller.problem.task import Task
     from stlc.controller.training.config import ResolvedConfig
+    from stlc.diagnostics import StlcError
     from stlc.native import Stop
 
 MARGIN_STATES = 128
@@ -71,29 +79,30 @@ class Trainer:
     """Everything that changes while training. Same seed and steps: same weights on the same machine."""
 
     def __init__(
-        self, task: Task, engine: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks = ALONE
+        self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks = ALONE
     ) -> None:
         self.task = task
-        self.engine = engine
+        self.config = config
         self.steps = steps
         self.device = device
         self.ranks = ranks
         self.step = 0
-        self.next_look = engine.every
-        self.generator = torch.Generator().manual_seed(ranks.seed(engine.seed))
-        self.network = _network(task, engine, device)
+        self.next_validation = config.every
+        self.generator = torch.Generator().manual_seed(ranks.seed(config.seed))
+        self.method: NetworkMethod = METHODS.get(config.method)
+        self.network = self._network()
         self.supply = self._supply()
-        self.average = _network(task, engine, device)
+        self.average = self._network()
         self.network.normalise(self.supply.take(4096))
         ranks.agree_on(self.network)
-        self.training = Fixed(self.supply, engine.samples, self.generator) if engine.samples else self.supply
+        self.training = Fixed(self.supply, config.samples, self.generator) if config.samples else self.supply
         self.average.load_state_dict(self.network.state_dict())
-        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=engine.lr, fused=True)
+        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=config.lr, fused=True)
         self.buffer = Buffer.empty(len(task.names), task.horizon, len(task.system.control_names), device)
-        self.margin = paper_objective(task).margin
-        if engine.method == "guided":
+        self.margin = task.system.decl.objective.gamma
+        if self.searches:
             self.margin = ranks.agree(self._feasible_margin())
-        self.objective = self._objective()
+        self.objective = self.method.objective(self)
         self.searcher = self._searcher(MARGIN_SHARE * self.margin)
         self.repairing: Search | None = None
         self.barren, self.effort, self.explored = False, 0, 0
@@ -109,12 +118,12 @@ class Trainer:
         self.optimizer.zero_grad()
         value.backward()  # type: ignore[no-untyped-call]
         value = self.ranks.learn(self.network.parameters(), value.detach())
-        length = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.engine.clip)
+        length = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
         if not bool(torch.isfinite(value + length)):
             return math.nan
         self.optimizer.step()
         self.step += 1
-        decay = min(self.engine.average, self.step / (self.step + 10.0))
+        decay = min(self.config.average, self.step / (self.step + 10.0))
         with torch.no_grad():
             pairs = zip(self.average.parameters(), self.network.parameters(), strict=True)
             for averaged, current in pairs:
@@ -127,15 +136,48 @@ class Trainer:
     @property
     def rate(self) -> float:
         """Learning rate of the next step: a short rise, a while at the peak, then half a cosine to 0."""
-        engine, hold = self.engine, self.engine.hold
-        rise = min(1.0, (self.step + 1) / (RISE if hold else max(1.0, engine.warmup * self.steps)))
+        config, hold = self.config, self.config.hold
+        rise = min(1.0, (self.step + 1) / (RISE if hold else max(1.0, config.warmup * self.steps)))
         fallen = max(0.0, self.step / self.steps - hold) / (1.0 - hold)
-        return engine.lr * rise * 0.5 * (1.0 + math.cos(math.pi * fallen))
+        return config.lr * rise * 0.5 * (1.0 + math.cos(math.pi * fallen))
 
     @property
     def policy(self) -> BestOfKPolicy:
-        """The policy that is handed out: the averaged weights."""
-        return BestOfKPolicy(self.task, self.average)
+        """The policy that is handed out: the averaged weights, on the processor as verdicts are."""
+        on_processor = self.device.type == "cpu"
+        return BestOfKPolicy(self.task, self.average if on_processor else deepcopy(self.average).cpu())
+
+    @property
+    def searches(self) -> bool:
+        """Whether failing states are repaired beside the steps."""
+        return self.method.searches
+
+    @property
+    def searching(self) -> bool:
+        """Whether a repair goes on at this moment."""
+        return self.repairing is not None and not self.repairing.done()
+
+    @property
+    def solved(self) -> bool:
+        """Whether a satisfying plan was ever found by a search."""
+        return self.buffer.count > 0
+
+    def torch_reasons(self) -> Mapping[str, str]:
+        """Part of the training -> why torch does its work, or "" where it runs as C."""
+        smooth = self.objective.smoothing is not None
+        return torch_reasons(self.task, self.device.type, searches=self.searches, smooth=smooth)
+
+    def wait(self, stop: Stop = never) -> bool:
+        """Let the repair come to its end; False where `stop` came first."""
+        return self.repairing is None or self.repairing.result(stop) is not None
+
+    def diagnose(self) -> tuple[StlcError, bool]:
+        """Cause of a step that was not finite, of whichever rank, and whether the weights before it are."""
+        theirs = [part["x0"].to(self.device) for part in self.ranks.gather({"x0": self.learnt})]
+        x0 = torch.cat((self.learnt, *theirs))
+        step = Step.of(self.network, self.objective, x0, self.step, self.task)
+        good = not self.ranks.any(not bool(torch.isfinite(step.u).all()))
+        return diagnose(step), good
 
     @torch.no_grad()
     def explore(self, stop: Stop = never) -> bool:
@@ -167,18 +209,18 @@ class Trainer:
         return self.effort >= len(EFFORTS)
 
     @torch.no_grad()
-    def look(self) -> Validation:
-        """Judge fresh states; with the guided method also repair what fails.
+    def validate(self) -> Validation:
+        """Judge fresh states; a method that searches also repairs what fails.
 
-        The repair goes on beside the training steps; the next look takes what it has found.
+        The repair goes on beside the training steps; the next validation takes what it has found.
         """
-        x0 = self.supply.take(self.engine.pool)
+        x0 = self.supply.take(self.config.pool)
         plans, judged = BestOfKPolicy(self.task, self.network).plan_judged(x0)
         good = satisfied(judged.rho)
         shares = tuple(float(share) for share in satisfied(judged.requirements).double().mean(0))
         accuracy = float(good.double().mean())
-        self.next_look = self.step + self.engine.every
-        if self.engine.method != "guided":
+        self.next_validation = self.step + self.config.every
+        if not self.searches:
             return self._of_all(Validation(accuracy, shares, None, 0, 0))
         failing, repaired, before = self._take_repaired()
         feasible = None if before is None else max(before, accuracy)
@@ -191,14 +233,14 @@ class Trainer:
 
     def _begin(self, x0: Tensor, plans: Tensor, seed: int | None = None) -> Search:
         """A search beside the steps until the next round."""
-        tries, steps = self._effort[1], self.engine.every
+        tries, steps = self._effort[1], self.config.every
         return self.searcher.begin(x0, plans, self.buffer.bank, tries=tries, steps=steps, seed=seed)
 
     @property
     def _effort(self) -> tuple[int, int]:
         """Failing states of a search round at most, and plans that are tried for each."""
         native = self.task.native is not None
-        return (self.engine.most, THOROUGH) if native else (min(self.engine.most, TORCH_MOST), TORCH_TRIES)
+        return (self.config.most, THOROUGH) if native else (min(self.config.most, TORCH_MOST), TORCH_TRIES)
 
     def close(self) -> None:
         """End the search that goes on beside the steps."""
@@ -242,9 +284,9 @@ class Trainer:
     # ------------------------------------------------------------------ pieces
 
     def _loss(self) -> Tensor:
-        engine = self.engine
-        fresh = self.training.take(engine.batch)
-        hard = engine.hard if len(self.buffer) else 0
+        config = self.config
+        fresh = self.training.take(config.batch)
+        hard = config.hard if len(self.buffer) else 0
         x0, targets = fresh, fresh.new_zeros(0)
         if hard:
             states, targets = self.buffer.draw(hard, self.generator)
@@ -255,12 +297,12 @@ class Trainer:
         rows = torch.arange(len(x0), device=self.device)
         chosen = plans[rows, winner]
         value = loss(self.task, self.objective, x0, chosen).total.mean()
-        if engine.share:
-            some = rows[:: engine.plans]
-            other = torch.randint(engine.plans, (len(some),), generator=self.generator).to(self.device)
+        if config.share:
+            some = rows[:: config.plans]
+            other = torch.randint(config.plans, (len(some),), generator=self.generator).to(self.device)
             value = (
                 value
-                + engine.share * loss(self.task, self.objective, x0[some], plans[some, other]).total.mean()
+                + config.share * loss(self.task, self.objective, x0[some], plans[some, other]).total.mean()
             )
         if hard:
             value = value + self._imitation(plans[-hard:], targets, good[-hard:])
@@ -270,7 +312,7 @@ class Trainer:
     def _winner(self, x0: Tensor, plans: Tensor) -> tuple[Tensor, Tensor]:
         """Which plan is trained, the one that does best, (B,), and whether it satisfies the specification."""
         batch, count = plans.shape[:2]
-        if count == 1 and self.engine.hard == 0:
+        if count == 1 and self.config.hard == 0:
             first = torch.zeros(batch, dtype=torch.int64, device=self.device)
             return first, torch.zeros_like(first, dtype=torch.bool)
         judged = self.task.judge(x0.repeat_interleave(count, 0), plans.flatten(0, 1))
@@ -281,7 +323,7 @@ class Trainer:
         """Distance of the nearest plan to the repaired one, where the state still fails."""
         half = (0.5 * (self.task.system.control_high - self.task.system.control_low)).to(plans.device)
         distance = ((plans - targets[:, None]) / half).square().mean((2, 3)).amin(1)
-        return self.engine.imitation * torch.where(solved, torch.zeros_like(distance), distance).mean()
+        return self.config.imitation * torch.where(solved, torch.zeros_like(distance), distance).mean()
 
     def _feasible_margin(self) -> float:
         """A gamma of the size that plans can reach: a share of what search reaches on the median state."""
@@ -306,12 +348,11 @@ class Trainer:
         policy = BestOfKPolicy(self.task, self.network)
         return Missions(self.task, self.generator, self.device, lambda x0: policy.plan_judged(x0)[1])
 
-    def _objective(self) -> Objective:
-        if self.engine.method == "gradient":
-            return paper_objective(self.task)
-        return guided_objective(
-            self.margin, slope=self.engine.slope, performance_weight=self.engine.performance
-        )
+    def _network(self) -> PlanNetwork:
+        """A network whose first weights depend on the seed alone."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.config.seed)
+            return self.method.network(self.task, self.config).to(self.device)
 
     # ------------------------------------------------------------- checkpoints
 
@@ -357,7 +398,7 @@ class Trainer:
             "steps": self.steps,
             "margin": self.margin,
             "solved": self.buffer.count,
-            "next_look": self.next_look,
+            "next_look": self.next_validation,
             "accuracy": self.accuracy,
             "barren": int(self.barren),
             "effort": self.effort,
@@ -367,11 +408,11 @@ class Trainer:
         """Go on where `tensors` and `facts` were taken."""
         tensors, facts = self._restored(tensors, facts)
         self.step, self.steps = int(facts["step"]), int(facts["steps"])
-        self.margin, self.next_look = float(facts["margin"]), int(facts["next_look"])
+        self.margin, self.next_validation = float(facts["margin"]), int(facts["next_look"])
         self.accuracy, self.loss = float(facts["accuracy"]), float(facts.get("loss", math.nan))
         self.effort = max(int(facts.get("effort", 0)), 0)
         self.barren = bool(facts.get("barren", 0)) and not self.exhausted
-        self.objective = self._objective()
+        self.objective = self.method.objective(self)
         self.searcher = self._searcher(MARGIN_SHARE * self.margin)
         for prefix, module in (("network", self.network), ("average", self.average)):
             module.load_state_dict(_below(tensors, prefix))
@@ -407,13 +448,6 @@ class Trainer:
         accuracy, solved, barren, effort = own.pop("counts").tolist()
         counts = {"solved": int(solved), "barren": int(barren), "effort": int(effort)}
         return common | own, {**facts, "accuracy": accuracy, **counts}
-
-
-def _network(task: Task, engine: ResolvedConfig, device: torch.device) -> PlanNetwork:
-    """A network whose first weights depend on the seed alone."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(engine.seed)
-        return network_of(task, engine).to(device)
 
 
 def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING, TypeAlias
 import torch
 from torch import Tensor
 
+from stlc.controller.policies.policy import plan_judged
 from stlc.controller.problem.task import satisfied
 from stlc.native import never
 
 if TYPE_CHECKING:
-    from stlc.controller.policies.policy import BestOfKPolicy
+    from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Judged, Task
     from stlc.native import Stop
 
@@ -136,12 +137,11 @@ def mission_steps(task: Task) -> int:
 
 
 @torch.no_grad()
-def visited(policy: BestOfKPolicy, n: int, seed: int, enough: Stop = never) -> Tensor:
+def visited(task: Task, policy: Policy, n: int, seed: int, enough: Stop = never) -> Tensor:
     """`n` states that missions pass through when the policy drives them, (n, dim) float64.
 
     Missions are driven no further once `enough` says so.
     """
-    task = policy.task
     generator = torch.Generator().manual_seed(seed)
     stride = max(task.horizon // 10, 1)
     legs = mission_steps(task) // stride + 1
@@ -150,7 +150,7 @@ def visited(policy: BestOfKPolicy, n: int, seed: int, enough: Stop = never) -> T
     for _ in range(legs):
         if enough():
             break
-        _, judged = policy.plan_judged(x)
+        _, judged = plan_judged(task, policy, x)
         x = torch.stack([judged.columns[name][stride] for name in task.names], 1)
         x = x[task.alive(x)]
         seen.append(x)

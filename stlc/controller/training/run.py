@@ -6,12 +6,11 @@ import json
 from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
-import torch
-
 from stlc.compile.frontend.modules import file_of
-from stlc.controller.policies.policy import BestOfKPolicy, network_of
+from stlc.controller.evaluation.held_out import save_states
+from stlc.controller.policies.policy import BestOfKPolicy, plan_judged
 from stlc.controller.problem.task import Task
-from stlc.controller.training.checkpoint import load_checkpoint, weights
+from stlc.controller.training.checkpoint import save_checkpoint
 from stlc.controller.training.config import ResolvedConfig, checked_config
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.dynamics.model.system import System
@@ -21,11 +20,19 @@ from stlc.files import read_source, write_atomic
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.provenance import sha256
+from stlc.registry import METHODS
 from stlc.rundir import RUNS, RunDir
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
+
+    from torch import Tensor
+
+    from stlc.controller.evaluation.held_out import Score
+    from stlc.controller.policies.policy import PlanNetwork, Policy
+    from stlc.controller.problem.task import Judged
+    from stlc.rundir import Status
 
 SPEC = "spec.stl"
 SYSTEM = "system.yaml"
@@ -46,7 +53,7 @@ class Run:
 
     dir: RunDir
     task: Task
-    policy: BestOfKPolicy
+    policy: Policy
 
     @classmethod
     def open(
@@ -70,18 +77,74 @@ class Run:
         """
         folder = RunDir.open(where, root)
         task = load_task(folder, overrides, scenario)
-        engine = load_config(folder)
-        saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=_trained_on(folder))
-        network = network_of(task, engine)
-        try:
-            network.load_state_dict(weights(saved, "average"))
-        except RuntimeError as error:
-            raise RunError(
-                Diagnostic(
-                    "R101", f"the checkpoint of `{folder.shown}` does not fit its network", note=(str(error),)
-                )
-            ) from error
-        return cls(folder, task, BestOfKPolicy(task, network.to(torch.device(device)).eval()))
+        config = load_config(folder)
+        return cls(folder, task, METHODS.get(config.method).load(task, folder, config, device))
+
+    @property
+    def network_policy(self) -> BestOfKPolicy:
+        """The policy, which is a network. Raises RunError (R101) where the run's method trains none."""
+        if not isinstance(self.policy, BestOfKPolicy):
+            message = f"the policy of `{self.dir.shown}` is no network"
+            raise RunError(Diagnostic("R101", message, help=("train with `--method guided`",)))
+        return self.policy
+
+    @property
+    def network(self) -> PlanNetwork:
+        """The network of the policy. Raises RunError (R101) where the run's method trains none."""
+        return self.network_policy.network
+
+    def plan_judged(self, x0: Tensor) -> tuple[Tensor, Judged]:
+        """The policy's plans from states (B, n) and their verdicts."""
+        return plan_judged(self.task, self.policy, x0)
+
+
+@dataclass(frozen=True, slots=True)
+class RunWriter:
+    """Writer of a run's folder while it is trained. Of several ranks the first alone writes.
+
+    Attributes:
+        folder: of the run.
+        writes: whether this process keeps it.
+    """
+
+    folder: RunDir
+    writes: bool = True
+
+    def config(self, config: ResolvedConfig) -> None:
+        """Keep the numbers of the run."""
+        if self.writes:
+            save_config(self.folder, config)
+
+    def note(self, facts: Mapping[str, object]) -> None:
+        """Enter facts into `run.json`."""
+        if self.writes:
+            self.folder.update(facts)
+
+    def before(self, look: int) -> None:
+        """Keep the rows of validations before the one at step `look`, which is still to come."""
+        if self.writes:
+            self.folder.keep_rows(lambda row: row.get("step", 0) < look)
+
+    def row(self, row: Mapping[str, Any]) -> None:
+        """Append a row to `train.jsonl`."""
+        if self.writes:
+            self.folder.append_row(row)
+
+    def checkpoint(self, tensors: Mapping[str, Tensor], facts: Mapping[str, object], *, step: int) -> None:
+        """Write a checkpoint of a step. Raises MissingError (R201); the last good one stays."""
+        if self.writes:
+            hashes = {"spec_hash": spec_hash(self.folder), "system_hash": system_hash(self.folder)}
+            save_checkpoint(self.folder, tensors, {**facts, **hashes}, step=step)
+
+    def held_out(self, task: Task, score: Score) -> None:
+        """Keep the held-out states and their verdicts."""
+        if self.writes:
+            save_states(self.folder.path / "eval" / "held_out.npz", task, score)
+
+    def close(self, status: Status, result: object = None) -> None:
+        """Say how the training ended."""
+        if self.writes:
+            self.folder.finish(status, result)
 
 
 def load_task(
@@ -112,7 +175,7 @@ def system_hash(folder: RunDir) -> str:
     return _hash(folder, SYSTEM)
 
 
-def _trained_on(folder: RunDir) -> str:
+def trained_on(folder: RunDir) -> str:
     """The hash of the system that a policy was trained on, if it may be deployed on the one in the folder.
 
     What a policy learns from must be as it was; worlds, scenarios and the backup may be edited since.
@@ -150,13 +213,13 @@ def read_library(folder: RunDir, below: str = LIB) -> dict[str, str]:
     return {key: read_source(folder.path / below / name).text for key, name in index.items()}
 
 
-def save_config(folder: RunDir, engine: ResolvedConfig) -> None:
-    """Write what the engine decided; JSON is YAML too."""
-    write_atomic(folder.path / CONFIG, json.dumps(asdict(engine), indent=1) + "\n")
+def save_config(folder: RunDir, config: ResolvedConfig) -> None:
+    """Write the numbers of a run; JSON is YAML too."""
+    write_atomic(folder.path / CONFIG, json.dumps(asdict(config), indent=1) + "\n")
 
 
 def load_config(folder: RunDir) -> ResolvedConfig:
-    """Read what the engine decided. Raises RunError R101 when that is damaged."""
+    """Read the numbers of a run. Raises RunError R101 when they are damaged."""
     try:
         values: dict[str, Any] = json.loads((folder.path / CONFIG).read_text())
         known = {field.name for field in fields(ResolvedConfig)}

@@ -28,6 +28,7 @@ from stlc.dynamics.schema.names import Names
 from stlc.dynamics.schema.reader import Reader
 from stlc.dynamics.schema.yaml_nodes import Node, Scalar, Sequence, as_int
 from stlc.grammar import ast
+from stlc.registry import METHODS
 from stlc.runtime.prefixes import SAMPLINGS
 from stlc.units import Unit
 
@@ -37,7 +38,6 @@ POLICY_KEYS = ("type", "hidden", "observe", "mirror", "feedback")
 FEEDBACK_KEYS = ("around", "weights", "gain", "authority")
 POLICIES = ("mlp",)
 TRAIN_KEYS = ("budget", "steps", "seed", "lr", "batch", "samples", "method")
-METHODS = ("guided", "gradient")
 BACKUP_KEYS = ("bins", "levels", "T0", "batch", "samples", "sampling")
 MOST_SAMPLES = 1 << 20
 OUTCOME = {
@@ -195,7 +195,7 @@ def read_train(node: Node | None, reader: Reader, names: Names) -> TrainDecl:
         reader.number(found.get("lr"), "`lr`", low=1e-12),
         reader.integer(found.get("batch"), "`batch`"),
         reader.integer(found.get("samples"), "`samples`"),
-        reader.option(found.get("method"), "`method`", METHODS),
+        reader.option(found.get("method"), "`method`", METHODS.names),
     )
 
 

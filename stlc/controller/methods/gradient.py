@@ -1,0 +1,32 @@
+"""The paper's own method: gradient descent on smooth robustness (Meng and Fan 2023, Eq. 6 to 10)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from stlc.controller.methods._network import NetworkMethod
+from stlc.controller.training.config import base_config
+from stlc.controller.training.objective import paper_objective
+
+if TYPE_CHECKING:
+    from stlc.controller.problem.task import Task
+    from stlc.controller.training.config import ResolvedConfig, TrainConfig
+    from stlc.controller.training.learner import Trainer
+    from stlc.controller.training.objective import Objective
+
+
+class Gradient(NetworkMethod):
+    """Gradient steps on log-sum-exp robustness with tanh switching; one plan, no search, no mirror."""
+
+    def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
+        """Fresh states, or the fixed set of `train: {samples: …}`."""
+        found = base_config(task, config, batch=512)
+        return replace(found, performance=1.0, samples=task.system.decl.train.samples or 0)
+
+    def objective(self, learner: Trainer) -> Objective:
+        """The paper's, whose margin is the gamma of the system file."""
+        return paper_objective(learner.task)
+
+
+METHOD = Gradient()

@@ -1,0 +1,125 @@
+"""Evaluation at the end of a training: held-out states, conflicts, closed-loop simulations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from stlc.controller.evaluation.closed_loop import ClosedLoop, closed_loop
+from stlc.controller.evaluation.held_out import Score, score
+from stlc.controller.training.budget import simulation_reserve, verdict_reserve
+from stlc.controller.training.conflict import conflict, refuted
+from stlc.controller.training.run import Run
+
+if TYPE_CHECKING:
+    from stlc.controller.policies.policy import Policy
+    from stlc.controller.problem.task import Task
+    from stlc.controller.training.budget import TimeBudget
+    from stlc.controller.training.config import ResolvedConfig
+    from stlc.controller.training.run import RunWriter
+    from stlc.diagnostics import Diagnostic
+
+VERDICT_OVER = 0.04
+"""Share of a budget by which the verdict may exceed it before the search for what is feasible is ended."""
+SIMULATION_SHARE = 0.15
+"""Share of the seconds that a training without a budget took, for which its policy is simulated."""
+VERDICT_LEAST, VERDICT_SHARE = 20.0, 0.2
+"""Seconds, and share of the seconds that the steps took, which the verdict of a run without a budget has."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Result of a training.
+
+    Attributes:
+        run: the run with its policy.
+        score: on held-out states; None where training was interrupted, and on ranks after the first.
+        seconds: of training, held-out verdict included.
+        interrupted: ended by `Watch.stop`.
+        ranks: that trained together.
+        why: requirements that no plan was found for, where none was found for any start.
+        steps: that were made in all.
+        driven: the policy in closed loop; None where it was not simulated.
+    """
+
+    run: Run
+    score: Score | None
+    seconds: float
+    interrupted: bool
+    ranks: int = 1
+    why: Diagnostic | None = None
+    steps: int = 0
+    driven: ClosedLoop | None = None
+
+
+@dataclass(slots=True)
+class FinalEvaluation:
+    """Evaluation of a policy within what is left of its training's time.
+
+    Attributes:
+        writer: of the run.
+        task: what was trained for.
+        config: numbers of the run.
+        time: of the training.
+        trained: reading of the clock when the evaluation began.
+    """
+
+    writer: RunWriter
+    task: Task
+    config: ResolvedConfig
+    time: TimeBudget
+    trained: float = 0.0
+
+    @property
+    def reserve(self) -> float:
+        """Seconds of the budget for the whole evaluation."""
+        return verdict_reserve(self.time.seconds) + self._for_simulations
+
+    @property
+    def _for_simulations(self) -> float:
+        return simulation_reserve(self.time.seconds) if self.config.drives else 0.0
+
+    def of(self, policy: Policy, steps: int) -> Outcome:
+        """Judge a policy after so many steps, keep the verdict in the run, and close its record."""
+        self.trained = self.time.now()
+        result = score(self.task, policy, n=self.config.held_out, enough=self._out_of_time)
+        self.writer.held_out(self.task, result)
+        why = conflict(self.task, self._late) if result.feasible == 0.0 else None
+        run = Run(self.writer.folder, self.task, policy)
+        driven = self._simulated(run) if why is None else None
+        found: dict[str, object] = {"seconds": self.time.spent}
+        if why is not None:
+            found |= {"why": why.message, "proved": refuted(self.task)}
+        found |= {} if driven is None else {"closed_loop": driven.summary()}
+        self.writer.close("finished", {**result.summary(), **found})
+        seconds, ranks = self.time.spent, self.config.ranks
+        return Outcome(run, result, seconds, False, ranks, why=why, steps=steps, driven=driven)
+
+    def _simulated(self, run: Run) -> ClosedLoop | None:
+        """The policy in closed loop, for as long as there is time."""
+        if not self.config.drives:
+            return None
+        time, begun = self.time, self.time.now()
+        if time.allowed:
+            end = time.begun + (1.0 + VERDICT_OVER) * time.seconds
+            end = max(end, begun + 0.5 * simulation_reserve(time.seconds))
+        else:
+            end = begun + SIMULATION_SHARE * (begun - time.begun)
+        return closed_loop(run, lambda: end - time.now(), self.config.drives)
+
+    def _out_of_time(self) -> bool:
+        """Whether the verdict has to come to its end."""
+        return self.time.now() - self.trained > self._verdict_seconds
+
+    def _late(self) -> bool:
+        """Whether what follows the verdict has to come to its end, too."""
+        return self.time.now() - self.trained > 2.0 * self._verdict_seconds
+
+    @property
+    def _verdict_seconds(self) -> float:
+        """What is left of the budget for the verdict; without a budget a share of what the steps took."""
+        spent = self.trained - self.time.begun
+        if not self.time.allowed:
+            return max(VERDICT_LEAST, VERDICT_SHARE * spent)
+        left = (1.0 + VERDICT_OVER) * self.time.seconds - self._for_simulations - spent
+        return max(left, 0.5 * verdict_reserve(self.time.seconds))
