@@ -17,6 +17,8 @@ import typer
 from stlc.cli.framework.app import app, main
 from stlc.cli.framework.pages import read_page
 from stlc.diagnostics import CODES
+from stlc.dynamics.declaration.load import SystemKeys
+from stlc.dynamics.schema.record import reference
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -357,6 +359,11 @@ def test_every_file_is_listed_with_its_first_line(regenerate):
 def first_line(path: Path) -> str:
     text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
     return escaped(text.partition("\n")[0])
+
+
+def test_every_key_of_a_system_file_is_listed(regenerate):
+    text = "\n".join(reference(SystemKeys, "The file"))
+    hold(ROOT / "docs/systems.md", "keys", text, regenerate=regenerate)
 
 
 def test_the_architecture_names_files_that_exist():

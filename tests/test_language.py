@@ -13,7 +13,7 @@ from doc_examples import BOUNDS, VALUE, Claim, Example, Recorded, codes, example
 from stlc.compile.frontend.interface import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import Diagnostic, SpecError
-from stlc.dynamics.schema.schema import load_system_decl
+from stlc.dynamics.declaration.load import load_system_decl
 from stlc.files import find_system
 from stlc.grammar import ast
 from stlc.grammar.format.format import format_text

@@ -96,7 +96,7 @@ def stage(name: str, limit: float):
 
 @cache
 def _system():
-    from stlc.dynamics.schema.schema import parse_system
+    from stlc.dynamics.declaration.load import parse_system
     from stlc.source import Source
 
     return parse_system(Source("b.yaml", SYSTEM), Path("b.yaml"))

@@ -10,7 +10,7 @@ from stlc.compile.frontend.interface import Grid
 from stlc.compile.frontend.modules import Module, load_modules
 from stlc.diagnostics import Diagnostic, Label, StlcError
 from stlc.dynamics.declaration.decl import SystemDecl
-from stlc.dynamics.schema.schema import load_system_decl
+from stlc.dynamics.declaration.load import load_system_decl
 from stlc.editor.meaning import Meaning, understand
 from stlc.editor.reading import read
 from stlc.editor.symbols import Names, names_of

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from stlc.controller.policies.policy import PlanNetwork
     from stlc.controller.problem.task import Task
-    from stlc.dynamics.declaration.model import ControlDecl
+    from stlc.dynamics.declaration.columns import ControlDecl
 
 
 def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Value:

@@ -77,8 +77,8 @@ def given_times(dt: float | Fraction | None, horizon: float | Fraction | None) -
 
 def system_of(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, Interface]:
     """Times and interface of a system file, its functions loaded. Raises UsageError or SystemFileError."""
+    from stlc.dynamics.declaration.load import load_system_decl
     from stlc.dynamics.robots.functions import load_functions
-    from stlc.dynamics.schema.schema import load_system_decl
 
     decl = load_system_decl(find_system(name, Path(spec.source.name)), overrides)
     interface = replace(decl.interface(), functions=load_functions(decl))
@@ -87,7 +87,7 @@ def system_of(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[
 
 def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
     """Times of the system that the specification names; None without one, or without its file."""
-    from stlc.dynamics.schema.schema import load_system_decl
+    from stlc.dynamics.declaration.load import load_system_decl
 
     if spec.system is None:
         return None

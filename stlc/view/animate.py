@@ -148,8 +148,8 @@ def seen_in(run: RunDir, *, guarded: bool = True) -> Seen | None:
     With `guarded` false that of the same seed without the guard, where it was driven to compare.
     """
     from stlc.controller.world import world_type
+    from stlc.dynamics.declaration.load import load_system_decl
     from stlc.dynamics.scenarios.scenario import under
-    from stlc.dynamics.schema.schema import load_system_decl
 
     trace_name, scene_name = (TRACE, SCENE) if guarded else UNGUARDED
     scene = _load_scene(run.path / scene_name)

@@ -14,7 +14,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from stlc.diagnostics import StlcError
-from stlc.dynamics.schema.schema import load_system_decl
+from stlc.dynamics.declaration.load import load_system_decl
 from stlc.escape import operand, shell
 from stlc.rundir import RunDir
 from stlc.signature import Signature

@@ -9,8 +9,8 @@ from typing import Any
 from stlc.compile.ir.traverse import margin_unit
 from stlc.diagnostics import StlcError
 from stlc.dynamics.declaration.decl import SystemDecl
+from stlc.dynamics.declaration.load import load_system_decl
 from stlc.dynamics.scenarios.scenario import under
-from stlc.dynamics.schema.schema import load_system_decl
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor

@@ -17,8 +17,8 @@ from stlc.controller.deployment.simulator import Recorder, Setting, drive
 from stlc.controller.guard.guard import Guard, Mode
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
+from stlc.dynamics.declaration.load import parse_system
 from stlc.dynamics.model.system import System
-from stlc.dynamics.schema.schema import parse_system
 from stlc.grammar.parse.parser import parse
 from stlc.signature import Column
 from stlc.source import Source

@@ -12,8 +12,8 @@ from stlc.controller.guard.plan_repair import POLISHED, FullBackup, Limits
 from stlc.controller.guard.relaxed import Closest
 from stlc.controller.guard.tightened import sparing
 from stlc.controller.problem.task import Task
+from stlc.dynamics.declaration.load import parse_system
 from stlc.dynamics.model.system import System
-from stlc.dynamics.schema.schema import parse_system
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

@@ -11,8 +11,8 @@ from stlc import native
 from stlc.compile.semantics.switch import Hard, Tanh
 from stlc.controller.problem.task import Task
 from stlc.controller.training.objective import Objective, guided_objective, loss, paper_objective
+from stlc.dynamics.declaration.load import parse_system
 from stlc.dynamics.model.system import System
-from stlc.dynamics.schema.schema import parse_system
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

@@ -18,9 +18,9 @@ from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.diagnostics import StlcError
 from stlc.dynamics.declaration.deployment import ErrorsDecl
+from stlc.dynamics.declaration.load import parse_system
 from stlc.dynamics.model.system import System
 from stlc.dynamics.scenarios.scenario import standard, under
-from stlc.dynamics.schema.schema import parse_system
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

@@ -12,9 +12,9 @@ from stlc.controller.guard.margin_calibration import measured_margin
 from stlc.controller.guard.margin_request import Asked, parse_margins
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
+from stlc.dynamics.declaration.load import parse_system
 from stlc.dynamics.model.system import System
 from stlc.dynamics.scenarios.scenario import under
-from stlc.dynamics.schema.schema import parse_system
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

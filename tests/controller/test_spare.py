@@ -17,9 +17,9 @@ from stlc.controller.guard.tightened import sparing, tighter
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
+from stlc.dynamics.declaration.load import parse_system
 from stlc.dynamics.model.system import System
 from stlc.dynamics.scenarios.scenario import under
-from stlc.dynamics.schema.schema import parse_system
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

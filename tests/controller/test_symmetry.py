@@ -11,8 +11,8 @@ from stlc.controller.policies.policy import PlanNetwork
 from stlc.controller.problem.symmetry import check_mirror
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import SystemFileError
+from stlc.dynamics.declaration.load import parse_system
 from stlc.dynamics.model.system import System
-from stlc.dynamics.schema.schema import parse_system
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

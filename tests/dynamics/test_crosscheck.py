@@ -10,7 +10,7 @@ import pytest
 
 from stlc.cli.framework.app import main
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.declaration.model import FunctionDecl
+from stlc.dynamics.declaration.functions import FunctionDecl
 from stlc.dynamics.robots import crosscheck
 from stlc.dynamics.robots.kinematics import position
 from stlc.dynamics.robots.urdf import chain

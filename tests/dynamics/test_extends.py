@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from stlc.diagnostics import StlcError
+from stlc.dynamics.declaration.load import load_system_decl
 from stlc.dynamics.robots.functions import function_files
-from stlc.dynamics.schema.schema import load_system_decl
 
 BASE = """\
 stlc: 1

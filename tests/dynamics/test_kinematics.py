@@ -16,9 +16,9 @@ from stlc.compile.backends.array.arith import Program
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import SystemFileError
+from stlc.dynamics.declaration.load import parse_system
 from stlc.dynamics.robots.kinematics import position
 from stlc.dynamics.robots.urdf import Joint, chain
-from stlc.dynamics.schema.schema import parse_system
 from stlc.source import Source
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -9,10 +9,10 @@ import torch
 
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.decl import SystemDecl
+from stlc.dynamics.declaration.load import load_system_decl, parse_system
 from stlc.dynamics.model.system import System
 from stlc.dynamics.scenarios.mistaken import Mistaken
 from stlc.dynamics.scenarios.uncertain import loosened
-from stlc.dynamics.schema.schema import load_system_decl, parse_system
 from stlc.source import Source
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import stlc
-from stlc.dynamics.schema.schema import load_system_decl
+from stlc.dynamics.declaration.load import load_system_decl
 from stlc.monitor.verdict import Monitor
 
 ROOT = Path(__file__).parents[2]

@@ -15,7 +15,7 @@ from stlc.compile.backends.onnx.sheet import BATCH, Sheet
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.switch import Hard
 from stlc.dynamics.model.algebra import substitute
-from stlc.dynamics.model.integrators import rk4
+from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.step import Step
 from stlc.export.onnx_graphs import deciding, judging
@@ -130,6 +130,7 @@ def test_a_step_of_many_parts_is_written_once(substeps: int) -> None:
     state: dict[str, ir.Num] = {"angle": angle, "speed": speed}
     lets: list[tuple[str, ir.Num]] = []
     for part in range(substeps):
+        rk4 = INTEGRATORS["rk4"]
         moved = rk4(lambda at: {"angle": at["speed"], "speed": substitute(pull, at)}, state, 0.1 / substeps)
         lets += [(f"{name}#{part}", number) for name, number in moved.items()]
         state = {name: ir.Signal(f"{name}#{part}") for name in moved}

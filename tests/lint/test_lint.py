@@ -9,7 +9,7 @@ import pytest
 
 from stlc.compile.frontend.interface import Grid
 from stlc.diagnostics import UsageError
-from stlc.dynamics.schema.schema import load_system_decl
+from stlc.dynamics.declaration.load import load_system_decl
 from stlc.files import read_source
 from stlc.grammar.format.format import format_text
 from stlc.grammar.parse.parser import parse

@@ -90,7 +90,7 @@ def _compiled(path: Path, system: str | None, overrides: Mapping[str, str]) -> t
     from stlc.compile.frontend.interface import Grid
     from stlc.compile.pipeline import compile_spec
     from stlc.diagnostics import Diagnostic, UsageError
-    from stlc.dynamics.schema.schema import load_system_decl
+    from stlc.dynamics.declaration.load import load_system_decl
     from stlc.files import find_spec, find_system, read_source
     from stlc.grammar.parse.parser import parse
 

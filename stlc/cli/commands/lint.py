@@ -151,7 +151,7 @@ def _surroundings(system: str | None, source: Source) -> Surroundings | None:
     if system is None:
         return None
     from stlc.compile.frontend.interface import Grid
-    from stlc.dynamics.schema.schema import load_system_decl
+    from stlc.dynamics.declaration.load import load_system_decl
     from stlc.files import find_system
     from stlc.lint.lint import Surroundings
 

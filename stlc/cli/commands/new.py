@@ -55,7 +55,7 @@ def spec(
     decl = None
     reference = ""
     if from_ is not None:
-        from stlc.dynamics.schema.schema import load_system_decl
+        from stlc.dynamics.declaration.load import load_system_decl
         from stlc.files import find_system
 
         decl = load_system_decl(find_system(from_))

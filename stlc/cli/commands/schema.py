@@ -14,6 +14,7 @@ from stlc.diagnostics import Diagnostic, UsageError
 from stlc.registry import closest
 
 FOLDER = Path(__file__).parents[2] / "schemas"
+SYSTEM_FILE = "system-file"
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
@@ -42,8 +43,9 @@ def schema(
 
 
 def names() -> list[str]:
-    """All schemas, such as `check/1`."""
-    return sorted(f"{path.stem}/1" for path in FOLDER.glob("*.json") if path.stem != "frame")
+    """All schemas, such as `check/1`; `system-file/1` is that of what users write."""
+    commands = (path.stem for path in FOLDER.glob("*.json") if path.stem != "frame")
+    return sorted(f"{name}/1" for name in (*commands, SYSTEM_FILE))
 
 
 def load_schema(name: str) -> dict[str, Any]:
@@ -58,6 +60,10 @@ def load_schema(name: str) -> dict[str, Any]:
         advice = (f"did you mean `{near}`?",) if near else ("stlc schema  lists them",)
         raise UsageError(Diagnostic("U101", f"there is no schema `{name}`", help=advice))
     command = wanted.partition("/")[0]
+    if command == SYSTEM_FILE:
+        from stlc.dynamics.declaration.load import system_schema
+
+        return {"$schema": _DIALECT, "title": wanted, **system_schema()}
     frame = _read("frame")
     properties = {**frame["properties"], "schema": {"const": wanted}}
     result = _read(command)

@@ -115,7 +115,7 @@ def _counted(count: int, what: str) -> str:
 
 
 def _load(name: str, overrides: dict[str, str]) -> SystemDecl:
-    from stlc.dynamics.schema.schema import load_system_decl
+    from stlc.dynamics.declaration.load import load_system_decl
     from stlc.files import find_system
 
     return load_system_decl(find_system(name), overrides)
@@ -177,7 +177,7 @@ def _values(decl: SystemDecl) -> dict[str, Any]:
 def _all_systems() -> Iterator[tuple[str, str, str]]:
     """Name, path and first sentence of every system file in the places that are looked at."""
     from stlc.diagnostics import StlcError
-    from stlc.dynamics.schema.schema import load_system_decl
+    from stlc.dynamics.declaration.load import load_system_decl
     from stlc.files import SYSTEMS
 
     seen: set[str] = set()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from stlc.dynamics.declaration.model import Assign
+    from stlc.dynamics.declaration.motion import Assign
     from stlc.dynamics.model.system import System
 
 SECOND = parse_unit("s")

@@ -20,7 +20,7 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.feasibility import safely, solvable
 from stlc.controller.training.run import INDEX, read_library, save_library
 from stlc.diagnostics import Diagnostic, RunError, SystemFileError, UsageError
-from stlc.dynamics.schema.schema import load_system_decl
+from stlc.dynamics.declaration.load import load_system_decl
 from stlc.files import read_source, write_atomic
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse

@@ -13,9 +13,9 @@ from stlc.controller.problem.task import Task
 from stlc.controller.training.checkpoint import save_checkpoint
 from stlc.controller.training.config import ResolvedConfig, checked_config
 from stlc.diagnostics import Diagnostic, RunError
+from stlc.dynamics.declaration.load import load_system_decl
 from stlc.dynamics.model.system import System
 from stlc.dynamics.scenarios.scenario import scenario_constants
-from stlc.dynamics.schema.schema import load_system_decl
 from stlc.files import read_source, write_atomic
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse

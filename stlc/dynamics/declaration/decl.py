@@ -10,10 +10,12 @@ from pathlib import Path
 
 from stlc.compile.frontend.interface import Grid, Interface
 from stlc.diagnostics import Diagnostic
+from stlc.dynamics.declaration.columns import ControlDecl
 from stlc.dynamics.declaration.deployment import BackupDecl, JudgeRef, ScenarioDecl, TestDecl, WorldRef
+from stlc.dynamics.declaration.functions import FunctionDecl
 from stlc.dynamics.declaration.init import InitDecl
-from stlc.dynamics.declaration.learning import ObjectiveDecl, PolicyDecl, TrainDecl
-from stlc.dynamics.declaration.model import Assign, ControlDecl, Feedback, FunctionDecl, JumpDecl
+from stlc.dynamics.declaration.learning import Feedback, ObjectiveDecl, PolicyDecl, TrainDecl
+from stlc.dynamics.declaration.motion import Assign, JumpDecl
 from stlc.signature import Signature
 from stlc.source import Source, Span
 from stlc.units import Unit

@@ -1,59 +1,155 @@
-"""How a policy is deployed, as data: its backup, its world and what happens there, and scenarios."""
+"""The sections `backup`, `test` and `scenario`: a deployment, its events, its world, and its overlays."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from types import MappingProxyType
+from typing import Any, Literal, get_args
 
 from stlc.compile.ir import nodes as ir
-from stlc.dynamics.declaration.learning import Term
-from stlc.dynamics.declaration.model import Assign
-from stlc.runtime.prefixes import SAMPLES, Sampling
+from stlc.dynamics.declaration.columns import read_levels
+from stlc.dynamics.declaration.learning import INTEGERS, TERMS, Term
+from stlc.dynamics.declaration.motion import SETS, Assign, rate_unit, states_of
+from stlc.dynamics.schema.expressions import written
+from stlc.dynamics.schema.names import Context, base_name
+from stlc.dynamics.schema.reader import first_line
+from stlc.dynamics.schema.record import (
+    EXPRESSION,
+    LINE,
+    NAME,
+    OF,
+    SHARE,
+    STEPS,
+    VECTOR,
+    Kind,
+    integer,
+    json_schema,
+    key,
+    list_of,
+    mapping_of,
+    part,
+    read,
+    values_of,
+    word,
+)
+from stlc.dynamics.schema.yaml_nodes import Entry, Node, Scalar
+from stlc.dynamics.schema.yaml_nodes import Mapping as MappingNode
+from stlc.grammar import ast
+from stlc.runtime.prefixes import SAMPLES, SAMPLINGS, Sampling
 from stlc.source import Span
+
+METRICS = ("stl_accuracy", "safety", "progress", "latency")
+SPECS = (".stl", ".stlc")
+Edge = Literal["rise", "fall"]
+Starts = Literal["any", "savable", "feasible"]
+"""Initial states of agents: all that are drawn, or those from which a search finds a safe plan, or a plan
+that satisfies everything."""
+
+
+# ------------------------------------------------------------------------------------ backup
+
+
+def _levels(cx: Context, node: Node, label: str) -> Mapping[str, tuple[float, ...]]:
+    """Values of controls, in the place of what those declare themselves."""
+    found = {}
+    for entry in cx.reader.entries(node, label):
+        name = entry.key.text
+        meant = [each for each in cx.names.controls if name in (each.name, base_name(each.name))]
+        if not meant:
+            cx.reader.unknown(entry.key, label, tuple(each.name for each in cx.names.controls))
+        for control in meant:
+            where, bounds = f"the control `{control.name}`", (control.low, control.high)
+            levels = read_levels(entry.value, where, control.unit, bounds, cx.plain)
+            found[control.name] = levels or control.levels
+    return MappingProxyType(found)
 
 
 @dataclass(frozen=True, slots=True)
 class BackupDecl:
-    """What the backup policy tries.
+    """The prefixes that the backup policy tries."""
 
-    Attributes:
-        bins: values of a control, evenly over its range.
-        lengths: of prefixes, T0.
-        batch: trajectories at a time.
-        levels: name of a control -> its values, in the place of `bins`.
-        samples: prefixes of one length at most.
-        sampling: which, where there are more.
-    """
+    bins: int = key(integer(2), "values of a control, evenly over its range", 5)
+    levels: Mapping[str, tuple[float, ...]] = key(
+        Kind(_levels, mapping_of({"type": "array", "items": EXPRESSION})),
+        "values by control, in place of `bins`",
+        {},
+    )
+    lengths: tuple[int, ...] = key(INTEGERS, "lengths of prefixes, in steps", (1, 2, 3), name="T0")
+    batch: int = key(integer(), "trajectories at a time", 8192)
+    samples: int = key(integer(high=1 << 20), "largest number of prefixes of one length", SAMPLES)
+    sampling: Sampling = key(word(SAMPLINGS), "choice of prefixes, where there are more", "lattice")
 
-    bins: int = 5
-    lengths: tuple[int, ...] = (1, 2, 3)
-    batch: int = 8192
-    levels: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    samples: int = SAMPLES
-    sampling: Sampling = "lattice"
+
+def read_backup(cx: Context, node: Node | None, label: str) -> BackupDecl:
+    """The section `backup`, or that of a scenario; prefixes end at the horizon."""
+    backup, horizon = read(BackupDecl, cx, node, label), cx.clock.horizon
+    lengths = node.get("T0") if isinstance(node, MappingNode) else None
+    if lengths is not None and 0 < horizon < max(backup.lengths):
+        cx.reader.report("S103", f"`T0` goes beyond the horizon of {horizon} steps", lengths.span)
+    return replace(backup, lengths=tuple(each for each in backup.lengths if each <= horizon) or (1,))
+
+
+_BACKUP = Kind(read_backup, json_schema(BackupDecl), BackupDecl)
+
+
+# ------------------------------------------------------------------------------------ events
+
+
+def _trigger(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
+    """A state formula, or `rise(…)`, `fall(…)` of one."""
+    expr = cx.here.parse(node, label)
+    match expr:
+        case None:
+            return None
+        case ast.Call(_, ast.Name(_, "rise" | "fall" as edge), (ast.Arg(_, None, value),)):
+            return {"when": cx.here.formula_of(value), "edge": edge}
+        case _:
+            return {"when": cx.here.formula_of(expr)}
+
+
+def _instant(cx: Context, node: Node, label: str) -> int | None:
+    """A step of the deployment; 0 is its start."""
+    return 0 if written(node) in {"0", "0 s", "0 steps"} else STEPS.read(cx, node, label)
 
 
 @dataclass(frozen=True, slots=True)
 class EventDecl:
-    """Something that happens between steps and that the planner does not foresee.
+    """An exogenous event between two steps, unknown to the planner.
 
-    Attributes:
-        name: for messages.
-        when: a state formula; None where the event is timed.
-        edge: fire only where `when` has just become true (`rise`) or false (`fall`).
-        at: step at which it fires once.
-        every: period in steps.
-        sets: new values, in order; later ones read earlier ones.
+    `edge`: fire only where `when` has just become true (`rise`) or false (`fall`).
     """
 
-    name: str
-    sets: tuple[Assign, ...]
-    when: ir.Formula | None = None
-    edge: Literal["rise", "fall"] | None = None
-    at: int | None = None
-    every: int | None = None
+    name: str = key(NAME, "for messages", "", label=OF)
+    when: ir.Formula | None = key(
+        Kind(_trigger, EXPRESSION), "condition, or `rise(…)`, `fall(…)` of one", spread=True
+    )
+    edge: Edge | None = None
+    at: int | None = key(Kind(_instant, EXPRESSION), "time or step at which it happens once")
+    every: int | None = key(STEPS, "period, as a time or in steps")
+    sets: tuple[Assign, ...] = key(SETS, "new values, in order", (), name="set", required=True)
+
+
+def read_events(cx: Context, node: Node, label: str) -> tuple[EventDecl, ...]:
+    """Events, each with exactly one of `when`, `at` and `every`."""
+    found = []
+    for index, item in enumerate(cx.reader.items(node, label)):
+        event = read(EventDecl, cx, item, "an event")
+        event = replace(event, name=event.name or f"event {index + 1}")
+        given = {each.key.text for each in item.entries} if isinstance(item, MappingNode) else set()
+        if len(given & {"when", "at", "every"}) != 1:
+            message = f"the event `{event.name}` needs exactly one of `when`, `at` and `every`"
+            cx.reader.report("S102", message, first_line(item.span))
+        found.append(event)
+    return tuple(found)
+
+
+_EVENTS = Kind(read_events, {"type": ["array", "null"], "items": json_schema(EventDecl)}, EventDecl)
+
+
+# -------------------------------------------------------------------------------------- test
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +163,7 @@ class WorldRef:
 
 @dataclass(frozen=True, slots=True)
 class JudgeRef:
-    """The specification that drives are judged by.
+    """The specification that closed-loop runs are judged by.
 
     Attributes:
         path: of its file.
@@ -80,87 +176,152 @@ class JudgeRef:
     span: Span = field(compare=False, repr=False)
 
 
-Starts = Literal["any", "savable", "feasible"]
-"""Starts that agents may have: all that are drawn, or those from which a search finds a safe plan, or a
-plan that satisfies everything."""
+def _world(cx: Context, node: Node, _label: str) -> WorldRef | None:
+    """`file.py:Class`, relative to the system file."""
+    text = None if isinstance(node, Scalar) and node.is_null else cx.reader.text(node, "`world`")
+    if text is None:
+        return None
+    file, _, name = text.rpartition(":")
+    if not file.endswith(".py") or not name.isidentifier():
+        cx.reader.wrong(node, "`world`", "a Python file and a class", "write `traffic_grid.py:TrafficGrid`")
+        return None
+    return WorldRef(Path(node.span.source.name).parent / file, name, node.span)
+
+
+def _judge(cx: Context, node: Node, _label: str) -> JudgeRef | None:
+    """A specification, relative to the file that names it."""
+    text = None if isinstance(node, Scalar) and node.is_null else cx.reader.text(node, "`judge`")
+    if text is None:
+        return None
+    if not text.endswith(SPECS):
+        cx.reader.wrong(node, "`judge`", "the path of a specification", "write `../specs/driving_rules.stl`")
+        return None
+    folder = Path(node.span.source.name).parent
+    return JudgeRef(Path(os.path.normpath(folder / text)), text, node.span)
+
+
+def _uncertain(cx: Context, node: Node, label: str) -> tuple[str, ...]:
+    """Constants, by name; a vector has one."""
+    known = tuple(dict.fromkeys(map(base_name, cx.names.constants)))
+    items = [item for item in cx.reader.items(node, label) if isinstance(item, Scalar)]
+    for item in items:
+        if item.text not in known:
+            cx.reader.unknown(item, label, known)
+    return tuple(item.text for item in items)
+
+
+_WORLD = Kind(_world, {"type": ["string", "null"]})
+_JUDGE = Kind(_judge, {"type": ["string", "null"]})
 
 
 @dataclass(frozen=True, slots=True)
 class TestDecl:
-    """A deployment: how long, how many agents, how often they plan, and what happens to them.
-
-    `uncertain`: the constants that `parameters` of a scenario's errors makes wrong; None: those that
-    `stlc.dynamics.scenarios.uncertain` finds.
-    `judge`: the specification that drives are judged by; None: the one that plans are made for.
-    `starts`: which of the starts that are drawn are taken; the others are drawn again.
-    """
+    """A deployment: its length, the number of agents, when they plan, and the events that they meet."""
 
     __test__ = False
 
-    steps: int = 200
-    agents: int = 20
-    replan: int = 1
-    events: tuple[EventDecl, ...] = ()
-    metrics: tuple[str, ...] = ()
-    world: WorldRef | None = None
-    uncertain: tuple[str, ...] | None = None
-    judge: JudgeRef | None = None
-    starts: Starts = "any"
+    steps: int = key(STEPS, "length, as a time or in steps", 200)
+    agents: int = key(integer(high=100_000), "agents", 20)
+    replan: int = key(integer(), "steps between plans", 1)
+    events: tuple[EventDecl, ...] = key(_EVENTS, "exogenous events, in order", ())
+    metrics: tuple[str, ...] = key(list_of(word(METRICS), "a metric"), "metrics to report", ())
+    world: WorldRef | None = key(_WORLD, "`file.py:Class`: a world in Python, in place of events")
+    uncertain: tuple[str, ...] | None = key(
+        Kind(_uncertain, {"type": ["array", "null"], "items": {"type": "string"}}),
+        "constants that `errors: {parameters: …}` perturbs; those of the dynamics unless given",
+    )
+    judge: JudgeRef | None = key(_JUDGE, "specification that closed-loop runs are judged by")
+    starts: Starts = key(word(get_args(Starts)), "initial states of agents", "any")
+
+
+# --------------------------------------------------------------------------------- scenarios
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorsDecl:
-    """How far actuators and sensors are off, as shares.
+    """Errors of actuators, parameters and sensors, as shares.
 
-    Attributes:
-        actuator_gain: of every control each agent gets so much more or less than it commands, all the time;
-            a direction (squash `angle`) is off by this share of a radian instead.
-        parameters: of every number in the dynamics (`stlc.dynamics.scenarios.uncertain`) the truth of each
-            agent has so much more or less, all the time.
-        actuator_noise: standard deviation of what is added to controls at every step, of half their range;
-            to a direction, of a radian.
-        sensor_noise: of what is added to the real states that agents see, of their nominal range; clocks,
-            which are states in seconds, are known.
+    A direction (squash `angle`) is off by a share of a radian instead. Parameters are the numbers in the
+    dynamics (`stlc.dynamics.scenarios.uncertain`). Clocks, which are states in seconds, are known exactly.
     """
 
-    actuator_gain: float = 0.0
-    parameters: float = 0.0
-    actuator_noise: float = 0.0
-    sensor_noise: float = 0.0
+    actuator_gain: float = key(SHARE, "constant relative error of every control of an agent", 0.0)
+    parameters: float = key(SHARE, "constant relative error of every number in the dynamics", 0.0)
+    actuator_noise: float = key(SHARE, "standard deviation of noise on controls, of half their range", 0.0)
+    sensor_noise: float = key(SHARE, "standard deviation of noise on observed states, of their range", 0.0)
+
+
+def _constants(cx: Context, node: Node, label: str) -> Mapping[str, str]:
+    """Constants and their other values, as text."""
+    found: dict[str, str] = {}
+    for entry in cx.reader.entries(node, label):
+        name = entry.key.text
+        if name not in cx.names.constants and f"{name}[0]" not in cx.names.constants:
+            cx.reader.unknown(entry.key, label, tuple(cx.names.constants))
+        elif cx.plain.here.numbers(entry.value, f"`{name}`") is not None:
+            found[name] = written(entry.value) or entry.value.span.text
+    return MappingProxyType(found)
+
+
+def _rates(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
+    """Additions to derivatives (or next values), in the unit of the state per second."""
+    found: list[Assign] = []
+    here = cx.amounts().here
+    for entry in cx.reader.entries(node, label):
+        columns = states_of(entry, label, cx)
+        if not columns:
+            continue
+        unit = columns[0].unit if cx.clock.discrete else rate_unit(columns[0].unit)
+        values = here.stored_each(entry.value, f"`{entry.key.text}`", unit, len(columns))
+        text = written(entry.value)
+        found.extend(Assign(c.name, value, text) for c, value in zip(columns, values or (), strict=False))
+    return tuple(found)
+
+
+_CONSTANTS = Kind(_constants, mapping_of(VECTOR))
 
 
 @dataclass(frozen=True, slots=True)
 class ScenarioDecl:
-    """A named overlay of a deployment.
-
-    Attributes:
-        name: as written.
-        doc: one line for people.
-        expect: "nominal", or "ood" where a policy meets what training never drew.
-        constants: other values, as text; they change the model too.
-        override: initial values, drawn after all others.
-        events: that happen beside those of `test`.
-        disturb: what is added to derivatives of the truth, not of the model.
-        noise: what is added to the states that agents see.
-        mismatch: constants of the truth that the model does not know, as text.
-        world: in the place of that of `test`.
-        errors: of actuators and sensors.
-        prefer: performance terms that plans are chosen by, beside those of the objective.
-        backup: in the place of the system's.
-        judge: in the place of that of `test`.
-    """
+    """A named overlay of a deployment."""
 
     name: str
-    doc: str = ""
-    expect: str = "nominal"
-    constants: Mapping[str, str] = field(default_factory=dict)
-    override: tuple[Assign, ...] = ()
-    events: tuple[EventDecl, ...] = ()
-    disturb: tuple[Assign, ...] = ()
-    noise: tuple[Assign, ...] = ()
-    mismatch: Mapping[str, str] = field(default_factory=dict)
-    world: WorldRef | None = None
-    errors: ErrorsDecl = field(default_factory=ErrorsDecl)
-    prefer: tuple[Term, ...] = ()
-    backup: BackupDecl | None = None
-    judge: JudgeRef | None = None
+    doc: str = key(LINE, "one line for people", "")
+    expect: str = key(word(("nominal", "ood")), "`ood`: states that training never drew", "nominal")
+    constants: Mapping[str, str] = key(
+        _CONSTANTS, "other values of constants, in model and truth", {}, name="const"
+    )
+    override: tuple[Assign, ...] = key(SETS, "initial values, drawn after all others", ())
+    events: tuple[EventDecl, ...] = key(_EVENTS, "events beside those of `test`", ())
+    disturb: tuple[Assign, ...] = key(
+        Kind(_rates, mapping_of(VECTOR)), "additions to derivatives of the truth, not of the model", ()
+    )
+    noise: tuple[Assign, ...] = key(
+        Kind(lambda cx, node, label: SETS.read(cx.amounts(), node, label), mapping_of(VECTOR)),
+        "additions to the states that agents observe",
+        (),
+    )
+    mismatch: Mapping[str, str] = key(
+        _CONSTANTS, "constants of the truth that the model does not know", {}, name="model_mismatch"
+    )
+    errors: ErrorsDecl = key(part(ErrorsDecl), "errors, as shares", ErrorsDecl())
+    world: WorldRef | None = key(_WORLD, "world in place of that of `test`")
+    prefer: tuple[Term, ...] = key(
+        TERMS, "performance terms that plans are ranked by, beside those of `objective`", ()
+    )
+    backup: BackupDecl | None = key(_BACKUP, "backup in place of that of the system")
+    judge: JudgeRef | None = key(_JUDGE, "specification in place of that of `test`")
+
+
+def read_scenarios(node: Node | None, cx: Context) -> tuple[ScenarioDecl, ...]:
+    """The section `scenario`: all overlays, in order, each checked whether it is chosen or not."""
+    return tuple(
+        _scenario(entry, cx)
+        for entry in cx.reader.entries(node, "`scenario`")
+        if cx.reader.nameable(entry.key, "the name of a scenario")
+    )
+
+
+def _scenario(entry: Entry, cx: Context) -> ScenarioDecl:
+    name = entry.key.text
+    return ScenarioDecl(name, **values_of(ScenarioDecl, cx.timed, entry.value, f"the scenario `{name}`", OF))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.init import Situation
-from stlc.dynamics.declaration.model import Assign
+from stlc.dynamics.declaration.motion import Assign
 from stlc.escape import visible
 from stlc.signature import Column
 

@@ -1,13 +1,41 @@
-"""Where a system begins, as data: a mixture of situations, and conditions on every state."""
+"""The section `init`: the distribution of initial states, as a mixture of situations, a grid, or a file."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import re
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from stlc.compile.frontend.scope import Entry as Name
+from stlc.compile.frontend.scope import Known
+from stlc.compile.frontend.values import Number, Vector
 from stlc.compile.ir import nodes as ir
-from stlc.dynamics.declaration.model import Assign
+from stlc.dynamics.declaration.motion import Assign, column_assign, shared_draws, state_assigns, states_of
+from stlc.dynamics.schema.expressions import written
+from stlc.dynamics.schema.names import Context, base_name, component_names
+from stlc.dynamics.schema.reader import first_line
+from stlc.dynamics.schema.record import (
+    EXPRESSION,
+    NAME,
+    OF,
+    VECTOR,
+    integer,
+    key,
+    list_of,
+    mapping_of,
+    number,
+    raw,
+    read,
+    section,
+)
+from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Sequence
+from stlc.files import beside
+from stlc.signature import Column
 from stlc.source import Span
+
+MAX_COUNT = 1_000_000
+FORMATS = (".npz", ".csv", ".parquet", ".mat", ".mcap")
+_DRAWS = raw(mapping_of(VECTOR))
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +47,7 @@ class GridDecl:
 
 @dataclass(frozen=True, slots=True)
 class FileDecl:
-    """States that lie in a file: each column an array of that name, all samples of all traces."""
+    """States from a file: each column an array of that name, all samples of all traces."""
 
     path: Path
     names: tuple[str, ...]
@@ -51,10 +79,10 @@ class InitDecl:
 
     Attributes:
         mixture: of situations.
-        where: what every state must meet.
+        where: conditions that every state must meet.
         where_text: as written.
-        params: what is drawn before a situation is picked; situations may draw it anew.
-        override: what is drawn last, over what situations say.
+        params: drawn before a situation is picked; situations may draw them anew.
+        override: drawn last, over the draws of situations.
         span: for messages.
     """
 
@@ -64,3 +92,269 @@ class InitDecl:
     params: tuple[Assign, ...] = ()
     override: tuple[Assign, ...] = ()
     span: Span | None = field(default=None, compare=False, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class SituationKeys:
+    """The keys of a situation, and of each branch of one."""
+
+    name: str = key(NAME, "for messages and tables", "", label=OF)
+    weight: float = key(number(), "share among its siblings, not normalised", 1.0)
+    draw: Node | None = key(_DRAWS, "initial values of states, in order")
+    choose: Node | None = key(raw({"type": ["array", "null"]}), "branches, of which one is drawn")
+    let: Node | None = key(_DRAWS, "local names")
+    also: Node | None = key(_DRAWS, "further values, in place of those of `draw`")
+
+
+@dataclass(frozen=True, slots=True)
+class InitKeys:
+    """The section `init`."""
+
+    mixture: tuple[Node, ...] = key(list_of(section(SituationKeys), ""), "situations", ())
+    where: Node | None = key(
+        raw({"type": ["array", "null"], "items": EXPRESSION}), "conditions on every initial state"
+    )
+    grid: Node | None = key(raw({"type": "object"}), "values of states; every combination equally often")
+    from_: Node | None = key(raw({"type": "string"}), "a file of states, relative to this one", name="from")
+    draw: Node | None = key(_DRAWS, "values of the states that `grid` or `from` leave out")
+    let: Node | None = key(_DRAWS, "local names for `draw`")
+
+
+@dataclass(frozen=True, slots=True)
+class AxisKeys:
+    """Evenly spaced values of a grid."""
+
+    from_: Node | None = key(raw(EXPRESSION), "first value", name="from", required=True)
+    to: Node | None = key(raw(EXPRESSION), "last value", required=True)
+    count: int | None = key(integer(2, MAX_COUNT), "number of values", label=OF, required=True)
+
+
+# ------------------------------------------------------------------------------ situations
+
+
+@dataclass(frozen=True, slots=True)
+class _Drawn:
+    """The states and local names that have a value at some point of a situation."""
+
+    states: frozenset[str] = frozenset()
+    locals: tuple[tuple[str, Number | Vector], ...] = ()
+
+    def drawing(self, cx: Context) -> Context:
+        """Expressions that may draw, and read what has a value."""
+        entries: dict[str, Name] = {name: Known(number, "local name") for name, number in self.locals}
+        ready = self.states | {name for local, value in self.locals for name in _columns_of(local, value)}
+        return cx.drawing(entries, ready)
+
+
+def _columns_of(name: str, value: Number | Vector) -> tuple[str, ...]:
+    return component_names(name, len(value.items) if isinstance(value, Vector) else None)
+
+
+def read_init(node: Node | None, cx: Context, params: tuple[Assign, ...] = ()) -> InitDecl:
+    """The section `init`; `params` are drawn before everything else."""
+    reader = cx.reader
+    if node is None:
+        advice = "init: {mixture: [{draw: {x: 0}}]}"
+        reader.report("S102", "the file lacks `init`", reader.source.span(0, 1), advice)
+        return InitDecl(())
+    keys = read(InitKeys, cx, node, "`init`")
+    written_keys = {each.key.text for each in node.entries} if isinstance(node, Mapping) else set()
+    given = [name for name in ("mixture", "grid", "from") if name in written_keys]
+    if len(given) > 1:
+        message = f"`init` takes one of `mixture`, `grid` and `from`, not {len(given)}"
+        reader.report("S102", message, first_line(node.span))
+    drawn = _Drawn(frozenset(assign.name for assign in params))
+    if "mixture" in given or not given:
+        for name, value in (("draw", keys.draw), ("let", keys.let)):
+            if value is not None:
+                reader.report("S102", f"`{name}` under `init` goes with `grid` or `from`", value.span)
+        if not keys.mixture:
+            message, advice = "`init` lacks a `mixture` of situations", "mixture: [{draw: {x: 0}}]"
+            reader.report("S102", message, first_line(node.span), advice)
+        mixture = _mixture(keys.mixture, drawn, cx)
+    else:
+        mixture = (_known(keys, node, drawn, cx),)
+    items = reader.items(keys.where, "`where`")
+    formulas = [cx.here.formula(item, "a line of `where`") for item in items]
+    span = node.span if keys.where is None else keys.where.span
+    where = tuple(each for each in formulas if each is not None)
+    return InitDecl(mixture, where, tuple(map(written, items)), params, span=first_line(span))
+
+
+def _mixture(items: tuple[Node, ...], drawn: _Drawn, cx: Context) -> tuple[Situation, ...]:
+    """Situations, with weights that are not all 0."""
+    situations = [_situation(item, drawn, cx) for item in items]
+    if items and not any(situation.weight > 0 for situation in situations):
+        cx.reader.report("S103", "the weights of a mixture are all 0", first_line(items[0].span))
+    return tuple(situations)
+
+
+def _situation(node: Node, drawn: _Drawn, cx: Context) -> Situation:
+    """One situation, or one branch of one."""
+    keys = read(SituationKeys, cx, node, "a situation")
+    draws = _Draws(cx, drawn)
+    draws.read(keys)
+    choices = cx.reader.items(keys.choose, "`choose`")
+    branches = _mixture(choices, draws.drawn, cx)
+    if not choices and isinstance(node, Mapping):
+        _all_drawn(f"the situation `{keys.name}`" if keys.name else "this situation", draws, node, cx)
+    return Situation(keys.name, keys.weight, tuple(draws.found), branches)
+
+
+def _all_drawn(called: str, draws: _Draws, node: Node, cx: Context) -> None:
+    """Report states that have no first value."""
+    undrawn = [column.name for column in cx.names.columns if column.name not in draws.drawn.states]
+    missing = list(dict.fromkeys(map(base_name, undrawn)))
+    if missing and not draws.failed:
+        listed = ", ".join(f"`{column}`" for column in missing)
+        message = f"{called} draws no value for {listed}"
+        cx.reader.report("S102", message, first_line(node.span), "every state needs a first value")
+
+
+class _Draws:
+    """The assignments of one situation; local names are resolved where they are first needed."""
+
+    def __init__(self, cx: Context, drawn: _Drawn) -> None:
+        self.cx = cx
+        self.drawn = drawn
+        self.found: list[Assign] = []
+        self.failed = False
+        self.lets: dict[str, Node] = {}
+
+    def read(self, keys: SituationKeys | InitKeys) -> None:
+        """`let`, `draw` and `also`, in the order of their dependencies."""
+        reader = self.cx.reader
+        before = len(reader.findings)
+        for entry in reader.entries(keys.let, "`let`"):
+            if entry.key.text in self.cx.names.places:
+                message = f"`{entry.key.text}` is already the name of something"
+                reader.report("E102", message, entry.key.span)
+            else:
+                self.lets[entry.key.text] = entry.value
+        also_node = keys.also if isinstance(keys, SituationKeys) else None
+        also = {entry.key.text: entry for entry in reader.entries(also_node, "`also`")}
+        for entry in reader.entries(keys.draw, "`draw`"):
+            self._draw(also.pop(entry.key.text, entry), "`draw`")
+        for entry in also.values():
+            self._draw(entry, "`also`")
+        for name in list(self.lets):
+            self._let(name)
+        self.failed = len(reader.findings) > before
+
+    def _draw(self, entry: Entry, where: str) -> None:
+        """One state."""
+        columns = states_of(entry, where, self.cx)
+        if not columns:
+            return
+        self._needed(entry.value)
+        self.found.extend(shared_draws(state_assigns(entry, where, self.drawn.drawing(self.cx))))
+        self.drawn = replace(self.drawn, states=self.drawn.states | {column.name for column in columns})
+
+    def _needed(self, node: Node) -> None:
+        """The local names that an expression mentions."""
+        texts = [written(item) for item in (node.items if isinstance(node, Sequence) else (node,))]
+        for name in list(self.lets):
+            if any(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) for text in texts):
+                self._let(name)
+
+    def _let(self, name: str) -> None:
+        """One local name, and those that it needs."""
+        if name not in self.lets:
+            return
+        node = self.lets.pop(name)
+        self._needed(node)
+        numbers = self.drawn.drawing(self.cx).here.numbers(node, f"`{name}`")
+        known: Number | Vector = Number(ir.Const(0.0), flexible=True)
+        if numbers is not None:
+            vector = len(numbers) > 1 or isinstance(node, Sequence)
+            called = component_names(name, len(numbers) if vector else None)
+            assigns = [
+                Assign(each, number.num, written(node)) for each, number in zip(called, numbers, strict=True)
+            ]
+            self.found.extend(shared_draws(assigns))
+            items = tuple(
+                replace(number, num=ir.Signal(each), exact=None, span=None, origin=None)
+                for each, number in zip(called, numbers, strict=True)
+            )
+            known = Vector(items) if vector else items[0]
+        self.drawn = replace(self.drawn, locals=(*self.drawn.locals, (name, known)))
+
+
+# ---------------------------------------------------------------------------- known points
+
+
+def _known(keys: InitKeys, node: Node, drawn: _Drawn, cx: Context) -> Situation:
+    """One situation whose states, but for those that it draws, are those of a grid or a file."""
+    rest = {entry.key.text for entry in cx.reader.entries(keys.draw, "`draw`")}
+    missing = [
+        column.name
+        for column in cx.names.columns
+        if column.name not in drawn.states and not {column.name, base_name(column.name)} & rest
+    ]
+    points: GridDecl | FileDecl | None
+    if keys.grid is not None:
+        points = _grid(keys.grid, cx)
+        taken = {name for name, _ in points.axes}
+    else:
+        assert keys.from_ is not None
+        points = _file(keys.from_, tuple(missing), cx)
+        taken = set(missing)
+    draws = _Draws(cx, replace(drawn, states=drawn.states | taken))
+    draws.read(keys)
+    _all_drawn("the grid", draws, node, cx)
+    return Situation("grid" if keys.grid is not None else "from", 1.0, tuple(draws.found), (), points)
+
+
+def _grid(node: Node, cx: Context) -> GridDecl:
+    """`{x: {from: -1, to: 1, count: 21}, sign: [stop, light]}`: every combination of the values."""
+    axes = []
+    for entry in cx.reader.entries(node, "`grid`"):
+        columns = states_of(entry, "`grid`", cx)
+        if columns and cx.names.vector(entry.key.text):
+            advice = f'"{columns[0].name}": …'
+            cx.reader.report("S203", f"`{entry.key.text}` is a vector", entry.key.span, advice)
+        elif columns:
+            axes.append((columns[0].name, _values(columns[0], entry, cx)))
+    if not axes:
+        cx.reader.wrong(node, "`grid`", "states and their values", "{x: {from: -1, to: 1, count: 21}}")
+    return GridDecl(tuple(axes))
+
+
+def _values(column: Column, entry: Entry, cx: Context) -> tuple[float, ...]:
+    """The values of one axis, in the unit of the column; one that is wrong stands for 0."""
+    where = f"the values of `{column.name}`"
+    if isinstance(entry.value, Mapping):
+        return _spaced(column, entry.value, where, cx)
+    single = not isinstance(entry.value, Sequence)
+    items = (entry.value,) if single else cx.reader.items(entry.value, where)
+    if not items:
+        cx.reader.wrong(entry.value, where, "a list of at least one value")
+    found = []
+    for item in items:
+        assign = column_assign(column, item, cx)
+        if assign is not None and not isinstance(assign.value, ir.Const):
+            cx.reader.wrong(item, f"a value of `{column.name}`", "a constant", "draw it under `draw`")
+        found.append(assign.value.value if assign is not None and isinstance(assign.value, ir.Const) else 0.0)
+    return tuple(found) or (0.0,)
+
+
+def _spaced(column: Column, node: Mapping, where: str, cx: Context) -> tuple[float, ...]:
+    """`{from: 0, to: 1, count: 5}`: evenly spaced, both ends among them."""
+    keys = read(AxisKeys, cx, node, where)
+    low = cx.here.constant(keys.from_, f"`from` of {where}", column.unit)
+    high = cx.here.constant(keys.to, f"`to` of {where}", column.unit)
+    if column.kind != "real":
+        cx.reader.wrong(node, where, "a list of its members")
+    if low is None or high is None or keys.count is None:
+        return (0.0,)
+    return tuple(low + (high - low) * index / (keys.count - 1) for index in range(keys.count))
+
+
+def _file(node: Node, names: tuple[str, ...], cx: Context) -> FileDecl | None:
+    """`from: starts.npz`, relative to the system file; the states that are not drawn come from there."""
+    text = cx.reader.text(node, "`from`")
+    if text is None:
+        return None
+    if Path(text).suffix not in FORMATS:
+        cx.reader.wrong(node, "`from`", "a file of states", f"formats: {', '.join(FORMATS)}")
+    return FileDecl(beside(Path(node.span.source.name).parent, text), names, node.span)

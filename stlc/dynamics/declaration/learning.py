@@ -1,90 +1,330 @@
-"""What a policy is to learn and how, as data: the objective, the network, and the training."""
+"""The sections `objective`, `policy` and `train`: the loss, the network, and the training of a policy."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
+from stlc.compile.frontend.algebra import absolute
+from stlc.compile.frontend.scope import Entry, Known
+from stlc.compile.frontend.values import Number, Vector
 from stlc.compile.ir import nodes as ir
-from stlc.dynamics.declaration.model import Assign
+from stlc.dynamics.declaration.motion import Assign, component_texts, state_assigns
+from stlc.dynamics.model.algebra import names_in, substitute
+from stlc.dynamics.schema.expressions import SECOND, written
+from stlc.dynamics.schema.names import Context
+from stlc.dynamics.schema.record import (
+    EXPRESSION,
+    NAME,
+    OF,
+    SECONDS,
+    VECTOR,
+    Kind,
+    integer,
+    json_schema,
+    key,
+    mapping_of,
+    number,
+    read,
+    word,
+)
+from stlc.dynamics.schema.yaml_nodes import Node, Scalar, Sequence, as_int
+from stlc.grammar import ast
+from stlc.registry import METHODS
 from stlc.source import Span
+from stlc.units import Unit
 
 START = "_start"
 """Behind the name of a state: its value at the start of the plan, in performance terms."""
+OUTCOME = {
+    "sat": "1 where the trajectory satisfies the specification",
+    "rho": "robustness of the trajectory",
+    "k": "number of the step",
+}
+
+
+# ------------------------------------------------------------------------------- objective
+
+
+def _absolute(cx: Context, node: Node, label: str) -> ir.Num | None:
+    value = cx.here.number(node, label)
+    return None if value is None else absolute(value).num
+
+
+def _term_label(found: Mapping[str, Node]) -> str:
+    name = found.get("name")
+    shown = name.text if isinstance(name, Scalar) and not name.is_null else written(found.get("expr"))
+    return f"the term `{shown}`"
 
 
 @dataclass(frozen=True, slots=True)
 class Term:
     """A performance term of the objective: `weight` times the mean of `value` over time and batch."""
 
-    name: str
-    weight: float
-    value: ir.Num
+    name: str = key(NAME, "for tables; the expression unless given", "", label=OF)
+    weight: float = key(number(), "factor of the mean over a plan", 1.0)
+    value: ir.Num = key(
+        Kind(_absolute, EXPRESSION), "the cost", name="expr", label=_term_label, required=True
+    )
+
+
+def read_terms(cx: Context, node: Node | None, label: str) -> tuple[Term, ...]:
+    """A list of performance terms; they read `sat`, `rho`, `k`, `t`, and `x_start` for each state `x`."""
+    names = cx.names
+    entries = {name: Known(Number(ir.Signal(name), flexible=True), about) for name, about in OUTCOME.items()}
+    entries["t"] = Known(Number(ir.Signal("t"), SECOND), "seconds since the start of the plan")
+    entries |= {
+        f"{each}{START}": _first(names.entries[each]) for each in names.states if each in names.entries
+    }
+    plain = cx.plain
+    here = plain.here.extended({name: e for name, e in entries.items() if name not in names.entries})
+    terms = []
+    for item in cx.reader.items(node, label):
+        term = read(Term, replace(plain, here=here), item, "a term")
+        if term.value is not None:
+            terms.append(replace(term, name=term.name or _term_label_of(item)))
+    return tuple(terms)
+
+
+TERMS = Kind(read_terms, {"type": ["array", "null"], "items": json_schema(Term)}, Term)
+
+
+def _term_label_of(node: Node) -> str:
+    return written(node.get("expr")) if not isinstance(node, (Scalar, Sequence)) else ""
+
+
+def _first(state: Entry) -> Known:
+    """The value of a state at the start of the plan; a column may be converted to another unit."""
+    assert isinstance(state, Known)
+    about = "its value at the start of the plan"
+    match state.value:
+        case Number() as number:
+            return Known(_at_start(number), about)
+        case Vector(items) as vector:
+            return Known(replace(vector, items=tuple(map(_at_start, items))), about)
+        case _:
+            return state
+
+
+def _at_start(number: Number) -> Number:
+    table = {name: ir.Signal(name + START) for name in names_in(number.num)}
+    return replace(number, num=substitute(number.num, table))
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectiveDecl:
-    """The paper's loss (Eq. 8-10): hinge at `gamma` on the robustness of scale `smoothing`, plus `terms`."""
+    """The paper's loss (Eq. 8-10): a hinge on the robustness, plus performance terms."""
 
-    gamma: float = 0.5
-    smoothing: float = 500.0
-    stl_weight: float = 1.0
-    terms: tuple[Term, ...] = ()
+    gamma: float = key(number(), "robustness at which the hinge ends", 0.5)
+    smoothing: float = key(number(1e-9), "scale of the smooth robustness", 500.0)
+    stl_weight: float = key(number(), "weight of the hinge", 1.0, name="lambda")
+    terms: tuple[Term, ...] = key(TERMS, "performance terms", ())
+
+
+# ------------------------------------------------------------------------------------ policy
+
+
+@dataclass(frozen=True, slots=True)
+class Feedback:
+    """A linear feedback beneath the plans: actuators get clip(u0 + v + clip(K (x0 - x), -a, a), low, high).
+
+    `v` is what is planned; everything is in the units of the columns.
+
+    Attributes:
+        gain: K, a row a control with an entry a state.
+        state: x0, one a state.
+        control: u0, one a control.
+        low: lower ends of the actuators' ranges.
+        high: upper ends.
+        authority: a, how much the feedback adds at most, one a control.
+    """
+
+    gain: tuple[tuple[float, ...], ...]
+    state: tuple[float, ...]
+    control: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    authority: tuple[float, ...]
+
+
+def _by_column(cx: Context, node: Node | None, label: str, known: Mapping[str, Unit]) -> dict[str, Node]:
+    """Values by the names of columns."""
+    found = {}
+    for entry in cx.reader.entries(node, label):
+        if entry.key.text in known:
+            found[entry.key.text] = entry.value
+        else:
+            cx.reader.unknown(entry.key, label, tuple(known))
+    return found
+
+
+def _units(cx: Context) -> dict[str, Unit]:
+    """The units of states and controls."""
+    states = {each.name: each.unit for each in cx.names.columns}
+    return states | {each.name: each.unit for each in cx.names.controls}
+
+
+def _around(cx: Context, node: Node, label: str) -> dict[str, float]:
+    units = _units(cx)
+    points = {
+        name: cx.here.constant(each, f"`{name}`", units[name])
+        for name, each in _by_column(cx, node, label, units).items()
+    }
+    return {name: value for name, value in points.items() if value is not None}
+
+
+def _weights(cx: Context, node: Node, label: str) -> dict[str, float]:
+    costs = {
+        name: cx.reader.number(each, f"the weight of `{name}`")
+        for name, each in _by_column(cx, node, label, _units(cx)).items()
+    }
+    return {name: value for name, value in costs.items() if value is not None}
+
+
+def _gain(cx: Context, node: Node, label: str) -> dict[str, dict[str, float]]:
+    states = {each.name: each.unit for each in cx.names.columns}
+    controls = {each.name: each.unit for each in cx.names.controls}
+    found: dict[str, dict[str, float]] = {}
+    for control, row in _by_column(cx, node, label, controls).items():
+        entries = {
+            name: cx.here.constant(each, f"the gain of `{name}`", controls[control] / states[name])
+            for name, each in _by_column(cx, row, f"{label} of {control}", states).items()
+        }
+        found[control] = {name: value for name, value in entries.items() if value is not None}
+    return found
 
 
 @dataclass(frozen=True, slots=True)
 class FeedbackDecl:
-    """What `policy: {feedback: …}` asks for; `stlc.dynamics.model.feedback` makes it a gain.
+    """The entry `feedback` of the policy; `stlc.dynamics.model.feedback` computes the gain."""
 
-    Attributes:
-        around: name of a state or control -> its value at the point of operation, in its unit.
-        weights: name of a state or control -> weight of its cost for the regulator.
-        gain: control -> state -> entry of the gain, in the units of both; empty: that of the regulator.
-        authority: how much the feedback adds at most, as a share of half the range of each actuator.
+    around: Mapping[str, float] = key(
+        Kind(_around, mapping_of(EXPRESSION)), "point of operation: states and controls", {}
+    )
+    weights: Mapping[str, float] = key(
+        Kind(_weights, mapping_of({"type": "number", "minimum": 0})),
+        "weights of the regulator's cost, by state or control",
+        {},
+    )
+    gain: Mapping[str, Mapping[str, float]] = key(
+        Kind(_gain, mapping_of(mapping_of(EXPRESSION))),
+        "the gain, by control and state, in place of the regulator's",
+        {},
+    )
+    authority: float = key(number(), "largest share of half an actuator's range that the feedback adds", 1.0)
+
+
+def _feedback(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
+    """`lqr`, or a mapping."""
+    if isinstance(node, Scalar) and node.is_null:
+        return {"feedback_span": node.span}
+    if not isinstance(node, Scalar):
+        return {"feedback": read(FeedbackDecl, cx, node, label), "feedback_span": node.span}
+    if node.text == "lqr":
+        return {"feedback": FeedbackDecl(), "feedback_span": node.span}
+    cx.reader.wrong(node, label, "`lqr`, or a mapping", "feedback: {weights: {angle: 10}}")
+    return None
+
+
+def _observed(cx: Context, node: Node, label: str) -> dict[str, Any]:
+    seen = [each for item in cx.reader.items(node, label) for each in _seen(item, cx)]
+    return {"observe": tuple(num for num, _ in seen), "observe_text": tuple(text for _, text in seen)}
+
+
+def _seen(node: Node, cx: Context) -> tuple[tuple[ir.Num, str], ...]:
+    """One item of `observe`: a number, a formula, or the components of a vector."""
+    expr = cx.here.parse(node, "an observation")
+    if isinstance(expr, ast.Bool | ast.Compare | ast.Not | ast.Logic | ast.Member):
+        value = cx.here.truth(node, "an observation")
+        return () if value is None else ((value, written(node)),)
+    numbers = None if expr is None else cx.here.numbers(node, "an observation")
+    if numbers is None:
+        return ()
+    texts = (written(node),) if len(numbers) == 1 else component_texts(node, len(numbers))
+    return tuple(zip((number.num for number in numbers), texts, strict=True))
+
+
+def _mirror(cx: Context, node: Node, label: str) -> dict[str, Any]:
+    """The mirror image of every state and control that has another one than itself.
+
+    Dynamics and specification are compared with their images later: see `controller.problem.symmetry`.
     """
+    found: list[Assign] = []
+    entries = cx.reader.entries(node, label)
+    controls = {each.name: each for each in cx.names.controls}
+    for entry in entries:
+        control = controls.get(entry.key.text)
+        if control is None:
+            found.extend(state_assigns(entry, label, cx))
+        elif (value := cx.here.stored(entry.value, f"`{control.name}`", control.unit)) is not None:
+            found.append(Assign(control.name, value, written(entry.value)))
+    if found and not any(column.name == found[0].name for column in cx.names.columns):
+        message = f"`mirror` begins with the control `{found[0].name}`"
+        advice = "write a state first: it tells a state from its mirror image"
+        cx.reader.report("S103", message, entries[0].key.span, advice)
+    return {"mirror": tuple(found), "mirror_span": node.span}
 
-    around: Mapping[str, float] = field(default_factory=dict)
-    weights: Mapping[str, float] = field(default_factory=dict)
-    gain: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    authority: float = 1.0
+
+def _integers(cx: Context, node: Node, label: str) -> tuple[int, ...] | None:
+    if isinstance(node, Scalar) and as_int(node) is not None:
+        node = Sequence(node.span, (node,), 1)
+    items = [
+        cx.reader.integer(item, f"an entry of {label}", high=65_536) for item in cx.reader.items(node, label)
+    ]
+    return tuple(value for value in items if value is not None) or None
+
+
+_WHOLE = {"type": "integer", "minimum": 1, "maximum": 65_536}
+INTEGERS = Kind(_integers, {"anyOf": [_WHOLE, {"type": "array", "items": _WHOLE}]})
+"""Positive whole numbers; one alone counts as a list."""
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyDecl:
-    """Shape of the network and what it sees; no `observe` means every state.
+    """The network, its inputs, a symmetry of the system, and the feedback beneath its plans."""
 
-    `mirror`: images of states and controls under a symmetry of system and specification; none where empty.
-    `feedback`: what lies beneath its plans, as asked for; None where plans are the controls themselves.
-    """
-
-    type: str = "mlp"
-    hidden: tuple[int, ...] = (256, 256, 256)
-    observe: tuple[ir.Num, ...] = ()
+    type: str = key(word(("mlp",)), "kind of network", "mlp", label="`{name}` of the policy")
+    hidden: tuple[int, ...] = key(INTEGERS, "widths of the hidden layers", (256, 256, 256))
+    observe: tuple[ir.Num, ...] = key(
+        Kind(_observed, {"type": ["array", "null"], "items": VECTOR}),
+        "inputs of the network; every state unless given",
+        (),
+        spread=True,
+    )
     observe_text: tuple[str, ...] = field(default=(), compare=False)
-    mirror: tuple[Assign, ...] = ()
+    mirror: tuple[Assign, ...] = key(
+        Kind(_mirror, mapping_of(VECTOR)),
+        "images of states and controls under a symmetry of system and specification",
+        (),
+        spread=True,
+    )
     mirror_span: Span | None = field(default=None, compare=False, repr=False)
-    feedback: FeedbackDecl | None = None
+    feedback: FeedbackDecl | None = key(
+        Kind(_feedback, {"anyOf": [{"enum": ["lqr"]}, json_schema(FeedbackDecl)]}, FeedbackDecl),
+        "a stabilising feedback beneath the plans",
+        spread=True,
+    )
     feedback_span: Span | None = field(default=None, compare=False, repr=False)
+
+
+# ------------------------------------------------------------------------------------- train
 
 
 @dataclass(frozen=True, slots=True)
 class TrainDecl:
-    """Training defaults of this system; None leaves the choice to the engine.
+    """Training defaults of this system; None leaves the choice to the method."""
 
-    Attributes:
-        budget: seconds.
-        steps: of the optimiser; wins over `budget`.
-        seed: of everything random in training.
-        lr: learning rate.
-        batch: fresh states a step.
-        samples: size of a fixed training set (`method: gradient`).
-        method: name of the training method.
-    """
+    budget: float | None = key(
+        Kind(lambda cx, node, label: _float(SECONDS.read(cx, node, label)), EXPRESSION), "time for training"
+    )
+    steps: int | None = key(integer(), "optimiser steps; takes precedence over `budget`")
+    seed: int = key(integer(0, 2**63 - 1), "of everything random in training", 0)
+    lr: float | None = key(number(1e-12), "learning rate")
+    batch: int | None = key(integer(), "fresh initial states a step")
+    samples: int | None = key(integer(), "size of the training set of `method: gradient`")
+    method: str | None = key(word(METHODS.names), "training method")
 
-    budget: float | None = None
-    steps: int | None = None
-    seed: int = 0
-    lr: float | None = None
-    batch: int | None = None
-    samples: int | None = None
-    method: str | None = None
+
+def _float(value: Any) -> float | None:
+    return None if value is None else float(value)

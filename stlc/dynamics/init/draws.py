@@ -13,7 +13,7 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import sampler_names
 from stlc.compile.semantics.switch import Hard
-from stlc.dynamics.declaration.model import Assign
+from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.model.algebra import map_parts
 
 _HARD = Hard()

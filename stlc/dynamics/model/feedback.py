@@ -25,7 +25,7 @@ import numpy as np
 from stlc.compile.backends.array.arith import Program
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.diagnostics import Diagnostic
-from stlc.dynamics.declaration.model import Feedback
+from stlc.dynamics.declaration.learning import Feedback
 from stlc.dynamics.model.step import build_step
 
 if TYPE_CHECKING:

@@ -18,7 +18,8 @@ from stlc.compile.semantics.switch import Hard
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from stlc.dynamics.declaration.model import Assign, ControlDecl
+    from stlc.dynamics.declaration.columns import ControlDecl
+    from stlc.dynamics.declaration.motion import Assign
 
 HARD = Hard()
 

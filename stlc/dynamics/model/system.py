@@ -18,10 +18,12 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.typed import Parameter
 from stlc.compile.semantics.switch import Hard, Switch
 from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.dynamics.declaration.columns import ControlDecl
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.describe import describe
 from stlc.dynamics.declaration.learning import START
-from stlc.dynamics.declaration.model import Assign, ControlDecl
+from stlc.dynamics.declaration.load import load_system_decl
+from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.init.draws import Drawing, Rows
 from stlc.dynamics.init.samplers import InitialStates
 from stlc.dynamics.model.algebra import add, multiply, names_in, substitute
@@ -31,7 +33,6 @@ from stlc.dynamics.model.rollout import Columns, Stepper
 from stlc.dynamics.model.step import Step, build_step, commands
 from stlc.dynamics.robots.functions import load_functions
 from stlc.dynamics.scenarios.scenario import truth, under
-from stlc.dynamics.schema.schema import load_system_decl
 from stlc.files import find_system
 
 HARD = Hard()

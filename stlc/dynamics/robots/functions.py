@@ -16,8 +16,8 @@ from stlc.compile.backends.array.namespace import Array
 from stlc.compile.frontend.interface import Function
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.declaration.decl import SystemDecl
+from stlc.dynamics.declaration.functions import FunctionDecl
 from stlc.dynamics.declaration.init import FileDecl
-from stlc.dynamics.declaration.model import FunctionDecl
 from stlc.registry import closest
 
 

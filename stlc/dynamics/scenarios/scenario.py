@@ -14,7 +14,7 @@ from pathlib import Path
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.deployment import ErrorsDecl, ScenarioDecl
-from stlc.dynamics.schema.schema import load_system_decl, parse_system
+from stlc.dynamics.declaration.load import load_system_decl, parse_system
 from stlc.registry import closest
 
 DISTURBED = ("mismatch-5", "mismatch-10", "mismatch-20", "disturb", "noise")

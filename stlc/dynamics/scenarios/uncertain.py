@@ -16,13 +16,12 @@ from stlc.compile.frontend.scope import Definition, Entry, Known
 from stlc.compile.frontend.values import Number, Vector
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.decl import SystemDecl
-from stlc.dynamics.declaration.model import Assign, JumpDecl
+from stlc.dynamics.declaration.load import moving_parts
+from stlc.dynamics.declaration.motion import Assign, JumpDecl, read_flow, read_jumps
 from stlc.dynamics.model.algebra import multiply, names_in, names_in_formula
 from stlc.dynamics.schema.expressions import Expressions
-from stlc.dynamics.schema.flow import read_flow, read_jumps
-from stlc.dynamics.schema.names import Names, base_name
+from stlc.dynamics.schema.names import Context, Names, base_name
 from stlc.dynamics.schema.reader import Reader
-from stlc.dynamics.schema.schema import moving_parts
 from stlc.dynamics.schema.yaml_nodes import Node
 from stlc.grammar import ast
 from stlc.grammar.children import children, descendants
@@ -57,12 +56,13 @@ class Loose:
 
 def loosened(decl: SystemDecl) -> Loose:
     """The dynamics of a declaration with a factor at every uncertain number."""
-    names, clock, flow, jump = moving_parts(decl)
+    parts = moving_parts(decl)
+    names = parts.names
     seen, listed = _Seen(names), decl.test.uncertain
 
     def read(marked: Names) -> tuple[tuple[Assign, ...], tuple[JumpDecl, ...]]:
-        scratch = Reader(decl.source)  # what cannot be wrong by a factor stays, and is no finding
-        return read_flow(flow, scratch, marked, clock), read_jumps(jump, scratch, marked)
+        cx = Context.of(Reader(decl.source), marked, parts.clock)  # findings are dropped
+        return read_flow(parts.flow, cx), read_jumps(parts.jump, cx)
 
     read(_Marked.of(names, seen.look))
     chosen = seen.computed_with - seen.compared if listed is None else frozenset(listed)

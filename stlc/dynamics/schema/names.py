@@ -3,42 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Mapping as MappingType
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from typing import TYPE_CHECKING
 
 from stlc.compile.frontend.algebra import absolute
-from stlc.compile.frontend.scope import (
-    Definition,
-    Entry,
-    Known,
-    Scope,
-    constant_value,
-    enforced,
-)
-from stlc.compile.frontend.values import Vector
+from stlc.compile.frontend.scope import Definition, Entry, Known, Scope, constant_value, enforced
+from stlc.compile.frontend.values import Number, Vector
+from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Label, SystemFileError
-from stlc.dynamics.declaration.model import ControlDecl
+from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.schema.expressions import SECOND, Expressions
-from stlc.dynamics.schema.reader import Reader, first_line
+from stlc.dynamics.schema.reader import Reader
+from stlc.dynamics.schema.record import FLAG, SECONDS, STEPS, Kind, integer, key, read, word
 from stlc.dynamics.schema.yaml_nodes import Mapping, Node, Scalar, Sequence
 from stlc.grammar import ast
 from stlc.signature import Column, Signature
 from stlc.source import Span
 from stlc.units import CELSIUS, Unit, means_celsius, parse_unit
 
-TIME_KEYS = ("dt", "horizon", "integrator", "substeps", "discrete")
-INTEGRATORS = ("euler", "heun", "rk4")
+if TYPE_CHECKING:
+    from stlc.dynamics.declaration.columns import ControlDecl
 
 
 @dataclass(frozen=True, slots=True)
 class Clockwork:
     """The section `time`; a horizon of 0 is not known."""
 
-    dt: Fraction = Fraction(1, 10)
-    horizon: int = 0
-    substeps: int = 1
-    integrator: str = "euler"
-    discrete: bool = False
+    dt: Fraction = key(SECONDS, "time step, exact", Fraction(1, 10), required=True)
+    horizon: int = key(STEPS, "planning horizon, as a time or in steps", 0, required=True)
+    integrator: str = key(word(INTEGRATORS), "integration method", "euler")
+    substeps: int = key(integer(high=1000), "integration steps within one step", 1)
+    discrete: bool = key(FLAG, "`flow` gives next values instead of derivatives", False)
 
 
 def base_name(column: str) -> str:
@@ -121,20 +118,55 @@ class Names:
         return True
 
 
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What the values of a section are read with.
+
+    Attributes:
+        reader: takes the findings.
+        names: everything that is declared.
+        clock: the time step and horizon.
+        here: expressions of this section.
+    """
+
+    reader: Reader
+    names: Names
+    clock: Clockwork
+    here: Expressions
+
+    @staticmethod
+    def of(reader: Reader, names: Names, clock: Clockwork | None = None) -> Context:
+        """The context of a section whose expressions read all names and draw nothing."""
+        return Context(reader, names, clock or Clockwork(), names.expressions(reader))
+
+    @property
+    def plain(self) -> Context:
+        """The same without what `here` adds to the names."""
+        return replace(self, here=self.names.expressions(self.reader))
+
+    @property
+    def timed(self) -> Context:
+        """The same with samplers, and `t` as the time of a deployment."""
+        clock = Known(Number(ir.Signal("t"), SECOND), "seconds since the start of the deployment")
+        return self.drawing({} if "t" in self.names.places else {"t": clock})
+
+    def drawing(self, entries: MappingType[str, Entry], ready: frozenset[str] | None = None) -> Context:
+        """The same with samplers and more names; `ready` are the columns that have a value, if not all."""
+        return replace(self, here=self.plain.here.extended(entries, samplers=True, ready=ready))
+
+    def amounts(self) -> Context:
+        """The same where numbers are added to what columns hold."""
+        return replace(self, here=replace(self.here, amounts=True))
+
+
 def read_time(node: Node | None, reader: Reader, names: Names) -> Clockwork:
     """The section `time`; `dt` becomes a name."""
-    found = reader.fields(node, "`time`", TIME_KEYS, required=("dt", "horizon"))
-    here = names.expressions(reader)
-    default = Clockwork()
-    dt = here.duration(found.get("dt"), "`dt`") or default.dt
-    names.entries["dt"] = Known(constant_value(float(dt), SECOND), "the step")
-    return Clockwork(
-        dt,
-        here.steps(found.get("horizon"), "`horizon`", dt) or default.horizon,
-        reader.integer(found.get("substeps"), "`substeps`", high=1000) or default.substeps,
-        reader.option(found.get("integrator"), "`integrator`", INTEGRATORS) or default.integrator,
-        reader.flag(found.get("discrete"), "`discrete`") or default.discrete,
-    )
+    first = node.get("dt") if isinstance(node, Mapping) else None
+    scratch = Expressions(Reader(reader.source), names.expressions(reader).scope)
+    dt = scratch.duration(first, "`dt`") or Clockwork().dt
+    clock = read(Clockwork, Context.of(reader, names, Clockwork(dt)), node, "`time`")
+    names.entries["dt"] = Known(constant_value(float(clock.dt), SECOND), "the step")
+    return clock
 
 
 def read_constants(node: Node | None, reader: Reader, names: Names) -> None:
@@ -161,17 +193,19 @@ def read_constants(node: Node | None, reader: Reader, names: Names) -> None:
         names.entries[name] = Known(value, "constant", entry.key.span)
 
 
-def read_unit(node: Node | None, reader: Reader) -> Unit:
-    """The unit of a field; nothing written is a unit too."""
-    text = reader.text(node, "`unit`")
-    if node is None or text is None:
-        return Unit()
+def _unit(cx: Context, node: Node, _label: str) -> Unit | None:
+    text = cx.reader.text(node, "`unit`")
     try:
-        return parse_unit(text)
+        return None if text is None else parse_unit(text)
     except ValueError as error:
-        advice = CELSIUS if means_celsius(text) else "a unit is a product of powers, for example `m/s^2`"
-        reader.report("S103", str(error), node.span, advice)
-        return Unit()
+        advice = (
+            CELSIUS if means_celsius(text or "") else "a unit is a product of powers, for example `m/s^2`"
+        )
+        cx.reader.report("S103", str(error), node.span, advice)
+        return None
+
+
+UNIT = Kind(_unit, {"type": "string"})
 
 
 def read_definitions(node: Node | None, reader: Reader, names: Names) -> None:
@@ -189,24 +223,3 @@ def read_definitions(node: Node | None, reader: Reader, names: Names) -> None:
     here = names.expressions(reader)
     for expr in written:
         here.check(expr)
-
-
-def later(reader: Reader, node: Node, what: str) -> None:
-    """Report a key whose meaning this version does not act on."""
-    place = first_line(node.span)
-    reader.report(
-        "E015", f"{what} is not supported by this version", place, label="not acted on, so it is refused"
-    )
-
-
-def empty(node: Node | None) -> bool:
-    """Whether a section says nothing."""
-    match node:
-        case None:
-            return True
-        case Scalar():
-            return node.is_null
-        case Mapping(entries=entries):
-            return not entries
-        case Sequence(items=items):
-            return not items

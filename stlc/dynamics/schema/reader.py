@@ -11,7 +11,7 @@ from stlc.escape import unseen
 from stlc.registry import closest
 from stlc.source import Source, Span
 
-LONGEST_NAME = 200
+MAX_NAME = 200
 """Characters of a name that is free text: of a system, an event, a scenario, the word of an enum."""
 _OPENING, _CLOSING = "([{", ")]}"
 
@@ -154,9 +154,9 @@ class Reader:
         """Whether a text can be a name: nothing in it is invisible, and it is not too long; says why not."""
         assert isinstance(node, Scalar)
         hidden = unseen(node.text)
-        if not hidden and len(node.text) <= LONGEST_NAME:
+        if not hidden and len(node.text) <= MAX_NAME:
             return True
-        wanted = f"a text of at most {LONGEST_NAME} characters that can all be seen"
+        wanted = f"a text of at most {MAX_NAME} characters that can all be seen"
         told = f"of {len(node.text)} characters" if not hidden else f"with the character U+{ord(hidden):04X}"
         self.report("S103", f"{where} must be {wanted}, this is one {told}", first_line(node.span))
         return False

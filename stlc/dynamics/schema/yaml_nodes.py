@@ -94,6 +94,11 @@ class Entry:
     key: Scalar
     value: Node
 
+    def place(self, key: str) -> Span:
+        """The place of the value of `key` within this one, else that of all of it."""
+        node = self.value.get(key) if isinstance(self.value, Mapping) else None
+        return self.value.span if node is None else node.span
+
 
 @dataclass(frozen=True, slots=True)
 class Mapping:

@@ -1,0 +1,317 @@
+"""The sections `state`, `param` and `control`: columns with units and bounds, components of vectors each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias, get_args
+
+from stlc.compile.analysis.spread import spread
+from stlc.compile.frontend.scope import column_entries, member_entries
+from stlc.compile.frontend.signals import MAX_COMPONENTS
+from stlc.compile.ir import nodes as ir
+from stlc.dynamics.declaration.motion import Assign, shared_draws, state_assigns
+from stlc.dynamics.schema.names import UNIT, Context, Names, base_name, component_names
+from stlc.dynamics.schema.reader import Reader
+from stlc.dynamics.schema.record import (
+    EXPRESSION,
+    FLAG,
+    OF,
+    VECTOR,
+    integer,
+    key,
+    raw,
+    read,
+    values_of,
+    word,
+)
+from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence
+from stlc.signature import Column, Role
+from stlc.units import Unit
+
+Squash: TypeAlias = Literal["tanh", "clip", "angle"]
+Ranges = tuple[tuple[float, float], ...]
+
+_RANGE = raw({"type": "array", "prefixItems": [VECTOR, VECTOR], "minItems": 2, "maxItems": 2})
+_SIZE = integer(high=MAX_COMPONENTS)
+_ENUM = raw({"type": ["array", "object"]})
+_FORMULA = raw(EXPRESSION)
+
+
+@dataclass(frozen=True, slots=True)
+class ControlDecl:
+    """One control input, or one component of a vector of them.
+
+    Attributes:
+        name: as written.
+        unit: of the numbers that are stored.
+        low: lower end of its range, in `unit`.
+        high: upper end.
+        squash: map from a network output to a value in the range.
+        levels: the values that a search may try; empty where the range is sampled evenly.
+    """
+
+    name: str
+    unit: Unit
+    low: float
+    high: float
+    squash: Squash = "tanh"
+    levels: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class StateKeys:
+    """The keys of a state."""
+
+    unit: Unit = key(UNIT, "unit of the stored numbers", Unit())
+    ends: Node | None = key(_RANGE, "lower and upper end, numbers or vectors", name="range")
+    clamp: bool = key(FLAG, "kept within `range` after every step", False)
+    role: str = key(word(("state", "env")), "`env`: changed by events alone", "state")
+    enum: Node | None = key(_ENUM, "members, by name or by name and value")
+    boolean: bool = key(FLAG, "takes 0 and 1", False, name="bool")
+    size: int | None = key(_SIZE, "components of a vector")
+    timer: Node | None = key(raw({"enum": ["up", "down"]}), "counts seconds up or down")
+    run: Node | None = key(_FORMULA, "condition under which a timer runs")
+    reset_when: Node | None = key(_FORMULA, "condition that resets a timer")
+    to: Node | None = key(raw(EXPRESSION), "value after a reset; 0 unless given")
+
+
+@dataclass(frozen=True, slots=True)
+class ParamKeys:
+    """The keys of a parameter."""
+
+    unit: Unit = key(UNIT, "unit of the stored numbers", Unit())
+    ends: Node | None = key(_RANGE, "drawn uniformly from it unless `draw` is given", name="range")
+    draw: Node | None = key(raw(VECTOR), "distribution of the value")
+    size: int | None = key(_SIZE, "components of a vector")
+    enum: Node | None = key(_ENUM, "members, by name or by name and value")
+    boolean: bool = key(FLAG, "takes 0 and 1", False, name="bool")
+
+
+@dataclass(frozen=True, slots=True)
+class ControlKeys:
+    """The keys of a control."""
+
+    unit: Unit = key(UNIT, "unit of the stored numbers", Unit())
+    ends: Node | None = key(_RANGE, "lower and upper end, numbers or vectors", name="range")
+    squash: Squash = key(
+        word(get_args(Squash)), "map from a network output to the range; `angle`: a direction", "tanh"
+    )
+    levels: Node | None = key(
+        raw({"type": ["array", "null"], "items": EXPRESSION}), "values that a search may try"
+    )
+    size: int | None = key(_SIZE, "components of a vector")
+
+
+# ---------------------------------------------------------------------------------- states
+
+
+def read_states(node: Node | None, reader: Reader, names: Names) -> dict[str, StateKeys]:
+    """The section `state`; gives back the keys of every state."""
+    if node is None:
+        reader.report("S102", "the file lacks `state`", reader.source.span(0, 1), "state: {x: {unit: m}}")
+    described: dict[str, StateKeys] = {}
+    for entry in reader.entries(node, "`state`"):
+        names.declare(entry.key, "state", reader)
+        where = f"the state `{entry.key.text}`"
+        cx = Context.of(reader, names)
+        given = values_of(StateKeys, cx, entry.value, where, OF)
+        keys = described[entry.key.text] = StateKeys(**given)
+        if keys.clamp and keys.ends is None:
+            message, advice = f"{where} is clamped but has no range", "add `range: [low, high]`"
+            reader.report("S204", message, entry.place("clamp"), advice)
+        if keys.timer is not None and "size" in given:
+            message = f"the timer `{entry.key.text}` is a single number"
+            reader.report("S103", message, entry.place("size"), "declare one a timer")
+        role: Role = "env" if keys.role == "env" else "state"
+        columns = _columns(entry.key.text, keys, where, cx)
+        _add(tuple(replace(each, role=role, fact=each.fact or keys.clamp) for each in columns), names)
+    name_columns(names, "state")
+    return described
+
+
+def _add(columns: tuple[Column, ...], names: Names) -> None:
+    """Columns of one state, whose components are declared where it is."""
+    names.columns.extend(columns)
+    names.place_components(base_name(columns[0].name), [column.name for column in columns])
+
+
+def name_columns(names: Names, about: str) -> None:
+    """Make the columns names that expressions may use, and their members with them."""
+    known = column_entries(names.columns, about=about)
+    names.entries |= {name: entry for name, entry in known.items() if name not in names.entries}
+    names.entries |= member_entries(column.labels for column in names.columns if column.kind == "enum")
+
+
+def _columns(name: str, keys: StateKeys | ParamKeys, where: str, cx: Context) -> tuple[Column, ...]:
+    """The columns that `unit`, `range`, `enum`, `bool` and `size` describe."""
+    called = component_names(name, keys.size)
+    if keys.enum is not None:
+        labels = _members(keys.enum, where, cx.reader)
+        values = [value for _, value in labels] or [0.0]
+        ends = min(values), max(values)
+        return tuple(Column(each, keys.unit, "enum", "state", *ends, labels, fact=True) for each in called)
+    if keys.boolean:
+        return tuple(Column(each, keys.unit, "bool", "state", 0.0, 1.0, (), fact=True) for each in called)
+    bounds = _ranges(keys, where, cx)
+    if bounds is None:
+        return tuple(Column(each, keys.unit) for each in called)
+    return tuple(
+        Column(each, keys.unit, low=low, high=high) for each, (low, high) in zip(called, bounds, strict=True)
+    )
+
+
+def _members(node: Node, where: str, reader: Reader) -> tuple[tuple[str, float], ...]:
+    """`{stop: 0, light: 1}` or `[stop, light]`."""
+    members: list[tuple[str, float]] = []
+    if isinstance(node, Sequence):
+        words = [reader.name(item, f"a member of {where}") for item in reader.items(node, where)]
+        members = [(word, float(value)) for value, word in enumerate(words) if word]
+    else:
+        for entry in reader.entries(node, f"`enum` of {where}"):
+            value = reader.integer(entry.value, f"the member `{entry.key.text}`", low=-1_000_000)
+            if value is not None and reader.nameable(entry.key, f"a member of {where}"):
+                members.append((entry.key.text, float(value)))
+    if len(dict(members)) < max(len(members), 1) or len({value for _, value in members}) < len(members):
+        message = f"{where} needs members, each with a name and a value of its own"
+        reader.report("S103", message, node.span, "{enum: {stop: 0, go: 1}}")
+    return tuple(members)
+
+
+def _ranges(keys: StateKeys | ParamKeys | ControlKeys, where: str, cx: Context) -> Ranges | None:
+    """`[low, high]` of every component, in its unit; an end is a number for all or a vector."""
+    node, reader, here = keys.ends, cx.reader, cx.here
+    if node is None:
+        return None
+    items = reader.items(node, f"`range` of {where}")
+    if len(items) != 2:
+        if items or (isinstance(node, Sequence) and not node.items):
+            reader.wrong(node, f"`range` of {where}", "two numbers `[low, high]`")
+        return None
+    lows = here.constants(items[0], f"the lower bound of {where}", keys.unit, keys.size or 1)
+    highs = here.constants(items[1], f"the upper bound of {where}", keys.unit, keys.size or 1)
+    if lows is None or highs is None:
+        return None
+    for low, high in zip(lows, highs, strict=True):
+        if not low < high:
+            message = f"the range of {where} ends before it starts"
+            reader.report("S204", message, node.span, f"[{high:g}, {low:g}]")
+            return None
+    return tuple(zip(lows, highs, strict=True))
+
+
+# ------------------------------------------------------------------------------ parameters
+
+
+def read_params(node: Node | None, reader: Reader, names: Names) -> tuple[Assign, ...]:
+    """The section `param`: columns after the states, and their distributions, in order.
+
+    `r: {unit: m, range: [0.6, 1.2]}` is uniform on its range; `draw` gives another distribution, and may
+    stand alone: `r: normal(1 m, 0.1 m)`. Later parameters may read earlier ones.
+    """
+    found: list[Assign] = []
+    drawn: frozenset[str] = frozenset()
+    for entry in reader.entries(node, "`param`"):
+        if not names.declare(entry.key, "parameter", reader):
+            continue
+        cx = Context.of(reader, names).drawing({}, drawn)
+        keys = _param_keys(entry, cx)
+        columns = tuple(
+            replace(column, role="env")
+            for column in _columns(entry.key.text, keys, f"the parameter `{entry.key.text}`", cx)
+        )
+        _add(columns, names)
+        if keys.draw is not None:
+            assigns = shared_draws(state_assigns(Entry(entry.key, keys.draw), "`param`", cx))
+        else:
+            assigns = tuple(Assign(column.name, *_even(column)) for column in columns)
+        found.extend(assigns)
+        names.columns[-len(columns) :] = [_ranged(column, assigns) for column in columns]
+        name_columns(names, "parameter")
+        drawn |= {column.name for column in columns}
+    return tuple(found)
+
+
+def _param_keys(entry: Entry, cx: Context) -> ParamKeys:
+    """The keys of a parameter; an expression alone is its `draw`, and gives its unit."""
+    if isinstance(entry.value, Scalar):
+        number = replace(cx.here, reader=Reader(cx.reader.source)).number(entry.value, "")
+        unit = Unit() if number is None or number.bare else number.unit
+        return ParamKeys(unit=unit if unit.offset else unit.si, draw=entry.value)
+    where = f"the parameter `{entry.key.text}`"
+    given = values_of(ParamKeys, cx, entry.value, where, OF)
+    named = {each.key.text for each in entry.value.entries} if isinstance(entry.value, Mapping) else set()
+    if not named & {"draw", "range", "enum", "bool"}:
+        cx.reader.report(
+            "S102",
+            f"{where} says nothing about its values",
+            entry.key.span,
+            f'{entry.key.text}: {{range: [0, 1]}}, or {entry.key.text}: "uniform(0, 1)"',
+        )
+    return ParamKeys(**given)
+
+
+def _even(column: Column) -> tuple[ir.Num, str]:
+    """The uniform distribution on the values of a column, and its text."""
+    if column.labels:
+        members = ", ".join(label for label, _ in column.labels)
+        return ir.Op("choice", tuple(ir.Const(value) for _, value in column.labels)), f"choice({members})"
+    if column.kind == "bool":
+        return ir.Op("bernoulli", (ir.Const(0.5),)), "bernoulli(0.5)"
+    low, high = column.low or 0.0, column.high or 0.0
+    return ir.Op("uniform", (ir.Const(low), ir.Const(high))), f"uniform({low:g}, {high:g})"
+
+
+def _ranged(column: Column, assigns: tuple[Assign, ...]) -> Column:
+    """The column with the range of its distribution, where none is written."""
+    draw = next((assign.value for assign in assigns if assign.name == column.name), None)
+    ends = None if draw is None or column.low is not None else spread(draw)
+    return column if ends is None or ends[0] == ends[1] else replace(column, low=ends[0], high=ends[1])
+
+
+# -------------------------------------------------------------------------------- controls
+
+
+def read_controls(node: Node | None, reader: Reader, names: Names) -> None:
+    """The section `control`."""
+    if node is None:
+        advice = "control: {u: {range: [-1, 1]}}"
+        reader.report("S102", "the file lacks `control`", reader.source.span(0, 1), advice)
+    for entry in reader.entries(node, "`control`"):
+        names.declare(entry.key, "control", reader)
+        name = entry.key.text
+        where, cx = f"the control `{name}`", Context.of(reader, names)
+        keys = read(ControlKeys, cx, entry.value, where, OF)
+        if keys.ends is None:
+            advice = f"{name}: {{range: [-1, 1]}}"
+            reader.report("S204", f"{where} has no range", entry.key.span, advice, label="needs bounds")
+        controls = _controls(name, keys, where, cx)
+        names.controls.extend(controls)
+        names.place_components(name, [control.name for control in controls])
+    columns = [Column(c.name, c.unit, "real", "input", c.low, c.high, (), fact=True) for c in names.controls]
+    names.entries |= column_entries(columns, about="control")
+
+
+def _controls(name: str, keys: ControlKeys, where: str, cx: Context) -> tuple[ControlDecl, ...]:
+    """One control, or the components of a vector."""
+    called = component_names(name, keys.size)
+    bounds = _ranges(keys, where, cx) or ((-1.0, 1.0),) * len(called)
+    low, high = max(low for low, _ in bounds), min(high for _, high in bounds)
+    kept = read_levels(keys.levels, where, keys.unit, (low, high), cx)
+    return tuple(
+        ControlDecl(each, keys.unit, *ends, keys.squash, kept)
+        for each, ends in zip(called, bounds, strict=True)
+    )
+
+
+def read_levels(
+    node: Node | None, where: str, unit: Unit, bounds: tuple[float, float], cx: Context
+) -> tuple[float, ...]:
+    """The values of a control that a search may try, within its range."""
+    items = cx.reader.items(node, f"`levels` of {where}")
+    levels = [cx.here.constant(item, f"a level of {where}", unit) for item in items]
+    low, high = bounds
+    for item, level in zip(items, levels, strict=True):
+        if level is not None and not low <= level <= high:
+            message, advice = f"a level of {where} is outside its range", f"the range is [{low:g}, {high:g}]"
+            cx.reader.report("S204", message, item.span, advice)
+    return tuple(level for level in levels if level is not None)

@@ -1,0 +1,132 @@
+"""The section `functions`: Python functions, named and not loaded, and kinematics from robot descriptions."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from stlc.compile.frontend.scope import External
+from stlc.compile.ir import nodes as ir
+from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.dynamics.robots.kinematics import position
+from stlc.dynamics.robots.urdf import chain, read_urdf
+from stlc.dynamics.schema.names import Context
+from stlc.dynamics.schema.record import OF, TEXT, key, read, word
+from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node
+from stlc.source import Span
+from stlc.units import parse_unit
+
+_TARGET = re.compile(r"(?P<module>[\w./-]+\.py|\w+(?:\.\w+)*):(?P<attribute>[^\W\d]\w*)")
+_OWN = {"python": ("kind", "target", "arrays"), "urdf": ("kind", "file", "tip", "base")}
+
+
+@dataclass(frozen=True, slots=True)
+class FunctionDecl:
+    """A function that specifications may call: in Python, on arrays, or known as numbers.
+
+    Attributes:
+        name: by which `extern fn` knows it.
+        module: the module, or the file beside the system file, that holds it.
+        attribute: its name there.
+        library: the arrays that it takes; None takes what the caller has.
+        span: where it is named.
+        body: what it computes, from one vector to one, where the file says that; None for Python.
+        base: of kinematics, the link that positions are relative to; "" is the root.
+    """
+
+    name: str
+    module: str | Path
+    attribute: str
+    library: Literal["numpy", "torch"] | None = None
+    span: Span | None = field(default=None, compare=False, repr=False)
+    body: ir.Body | None = field(default=None, repr=False)
+    base: str = ""
+
+    def bound(self, arguments: tuple[int | None, ...], result: int | None) -> ir.Body:
+        """What it computes; see `stlc.compile.frontend.interface.Function`. Raises SystemFileError (S208)."""
+        assert self.body is not None
+        takes, gives = len(self.body.formals), len(self.body.outputs)
+        if (arguments, result) == ((takes,), gives):
+            return self.body
+        form = f"extern fn {self.name}(q: real[{takes}]) -> real[{gives}]"
+        message = (
+            f"`{self.name}` takes a vector of {takes} and gives one of {gives}, declared is another form"
+        )
+        raise SystemFileError(Diagnostic("S208", message, self.span, "named here", help=(form,)))
+
+
+@dataclass(frozen=True, slots=True)
+class FunctionKeys:
+    """The keys of a function from outside."""
+
+    kind: str | None = key(word(_OWN), "origin of the function", required=True)
+    target: str | None = key(TEXT, "of `python`: `package.module:function` or `file.py:function`")
+    arrays: Literal["numpy", "torch"] | None = key(
+        word(("numpy", "torch")), "of `python`: the arrays that it takes"
+    )
+    file: str | None = key(TEXT, "of `urdf`: the robot description")
+    tip: str | None = key(TEXT, "of `urdf`: the link whose position is wanted")
+    base: str | None = key(TEXT, "of `urdf`: the link that positions are relative to")
+
+
+def read_functions(node: Node | None, cx: Context) -> tuple[FunctionDecl, ...]:
+    """Functions from outside; those known as numbers become names that expressions may call.
+
+    `f: {kind: python, target: "package.module:function"}`, or `"file.py:function"` beside the file;
+    `ee: {kind: urdf, file: arm.urdf, tip: flange}`: the position of that link, from those of its joints.
+    """
+    found = [_function(entry, cx) for entry in cx.reader.entries(node, "`functions`")]
+    kept = tuple(function for function in found if function is not None)
+    for function in kept:
+        if function.body is not None:
+            sizes = (len(function.body.formals),), len(function.body.outputs)
+            cx.names.entries[function.name] = External(
+                function.name, *sizes, parse_unit("m"), "real", function.body, "function", function.span
+            )
+    return kept
+
+
+def _function(entry: Entry, cx: Context) -> FunctionDecl | None:
+    where = f"the function `{entry.key.text}`"
+    if not cx.reader.nameable(entry.key, "the name of a function"):
+        return None
+    keys = read(FunctionKeys, cx, entry.value, where, OF)
+    if keys.kind is None or not isinstance(entry.value, Mapping):
+        return None
+    needed = ("target",) if keys.kind == "python" else ("file", "tip")
+    cx.reader.fields(entry.value, where, _OWN[keys.kind], required=needed)
+    if any(getattr(keys, name) is None for name in needed):
+        return None
+    return _python(entry, keys, where, cx) if keys.kind == "python" else _kinematics(entry, keys, cx)
+
+
+def _python(entry: Entry, keys: FunctionKeys, where: str, cx: Context) -> FunctionDecl | None:
+    place = entry.place("target")
+    match = _TARGET.fullmatch(keys.target or "")
+    if match is None:
+        assert isinstance(entry.value, Mapping)
+        target, advice = entry.value.get("target"), 'write `"package.module:function"` or `"file.py:f"`'
+        assert target is not None
+        cx.reader.wrong(target, f"`target` of {where}", "a module and a function", advice)
+        return None
+    module: str | Path = match["module"]
+    if match["module"].endswith(".py"):
+        module = Path(place.source.name).parent / match["module"]
+    return FunctionDecl(entry.key.text, module, match["attribute"], keys.arrays, place)
+
+
+def _kinematics(entry: Entry, keys: FunctionKeys, cx: Context) -> FunctionDecl | None:
+    """Forward kinematics of one link."""
+    file, tip, place = keys.file or "", keys.tip or "", entry.place("file")
+    path = Path(place.source.name).parent / file
+    try:
+        joints = chain(read_urdf(path), tip, keys.base)
+        if all(joint.kind == "fixed" for joint in joints):
+            raise ValueError(f"no joint moves `{tip}`")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        cx.reader.report("S208", f"`{file}` gives no kinematics: {reason}", place, label="named here")
+        return None
+    return FunctionDecl(entry.key.text, path, tip, span=place, body=position(joints), base=keys.base or "")

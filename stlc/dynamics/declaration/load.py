@@ -1,0 +1,444 @@
+"""A system file as a declaration: every section read, every finding reported at once. No torch."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping as MappingType
+from collections.abc import Sequence as SequenceType
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+
+from stlc.compile.ir.support import columns as columns_of_formula
+from stlc.compile.ir.support import columns_of
+from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
+from stlc.dynamics.declaration.columns import (
+    ControlKeys,
+    ParamKeys,
+    StateKeys,
+    name_columns,
+    read_controls,
+    read_params,
+    read_states,
+)
+from stlc.dynamics.declaration.decl import SystemDecl
+from stlc.dynamics.declaration.deployment import (
+    BackupDecl,
+    ScenarioDecl,
+    TestDecl,
+    read_backup,
+    read_scenarios,
+)
+from stlc.dynamics.declaration.functions import FunctionDecl, FunctionKeys, read_functions
+from stlc.dynamics.declaration.init import InitDecl, InitKeys, read_init
+from stlc.dynamics.declaration.learning import ObjectiveDecl, PolicyDecl, TrainDecl
+from stlc.dynamics.declaration.motion import (
+    Assign,
+    JumpDecl,
+    read_flow,
+    read_jumps,
+    read_latches,
+    read_timers,
+    shared_draws,
+    state_assigns,
+)
+from stlc.dynamics.schema.names import (
+    Clockwork,
+    Context,
+    Names,
+    base_name,
+    read_constants,
+    read_definitions,
+    read_time,
+)
+from stlc.dynamics.schema.reader import Reader, first_line
+from stlc.dynamics.schema.record import (
+    EXPRESSION,
+    VECTOR,
+    Json,
+    json_schema,
+    key,
+    mapping_of,
+    raw,
+    read,
+    section,
+)
+from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence, load_node, load_yaml
+from stlc.files import beside, read_source
+from stlc.registry import closest
+from stlc.source import Source
+
+VERSION = 1
+MAX_FILES = 8
+"""Files that one file may extend, one through the other."""
+_EXTENDS = "extends"
+_PLUGIN = "dynamics from a plugin"
+
+
+@dataclass(frozen=True, slots=True)
+class SystemKeys:
+    """The sections of a system file."""
+
+    stlc: Node | None = key(raw({"const": VERSION}), "version of this format", required=True)
+    name: Node | None = key(raw({"type": "string"}), "name of the system", required=True)
+    doc: Node | None = key(raw({"type": "string"}), "one line for people")
+    extends: Node | None = key(raw({"type": "string"}), "system file that this one begins as")
+    spec: Node | None = key(raw({"type": "string"}), "default specification, relative to this file")
+    time: Node | None = key(section(Clockwork), "time step and horizon", required=True)
+    const: Node | None = key(raw(mapping_of(VECTOR)), "constants; later ones may use earlier ones")
+    param: Node | None = key(
+        raw(mapping_of({"anyOf": [EXPRESSION, json_schema(ParamKeys)]}), ParamKeys),
+        "constants of a trajectory, drawn at its start",
+    )
+    state: Node | None = key(section(StateKeys, free=True), "states, in the order of the columns")
+    control: Node | None = key(section(ControlKeys, free=True), "controls")
+    def_: Node | None = key(raw(mapping_of(EXPRESSION)), "named sub-expressions", name="def")
+    flow: Node | None = key(raw(mapping_of(VECTOR)), "derivatives, or next values of a discrete system")
+    jump: Node | None = key(
+        raw({"type": ["array", "null"], "items": json_schema(JumpDecl)}, JumpDecl), "guarded resets"
+    )
+    init: Node | None = key(section(InitKeys), "initial states")
+    objective: Node | None = key(section(ObjectiveDecl), "loss that training minimises")
+    policy: Node | None = key(section(PolicyDecl), "network and its inputs")
+    train: Node | None = key(section(TrainDecl), "training defaults")
+    backup: Node | None = key(section(BackupDecl), "prefixes that the backup policy tries")
+    test: Node | None = key(section(TestDecl), "deployment")
+    scenario: Node | None = key(section(ScenarioDecl, free=True), "overlays of a deployment, by name")
+    functions: Node | None = key(section(FunctionKeys, free=True), "functions from outside, by name")
+    plugin: Node | None = key(raw({"type": "null"}), f"{_PLUGIN}: not supported yet")
+    plot: Node | None = key(raw({}), "left to plots")
+
+
+def system_schema() -> Json:
+    """JSON Schema of system files, for editors; a file that extends another one may leave anything out."""
+    found = json_schema(SystemKeys)
+    required = found.pop("required")
+    return {**found, "anyOf": [{"required": required}, {"required": [_EXTENDS]}]}
+
+
+def load_system_decl(path: Path | str, overrides: MappingType[str, str] | None = None) -> SystemDecl:
+    """The declaration that a system file holds.
+
+    Args:
+        path: of the file.
+        overrides: values by dotted key (`train.lr`), or by the name of a constant; a plain name that is no
+            constant of this file is left to the specification.
+
+    Raises:
+        UsageError: there is no such file.
+        SpecError: the file is not text.
+        SystemFileError: with all findings.
+    """
+    return parse_system(read_source(path), Path(path), overrides or {})
+
+
+def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | None = None) -> SystemDecl:
+    """The declaration that a text holds; `path` says what its relative paths start from."""
+    reader = Reader(source)
+    root = load_yaml(source, sink=reader.findings)
+    root, bases = extended(root, reader)
+    root = overridden(root, overrides or {}, reader)
+    found = read(SystemKeys, Context.of(reader, Names()), root, "a system file")
+    version = reader.integer(found.stlc, "`stlc`")
+    if found.stlc is not None and version not in (None, VERSION):
+        message, advice = f"schema version {version} is not known", f"this release reads `stlc: {VERSION}`"
+        reader.report("S103", message, found.stlc.span, advice)
+    if not _empty(found.plugin):
+        assert found.plugin is not None
+        message, label = f"{_PLUGIN} is not supported by this version", "not acted on, so it is refused"
+        reader.report("E015", message, first_line(found.plugin.span), label=label)
+    decl = _declaration(found, reader, source, path, overrides or {})
+    reader.close()
+    return _with_feedback(replace(decl, bases=bases))
+
+
+def _with_feedback(decl: SystemDecl) -> SystemDecl:
+    """The declaration with the feedback beneath its plans that it asks for. Raises SystemFileError (S205)."""
+    asked = decl.policy.feedback
+    if asked is None:
+        return decl
+    from stlc.dynamics.model.feedback import NoFeedbackError, closed
+
+    try:
+        return closed(decl, asked)
+    except NoFeedbackError as error:
+        advice = "give a `gain`, another point of operation (`around`), or leave `feedback` out"
+        finding = Diagnostic(
+            "S205", f"no feedback can be had: {error}", decl.policy.feedback_span, help=(advice,)
+        )
+        raise SystemFileError(finding) from None
+
+
+def _declaration(
+    found: SystemKeys, reader: Reader, source: Source, path: Path, overrides: MappingType[str, str]
+) -> SystemDecl:
+    """All sections, in the order in which names are declared."""
+    named = _named(found, reader)
+    names, clock = named.names, named.clock
+    cx = Context.of(reader, names, clock)
+    timer_flow, timer_jumps = read_timers(named.states, cx)
+    flow = (*timer_flow, *read_flow(found.flow, cx))
+    jumps = (*read_jumps(found.jump, cx), *timer_jumps)
+    _report_idle(found.control, reader, names, flow, jumps)
+    clamped = [each for each in names.columns if each.kind == "real" and each.fact]
+    spec = reader.text(found.spec, "`spec`")
+    folder = path.parent
+    if found.spec is not None and found.spec.span.source != source:
+        folder = Path(found.spec.span.source.name).parent
+    return SystemDecl(
+        name=reader.name(found.name, "`name`") or path.stem,
+        doc=" ".join((reader.text(found.doc, "`doc`") or "").split()),
+        path=path,
+        source=source,
+        spec=Path(os.path.normpath(folder / spec)) if spec else None,
+        dt=clock.dt,
+        horizon=clock.horizon,
+        substeps=clock.substeps,
+        integrator=clock.integrator,
+        discrete=clock.discrete,
+        constants=MappingProxyType(names.constants),
+        signature=names.signature,
+        controls=tuple(names.controls),
+        flow=flow,
+        jumps=jumps,
+        clamps=MappingProxyType(
+            {c.name: (c.low, c.high) for c in clamped if c.low is not None and c.high is not None}
+        ),
+        init=_given_states(read_init(found.init, cx, named.drawn), overrides, cx),
+        objective=read(ObjectiveDecl, cx, found.objective, "`objective`"),
+        policy=read(PolicyDecl, cx, found.policy, "`policy`"),
+        train=read(TrainDecl, cx, found.train, "`train`"),
+        backup=read_backup(cx, found.backup, "`backup`"),
+        test=read(TestDecl, cx.timed, found.test, "`test`"),
+        scenarios=read_scenarios(found.scenario, cx),
+        functions=named.functions,
+        overrides=MappingProxyType(dict(overrides)),
+        places=MappingProxyType(names.places),
+        warnings=tuple(finding for finding in reader.findings if finding.severity == "warning"),
+    )
+
+
+def _report_idle(
+    node: Node | None, reader: Reader, names: Names, flow: SequenceType[Assign], jumps: SequenceType[JumpDecl]
+) -> None:
+    """W603 for controls that move nothing."""
+    moved = [assign.value for assign in (*flow, *(reset for jump in jumps for reset in jump.resets))]
+    read = {name for num in moved for name in columns_of(num)}
+    read |= {name for jump in jumps for name in columns_of_formula(jump.guard)}
+    known = {entry.key.text: entry.key.span for entry in reader.entries(node, "`control`")}
+    for control in names.controls:
+        span = known.get(control.name) or known.get(base_name(control.name))
+        if control.name not in read and span is not None:
+            message = f"the control `{control.name}` has no effect: no flow and no jump reads it"
+            advice = f"`{base_name(control.name)}: ~` takes one away that an extended file has"
+            reader.report("W603", message, span, advice)
+
+
+@dataclass(frozen=True, slots=True)
+class _Named:
+    """The sections that declare names.
+
+    Attributes:
+        names: everything that is declared.
+        clock: time step and horizon.
+        states: keys of each state, timers among them.
+        drawn: parameters and latches, drawn before the states.
+        functions: from outside.
+    """
+
+    names: Names
+    clock: Clockwork
+    states: dict[str, StateKeys]
+    drawn: tuple[Assign, ...]
+    functions: tuple[FunctionDecl, ...]
+
+
+def _named(found: SystemKeys, reader: Reader) -> _Named:
+    """The sections that declare names, in order."""
+    names = Names()
+    read_constants(found.const, reader, names)
+    clock = Clockwork() if found.time is None else read_time(found.time, reader, names)
+    states = read_states(found.state, reader, names)
+    drawn = read_params(found.param, reader, names) + read_latches(found.jump, reader, names)
+    name_columns(names, "state")
+    read_controls(found.control, reader, names)
+    functions = read_functions(found.functions, Context.of(reader, names))
+    read_definitions(found.def_, reader, names)
+    return _Named(names, clock, states, drawn, functions)
+
+
+@dataclass(frozen=True, slots=True)
+class MovingParts:
+    """The names, the time, and the sections `flow` and `jump` of a valid declaration."""
+
+    names: Names
+    clock: Clockwork
+    flow: Node | None
+    jump: Node | None
+
+
+def moving_parts(decl: SystemDecl) -> MovingParts:
+    """The parts of a file that say how its states move."""
+    reader = Reader(decl.source)
+    root, _ = extended(load_yaml(decl.source, sink=reader.findings), reader)
+    root = overridden(root, decl.overrides, reader)
+    found = read(SystemKeys, Context.of(reader, Names()), root, "a system file")
+    named = _named(found, reader)
+    return MovingParts(named.names, named.clock, found.flow, found.jump)
+
+
+def _empty(node: Node | None) -> bool:
+    """Whether a section says nothing."""
+    match node:
+        case None:
+            return True
+        case Scalar():
+            return node.is_null
+        case Mapping(entries=entries):
+            return not entries
+        case Sequence(items=items):
+            return not items
+
+
+# ---------------------------------------------------------------------------------- extends
+
+
+def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]]:
+    """The document with everything that the files it extends say, and the texts of these.
+
+    A section that is a mapping in both keeps the entries of both, and where both have an entry that of the
+    extending file; an entry that is nothing (`~`) takes that of the extended file away, and anything else is
+    replaced. Every value keeps the place where it is written. S209 is
+    reported where a file cannot be read, or leads back to itself.
+    """
+    sources: list[Source] = []
+    seen = {Path(reader.source.name).resolve()}
+    chain = [root]
+    while (node := chain[-1].get(_EXTENDS)) is not None:
+        text = reader.text(node, f"`{_EXTENDS}`")
+        if text is None:
+            break
+        path = beside(Path(node.span.source.name).parent, text)
+        if path.resolve() in seen or len(chain) > MAX_FILES:
+            again = path.resolve() in seen
+            why = "leads back to itself" if again else f"goes through more than {MAX_FILES} files"
+            reader.report("S209", f"`{_EXTENDS}: {text}` {why}", node.span, label="named here")
+            break
+        seen.add(path.resolve())
+        try:
+            source = read_source(path)
+            chain.append(load_yaml(source, sink=reader.findings))
+        except StlcError as error:
+            reader.report("S209", f"`{text}` cannot be read", node.span, error.diagnostics[0].message)
+            break
+        sources.append(source)
+    merged = chain[-1]
+    for document in reversed(chain[:-1]):
+        merged = _merged(merged, document)
+    return merged, tuple(sources)
+
+
+def _merged(base: Mapping, own: Mapping) -> Mapping:
+    """Two documents: the sections of both, mappings entry by entry."""
+    result = Mapping(own.span, base.entries, base.size)
+    for entry in own.entries:
+        if _removes(entry, base):
+            result = result.without(entry.key.text)
+        else:
+            result = result.replaced(entry.key, _section(base.get(entry.key.text), entry.value))
+    return result
+
+
+def _removes(entry: Entry, base: Mapping) -> bool:
+    """Whether an entry takes one of the extended file away: `brake: ~`."""
+    return isinstance(entry.value, Scalar) and entry.value.is_null and base.get(entry.key.text) is not None
+
+
+def _section(base: Node | None, own: Node) -> Node:
+    if not isinstance(base, Mapping) or not isinstance(own, Mapping):
+        return own
+    result = Mapping(own.span, base.entries, base.size)
+    for entry in own.entries:
+        removed = _removes(entry, base)
+        result = result.without(entry.key.text) if removed else result.replaced(entry.key, entry.value)
+    return result
+
+
+# -------------------------------------------------------------------------------- overrides
+
+
+def overridden(root: Mapping, overrides: MappingType[str, str], reader: Reader) -> Mapping:
+    """The document with the fields that `overrides` names replaced.
+
+    A dotted key names a field (`train.lr`, `init.mixture.0.weight`); a plain one a constant, a parameter, or
+    a field at the top that holds a single value. Other plain names are left to the specification.
+    """
+    known, params = _keys(root.get("const")), _keys(root.get("param"))
+    for name, text in overrides.items():
+        value = _value(name, text, reader)
+        path = name.split(".")
+        if value is None:
+            continue
+        if len(path) == 1:
+            if name in known:
+                path = ["const", name]
+            elif name in params:
+                path = ["param", name, *(["draw"] if isinstance(params[name], Mapping) else [])]
+            elif not isinstance(root.get(name), Scalar):
+                continue
+        changed = _replaced(root, path, value, name, reader)
+        root = changed if isinstance(changed, Mapping) else root
+    return root
+
+
+def _keys(node: Node | None) -> dict[str, Node]:
+    """What a section declares."""
+    return {entry.key.text: entry.value for entry in node.entries} if isinstance(node, Mapping) else {}
+
+
+def _value(key: str, text: str, reader: Reader) -> Node | None:
+    """The value of an override, as a node of its own little text."""
+    source = Source(f"--set {key}", text)
+    try:
+        return load_node(source, sink=reader.findings)
+    except SystemFileError as error:
+        reader.add(*error.diagnostics)
+        return None
+
+
+def _replaced(node: Node, path: list[str], value: Node, key: str, reader: Reader) -> Node:
+    """`node` with the value at `path` replaced; keys that are not there are added."""
+    head, rest = path[0], path[1:]
+    match node:
+        case Sequence(items=items) if head.isdigit() and int(head) < len(items):
+            index = int(head)
+            inner = _replaced(items[index], rest, value, key, reader) if rest else value
+            return Sequence(node.span, (*items[:index], inner, *items[index + 1 :]), node.size + value.size)
+        case Mapping():
+            old = node.get(head) or Mapping(value.span, (), 1)
+            inner = _replaced(old, rest, value, key, reader) if rest else value
+            return node.replaced(Scalar(value.span, head), inner)
+        case _:
+            return _missing(node, head, value, key, reader)
+
+
+def _missing(node: Node, head: str, value: Node, key: str, reader: Reader) -> Node:
+    """Report a path that leads nowhere."""
+    keys = [entry.key.text for entry in node.entries] if isinstance(node, Mapping) else []
+    near = closest(head, keys)
+    guess = f"did you mean `{near}`?" if near else f"keys here: {', '.join(keys)}" if keys else ""
+    reader.report("S101", f"`--set {key}`: there is no `{head}` in the system file", value.span, guess)
+    return node
+
+
+def _given_states(init: InitDecl, overrides: MappingType[str, str], cx: Context) -> InitDecl:
+    """Initial states where `--set` names a state: `--set x=3m`, or how it is drawn instead."""
+    params = {base_name(assign.name) for assign in init.params}
+    found: list[Assign] = []
+    for name, text in overrides.items():
+        if cx.names.group(name) and name not in params:
+            node = _value(name, text, cx.reader)
+            if node is not None:
+                entry = Entry(Scalar(node.span, name), node)
+                found.extend(shared_draws(state_assigns(entry, "`--set`", cx.drawing({}))))
+    return replace(init, override=(*init.override, *found))

@@ -1,0 +1,320 @@
+"""The sections `flow` and `jump`: derivatives, guards and resets; a timer is one of each."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.functions import sampler_names
+from stlc.dynamics.model.algebra import add, map_parts, multiply
+from stlc.dynamics.schema.expressions import SECOND, written
+from stlc.dynamics.schema.names import Context, Names, base_name
+from stlc.dynamics.schema.reader import Reader, first_line
+from stlc.dynamics.schema.record import (
+    FLAG,
+    FORMULA,
+    NAME,
+    OF,
+    VECTOR,
+    Kind,
+    key,
+    mapping_of,
+    number,
+    values_of,
+)
+from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, as_bool
+from stlc.dynamics.schema.yaml_nodes import Sequence as ListNode
+from stlc.signature import Column
+from stlc.units import Unit
+
+if TYPE_CHECKING:
+    from stlc.dynamics.declaration.columns import StateKeys
+
+_SAMPLERS = frozenset(sampler_names())
+
+
+@dataclass(frozen=True, slots=True)
+class Assign:
+    """A column (or a local name) and its new value, in the unit of that column."""
+
+    name: str
+    value: ir.Num
+    text: str = field(default="", compare=False)
+
+
+# ----------------------------------------------------------------------------- new values
+
+
+def read_sets(cx: Context, node: Node | None, label: str) -> tuple[Assign, ...]:
+    """New values of states, in order."""
+    found: list[Assign] = []
+    for entry in cx.reader.entries(node, label):
+        found.extend(shared_draws(state_assigns(entry, label, cx)))
+    return tuple(found)
+
+
+SETS = Kind(read_sets, mapping_of(VECTOR))
+"""New values by the names of states."""
+
+
+def state_assigns(entry: Entry, where: str, cx: Context) -> tuple[Assign, ...]:
+    """A value for a state: one for each component of a vector."""
+    columns = states_of(entry, where, cx)
+    if not columns:
+        return ()
+    if not cx.names.vector(entry.key.text):
+        found = column_assign(columns[0], entry.value, cx)
+        return () if found is None else (found,)
+    if columns[0].kind == "real":
+        return components(columns, entry.value, f"`{entry.key.text}`", columns[0].unit, cx)
+    items = (entry.value,) * len(columns)
+    if isinstance(entry.value, ListNode):
+        items = cx.reader.items(entry.value, where)
+    if len(items) != len(columns):
+        message = f"`{entry.key.text}` has {len(columns)} components, this has {len(items)}"
+        cx.reader.report("S203", message, first_line(entry.value.span))
+        return ()
+    each = [column_assign(column, item, cx) for column, item in zip(columns, items, strict=True)]
+    return tuple(found for found in each if found is not None)
+
+
+def components(
+    columns: tuple[Column, ...], node: Node, where: str, unit: Unit, cx: Context
+) -> tuple[Assign, ...]:
+    """Values for the components of a vector."""
+    values = cx.here.stored_each(node, where, unit, len(columns))
+    if values is None:
+        return ()
+    texts = component_texts(node, len(columns))
+    return tuple(
+        Assign(column.name, value, text) for column, value, text in zip(columns, values, texts, strict=True)
+    )
+
+
+def component_texts(node: Node, size: int) -> tuple[str, ...]:
+    """What each component of a vector is written as."""
+    if isinstance(node, ListNode):
+        return tuple(written(item) for item in node.items)
+    text = written(node)
+    return tuple(f"{text if text.isidentifier() else f'({text})'}[{index}]" for index in range(size))
+
+
+def column_assign(column: Column, node: Node, cx: Context) -> Assign | None:
+    """A value for a column: members by name for an enum, formulas for a bool, units checked."""
+    where = f"`{column.name}`"
+    boolean, here = column.kind == "bool", cx.here
+    value = here.truth(node, where) if boolean else here.stored(node, where, column.unit)
+    allowed = {0.0: "false", 1.0: "true"} if boolean else {number: label for label, number in column.labels}
+    if allowed and isinstance(value, ir.Const) and value.value not in allowed:
+        cx.reader.wrong(node, where, " or ".join(f"`{label}`" for label in allowed.values()))
+        return None
+    return None if value is None else Assign(column.name, value, written(node))
+
+
+def states_of(entry: Entry, where: str, cx: Context) -> tuple[Column, ...]:
+    """The columns of the state that a key names (S202 where it names none)."""
+    name = entry.key.text
+    columns = cx.names.group(name)
+    if columns:
+        return columns
+    states = list(dict.fromkeys(base_name(column.name) for column in cx.names.columns))
+    near = cx.reader.near(name, states)
+    guess = f"did you mean `{near}`?" if near else f"states: {', '.join(states)}"
+    cx.reader.report("S202", f"{where} sets `{name}`, which is not a state", entry.key.span, guess)
+    return ()
+
+
+def rate_unit(unit: Unit) -> Unit:
+    """The unit of a derivative; that of an undeclared unit is undeclared."""
+    return unit / SECOND if unit.text else replace(unit)
+
+
+# ----------------------------------------------------------------------------------- flow
+
+
+def read_flow(node: Node | None, cx: Context) -> tuple[Assign, ...]:
+    """The section `flow`: derivatives in the unit of the state per second, or next values."""
+    found: list[Assign] = []
+    for entry in cx.reader.entries(node, "`flow`"):
+        columns = states_of(entry, "`flow`", cx)
+        if not columns:
+            continue
+        first = columns[0]
+        if first.kind != "real" and not cx.clock.discrete:
+            kind = "true or false" if first.kind == "bool" else "an enum"
+            message = f"`flow` sets `{entry.key.text}`, which is {kind}"
+            cx.reader.report("S203", message, entry.key.span, "change it with a jump or an event")
+            continue
+        if cx.clock.discrete:
+            where, unit = f"the next `{entry.key.text}`", first.unit
+        else:
+            where, unit = f"the derivative of `{entry.key.text}`", rate_unit(first.unit)
+        if cx.names.vector(entry.key.text):
+            found.extend(components(columns, entry.value, where, unit, cx))
+            continue
+        value = cx.here.stored(entry.value, where, unit)
+        if value is not None:
+            found.append(Assign(first.name, value, written(entry.value)))
+    return tuple(found)
+
+
+# ----------------------------------------------------------------------------------- jumps
+
+
+@dataclass(frozen=True, slots=True)
+class JumpDecl:
+    """A jump: where the guard holds at the start of a step, the resets replace the flow (Eq. 6)."""
+
+    name: str = key(NAME, "for messages", "", label=OF)
+    guard: ir.Formula = key(FORMULA, "condition on the state", label="a guard", required=True)
+    resets: tuple[Assign, ...] = key(SETS, "new values", (), name="reset", required=True)
+    sharpness: float | None = key(number(1e-9), "of the blend with the flow in training (w of Eq. 6)")
+    text: str = field(default="", compare=False)
+    once: bool = key(FLAG, "at most once in a trajectory", False, shown=False)
+
+
+def read_jumps(node: Node | None, cx: Context) -> tuple[JumpDecl, ...]:
+    """The section `jump`."""
+    found: list[JumpDecl] = []
+    for index, item in enumerate(cx.reader.items(node, "`jump`")):
+        values = values_of(JumpDecl, cx, item, "a jump")
+        if "guard" not in values:
+            continue
+        guard = item.get("guard") if isinstance(item, Mapping) else None
+        jump = JumpDecl(**{"name": f"jump {index + 1}", "text": written(guard), **values})
+        if jump.once:
+            latch = latch_name(jump.name)
+            open_ = ir.Predicate(ir.Op("sub", (ir.Const(0.5), ir.Signal(latch))))
+            resets = (*jump.resets, Assign(latch, ir.Const(1.0), "true"))
+            jump = replace(jump, guard=ir.BoolOp("and", (jump.guard, open_)), resets=resets)
+        found.append(jump)
+    return tuple(found)
+
+
+def read_latches(node: Node | None, reader: Reader, names: Names) -> tuple[Assign, ...]:
+    """For every jump that happens `once`, a state that remembers whether it has; false at first."""
+    found: list[Assign] = []
+    for index, item in enumerate(node.items if isinstance(node, ListNode) else ()):
+        once = item.get("once") if isinstance(item, Mapping) else None
+        if not isinstance(once, Scalar) or as_bool(once) is not True or not isinstance(item, Mapping):
+            continue
+        written_name = item.get("name")
+        name = written_name.text if isinstance(written_name, Scalar) else f"jump {index + 1}"
+        latch = latch_name(name)
+        if names.group(latch) or latch in names.places:
+            reader.report("E102", f"`{latch}` remembers the jump `{name}`, and is declared", once.span)
+            continue
+        names.places[latch] = once.span
+        names.columns.append(Column(latch, Unit(), "bool", "state", 0.0, 1.0, (), fact=True))
+        found.append(Assign(latch, ir.Const(0.0), "false"))
+    return tuple(found)
+
+
+def latch_name(jump: str) -> str:
+    """The state that remembers whether a jump has happened."""
+    return f"{re.sub(r'[^0-9A-Za-z_]', '_', jump)}_happened"
+
+
+# ---------------------------------------------------------------------------------- timers
+
+
+def read_timers(states: dict[str, StateKeys], cx: Context) -> tuple[tuple[Assign, ...], tuple[JumpDecl, ...]]:
+    """States written as `timer: up | down` with `run`, `reset_when` and `to`."""
+    flows: list[Assign] = []
+    jumps: list[JumpDecl] = []
+    for name, keys in states.items():
+        column = cx.names.group(name)[0]
+        where = f"the timer `{name}`"
+        if keys.timer is None:
+            for called, node in (("run", keys.run), ("reset_when", keys.reset_when), ("to", keys.to)):
+                if node is not None:
+                    message = f"`{called}` needs `timer: up` or `timer: down` in {where}"
+                    cx.reader.report("S102", message, node.span)
+            continue
+        if not cx.names.vector(name):
+            flow, jump = _timer(column, keys, where, cx)
+            flows += flow
+            jumps += jump
+    return tuple(flows), tuple(jumps)
+
+
+def _timer(column: Column, keys: StateKeys, where: str, cx: Context) -> tuple[list[Assign], list[JumpDecl]]:
+    """The flow and the resets of one timer."""
+    assert keys.timer is not None
+    direction = cx.reader.option(keys.timer, f"`timer` of {where}", ("up", "down")) or "up"
+    run = ir.Truth(True) if keys.run is None else cx.here.formula(keys.run, f"`run` of {where}")
+    flows: list[Assign] = []
+    if run is not None:
+        speed = ir.Const((1.0 if direction == "up" else -1.0) / column.unit.scale)
+        rate: ir.Num = speed if run == ir.Truth(True) else ir.Op("mul", (speed, ir.Indicator(run)))
+        if cx.clock.discrete:
+            rate = add(ir.Signal(column.name), multiply(ir.Const(float(cx.clock.dt)), rate))
+        flows.append(Assign(column.name, rate, f"timer {direction}"))
+    guard = cx.here.formula(keys.reset_when, f"`reset_when` of {where}")
+    value = ir.Const(0.0) if keys.to is None else cx.here.stored(keys.to, where, column.unit)
+    if guard is None or value is None:
+        return flows, []
+    reset = Assign(column.name, value, written(keys.to))
+    return flows, [JumpDecl(f"reset {column.name}", guard, (reset,), text=written(keys.reset_when))]
+
+
+# ------------------------------------------------------------------------- shared samplers
+
+
+def shared_draws(assigns: Sequence[Assign]) -> tuple[Assign, ...]:
+    """The assignments, with what a sampler gives to more than one of them drawn before, as a local name.
+
+    `p: "uniform(0, 1) * [1, 2]"` names one random number; `p: "uniform(low, high)"` with vectors names one
+    for each component.
+    """
+    if len(assigns) < 2:
+        return tuple(assigns)
+    readers = Counter(draw for assign in assigns for draw in _samplers(assign.value))
+    shared = {draw for draw, count in readers.items() if count > 1}
+    if not shared:
+        return tuple(assigns)
+    writer = _Writer(assigns[0].name, shared)
+    changed = [replace(assign, value=writer.rewrite(assign.value)) for assign in assigns]
+    return (*writer.before, *changed)
+
+
+def _samplers(num: ir.Num) -> frozenset[int]:
+    """Identities of the samplers in a number."""
+    found: set[int] = set()
+    seen: set[int] = set()
+
+    def visit(part: ir.Num) -> ir.Num:
+        if id(part) not in seen:
+            seen.add(id(part))
+            if isinstance(part, ir.Op) and part.name in _SAMPLERS:
+                found.add(id(part))
+            map_parts(part, visit)
+        return part
+
+    visit(num)
+    return frozenset(found)
+
+
+class _Writer:
+    """Replaces shared samplers by names; `before` are their assignments, in order."""
+
+    def __init__(self, prefix: str, shared: set[int]) -> None:
+        self.before: list[Assign] = []
+        self._prefix = prefix
+        self._shared = shared
+        self._known: dict[int, ir.Num] = {}
+
+    def rewrite(self, num: ir.Num) -> ir.Num:
+        """The number with shared samplers replaced."""
+        if id(num) not in self._known:
+            changed = map_parts(num, self.rewrite)
+            if id(num) in self._shared:
+                name = f"{self._prefix}#{len(self.before)}"
+                self.before.append(Assign(name, changed))
+                changed = ir.Signal(name)
+            self._known[id(num)] = changed
+        return self._known[id(num)]

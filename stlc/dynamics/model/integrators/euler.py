@@ -1,0 +1,5 @@
+"""Explicit Euler: first order, one evaluation."""
+
+from stlc.dynamics.model.integrators.tableau import Tableau
+
+TABLEAU = Tableau(stages=((),), weights=(1,))

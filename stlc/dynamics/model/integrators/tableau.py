@@ -1,0 +1,68 @@
+"""Explicit Runge-Kutta methods as tableaux, applied to numbers of the IR.
+
+The result of a step is a formula, so one tableau serves rollouts in torch, NumPy programs and emitted C.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from stlc.compile.ir import nodes as ir
+from stlc.dynamics.model.algebra import add, multiply
+
+State: TypeAlias = Mapping[str, ir.Num]
+Rate: TypeAlias = Callable[[State], State]
+
+
+@dataclass(frozen=True, slots=True)
+class Tableau:
+    """The coefficients of an explicit Runge-Kutta method (Butcher).
+
+    Weights are whole numbers over a common divisor, so that equal ones share a product.
+
+    Attributes:
+        stages: row i holds the coefficients of the derivatives before stage i, of which the first has none.
+        weights: of the derivatives in the result, times `divisor`.
+        divisor: of the weights.
+    """
+
+    stages: tuple[tuple[float, ...], ...]
+    weights: tuple[float, ...]
+    divisor: float = 1.0
+
+    def __call__(self, rate: Rate, state: State, length: float) -> State:
+        """The state one step of `length` later; `rate` gives the derivatives of the components that move."""
+        slopes: list[State] = []
+        for row in self.stages:
+            slopes.append(rate(_moved(state, slopes, row, length)))
+        return _moved(state, slopes, self.weights, length / self.divisor)
+
+
+def _moved(state: State, slopes: Sequence[State], weights: Sequence[float], length: float) -> State:
+    """`state + length * sum(weight * slope)`; components that do not move stay."""
+    groups: dict[float, list[State]] = {}
+    for weight, slope in zip(weights, slopes, strict=True):
+        if weight:
+            groups.setdefault(weight, []).append(slope)
+    if not groups:
+        return state
+    if len(groups) == 1:
+        (scale,) = groups
+        groups, length = {1.0: groups[scale]}, length * scale
+    moved = {name: add(state[name], multiply(ir.Const(length), _sum(groups, name))) for name in slopes[0]}
+    return {**state, **moved}
+
+
+def _sum(groups: Mapping[float, Sequence[State]], name: str) -> ir.Num:
+    """The weighted sum of one component's derivatives, those of equal weights added first."""
+    total: ir.Num | None = None
+    for weight, slopes in groups.items():
+        part = slopes[0][name]
+        for slope in slopes[1:]:
+            part = add(part, slope[name])
+        part = part if weight == 1.0 else multiply(ir.Const(float(weight)), part)
+        total = part if total is None else add(total, part)
+    assert total is not None
+    return total

@@ -1,0 +1,281 @@
+"""Records of a system file: one description of a key gives its reader, its JSON Schema and its documentation.
+
+A record is a frozen dataclass some of whose fields are made by `key`:
+
+    @dataclass(frozen=True, slots=True)
+    class TrainDecl:
+        steps: int | None = key(integer(), "optimiser steps; takes precedence over `budget`")
+
+`read` fills it from a mapping of the file: unknown keys, wrong kinds and values out of range are reported
+with their place, and the field keeps its default. `json_schema` and `reference` print the same description.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from stlc.dynamics.schema.reader import MAX_NAME
+from stlc.units import DIMENSIONLESS
+
+if TYPE_CHECKING:
+    from stlc.dynamics.schema.names import Context
+    from stlc.dynamics.schema.yaml_nodes import Node
+
+R = TypeVar("R")
+Json = dict[str, Any]
+_KEY = "key"
+OF = "`{name}` of {of}"
+"""The label of a value that also names its mapping."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of value.
+
+    Attributes:
+        read: (context, node, label for messages) -> the value; None where a finding was reported.
+        schema: JSON Schema of what may be written.
+        record: the record that the value, or each of its items, is read into.
+    """
+
+    read: Callable[[Context, Node, str], Any]
+    schema: Mapping[str, Any]
+    record: type | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """A key of a mapping.
+
+    Attributes:
+        attribute: field of the record that takes the value.
+        name: of the key.
+        kind: of the value.
+        about: meaning, for the documentation.
+        label: name of the value in messages; `{of}` is that of the record.
+        required: the key must be there.
+        spread: the kind gives several fields, by name.
+    """
+
+    attribute: str
+    name: str
+    kind: Kind
+    about: str
+    label: str | Callable[[Mapping[str, Node]], str]
+    required: bool
+    spread: bool
+
+
+def key(
+    kind: Kind,
+    about: str,
+    default: Any = None,
+    *,
+    name: str = "",
+    label: str | Callable[[Mapping[str, Node]], str] = "",
+    required: bool = False,
+    spread: bool = False,
+    shown: bool = True,
+) -> Any:
+    """A field of a record that is read from the key `name` (that of the field unless given).
+
+    `shown=False` keeps a field that only the reader uses out of comparison and `repr`.
+    """
+    described = Key("", name, kind, about, label, required, spread)
+    options: Json = {"default_factory": dict} if isinstance(default, dict) else {"default": default}
+    return dataclasses.field(**options, metadata={_KEY: described}, repr=shown, compare=shown)
+
+
+@cache
+def keys_of(record: type) -> Mapping[str, Key]:
+    """The keys of a record by name, in order."""
+    found = {}
+    for each in dataclasses.fields(record):
+        if _KEY in each.metadata:
+            written: Key = each.metadata[_KEY]
+            name = written.name or each.name
+            found[name] = dataclasses.replace(written, attribute=each.name, name=name)
+    return found
+
+
+def values_of(
+    record: type, cx: Context, node: Node | None, of: str, label: str = "`{name}`"
+) -> dict[str, Any]:
+    """The fields that a mapping gives, read and checked.
+
+    `of` names the mapping in messages, and `label` its values that have no label of their own.
+    """
+    keys = keys_of(record)
+    found = cx.reader.fields(node, of, tuple(keys), [name for name, each in keys.items() if each.required])
+    values: dict[str, Any] = {}
+    for name, each in keys.items():
+        value = None
+        if name in found:
+            own = each.label if isinstance(each.label, str) else each.label(found)
+            shown = (own or label).replace("{name}", name).replace("{of}", of)
+            value = each.kind.read(cx, found[name], shown)
+        if value is not None:
+            values |= value if each.spread else {each.attribute: value}
+    return values
+
+
+def read(record: type[R], cx: Context, node: Node | None, of: str, label: str = "`{name}`") -> R:
+    """A record from a mapping, with defaults for what is missing or wrong."""
+    return record(**values_of(record, cx, node, of, label))
+
+
+# --------------------------------------------------------------------------------- kinds
+
+EXPRESSION: Mapping[str, Any] = {"type": ["string", "number", "boolean"]}
+VECTOR: Mapping[str, Any] = {"anyOf": [EXPRESSION, {"type": "array", "items": EXPRESSION}]}
+
+TEXT = Kind(lambda cx, node, label: cx.reader.text(node, label), {"type": "string"})
+LINE = Kind(
+    lambda cx, node, label: " ".join((cx.reader.text(node, label) or "").split()) or None, {"type": "string"}
+)
+NAME = Kind(
+    lambda cx, node, label: cx.reader.name(node, label), {"type": ["string", "number"], "maxLength": MAX_NAME}
+)
+FLAG = Kind(lambda cx, node, label: cx.reader.flag(node, label), {"type": "boolean"})
+SECONDS = Kind(lambda cx, node, label: cx.here.duration(node, label), EXPRESSION)
+"""A positive time, as a fraction of seconds."""
+STEPS = Kind(lambda cx, node, label: cx.here.steps(node, label, cx.clock.dt), EXPRESSION)
+"""A positive number of steps, given as such or as a time."""
+FORMULA = Kind(lambda cx, node, label: cx.here.formula(node, label), EXPRESSION)
+
+
+def integer(low: int = 1, high: int = 10**9) -> Kind:
+    """A whole number between `low` and `high`."""
+    return Kind(
+        lambda cx, node, label: cx.reader.integer(node, label, low=low, high=high),
+        {"type": "integer", "minimum": low, "maximum": high},
+    )
+
+
+def number(low: float = 0.0) -> Kind:
+    """A finite number of at least `low`."""
+    return Kind(
+        lambda cx, node, label: cx.reader.number(node, label, low=low), {"type": "number", "minimum": low}
+    )
+
+
+def word(options: Iterable[str]) -> Kind:
+    """One of a few words."""
+    known = tuple(options)
+    return Kind(lambda cx, node, label: cx.reader.option(node, label, known), {"enum": list(known)})
+
+
+def _share(cx: Context, node: Node, label: str) -> float | None:
+    share = cx.here.constant(node, label, DIMENSIONLESS)
+    if share is not None and not 0.0 <= share <= 1.0:
+        cx.reader.wrong(node, label, "a share between 0 and 1", "write `10 %`")
+    return share
+
+
+SHARE = Kind(_share, EXPRESSION)
+"""A number between 0 and 1, or a percentage."""
+
+
+def raw(schema: Mapping[str, Any], record: type | None = None) -> Kind:
+    """The node itself, for values that are read when more names are known."""
+    return Kind(lambda _cx, node, _label: node, schema, record)
+
+
+def mapping_of(schema: Mapping[str, Any]) -> Json:
+    """JSON Schema of a mapping with free keys; `~` takes an entry of an extended file away."""
+    return {
+        "type": ["object", "null"],
+        "additionalProperties": {"anyOf": [dict(schema), {"type": "null"}]},
+    }
+
+
+def list_of(kind: Kind, label: str) -> Kind:
+    """A list, as a tuple of the items that can be read; `label` names an item in messages."""
+
+    def items(cx: Context, node: Node, where: str) -> tuple[Any, ...]:
+        each = [kind.read(cx, item, label) for item in cx.reader.items(node, where)]
+        return tuple(item for item in each if item is not None)
+
+    return Kind(items, {"type": ["array", "null"], "items": dict(kind.schema)}, kind.record)
+
+
+def part(record: type) -> Kind:
+    """A mapping that is a record of its own."""
+    return Kind(lambda cx, node, label: read(record, cx, node, label), json_schema(record), record)
+
+
+def section(record: type, *, free: bool = False) -> Kind:
+    """A section of the file, as its node; with `free` a mapping of names to records."""
+    schema = json_schema(record)
+    return raw(mapping_of(schema) if free else {**schema, "type": ["object", "null"]}, record)
+
+
+# ------------------------------------------------------------------- what is derived from them
+
+
+def json_schema(record: type) -> Json:
+    """JSON Schema (draft 2020-12) of the mappings that a record is read from."""
+    properties = {
+        name: {**each.kind.schema, "description": each.about.replace("`", "")}
+        for name, each in keys_of(record).items()
+    }
+    required = [name for name, each in keys_of(record).items() if each.required]
+    found: Json = {"type": "object", "properties": properties, "additionalProperties": False}
+    return found | ({"required": required} if required else {})
+
+
+def reference(record: type, title: str) -> Iterator[str]:
+    """Lines of Markdown: a table of the keys of a record, then one of each record within."""
+    yield from (f"### {title}", "", "| key | value | default | meaning |", "|---|---|---|---|")
+    fields = {each.name: each for each in dataclasses.fields(record)}
+    inner: list[tuple[type, str]] = []
+    for name, each in keys_of(record).items():
+        default = "required" if each.required else _shown(fields[each.attribute].default)
+        yield f"| `{name}` | {_values(each.kind)} | {default} | {each.about} |"
+        if each.kind.record is not None:
+            inner.append((each.kind.record, name if title == "The file" else f"{title}.{name}"))
+    yield ""
+    for found, called in inner:
+        yield from reference(found, called)
+
+
+def _shown(default: Any) -> str:
+    """A default of a record in a table."""
+    if isinstance(default, (bool, int, float, str)) and default != "":
+        return f"`{str(default).lower() if isinstance(default, bool) else default}`"
+    if isinstance(default, tuple) and default and all(isinstance(each, int) for each in default):
+        return f"`{list(default)}`"
+    return ""
+
+
+def _values(kind: Kind) -> str:
+    """What a kind takes, in a few words."""
+    schema = kind.schema
+    if "enum" in schema:
+        return ", ".join(f"`{option}`" for option in schema["enum"])
+    types = schema.get("type", ())
+    types = [types] if isinstance(types, str) else [each for each in types if each != "null"]
+    match types:
+        case ["integer"]:
+            high = f" to {schema['maximum']}" if schema["maximum"] < 10**9 else ""
+            return f"whole number from {schema['minimum']}{high}"
+        case ["number"]:
+            return f"number from {schema['minimum']:g}"
+        case ["string"]:
+            return "text"
+        case ["boolean"]:
+            return "`true`, `false`"
+        case ["array"]:
+            return "list"
+        case ["object"]:
+            return "mapping"
+        case ["string", "number"]:
+            return "name"
+        case ["string", "number", "boolean"]:
+            return "expression"
+        case _:
+            return " or ".join(_values(Kind(kind.read, each)) for each in schema.get("anyOf", ()))
