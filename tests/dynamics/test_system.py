@@ -14,7 +14,7 @@ import torch
 from stlc.compile.semantics.switch import Tanh
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.describe import describe
-from stlc.dynamics.declaration.load import parse_system
+from stlc.dynamics.declaration.load import load_system_decl, parse_system
 from stlc.dynamics.model.controls import raw_width, squash
 from stlc.dynamics.model.system import PROBED, System
 from stlc.source import Source
@@ -220,3 +220,8 @@ def test_what_is_learnt_does_not_follow_comments_and_deployment() -> None:
         ("D:     4", "D:     5"),
     ]
     assert len({learnt(), *(learnt(*change) for change in changed)}) == len(changed) + 1
+
+
+def test_what_is_learnt_has_the_hash_of_earlier_releases() -> None:
+    rover = load_system_decl(Path(__file__).parents[2] / "examples" / "rover.yaml")
+    assert rover.learnt == "ff3e9e4e7051ab910eff381c70bc51345bc114ab56bac51369c04d3fb67cea83"

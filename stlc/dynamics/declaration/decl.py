@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -25,6 +26,11 @@ LEARNT = (
     *("flow", "jumps", "clamps", "init", "objective", "policy", "feedback"),
 )
 """The fields of a system that decide what a policy learns."""
+_HASHED_AS = {
+    **{"Const": "Lit", "Signal": "Col", "ShiftedSignal": "At", "FrozenVar": "Held"},
+    **{"Indicator": "Ind", "Predicate": "Atom", "BoolOp": "Join"},
+}
+"""Nodes under the names that they had when the first hashes were made: runs keep theirs."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +105,9 @@ class SystemDecl:
     @property
     def learnt(self) -> str:
         """SHA-256 of what a policy learns from, in hexadecimal: all but names, comments, and deployment."""
-        return hashlib.sha256(repr([getattr(self, name) for name in LEARNT]).encode()).hexdigest()
+        text = repr([getattr(self, name) for name in LEARNT])
+        text = re.sub(r"\b[A-Z]\w+(?=\()", lambda found: _HASHED_AS.get(found[0], found[0]), text)
+        return hashlib.sha256(text.encode()).hexdigest()
 
     @property
     def worlds(self) -> tuple[WorldRef, ...]:
