@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias, assert_never
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns, farthest
-from stlc.compile.ir.traverse import nodes
+from stlc.compile.ir.traverse import map_children, nodes
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -47,10 +47,6 @@ class _Ending:
     def of(self, formula: ir.Formula) -> ir.Formula:
         """The formula with what its windows may miss."""
         match formula:
-            case ir.Predicate() | ir.Truth():
-                return formula
-            case ir.BoolOp(items=items):
-                return replace(formula, items=tuple(map(self.of, items)))
             case ir.Temporal(op, window, body):
                 found = self._found(body, some=op == "eventually", cut=self._cuts(window))
                 return self._begun(replace(formula, body=found), window, some=op == "eventually")
@@ -61,11 +57,8 @@ class _Ending:
             case ir.Shift(steps, body):
                 found = self._found(body, some=not formula.weak, cut=self.cut and steps > 0)
                 return replace(formula, body=found)
-            case ir.PastTemporal(body=body) | ir.Freeze(body=body) | ir.AtStart(body=body):
-                return replace(formula, body=self.of(body))
-            case ir.Since(left=left, right=right):
-                return replace(formula, left=self.of(left), right=self.of(right))
-        assert_never(formula)
+            case _:
+                return map_children(formula, formulas=self.of)
 
     def _cuts(self, window: ir.Window) -> bool:
         return self.cut or window.hi is None
@@ -108,34 +101,16 @@ def lengthened(formula: ir.Formula, samples: int) -> ir.Formula:
 
 
 def _farthest(node: ir.Formula) -> int:
-    match node:
-        case (
-            ir.Temporal(window=window)
-            | ir.Until(window=window)
-            | ir.PastTemporal(window=window)
-            | ir.Since(window=window)
-        ):
-            return window.lo if window.hi is None else window.hi
-        case ir.Predicate(num=num):
-            return sum(farthest(num))
-        case _:
-            return 0
+    window: ir.Window | None = getattr(node, "window", None)
+    if window is not None:
+        return window.lo if window.hi is None else window.hi
+    return sum(farthest(node.num)) if isinstance(node, ir.Predicate) else 0
 
 
 def _long(formula: ir.Formula, length: int) -> ir.Formula:
-    match formula:
-        case ir.BoolOp(items=items):
-            return replace(formula, items=tuple(_long(item, length) for item in items))
-        case ir.Temporal(window=window, body=body):
-            return replace(formula, window=_longer(window, length), body=_long(body, length))
-        case ir.Until(window=window, left=left, right=right):
-            left, right = _long(left, length), _long(right, length)
-            return replace(formula, window=_longer(window, length), left=left, right=right)
-        case ir.PastTemporal(body=body) | ir.Shift(body=body) | ir.Freeze(body=body) | ir.AtStart(body=body):
-            return replace(formula, body=_long(body, length))
-        case ir.Since(left=left, right=right):
-            return replace(formula, left=_long(left, length), right=_long(right, length))
-    return formula
+    if isinstance(formula, (ir.Temporal, ir.Until)):
+        formula = replace(formula, window=_longer(formula.window, length))
+    return map_children(formula, formulas=lambda part: _long(part, length))
 
 
 def _longer(window: ir.Window, length: int) -> ir.Window:

@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache
-from typing import TypeAlias, assert_never
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import leaves
+from stlc.compile.ir.traverse import leaves, map_children
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -53,22 +53,14 @@ def unsure(formula: ir.Formula, holes: frozenset[str], *, least: bool) -> ir.For
     match formula:
         case ir.Predicate(num=num):
             return _guarded(formula, _known(num, holes), least=least)
-        case ir.Truth():
-            return formula
-        case ir.BoolOp(items=items):
-            return replace(formula, items=tuple(unsure(item, holes, least=least) for item in items))
         case ir.Freeze(bindings=bindings, body=body):
             known = {name: found for name, num in bindings if (found := _known(num, holes)) is not None}
             bound = frozenset(name for name, _ in bindings)
             inner = unsure(body, (holes - bound) | frozenset(known), least=least)
             more = tuple((KNOWN + name, num) for name, num in known.items())
             return replace(formula, bindings=(*bindings, *more), body=inner)
-        case ir.Temporal() | ir.PastTemporal() | ir.Shift() | ir.AtStart():
-            return replace(formula, body=unsure(formula.body, holes, least=least))
-        case ir.Until(left=left, right=right) | ir.Since(left=left, right=right):
-            left, right = unsure(left, holes, least=least), unsure(right, holes, least=least)
-            return replace(formula, left=left, right=right)
-    assert_never(formula)
+        case _:
+            return map_children(formula, formulas=lambda part: unsure(part, holes, least=least))
 
 
 def _known(num: ir.Num, holes: frozenset[str]) -> ir.Num | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias, assert_never
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -12,8 +12,8 @@ from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import columns_of, defined, farthest
-from stlc.compile.ir.traverse import operands, subexpressions
+from stlc.compile.ir.support import columns_of, defined, history
+from stlc.compile.ir.traverse import map_children, subexpressions
 from stlc.compile.schedule.schedule import End
 from stlc.compile.semantics.semantics import Exact, Semantics
 from stlc.monitor.holes import holes_in, unsure, without_holes
@@ -142,35 +142,6 @@ def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator
         yield replace(record, env={name: x[k - back :] for name, x in record.env.items()}), 1
 
 
-def history(formula: ir.Formula) -> int:
-    """How many samples before its instant a formula looks at where they exist."""
-    match formula:
-        case ir.Truth():
-            return 0
-        case ir.AtStart():
-            return _back(ir.Window(0, None))
-        case ir.Predicate(num=num):
-            return farthest(num).past
-        case ir.Freeze(bindings=bindings, body=body):
-            return max(history(body), *(farthest(num).past for _, num in bindings))
-        case ir.BoolOp(items=items):
-            return max(map(history, items))
-        case ir.Temporal(window=window, body=body):
-            return max(history(body) - window.lo, 0)
-        case ir.Until(left=left, right=right):
-            return max(history(left), history(right))
-        case ir.PastTemporal(window=window) | ir.Since(window=window):
-            return max(map(history, operands(formula))) + _back(window)
-        case ir.Shift(steps=steps, body=body):
-            return max(history(body) - steps, 0)
-    assert_never(formula)
-
-
-def _back(window: ir.Window) -> int:
-    """More than any record has where the window is unbounded."""
-    return 1 << 40 if window.hi is None else window.hi
-
-
 # ------------------------------------------------------------------ signals that nobody gave
 
 
@@ -182,19 +153,12 @@ def granted(formula: ir.Formula, names: Collection[str]) -> ir.Formula:
     match formula:
         case ir.Predicate(num=num):
             return formula if _read(num) <= set(names) else ir.Truth(True)
-        case ir.Truth():
-            return formula
-        case ir.BoolOp(items=items):
-            return replace(formula, items=tuple(granted(item, names) for item in items))
         case ir.Freeze(bindings=bindings, body=body):
             known = tuple(each for each in bindings if _read(each[1]) <= set(names))
             inner = granted(body, {*names, *(name for name, _ in known)})
             return replace(formula, bindings=known, body=inner) if known else inner
-        case ir.Temporal() | ir.PastTemporal() | ir.Shift() | ir.AtStart():
-            return replace(formula, body=granted(formula.body, names))
-        case ir.Until(left=left, right=right) | ir.Since(left=left, right=right):
-            return replace(formula, left=granted(left, names), right=granted(right, names))
-    assert_never(formula)
+        case _:
+            return map_children(formula, formulas=lambda part: granted(part, names))
 
 
 def _read(num: ir.Num) -> set[str]:
@@ -210,15 +174,6 @@ def by_truth(formula: ir.Formula) -> ir.Formula:
 
     `a > b` is true above 0 and `a >= b` from 0 on, without any tolerance.
     """
-    match formula:
-        case ir.Predicate():
-            return replace(formula, guard=True)
-        case ir.Truth():
-            return formula
-        case ir.BoolOp(items=items):
-            return replace(formula, items=tuple(map(by_truth, items)))
-        case ir.Temporal() | ir.PastTemporal() | ir.Shift() | ir.Freeze() | ir.AtStart():
-            return replace(formula, body=by_truth(formula.body))
-        case ir.Until(left=left, right=right) | ir.Since(left=left, right=right):
-            return replace(formula, left=by_truth(left), right=by_truth(right))
-    assert_never(formula)
+    if isinstance(formula, ir.Predicate):
+        return replace(formula, guard=True)
+    return map_children(formula, formulas=by_truth)

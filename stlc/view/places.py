@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias, assert_never
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir import typed
+from stlc.compile.ir.traverse import operands
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import StlcError
 from stlc.grammar import ast
@@ -213,20 +214,14 @@ def _uses(rule: CompiledRequirement, trace: Trace) -> Iterator[tuple[typed.Predi
                 stack.append((body, _turned(use)))
             case typed.Logic(op="->", items=(left, right)):
                 stack += [(right, use), (left, _turned(use))]
-            case typed.Logic(items=items):
-                stack += [(item, use) for item in reversed(items)]
             case typed.Temporal(op=op, interval=interval, body=body):
                 inner = replace(_within(interval, use, rule, trace), visit=op in ("eventually", "once"))
                 stack.append((body, inner))
             case typed.Until(interval=interval, left=left, right=right):
                 inner = replace(_within(interval, use, rule, trace), visit=True)
                 stack += [(right, inner), (left, use)]
-            case typed.Shift(body=body) | typed.Edge(body=body) | typed.Freeze(body=body):
-                stack.append((body, use))
-            case typed.Truth() | typed.Recalled():
-                pass
             case _:
-                assert_never(node)
+                stack += [(part, use) for part in reversed(operands(node))]
 
 
 def _turned(use: Use) -> Use:

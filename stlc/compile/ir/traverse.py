@@ -130,7 +130,7 @@ def numbers(formula: ir.Formula | typed.Formula) -> Iterator[ir.Num]:
         yield from (child for child in children(node) if isinstance(child, _NUMBERS))
 
 
-def subexpressions(num: ir.Num) -> Iterator[ir.Num]:
+def subexpressions(num: Node) -> Iterator[ir.Num]:
     """A number and all numbers in it, those of its conditions too."""
     if isinstance(num, _NUMBERS):
         yield num
@@ -138,7 +138,7 @@ def subexpressions(num: ir.Num) -> Iterator[ir.Num]:
         yield from subexpressions(child)
 
 
-def leaves(num: ir.Num) -> Iterator[Leaf]:
+def leaves(num: Node) -> Iterator[Leaf]:
     """The parts of a number without parts of their own, those of its conditions too."""
     for part in subexpressions(num):
         if isinstance(part, LEAVES):

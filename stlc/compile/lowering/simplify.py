@@ -9,10 +9,10 @@ both, `G[a,b] G[c,d] p` is `G[a+c, b+d] p`, and so for `F`, `H` and `O`.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import assert_never
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import frozen_in, numbers, substitute_frozen
+from stlc.compile.ir.normal_form import joined
+from stlc.compile.ir.traverse import frozen_in, map_children, numbers, substitute_frozen
 from stlc.compile.semantics.semantics import Exact, Semantics
 
 _EXACT = Exact()
@@ -26,45 +26,32 @@ def simplify(formula: ir.Formula, semantics: Semantics = _EXACT) -> ir.Formula:
         formula: in negation normal form.
         semantics: under which it has the same robustness; the exact one allows all laws.
     """
-
-    def inner(part: ir.Formula) -> ir.Formula:
-        return simplify(part, semantics)
-
-    match formula:
-        case ir.Truth() | ir.Predicate():
-            return formula
-        case ir.BoolOp(_, items):
-            return _join(formula, [inner(item) for item in items], semantics)
+    whole = map_children(formula, formulas=lambda part: simplify(part, semantics))
+    match whole:
+        case ir.BoolOp():
+            return _join(whole, semantics)
         case ir.Temporal() | ir.PastTemporal():
-            return _window(replace(formula, body=inner(formula.body)), semantics)
+            return _window(whole, semantics)
         case ir.Until() | ir.Since():
-            return _binary(replace(formula, left=inner(formula.left), right=inner(formula.right)), semantics)
-        case ir.Shift():
-            body = inner(formula.body)
-            return body if formula.steps == 0 else replace(formula, body=body)
+            return _binary(whole, semantics)
+        case ir.Shift(0, body):
+            return body
         case ir.Freeze():
-            return _freeze(replace(formula, body=inner(formula.body)))
-        case ir.AtStart():
-            body = inner(formula.body)
-            return body if isinstance(body, ir.Truth) else replace(formula, body=body)
+            return _freeze(whole)
+        case ir.AtStart(ir.Truth() as body):
+            return body
         case _:
-            assert_never(formula)
+            return whole
 
 
-def _join(whole: ir.BoolOp, items: list[ir.Formula], semantics: Semantics) -> ir.Formula:
+def _join(whole: ir.BoolOp, semantics: Semantics) -> ir.Formula:
     flat: list[ir.Formula] = []
-    for item in items:
+    for item in whole.items:
         nested = semantics.associative and isinstance(item, ir.BoolOp) and item.op == whole.op
         flat += item.items if nested and isinstance(item, ir.BoolOp) else (item,)
     if semantics.idempotent:
         flat = list(dict.fromkeys(flat))
-    absorbing = whole.op == "or"
-    kept = [item for item in flat if not isinstance(item, ir.Truth)]
-    if any(isinstance(item, ir.Truth) and item.value is absorbing for item in flat):
-        return ir.Truth(absorbing, whole.span)
-    if not kept:
-        return ir.Truth(not absorbing, whole.span)
-    return kept[0] if len(kept) == 1 else replace(whole, items=tuple(kept))
+    return joined(whole.op, flat, ir.Truth(whole.op == "and", whole.span))
 
 
 def _window(node: ir.Temporal | ir.PastTemporal, semantics: Semantics) -> ir.Formula:

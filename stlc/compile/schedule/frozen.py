@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
-from typing import TypeAlias, assert_never, final
+from typing import TypeAlias, final
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from stlc.compile.backends.array.inputs import inputs
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import Reach, columns, looks_at_ends, reach, uses_end
-from stlc.compile.ir.traverse import frozen_in, nodes, numbers
+from stlc.compile.ir.traverse import frozen_in, map_children, nodes, numbers
 from stlc.compile.schedule.schedule import Extent, Run, reads, upto, within
 
 Env: TypeAlias = Mapping[str, Array]
@@ -177,23 +177,14 @@ def _chunks(run: Run, size: int) -> Iterator[Run]:
 def without(body: ir.Formula, names: frozenset[str], extent: Extent) -> ir.Formula:
     """The formula where nothing is known of the frozen values `names`."""
     match body:
-        case ir.Truth():
-            return body
         case ir.Predicate(num, sign):
             if not frozen_in(num) & names:
                 return body
             return ir.Truth(extent.end == "upper" if extent.open else sign < 0, body.span)
-        case ir.BoolOp(_, items):
-            return replace(body, items=tuple(without(item, names, extent) for item in items))
-        case ir.Temporal() | ir.PastTemporal() | ir.Shift() | ir.AtStart():
-            return replace(body, body=without(body.body, names, extent))
-        case ir.Until() | ir.Since():
-            left, right = without(body.left, names, extent), without(body.right, names, extent)
-            return replace(body, left=left, right=right)
         case ir.Freeze(bindings, inner):
             lost = {name for name, num in bindings if frozen_in(num) & names}
             inner = without(inner, names - {name for name, _ in bindings} | lost, extent)
             kept = tuple((name, num) for name, num in bindings if name not in lost)
             return replace(body, bindings=kept, body=inner) if kept else inner
         case _:
-            assert_never(body)
+            return map_children(body, formulas=lambda part: without(part, names, extent))

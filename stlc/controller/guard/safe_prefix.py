@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import assert_never
 
 import torch
 from torch import Tensor
@@ -12,6 +11,7 @@ from torch import Tensor
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.traverse import map_children
 
 BEYOND = "#beyond"
 
@@ -22,19 +22,9 @@ def open_ended(formula: ir.Formula) -> ir.Formula:
     In negation normal form robustness grows with that of each predicate, so this is the upper bound over all
     ways in which the trace may go on: negative exactly where the known samples already violate the formula.
     """
-    match formula:
-        case ir.Truth():
-            return formula
-        case ir.Predicate():
-            return ir.BoolOp("or", (formula, ir.Predicate(ir.Signal(BEYOND), strict=True, guard=True)))
-        case ir.BoolOp():
-            return replace(formula, items=tuple(map(open_ended, formula.items)))
-        case ir.Temporal() | ir.PastTemporal() | ir.Shift() | ir.Freeze() | ir.AtStart():
-            return replace(formula, body=open_ended(formula.body))
-        case ir.Until() | ir.Since():
-            return replace(formula, left=open_ended(formula.left), right=open_ended(formula.right))
-        case _:
-            assert_never(formula)
+    if isinstance(formula, ir.Predicate):
+        return ir.BoolOp("or", (formula, ir.Predicate(ir.Signal(BEYOND), strict=True, guard=True)))
+    return map_children(formula, formulas=open_ended)
 
 
 def anchored(formula: ir.Formula) -> ir.Formula:

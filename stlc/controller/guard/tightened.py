@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeAlias, assert_never
+from typing import TYPE_CHECKING, TypeAlias
 
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.traverse import map_children
 from stlc.controller.problem.task import Task
 from stlc.dynamics.model.algebra import add
 
@@ -36,17 +37,10 @@ def _tightened(rule: CompiledRequirement, margin: float) -> CompiledRequirement:
 
 def tighter(formula: ir.Formula, margin: float) -> ir.Formula:
     """The formula whose robustness is less by `margin`, everywhere and exactly."""
-    match formula:
-        case ir.Truth():
-            return formula
-        case ir.Predicate():
-            if formula.guard:
-                return formula
-            return replace(formula, num=add(formula.num, ir.Const(-formula.sign * margin)))
-        case ir.BoolOp(items=items):
-            return replace(formula, items=tuple(tighter(item, margin) for item in items))
-        case ir.Temporal() | ir.PastTemporal() | ir.Shift() | ir.Freeze() | ir.AtStart():
-            return replace(formula, body=tighter(formula.body, margin))
-        case ir.Until(left=left, right=right) | ir.Since(left=left, right=right):
-            return replace(formula, left=tighter(left, margin), right=tighter(right, margin))
-    assert_never(formula)
+    if isinstance(formula, ir.Predicate):
+        return (
+            formula
+            if formula.guard
+            else replace(formula, num=add(formula.num, ir.Const(-formula.sign * margin)))
+        )
+    return map_children(formula, formulas=lambda part: tighter(part, margin))

@@ -3,40 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import assert_never
+from dataclasses import dataclass, field
 
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.traverse import leaves, map_children
 
 
-def names_in(num: ir.Num) -> frozenset[str]:
-    """Names of all columns that a number reads."""
-    match num:
-        case ir.Const() | ir.FrozenVar():
-            return frozenset()
-        case ir.Signal(name) | ir.ShiftedSignal(name):
-            return frozenset((name,))
-        case ir.Op(_, args) | ir.Extern(_, args):
-            return frozenset().union(*map(names_in, args))
-        case ir.Indicator(cond):
-            return names_in_formula(cond)
-        case ir.Where(cond, yes, no):
-            return names_in_formula(cond) | names_in(yes) | names_in(no)
-        case _:
-            assert_never(num)
-
-
-def names_in_formula(formula: ir.Formula) -> frozenset[str]:
-    """Names of all columns that a state formula reads."""
-    match formula:
-        case ir.Truth():
-            return frozenset()
-        case ir.Predicate(num):
-            return names_in(num)
-        case ir.BoolOp(_, items):
-            return frozenset().union(*map(names_in_formula, items))
-        case _:
-            raise TypeError(f"not a state formula: {formula!r}")
+def names_in(num: ir.Num | ir.Formula) -> frozenset[str]:
+    """Names of all columns that a number or a state formula reads."""
+    return frozenset(leaf.name for leaf in leaves(num) if isinstance(leaf, (ir.Signal, ir.ShiftedSignal)))
 
 
 Rewrite = Callable[[ir.Num], ir.Num]
@@ -44,30 +19,12 @@ Rewrite = Callable[[ir.Num], ir.Num]
 
 def map_formula(formula: ir.Formula, rewrite: Rewrite) -> ir.Formula:
     """A state formula with every predicate's number rewritten."""
-    match formula:
-        case ir.Truth():
-            return formula
-        case ir.Predicate(num):
-            return replace(formula, num=rewrite(num))
-        case ir.BoolOp(_, items):
-            return replace(formula, items=tuple(map_formula(item, rewrite) for item in items))
-        case _:
-            raise TypeError(f"not a state formula: {formula!r}")
+    return map_children(formula, formulas=lambda part: map_formula(part, rewrite), numbers=rewrite)
 
 
 def map_parts(num: ir.Num, rewrite: Rewrite) -> ir.Num:
     """A number with its direct parts rewritten."""
-    match num:
-        case ir.Const() | ir.Signal() | ir.ShiftedSignal() | ir.FrozenVar():
-            return num
-        case ir.Op(_, args) | ir.Extern(_, args):
-            return replace(num, args=tuple(map(rewrite, args)))
-        case ir.Indicator(cond):
-            return replace(num, cond=map_formula(cond, rewrite))
-        case ir.Where(cond, yes, no):
-            return ir.Where(map_formula(cond, rewrite), rewrite(yes), rewrite(no))
-        case _:
-            assert_never(num)
+    return map_children(num, formulas=lambda cond: map_formula(cond, rewrite), numbers=rewrite)
 
 
 def substitute(num: ir.Num, table: Mapping[str, ir.Num]) -> ir.Num:
@@ -120,7 +77,7 @@ class Hoist:
                 return self._sum(num)
             case ir.Op("mul"):
                 return self._product(num)
-            case ir.Where(cond, yes, no) if not names_in_formula(cond) & self.moving:
+            case ir.Where(cond, yes, no) if not names_in(cond) & self.moving:
                 return self._choice(cond, yes, no)
             case _:
                 return map_parts(num, self.split)

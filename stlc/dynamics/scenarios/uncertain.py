@@ -18,7 +18,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.load import moving_parts
 from stlc.dynamics.declaration.motion import Assign, JumpDecl, read_flow, read_jumps
-from stlc.dynamics.model.algebra import multiply, names_in, names_in_formula
+from stlc.dynamics.model.algebra import multiply, names_in
 from stlc.dynamics.schema.expressions import Expressions
 from stlc.dynamics.schema.names import Context, Names, base_name
 from stlc.dynamics.schema.reader import Reader
@@ -101,7 +101,7 @@ def _readers(decl: SystemDecl, factor: str) -> tuple[str, ...]:
     """The states whose equations, or whose jumps, read a factor."""
     found = [assign.name for assign in decl.flow if factor in names_in(assign.value)]
     for jump in decl.jumps:
-        guarded = factor in names_in_formula(jump.guard)
+        guarded = factor in names_in(jump.guard)
         found += [each.name for each in jump.resets if guarded or factor in names_in(each.value)]
     return tuple(dict.fromkeys(map(base_name, found)))
 

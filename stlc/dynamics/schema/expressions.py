@@ -15,7 +15,7 @@ from stlc.compile.frontend.scope import Entry, Scope
 from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Diagnostic, StlcError
-from stlc.dynamics.model.algebra import names_in, names_in_formula
+from stlc.dynamics.model.algebra import names_in
 from stlc.dynamics.schema.reader import Reader, first_line
 from stlc.dynamics.schema.yaml_nodes import Node, Scalar
 from stlc.dynamics.schema.yaml_nodes import Sequence as ListNode
@@ -127,7 +127,7 @@ class Expressions:
     def formula_of(self, expr: ast.Expr) -> ir.Formula | None:
         """The state formula that an expression is."""
         formula = self._typed(resolve_state_formula, expr)
-        if formula is not None and not self._known(names_in_formula(formula), expr.span):
+        if formula is not None and not self._known(names_in(formula), expr.span):
             return None
         return formula
 

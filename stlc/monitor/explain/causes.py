@@ -19,11 +19,19 @@ from stlc.compile.backends.array.graph import evaluate_parts
 from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.support import columns_of, defined
-from stlc.compile.ir.traverse import from_now, leaves, numbers, on_clock, operands, substitute_frozen
+from stlc.compile.ir.support import columns_of, defined, history
+from stlc.compile.ir.traverse import (
+    from_now,
+    leaves,
+    map_children,
+    numbers,
+    on_clock,
+    operands,
+    substitute_frozen,
+)
 from stlc.compile.lowering.lower import lower
 from stlc.monitor.holes import KNOWN, unsure
-from stlc.monitor.values import Record, bounds, granted, history
+from stlc.monitor.values import Record, bounds, granted
 from stlc.source import Span
 
 Floats = NDArray[np.float64]
@@ -154,19 +162,9 @@ def _leaves_of(formula: ir.Formula) -> dict[ir.Formula, None]:
 
 
 def _over_columns(formula: ir.Formula, names: Mapping[ir.Formula, str]) -> ir.Formula:
-    match formula:
-        case ir.Truth():
-            return formula
-        case ir.Predicate() | ir.Freeze():
-            return ir.Predicate(ir.Signal(names[formula]))
-        case ir.BoolOp(items=items):
-            return replace(formula, items=tuple(_over_columns(item, names) for item in items))
-        case ir.Temporal() | ir.PastTemporal() | ir.Shift() | ir.AtStart():
-            return replace(formula, body=_over_columns(formula.body, names))
-        case ir.Until() | ir.Since():
-            left, right = _over_columns(formula.left, names), _over_columns(formula.right, names)
-            return replace(formula, left=left, right=right)
-    assert_never(formula)
+    if isinstance(formula, (ir.Predicate, ir.Freeze)):
+        return ir.Predicate(ir.Signal(names[formula]))
+    return map_children(formula, formulas=lambda part: _over_columns(part, names))
 
 
 @dataclass(frozen=True, slots=True)

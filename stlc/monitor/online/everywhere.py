@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stlc.compile.ir.support import reach
+from stlc.compile.ir.support import history, reach
 from stlc.monitor.online.asked import Asked, Bounds, Floats, Plans, decided_first, first_needed, sides_of
 from stlc.monitor.online.columns import Reader, Side
 from stlc.monitor.online.streams import Plan
-from stlc.monitor.values import history
 
 
 @dataclass(slots=True)

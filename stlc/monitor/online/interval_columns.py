@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import reach
+from stlc.compile.ir.support import history, reach
 from stlc.monitor.online.asked import Bounds, Floats, Plans
 from stlc.monitor.online.columns import NOTHING, Reader, continued
 from stlc.monitor.online.streams import Latched, Leaf, Plan, plan
-from stlc.monitor.values import by_truth, history
+from stlc.monitor.values import by_truth
 
 _UNKNOWN = (-math.inf, math.inf)
 

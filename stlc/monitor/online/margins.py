@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.ir.support import columns
+from stlc.compile.ir.support import columns, history
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.monitor.instants import window_of
 from stlc.monitor.judgement import Status
 from stlc.monitor.online.trackers import Whole
-from stlc.monitor.values import history
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeAlias, assert_never
+from typing import Protocol, TypeAlias
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import Reach, farthest, reach
-from stlc.compile.ir.traverse import nodes, operands
+from stlc.compile.ir.traverse import map_children, nodes, operands
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.monitor.online.asked import Bounds, Floats
 from stlc.monitor.online.streams import endless
@@ -147,27 +147,19 @@ _Most: TypeAlias = tuple[int | None, int | None]
 def _cut(formula: ir.Formula, most: _Most) -> ir.Formula:
     ahead, back = most
     match formula:
-        case ir.Truth() | ir.Predicate() | ir.Freeze() | ir.AtStart():
+        case ir.Freeze() | ir.AtStart():
             return formula
-        case ir.BoolOp(items=items):
-            return replace(formula, items=tuple(_cut(item, most) for item in items))
-        case ir.Temporal(window=window, body=body):
-            return replace(formula, window=_shorter(window, ahead), body=_cut(body, most))
-        case ir.PastTemporal(window=window, body=body):
-            return replace(formula, window=_shorter(window, back), body=_cut(body, most))
-        case ir.Until(window=window, left=left, right=right):
-            left, right = _cut(left, most), _cut(right, most)
-            return replace(formula, window=_shorter(window, ahead), left=left, right=right)
-        case ir.Since(window=window, left=left, right=right):
-            left, right = _cut(left, most), _cut(right, most)
-            return replace(formula, window=_shorter(window, back), left=left, right=right)
-        case ir.Shift(steps=steps, body=body):
+        case ir.Temporal(window=window) | ir.Until(window=window):
+            formula = replace(formula, window=_shorter(window, ahead))
+        case ir.PastTemporal(window=window) | ir.Since(window=window):
+            formula = replace(formula, window=_shorter(window, back))
+        case ir.Shift(steps=steps):
             if steps > 0 and ahead is not None:
                 steps = min(steps, ahead)
             if steps < 0 and back is not None:
                 steps = max(steps, -back)
-            return replace(formula, steps=steps, body=_cut(body, most))
-    assert_never(formula)
+            formula = replace(formula, steps=steps)
+    return map_children(formula, formulas=lambda part: _cut(part, most))
 
 
 def _shorter(window: ir.Window, most: int | None) -> ir.Window:

@@ -9,7 +9,7 @@ import numpy as np
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import reach
+from stlc.compile.ir.support import history, reach
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.monitor.explain.report import Cause, explain
 from stlc.monitor.instants import rule_bounds, window_of
@@ -19,7 +19,7 @@ from stlc.monitor.online.history import Kept
 from stlc.monitor.online.streams import endless, looks_on
 from stlc.monitor.prepared import Prepared
 from stlc.monitor.signals import Signals
-from stlc.monitor.values import Record, history
+from stlc.monitor.values import Record
 
 _MOST = 1 << 21
 """Numbers that are kept at least, and twice as many at most; causes are worked out before samples go."""

@@ -12,10 +12,9 @@ from typing import Literal, TypeAlias
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns as names_of_columns
-from stlc.compile.ir.support import reach
+from stlc.compile.ir.support import history, reach
 from stlc.compile.ir.traverse import leaves as readings
-from stlc.compile.ir.traverse import nodes, numbers
-from stlc.monitor.values import history
+from stlc.compile.ir.traverse import map_children, nodes, numbers
 
 Latch: TypeAlias = Literal["once", "historically", "since", "trigger"]
 
@@ -129,26 +128,18 @@ class _Planner:
     def over_columns(self, formula: ir.Formula) -> ir.Formula:
         """The formula with columns for predicates and for unbounded past operators."""
         match formula:
-            case ir.Truth():
-                return formula
-            case ir.BoolOp(op, items):
-                return ir.BoolOp(op, tuple(map(self.over_columns, items)))
-            case ir.Temporal(op, window, body):
-                return ir.Temporal(op, window, self.over_columns(body))
-            case ir.Until(op, window, left, right):
-                return ir.Until(op, window, self.over_columns(left), self.over_columns(right))
-            case ir.Shift(steps, body, outside, _, weak):
-                return ir.Shift(steps, self.over_columns(body), outside, weak=weak)
+            case ir.Predicate():
+                return self._leaf(formula)
+            case ir.Freeze():
+                return self._frozen(formula)
+            case ir.AtStart():
+                raise EndlessError
             case ir.PastTemporal(op, window, body):
                 return self._past(op, window, self.over_columns(body))
             case ir.Since(op, window, left, right):
                 return self._since(op, window, self.over_columns(left), self.over_columns(right))
-            case ir.Predicate():
-                return self._leaf(formula)
-            case ir.AtStart():
-                raise EndlessError
             case _:
-                return self._frozen(formula)
+                return map_children(formula, formulas=self.over_columns)
 
     def _leaf(self, formula: ir.Formula) -> ir.Formula:
         if formula not in self.streams:

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import reach
+from stlc.compile.ir.support import history, reach
 from stlc.monitor.online.columns import NOTHING, Reader, Side
 from stlc.monitor.online.streams import EndlessError, Plan, column, endless
-from stlc.monitor.values import history
 
 Floats: TypeAlias = NDArray[np.float64]
 

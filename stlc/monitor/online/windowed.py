@@ -9,7 +9,7 @@ import numpy as np
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import reach
+from stlc.compile.ir.support import history, reach
 from stlc.monitor.online.asked import (
     Asked,
     Bounds,
@@ -22,7 +22,7 @@ from stlc.monitor.online.asked import (
 )
 from stlc.monitor.online.columns import Side
 from stlc.monitor.online.streams import Latched, Plan
-from stlc.monitor.values import Record, history, window_bounds
+from stlc.monitor.values import Record, window_bounds
 
 
 @dataclass(slots=True)

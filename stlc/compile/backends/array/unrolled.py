@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
-from typing import assert_never
 
 from stlc.compile.backends.array.arith import Program
 from stlc.compile.backends.array.graph import evaluate
@@ -15,7 +13,7 @@ from stlc.compile.backends.onnx.ops import ONNX
 from stlc.compile.backends.onnx.sheet import Value
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import defined
-from stlc.compile.ir.traverse import numbers, subexpressions
+from stlc.compile.ir.traverse import map_children, numbers, subexpressions
 from stlc.compile.schedule.schedule import Run
 
 Columns = dict[str, Value]
@@ -56,21 +54,11 @@ def require_numbers(nums: Iterator[ir.Num] | Sequence[ir.Num]) -> None:
 
 def _thawed(formula: ir.Formula, env: Columns) -> ir.Formula:
     """The formula with a new column of `env` in the place of every `freeze`."""
-    match formula:
-        case ir.Truth() | ir.Predicate():
-            return formula
-        case ir.BoolOp():
-            return replace(formula, items=tuple(_thawed(item, env) for item in formula.items))
-        case ir.Temporal() | ir.PastTemporal() | ir.Shift() | ir.AtStart():
-            return replace(formula, body=_thawed(formula.body, env))
-        case ir.Until() | ir.Since():
-            return replace(formula, left=_thawed(formula.left, env), right=_thawed(formula.right, env))
-        case ir.Freeze():
-            name = f"#frozen{len(env)}"
-            env[name] = _frozen(formula, env)
-            return ir.Predicate(ir.Signal(name))
-        case _:
-            assert_never(formula)
+    if isinstance(formula, ir.Freeze):
+        name = f"#frozen{len(env)}"
+        env[name] = _frozen(formula, env)
+        return ir.Predicate(ir.Signal(name))
+    return map_children(formula, formulas=lambda part: _thawed(part, env))
 
 
 def _frozen(node: ir.Freeze, env: Columns) -> Value:
