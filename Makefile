@@ -3,12 +3,13 @@ BIN := .venv/bin
 # Hundreds of tests start the program: what Python compiles is kept, whatever the shell says.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test format docs environment clean
+.PHONY: help demo test format docs site environment clean
 
 help:
 	@echo 'make demo    train, simulate, check and report the traffic benchmark, from nothing'
 	@echo 'make test    lint, format, types and tests: what has to be green'
 	@echo 'make docs    write anew what documents take from the code: commands, codes, files'
+	@echo 'make site    build the documentation site into docs/_build; warnings are errors'
 	@echo 'make format  lay the code out and fix what can be fixed'
 	@echo 'make clean   remove the environment and the caches; runs/ stays'
 
@@ -28,8 +29,12 @@ format: environment
 docs: environment
 	$(BIN)/python -m pytest -q tests/test_docs.py tests/editor/test_textmate.py --regenerate
 
+site: environment
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	$(BIN)/python -m sphinx -W --keep-going -q -E -b html docs docs/_build
+
 environment:
 	@$(PYTHON) tools/environment.py
 
 clean:
-	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist
+	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist docs/_build
