@@ -1,7 +1,7 @@
-"""Configuration of the documentation site: Sphinx with MyST; `make site` builds it (decision 38).
+"""Configuration of the documentation site: Sphinx with MyST; `make site` builds it (decision 42).
 
-The navigation is the home page itself: each list of links under a heading of `index.md` becomes a part of the sidebar,
-so the order of the pages is written once and reads the same on the site and in the repository.
+The navigation is the home page itself: each list of links under a heading of `index.md` becomes a part of the
+sidebar, so the order of the pages is written once and reads the same on the site and in the repository.
 """
 
 from __future__ import annotations
@@ -23,11 +23,9 @@ version = release = __version__
 language = "en"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["_build"]
-nitpicky = False
 
 myst_heading_anchors = 4
 myst_enable_extensions = ["dollarmath"]
-myst_links_external_new_tab = False
 suppress_warnings = ["myst.header"]  # the list of diagnostics begins below its own heading
 
 html_theme = "furo"
@@ -41,6 +39,7 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_preserve_defaults = True
+napoleon_attr_annotations = False
 python_use_unqualified_type_names = True
 
 HERE = Path(__file__).resolve().parent
@@ -67,10 +66,10 @@ def decisions() -> str:
     return "\n".join(["", "```{toctree}", ":hidden:", "", *names, "```"])
 
 
-def read_page(app: Any, name: str, source: list[str]) -> None:
+def read_page(_app: Any, name: str, source: list[str]) -> None:
     """Prepare the text of a page: its navigation, anchors as MyST targets, links that stay on the site.
 
-    A link to a file or a folder outside `docs/` leads somewhere in the repository only; the site shows its text.
+    A link to a file or a folder outside `docs/` leads nowhere on the site, which shows its text.
     """
     folder = (HERE / f"{name}.md").parent
 
@@ -83,8 +82,9 @@ def read_page(app: Any, name: str, source: list[str]) -> None:
     source[0] = text + pages.get(name, lambda _: "")(text)
 
 
-def escape_docstring(app: Any, what: str, name: str, item: Any, options: Any, lines: list[str]) -> None:
+def escape_docstring(*event: Any) -> None:
     """Escape in docstrings what reStructuredText would read as markup and Markdown does not."""
+    lines: list[str] = event[-1]
     fenced = False
     for number, line in enumerate(lines):
         if line.strip().startswith("```"):
@@ -93,9 +93,8 @@ def escape_docstring(app: Any, what: str, name: str, item: Any, options: Any, li
         if fenced or ">>>" in line:
             continue
         pieces = re.split(r"(`[^`]*`)", line)
-        lines[number] = "".join(
-            piece if piece.startswith("`") else re.sub(r"(?<!\*)([*|])(?!\*)", r"\\\1", piece) for piece in pieces
-        )
+        pieces[::2] = [re.sub(r"(?<!\*)([*|])(?!\*)", r"\\\1", piece) for piece in pieces[::2]]
+        lines[number] = re.sub(r"(`[^`]+`)(?=\w)", r"\1\\ ", "".join(pieces))
 
 
 def visit_math(self: Any, node: Any) -> None:
@@ -133,4 +132,6 @@ def setup(app: Any) -> None:
     app.connect("source-read", read_page)
     app.connect("autodoc-process-docstring", escape_docstring)
     app.add_lexer("stlc", StlLexer)
-    app.add_html_math_renderer("mathml", inline_renderers=(visit_math, None), block_renderers=(visit_math, None))
+    app.add_html_math_renderer(
+        "mathml", inline_renderers=(visit_math, None), block_renderers=(visit_math, None)
+    )
