@@ -2,32 +2,21 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
-from typing import IO, Any
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.trace.enums import instants_of
-from stlc.trace.formats.csv import table_of_text
-from stlc.trace.formats.extras import needed
-from stlc.trace.formats.npz import Member, open_members, unreadable
-from stlc.trace.formats.parquet import damage, open_parquet, signal_fields, table_of
-from stlc.trace.formats.table import of_table
-from stlc.trace.meta import TraceMeta, read_meta
-from stlc.trace.recording import CLOCK, EXTRA, Recording, Strand, of_arrays
+from stlc.trace.formats.registry import SUFFIXES, format_of, unreadable
+from stlc.trace.recording import CLOCK, Recording, Strand
 from stlc.trace.time_grid import TOLERANCE, resample_advice
 from stlc.trace.trace import Reading, Trace, trace_of
 
-Array = NDArray[Any]
-
-SUFFIXES = (".npz", ".csv", ".parquet", ".pq")
 LARGE = 1_500_000_000
 """Files whose numbers take more bytes than this are not read as a whole."""
 
@@ -38,19 +27,9 @@ def size_of(path: Path) -> int:
     Raises:
         StlcError: the file cannot be opened, or is damaged.
     """
-    suffix = path.suffix.lower()
-    if suffix == ".csv":
-        return path.stat().st_size
-    if suffix in (".parquet", ".pq"):
-        metadata = open_parquet(path, whole=False).metadata
-        return int(metadata.num_rows * metadata.num_columns * 8)
-    if suffix != ".npz" or not zipfile.is_zipfile(path):
-        return 0
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return sum(member.file_size for member in archive.infolist())
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
-        return 0
+    found = format_of(path)
+    size: int = found.function("size")(path) if found.chunked and path.suffix.lower() in SUFFIXES else 0
+    return size
 
 
 def pieces(path: Path, samples: int, reading: Reading) -> Iterator[Trace]:
@@ -73,14 +52,10 @@ def pieces(path: Path, samples: int, reading: Reading) -> Iterator[Trace]:
 
 
 def _recordings(path: Path, samples: int) -> Iterator[Recording]:
-    suffix = path.suffix.lower()
-    if suffix == ".csv":
-        return _from_csv(path, samples)
-    if suffix in (".parquet", ".pq"):
-        return _from_parquet(path, samples)
-    if suffix in SUFFIXES:
-        return _from_npz(path, samples)
-    raise TraceError(Diagnostic("E605", f"`{path}` is of a format that cannot be read in pieces"))
+    found = format_of(path)
+    if not found.chunked or path.suffix.lower() not in SUFFIXES:
+        raise TraceError(Diagnostic("E605", f"`{path}` is of a format that cannot be read in pieces"))
+    return cast("Iterator[Recording]", found.function("chunks")(path, samples))
 
 
 def _single(trace: Trace) -> Trace:
@@ -143,58 +118,3 @@ class _Clock:
                 f"where {wanted[i]:.6g} s was expected"
             )
             raise TraceError(Diagnostic("E602", message, help=(resample_advice(self.dt),)))
-
-
-# -------------------------------------------------------------------------- formats
-
-
-def _from_npz(path: Path, samples: int) -> Iterator[Recording]:
-    with ExitStack() as stack, damage(path):
-        members = open_members(path, stack)
-        meta, columns = read_meta(path, _meta_array(members))
-        signals = {name: m for name, m in members.items() if name != "meta" and not name.startswith(EXTRA)}
-        length = max((member.length for member in signals.values()), default=0)
-        odd = [name for name, member in signals.items() if member.length != length]
-        if odd:
-            message = (
-                f"`{odd[0]}` in `{path}` is not one value per sample: such a file cannot be read in pieces"
-            )
-            raise TraceError(Diagnostic("E605", message))
-        for begin in range(0, length, samples):
-            count = min(samples, length - begin)
-            arrays = {name: member.read(count) for name, member in signals.items()}
-            yield replace(of_arrays(path, arrays, meta), columns=columns)
-
-
-def _meta_array(members: dict[str, Member]) -> Array | None:
-    return None if "meta" not in members else members["meta"].whole()
-
-
-def _from_csv(path: Path, samples: int) -> Iterator[Recording]:
-    with path.open("rb") as file:
-        header = _header(file)
-        while lines := list(islice(file, samples)):
-            if any(map(bytes.strip, lines)):
-                yield of_table(path, table_of_text(path, header + b"".join(lines)))
-
-
-def _header(file: IO[bytes]) -> bytes:
-    """The first line that is not empty."""
-    for line in file:
-        if line.strip():
-            return line
-    return b""
-
-
-def _from_parquet(path: Path, samples: int) -> Iterator[Recording]:
-    file = open_parquet(path, whole=False)
-    names = [name for name, _ in signal_fields(file.schema_arrow)]
-    with damage(path):
-        batches = file.iter_batches(batch_size=samples, columns=names)
-    while True:
-        with damage(path):
-            batch = next(batches, None)
-        if batch is None:
-            return
-        table = needed("pyarrow").Table.from_batches([batch])
-        yield of_table(path, table_of(path, table), TraceMeta())

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stlc.jsontext import loads
 from stlc.signature import Column, Signature
-from stlc.trace.formats.npz import unreadable
+from stlc.trace.formats.registry import unreadable
 from stlc.units import DIMENSIONLESS, parse_unit
 
 _KINDS: dict[str, tuple[type, ...]] = {

@@ -18,12 +18,8 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.signature import Column, Kind, Signature
 from stlc.trace.enums import Words, in_numbers, wordless
-from stlc.trace.formats.csv import write_csv
-from stlc.trace.formats.extras import needed
-from stlc.trace.formats.npz import write_npz
-from stlc.trace.formats.registry import read_recording
-from stlc.trace.formats.table import GROUPS
-from stlc.trace.meta import TraceMeta, meta_array
+from stlc.trace.formats.registry import WRITTEN, format_of, needed, read_recording
+from stlc.trace.meta import TraceMeta
 from stlc.trace.recording import CLOCK, EXTRA, Recording, Strand, absent, fit
 from stlc.trace.resample import Grid, resampled, usual_step
 from stlc.trace.time_grid import read_clock, require_same_step, resample_advice
@@ -42,7 +38,6 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 RESERVED = ("t", "meta")
-WRITTEN = (".npz", ".csv", ".mcap")
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,23 +220,7 @@ def save_trace(path: Path | str, trace: Trace) -> None:
     taken = [name for name in trace.data if name in RESERVED or name.startswith(EXTRA)]
     if taken:
         raise TraceError(Diagnostic("E605", f"a recorded signal cannot be called `{taken[0]}`"))
-    if Path(path).suffix.lower() == ".csv":
-        if grouped := [name for name in trace.data if name in GROUPS]:
-            message = f"the column `{grouped[0]}` of a `.csv` says which trace a line is of"
-            raise TraceError(Diagnostic("E605", message, help=("write a `.npz`, which has no such column",)))
-        _to_csv(path, trace)
-        return
-    meta = meta_array(replace(trace.meta, dt=trace.dt), trace.signature)
-    if Path(path).suffix.lower() == ".mcap":
-        from stlc.trace.formats.mcap import Written, write_mcap
-
-        write_mcap(path, Written(trace.times, trace.data, trace.signature, meta, trace.meta.origin))
-        return
-    arrays: dict[str, NDArray[Any]] = {"t": trace.times}
-    arrays |= trace.data
-    arrays |= {f"{EXTRA}{name}": np.asarray(values) for name, values in trace.extras.items()}
-    arrays["meta"] = meta
-    write_npz(path, arrays)
+    format_of(Path(path)).function("write")(path, trace)
 
 
 def check_writable(path: Path | str) -> None:
@@ -251,21 +230,14 @@ def check_writable(path: Path | str) -> None:
         UsageError: U101, the suffix is none that traces are written with.
         MissingError: R301, an `.mcap` needs a package that is not installed.
     """
-    if Path(path).suffix.lower() == ".mcap":
-        needed("mcap.writer")
-    if Path(path).suffix.lower() not in WRITTEN and not Path(path).is_char_device():
+    suffix, found = Path(path).suffix.lower(), format_of(Path(path))
+    if suffix in WRITTEN and found.packages:
+        needed(found.packages[0])
+    if suffix not in WRITTEN and not Path(path).is_char_device():
         message = f"`{path}`: a trace is written as {', '.join(WRITTEN[:-1])} or {WRITTEN[-1]}"
         raise UsageError(
             Diagnostic("U101", message, help=(f"e.g. {Path(path).stem or 'trace'}{WRITTEN[0]}",))
         )
-
-
-def _to_csv(path: Path | str, trace: Trace) -> None:
-    columns: dict[str, NDArray[Any]] = {"t": np.tile(trace.times, trace.traces)}
-    if trace.traces > 1:
-        columns = {GROUPS[0]: np.repeat(np.arange(trace.traces), trace.samples), **columns}
-    columns |= {name: values.ravel() for name, values in trace.data.items()}
-    write_csv(path, columns, {column.name: column.unit.text for column in trace.signature.columns})
 
 
 def as_fraction(dt: float | Fraction) -> Fraction:

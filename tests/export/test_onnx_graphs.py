@@ -130,7 +130,7 @@ def test_a_step_of_many_parts_is_written_once(substeps: int) -> None:
     state: dict[str, ir.Num] = {"angle": angle, "speed": speed}
     lets: list[tuple[str, ir.Num]] = []
     for part in range(substeps):
-        rk4 = INTEGRATORS["rk4"]
+        rk4 = INTEGRATORS.get("rk4")
         moved = rk4(lambda at: {"angle": at["speed"], "speed": substitute(pull, at)}, state, 0.1 / substeps)
         lets += [(f"{name}#{part}", number) for name, number in moved.items()]
         state = {name: ir.Signal(f"{name}#{part}") for name in moved}

@@ -32,9 +32,10 @@ from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Sequence
 from stlc.files import beside
 from stlc.signature import Column
 from stlc.source import Span
+from stlc.trace.formats.registry import SUFFIXES
 
 MAX_COUNT = 1_000_000
-FORMATS = (".npz", ".csv", ".parquet", ".mat", ".mcap")
+
 _DRAWS = raw(mapping_of(VECTOR))
 
 
@@ -355,6 +356,6 @@ def _file(node: Node, names: tuple[str, ...], cx: Context) -> FileDecl | None:
     text = cx.reader.text(node, "`from`")
     if text is None:
         return None
-    if Path(text).suffix not in FORMATS:
-        cx.reader.wrong(node, "`from`", "a file of states", f"formats: {', '.join(FORMATS)}")
+    if Path(text).suffix.lower() not in SUFFIXES:
+        cx.reader.wrong(node, "`from`", "a file of states", f"formats: {', '.join(SUFFIXES)}")
     return FileDecl(beside(Path(node.span.source.name).parent, text), names, node.span)

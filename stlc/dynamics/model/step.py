@@ -10,7 +10,7 @@ from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.motion import JumpDecl
 from stlc.dynamics.model.algebra import add, blend, map_formula, multiply, substitute
 from stlc.dynamics.model.integrators import INTEGRATORS
-from stlc.dynamics.model.integrators.tableau import State
+from stlc.dynamics.model.integrators._tableau import State
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +102,7 @@ def _flow(decl: SystemDecl, writer: _Writer, state: State, given: State) -> Stat
         table = {**writer.named(at), **given}
         return {assign.name: substitute(assign.value, table) for assign in decl.flow}
 
-    integrate = INTEGRATORS[decl.integrator]
+    integrate = INTEGRATORS.get(decl.integrator)
     length = float(decl.dt) / decl.substeps
     for substep in range(decl.substeps):
         if substep:

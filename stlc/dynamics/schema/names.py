@@ -33,7 +33,7 @@ class Clockwork:
 
     dt: Fraction = key(SECONDS, "time step, exact", Fraction(1, 10), required=True)
     horizon: int = key(STEPS, "planning horizon, as a time or in steps", 0, required=True)
-    integrator: str = key(word(INTEGRATORS), "integration method", "euler")
+    integrator: str = key(word(INTEGRATORS.names), "integration method", "euler")
     substeps: int = key(integer(high=1000), "integration steps within one step", 1)
     discrete: bool = key(FLAG, "`flow` gives next values instead of derivatives", False)
 

@@ -21,10 +21,8 @@ from typing import Any, TypeAlias
 
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.files import is_stored
-from stlc.trace.formats.extras import needed
 from stlc.trace.formats.messages import MAX_BYTES, DamageError, Decode, Log, Room, mapped
-from stlc.trace.formats.npz import unreadable
-from stlc.trace.formats.parquet import damage
+from stlc.trace.formats.registry import damage, needed, unreadable
 from stlc.trace.formats.ros import decoder
 from stlc.trace.recording import Recording
 
@@ -35,6 +33,17 @@ _ALLOWED = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ)
 """What a query may do: no function, no pragma, no recursion that a database brings with it."""
 _LONGEST = 256_000_000
 """Bytes of a message."""
+
+
+def read(path: Path) -> Recording:
+    """The numbers in all messages of a bag: a `.bag`, a `.db3`, or a folder.
+
+    Raises:
+        UsageError: U102, there is no such file, or no bag in the folder.
+        MissingError: R301, a package is not installed.
+        TraceError: E603, another format, damaged, or without numbers.
+    """
+    return _read_ros1(path) if path.suffix.lower() == ".bag" and not path.is_dir() else _read_ros2(path)
 
 
 # --------------------------------------------------------------------------------- ROS 1
@@ -48,14 +57,8 @@ class _Connection:
     decode: Decode | None
 
 
-def read_bag(path: Path) -> Recording:
-    """The numbers in all messages of a bag of ROS 1.
-
-    Raises:
-        UsageError: U102, the file does not exist or cannot be opened.
-        MissingError: R301, chunks are packed with `lz4`, which is not installed.
-        TraceError: E603, another format, damaged, or without numbers.
-    """
+def _read_ros1(path: Path) -> Recording:
+    """The numbers in all messages of a bag of ROS 1."""
     log = Log(path)
     with mapped(path) as data, damage(path):
         if data[: len(_MAGIC)] != _MAGIC:
@@ -139,14 +142,8 @@ def _connection(log: Log, topic: str, content: bytes) -> _Connection:
 # --------------------------------------------------------------------------------- ROS 2
 
 
-def read_bag2(path: Path) -> Recording:
-    """The numbers in all messages of a bag of ROS 2: its folder, or one `.db3` of it.
-
-    Raises:
-        UsageError: U102, there is no such file, or no bag in the folder.
-        MissingError: R301, a package is not installed.
-        TraceError: E603, another format, damaged, or without numbers.
-    """
+def _read_ros2(path: Path) -> Recording:
+    """The numbers in all messages of a bag of ROS 2: its folder, or one `.db3` of it."""
     log = Log(path)
     if path.is_dir():
         stored = sorted((each for each in path.iterdir() if is_stored(each)), key=_order)

@@ -12,20 +12,24 @@ import io
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.diagnostics import Diagnostic, TraceError
 from stlc.escape import from_spreadsheet, spreadsheet
 from stlc.files import write_atomic
 from stlc.source import Source, Span
 from stlc.trace.formats.cells import NUMBER, STRETCH, Lines, bare, load, read_lines, value_of
-from stlc.trace.formats.npz import unreadable
-from stlc.trace.formats.table import Table, is_unit
+from stlc.trace.formats.registry import opened, unreadable
+from stlc.trace.formats.table import GROUPS, Table, is_unit, of_table
+from stlc.trace.recording import Recording
+
+if TYPE_CHECKING:
+    from stlc.trace.trace import Trace
 
 Array = NDArray[Any]
 
@@ -55,6 +59,25 @@ class _Sheet:
     body_at: int
 
 
+def read(path: Path) -> Recording:
+    """The trace of a file. Raises as `read_csv`, and TraceError (E605) as `of_table`."""
+    return of_table(path, read_csv(path))
+
+
+def size(path: Path) -> int:
+    """Bytes of the file, about as many as its numbers take."""
+    return path.stat().st_size
+
+
+def chunks(path: Path, samples: int) -> Iterator[Recording]:
+    """The trace of a file, so many lines at a time. Raises as `read`."""
+    with path.open("rb") as file:
+        header = next((line for line in file if line.strip()), b"")
+        while lines := list(islice(file, samples)):
+            if any(map(bytes.strip, lines)):
+                yield of_table(path, table_of_text(path, header + b"".join(lines)))
+
+
 def read_csv(path: Path) -> Table:
     """The columns of a `.csv` file (comma, semicolon or tab; UTF-8); those of words are texts.
 
@@ -78,12 +101,8 @@ def table_of_text(path: Path, data: bytes) -> Table:
 
 
 def _read(path: Path) -> bytes:
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        reason = (error.strerror or type(error).__name__).lower()
-        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: {reason}")) from None
+    with opened(path), path.open("rb") as file:
+        data = file.read(MAX_BYTES + 1)
     if len(data) > MAX_BYTES:
         raise unreadable(path, f"it is larger than {MAX_BYTES / 1e9:.0f} GB", advice="save it as `.npz`")
     return data
@@ -299,6 +318,23 @@ def _decimal_comma(sheet: _Sheet, cells: Sequence[object], width: int) -> tuple[
     if sheet.delimiter == "," and len(cells) == 2 * width:
         return ("decimal commas? write a point, or separate the columns with `;`",)
     return ()
+
+
+def write(path: Path | str, trace: Trace) -> None:
+    """Write the signals of a trace, a line a sample; `trace` numbers them where there are several.
+
+    Raises:
+        TraceError: E605, a signal has a name that the format reserves, or as `write_csv`.
+        MissingError: R201, no room or no permission.
+    """
+    if grouped := [name for name in trace.data if name in GROUPS]:
+        message = f"the column `{grouped[0]}` of a `.csv` says which trace a line is of"
+        raise TraceError(Diagnostic("E605", message, help=("write a `.npz`, which has no such column",)))
+    columns: dict[str, NDArray[Any]] = {"t": np.tile(trace.times, trace.traces)}
+    if trace.traces > 1:
+        columns = {GROUPS[0]: np.repeat(np.arange(trace.traces), trace.samples), **columns}
+    columns |= {name: values.ravel() for name, values in trace.data.items()}
+    write_csv(path, columns, {column.name: column.unit.text for column in trace.signature.columns})
 
 
 def write_csv(path: Path | str, columns: Mapping[str, NDArray[Any]], units: Mapping[str, str]) -> None:

@@ -14,11 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, UsageError
-from stlc.trace.formats.extras import needed
 from stlc.trace.formats.mat5 import complex_of, read_mat5
-from stlc.trace.formats.npz import MAX_ARRAYS, MAX_BYTES, room_for, unreadable
-from stlc.trace.formats.parquet import damage
+from stlc.trace.formats.npz import MAX_ARRAYS
+from stlc.trace.formats.registry import MAX_BYTES, damage, needed, opened, room_for, unreadable
 from stlc.trace.recording import Recording, of_arrays
 
 Array = NDArray[Any]
@@ -29,7 +27,7 @@ _RATIO = 1100
 """More than deflate can shrink anything."""
 
 
-def read_mat(path: Path) -> Recording:
+def read(path: Path) -> Recording:
     """The numeric variables of a file.
 
     Raises:
@@ -37,12 +35,8 @@ def read_mat(path: Path) -> Recording:
         MissingError: R301, version 7.3 needs `h5py`.
         TraceError: E603, another format, damaged, or larger than it may be.
     """
-    try:
-        with path.open("rb") as file:
-            head = file.read(520)
-    except OSError as error:
-        reason = (error.strerror or type(error).__name__).lower()
-        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: {reason}")) from None
+    with opened(path), path.open("rb") as file:
+        head = file.read(520)
     if path.stat().st_size > MAX_BYTES:
         raise unreadable(path, f"it is larger than {MAX_BYTES / 1e9:.0f} GB", advice="split it")
     if _HDF5 in (head[:8], head[512:520]):

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.trace.formats.npz import MAX_ARRAYS, room_for, unreadable
+from stlc.trace.formats.npz import MAX_ARRAYS
+from stlc.trace.formats.registry import room_for, unreadable
 
 Array = NDArray[Any]
 

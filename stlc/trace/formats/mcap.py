@@ -10,17 +10,14 @@ import json
 import math
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, TYPE_CHECKING, Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stlc.escape import topic as topic_of
 from stlc.files import atomic_path
-from stlc.signature import Signature
-from stlc.trace.formats.extras import needed
 from stlc.trace.formats.messages import (
     DEEPEST,
     HEADER,
@@ -34,20 +31,20 @@ from stlc.trace.formats.messages import (
     mapped,
     numbers_of,
 )
-from stlc.trace.formats.npz import unreadable
-from stlc.trace.formats.parquet import damage
+from stlc.trace.formats.registry import damage, needed, unreadable
 from stlc.trace.formats.ros import decoder
-from stlc.trace.meta import read_meta
+from stlc.trace.meta import meta_array, read_meta
 from stlc.trace.recording import Recording, Strand
 
-Floats = NDArray[np.float64]
+if TYPE_CHECKING:
+    from stlc.trace.trace import Trace
 
 OURS = "stlc"
 """The record of a file that says what its signals mean."""
 _READ = "read are JSON, Protocol Buffers, and ROS 1 and 2"
 
 
-def read_mcap(path: Path) -> Recording:
+def read(path: Path) -> Recording:
     """The numbers in all messages; signals that are not in every message of their topic are left out.
 
     Raises:
@@ -206,25 +203,7 @@ def _proto_value(name: str, value: Any, each: Any, depth: int) -> Iterator[Numbe
 # ---------------------------------------------------------------------------- stlc's own
 
 
-@dataclass(frozen=True, slots=True)
-class Written:
-    """A trace as it is written.
-
-    Attributes:
-        times: in seconds, (samples,).
-        data: signal -> (traces, samples).
-        signature: what they mean.
-        meta: where they come from; `origin` is the time of day at time 0.
-    """
-
-    times: Floats
-    data: Mapping[str, Floats]
-    signature: Signature
-    meta: NDArray[np.str_]
-    origin: int | None
-
-
-def write_mcap(path: Path | str, trace: Written) -> None:
+def write(path: Path | str, trace: Trace) -> None:
     """Write signals as messages of JSON: topic `/NAME` of a file `NAME.mcap`, or `/NAME/0`, `/NAME/1`, ….
 
     Raises:
@@ -232,11 +211,11 @@ def write_mcap(path: Path | str, trace: Written) -> None:
             was.
     """
     writers = needed("mcap.writer")
-    traces = len(next(iter(trace.data.values())))
     base = "/" + topic_of(Path(path).stem, empty="trace")
-    topics = [base] if traces == 1 else [f"{base}/{k}" for k in range(traces)]
+    topics = [base] if trace.traces == 1 else [f"{base}/{k}" for k in range(trace.traces)]
     first = math.floor(float(trace.times[0]) * 1e9)
-    origin = max(trace.origin or 0, -first)
+    origin = max(trace.meta.origin or 0, -first)
+    meta = meta_array(replace(trace.meta, dt=trace.dt), trace.signature)
     stamps = [origin + round(float(t) * 1e9) for t in trace.times]
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         writer = writers.Writer(file)
@@ -250,9 +229,7 @@ def write_mcap(path: Path | str, trace: Written) -> None:
                     f"{json.dumps(name)}: {_cell(values[k][i])}" for name, values in rows.items()
                 )
                 writer.add_message(channel, stamp, f"{{{cells}}}".encode(), stamp, sequence=k)
-        writer.add_metadata(
-            OURS, {"topics": json.dumps(topics), "origin": str(origin), "meta": str(trace.meta)}
-        )
+        writer.add_metadata(OURS, {"topics": json.dumps(topics), "origin": str(origin), "meta": str(meta)})
         writer.finish()
 
 
@@ -263,7 +240,7 @@ def _cell(value: float) -> str:
     return repr(value) if math.isfinite(value) else "1e999" if value > 0 else "-1e999"
 
 
-def _schema(trace: Written) -> dict[str, object]:
+def _schema(trace: Trace) -> dict[str, object]:
     units = {column.name: column.unit.text for column in trace.signature.columns}
     properties = {
         name: {"type": "number"} | ({"description": units[name]} if units.get(name) else {})

@@ -19,10 +19,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, UsageError
 from stlc.signature import Column
-from stlc.trace.formats.extras import needed
-from stlc.trace.formats.npz import unreadable
+from stlc.trace.formats.registry import needed, opened, unreadable
 from stlc.trace.meta import TraceMeta
 from stlc.trace.recording import Recording, Strand
 
@@ -85,17 +83,13 @@ def mapped(path: Path) -> Iterator[mmap]:
         UsageError: U102, the file does not exist or cannot be opened.
         TraceError: E603, it is empty, or larger than it may be.
     """
-    try:
-        with path.open("rb") as file:
-            size = file.seek(0, 2)
-            if size > MAX_BYTES:
-                raise unreadable(path, f"it is larger than {MAX_BYTES / 1e9:.0f} GB", advice="split it")
-            if not size:
-                raise unreadable(path, "it is empty")
-            data = mmap(file.fileno(), 0, access=ACCESS_READ)
-    except OSError as error:
-        reason = (error.strerror or type(error).__name__).lower()
-        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: {reason}")) from None
+    with opened(path), path.open("rb") as file:
+        size = file.seek(0, 2)
+        if size > MAX_BYTES:
+            raise unreadable(path, f"it is larger than {MAX_BYTES / 1e9:.0f} GB", advice="split it")
+        if not size:
+            raise unreadable(path, "it is empty")
+        data = mmap(file.fileno(), 0, access=ACCESS_READ)
     with data:
         yield data
 

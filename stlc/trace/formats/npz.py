@@ -12,17 +12,24 @@ import tokenize
 import warnings
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.lib.format as npy
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.diagnostics import Diagnostic, TraceError
 from stlc.files import atomic_path
+from stlc.trace.formats.registry import damage, opened, room_for, unreadable
+from stlc.trace.meta import meta_array, read_meta
+from stlc.trace.recording import EXTRA, Recording, of_arrays
+
+if TYPE_CHECKING:
+    from stlc.trace.trace import Trace
 
 try:
     from lzma import LZMAError
@@ -31,14 +38,9 @@ except ImportError:  # a Python without it: `zipfile` says so
 
 Array = NDArray[Any]
 
-MAX_BYTES = 4_000_000_000
 MAX_NAME = 60_000
 """Bytes of the name of an array that an archive has room for."""
 MAX_ARRAYS = 10_000
-
-_ROOM = 500_000_000
-_RATIO = 200
-"""A packed file may unpack to `_ROOM`, or to so many times its size; records of sensors take a tenth."""
 
 _LAST_LETTER, _PAIRS = 0x10FFFF, (0xD800, 0xDFFF)
 """What Unicode knows, and the halves of pairs that are no letters on their own."""
@@ -64,13 +66,6 @@ _DAMAGE = (
 )
 
 
-def unreadable(path: Path | str, why: str, *, advice: str = "") -> TraceError:
-    """E603: the file cannot be read, or is not safe to read."""
-    return TraceError(
-        Diagnostic("E603", f"cannot read `{path}`: {why}", help=(advice,) if advice else ()),
-    )
-
-
 def read_npz(path: Path) -> dict[str, Array]:
     """The arrays of an `.npz` file: numbers of any shape, and texts.
 
@@ -78,14 +73,13 @@ def read_npz(path: Path) -> dict[str, Array]:
         UsageError: U102, the file does not exist or cannot be opened.
         TraceError: E603, it is no archive of plain arrays, is damaged, or would not fit into memory.
     """
+    with opened(path):
+        file = path.open("rb")
     try:
-        with path.open("rb") as file:
+        with file:
             _check_magic(path, file)
             with zipfile.ZipFile(file) as archive:
                 return _read_members(path, archive)
-    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        reason = (error.strerror or type(error).__name__).lower()
-        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: {reason}")) from None
     except _DAMAGE as error:
         raise unreadable(path, f"the archive is damaged or cut short ({_brief(error)})") from None
 
@@ -109,83 +103,68 @@ def _check_magic(path: Path, file: IO[bytes]) -> None:
     raise unreadable(path, "it is empty" if not start else "it is not an `.npz` archive")
 
 
-def room_for(path: Path) -> int:
-    """Bytes that a packed file may unpack to."""
-    return min(MAX_BYTES, max(_ROOM, _RATIO * path.stat().st_size))
-
-
 class Member:
-    """One array of an open archive, read from its start on, so many values along the time axis at a time.
+    """One array of an open archive: read as a whole, or from its start on, so many samples at a time.
 
     Attributes:
-        length: samples: of the last axis of (samples,) and (1, samples), else of the first one.
+        length: samples: of the last axis of (samples,) and (1, samples), else of the first one; -1 where
+            samples do not lie one after the other.
     """
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, stack: ExitStack) -> None:
         self._path, self._name = path, info.filename.removesuffix(".npy")
         self._stream = stack.enter_context(archive.open(info))
-        self._shape, fortran, self._dtype = _checked_header(path, self._stream, info, self._name)
+        self._shape, self._fortran, self._dtype = _checked_header(path, self._stream, info, self._name)
         row = self._shape[:1] == (1,) or len(self._shape) == 1
         self._width = 1 if row else math.prod(self._shape[1:])
         self.length = self._shape[-1] if row and self._shape else (self._shape or (0,))[0]
-        if fortran and not row and len(self._shape) > 1:
+        if self._fortran and not row and len(self._shape) > 1:
             self.length = -1
 
     def read(self, count: int) -> Array:
         """The next `count` samples: (count,) or (count, …)."""
-        size = count * self._width * self._dtype.itemsize
-        data = self._stream.read(size)
-        if len(data) != size:
-            raise unreadable(self._path, f"`{self._name}` is cut short")
-        values = np.frombuffer(data, dtype=self._dtype)
-        _check_letters(self._path, self._name, values)
+        values = self._values(count * self._width)
         return values if self._width == 1 else values.reshape(count, *self._shape[1:])
 
     def whole(self) -> Array:
         """All of it, in its own shape."""
-        data = self._stream.read(math.prod(self._shape) * self._dtype.itemsize)
-        values = np.frombuffer(data, dtype=self._dtype)
+        values = self._values(math.prod(self._shape)).copy()
+        return values.reshape(self._shape, order="F" if self._fortran else "C")
+
+    def _values(self, count: int) -> Array:
+        data = self._stream.read(count * self._dtype.itemsize)
+        if len(data) != count * self._dtype.itemsize:
+            raise unreadable(self._path, f"`{self._name}` is cut short")
+        values = np.frombuffer(data, dtype=self._dtype) if data else np.zeros(0, self._dtype)
         _check_letters(self._path, self._name, values)
-        return values.reshape(self._shape)
+        return values
 
 
-def open_members(path: Path, stack: ExitStack) -> dict[str, Member]:
-    """The arrays of an archive that stays open as long as the stack. Raises as `read_npz`."""
-    archive = stack.enter_context(zipfile.ZipFile(path))
+def _infos(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """The members of an archive by the names of their arrays."""
     members = archive.infolist()
     if len(members) > MAX_ARRAYS:
         raise unreadable(path, f"it holds {len(members)} arrays, more than {MAX_ARRAYS}")
-    return {info.filename.removesuffix(".npy"): Member(path, archive, info, stack) for info in members}
+    found: dict[str, zipfile.ZipInfo] = {}
+    for member in members:
+        name = member.filename.removesuffix(".npy")
+        if name in found:
+            raise unreadable(path, f"it holds the array `{name}` twice")
+        found[name] = member
+    return found
 
 
 def _read_members(path: Path, archive: zipfile.ZipFile) -> dict[str, Array]:
-    members = archive.infolist()
-    if len(members) > MAX_ARRAYS:
-        raise unreadable(path, f"it holds {len(members)} arrays, more than {MAX_ARRAYS}")
-    size = sum(member.file_size for member in members)
-    most = room_for(path)
+    infos = _infos(path, archive)
+    size, most = sum(info.file_size for info in infos.values()), room_for(path)
     if size > most:
         reason = f"it unpacks to {size / 1e9:.1f} GB, more than {most / 1e9:.1f} GB"
         raise unreadable(path, reason, advice="split it, or do not compress it")
     arrays: dict[str, Array] = {}
-    for member in members:
-        name = member.filename.removesuffix(".npy")
-        if name in arrays:
-            raise unreadable(path, f"it holds the array `{name}` twice")
-        arrays[name] = _read_array(path, archive, member, name)
+    for name, info in infos.items():
+        with ExitStack() as stack:
+            arrays[name] = Member(path, archive, info, stack).whole()
     return arrays
-
-
-def _read_array(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) -> Array:
-    with archive.open(member) as stream:
-        shape, fortran, dtype = _checked_header(path, stream, member, name)
-        size = math.prod(shape) * dtype.itemsize
-        data = stream.read(size)
-    if len(data) != size:
-        raise unreadable(path, f"`{name}` is cut short")
-    flat = np.frombuffer(bytearray(data), dtype=dtype) if size else np.zeros(0, dtype)
-    _check_letters(path, name, flat)
-    return flat.reshape(shape, order="F" if fortran else "C")
 
 
 def _check_letters(path: Path, name: str, values: Array) -> None:
@@ -225,6 +204,56 @@ def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return readers[version](stream)
+
+
+# ------------------------------------------------------------------------------- as a format
+
+
+def read(path: Path) -> Recording:
+    """The trace of a file. Raises as `read_npz`, and TraceError (E603) for a `meta` that is none."""
+    arrays = read_npz(path)
+    meta, columns = read_meta(path, arrays.pop("meta", None))
+    return replace(of_arrays(path, arrays, meta), columns=columns)
+
+
+def size(path: Path) -> int:
+    """Bytes of all arrays; 0 where it is no archive."""
+    if not zipfile.is_zipfile(path):
+        return 0
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return sum(member.file_size for member in archive.infolist())
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
+        return 0
+
+
+def chunks(path: Path, samples: int) -> Iterator[Recording]:
+    """The trace of a file, so many samples at a time. Raises TraceError as `read`."""
+    with ExitStack() as stack, damage(path):
+        archive = stack.enter_context(zipfile.ZipFile(path))
+        members = {name: Member(path, archive, i, stack) for name, i in _infos(path, archive).items()}
+        described = members.pop("meta", None)
+        meta, columns = read_meta(path, None if described is None else described.whole())
+        signals = {name: m for name, m in members.items() if not name.startswith(EXTRA)}
+        length = max((member.length for member in signals.values()), default=0)
+        odd = [name for name, member in signals.items() if member.length != length]
+        if odd:
+            message = (
+                f"`{odd[0]}` in `{path}` is not one value per sample: such a file cannot be read in pieces"
+            )
+            raise TraceError(Diagnostic("E605", message))
+        for begin in range(0, length, samples):
+            count = min(samples, length - begin)
+            arrays = {name: member.read(count) for name, member in signals.items()}
+            yield replace(of_arrays(path, arrays, meta), columns=columns)
+
+
+def write(path: Path | str, trace: Trace) -> None:
+    """Write all of a trace. Raises as `write_npz`."""
+    arrays: dict[str, Array] = {"t": trace.times, **trace.data}
+    arrays |= {f"{EXTRA}{name}": np.asarray(values) for name, values in trace.extras.items()}
+    arrays["meta"] = meta_array(replace(trace.meta, dt=trace.dt), trace.signature)
+    write_npz(path, arrays)
 
 
 def write_npz(path: Path | str, arrays: Mapping[str, Array]) -> None:

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, StlcError, TraceError, UsageError
+from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.trace.formats.csv import split_head
-from stlc.trace.formats.extras import needed
-from stlc.trace.formats.npz import MAX_BYTES, room_for, unreadable
+from stlc.trace.formats.registry import MAX_BYTES, damage, needed, room_for, unreadable
 from stlc.trace.formats.table import Table, of_table
 from stlc.trace.recording import Recording
 
@@ -27,7 +26,7 @@ MAX_LETTERS = 64
 """Longer texts are cut; no member of an enum has so long a name."""
 
 
-def read_parquet(path: Path) -> Recording:
+def read(path: Path) -> Recording:
     """The columns of a file that can be signals, and its words.
 
     Raises:
@@ -37,8 +36,8 @@ def read_parquet(path: Path) -> Recording:
     """
     file = open_parquet(path)
     with damage(path):
-        table = file.read(columns=[name for name, _ in signal_fields(file.schema_arrow)])
-    return of_table(path, table_of(path, table))
+        table = file.read(columns=_names(file))
+    return of_table(path, _table(path, table))
 
 
 def open_parquet(path: Path, *, whole: bool = True) -> Any:
@@ -56,29 +55,34 @@ def open_parquet(path: Path, *, whole: bool = True) -> Any:
     return file
 
 
-class damage:  # noqa: N801 - reads as a word: with damage(path): …
-    """Whatever a library says about a file that it cannot read, as E603."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        if isinstance(error, Exception) and not isinstance(error, StlcError):
-            lines = str(error).strip().splitlines()
-            why = lines[0][:100] if lines else type(error).__name__
-            raise unreadable(self.path, f"it is damaged or of another format ({why})") from None
+def size(path: Path) -> int:
+    """Bytes of all numbers."""
+    metadata = open_parquet(path, whole=False).metadata
+    return int(metadata.num_rows * metadata.num_columns * 8)
 
 
-def signal_fields(schema: Any) -> Iterator[tuple[str, Any]]:
-    """Name and type of every column that can be a signal, or holds words."""
+def chunks(path: Path, samples: int) -> Iterator[Recording]:
+    """The trace of a file, so many rows at a time. Raises as `read`."""
+    file = open_parquet(path, whole=False)
+    with damage(path):
+        batches = file.iter_batches(batch_size=samples, columns=_names(file))
+    while True:
+        with damage(path):
+            batch = next(batches, None)
+        if batch is None:
+            return
+        yield of_table(path, _table(path, needed("pyarrow").Table.from_batches([batch])))
+
+
+def _names(file: Any) -> list[str]:
+    """The columns that can be signals, or hold words."""
     types = needed("pyarrow").types
-    for field in schema:
+    found = []
+    for field in file.schema_arrow:
         kind = field.type.value_type if _list(field.type, types) else field.type
         if _numeric(kind, types) or _text(field.type, types):
-            yield field.name, field.type
+            found.append(field.name)
+    return found
 
 
 def _numeric(kind: Any, types: Any) -> bool:
@@ -95,7 +99,7 @@ def _list(kind: Any, types: Any) -> bool:
     return bool(types.is_fixed_size_list(kind) or types.is_list(kind) or types.is_large_list(kind))
 
 
-def table_of(path: Path, table: Any) -> Table:
+def _table(path: Path, table: Any) -> Table:
     """An arrow table as numbers and words; a missing number is NaN, a missing word empty.
 
     Raises:

@@ -1,32 +1,82 @@
-"""Which reader reads which file: by its suffix; everything that is not known is taken for an `.npz`."""
+"""The formats of trace files: one table, and what their readers share.
+
+A format is a module of this package and a line of `FORMATS`. The module holds
+
+- `read(path) -> Recording`;
+- if it `writes`: `write(path, trace)`;
+- if it is `chunked`: `size(path) -> int`, the bytes of its numbers in memory (0: not readable in chunks), and
+  `chunks(path, samples) -> Iterator[Recording]`.
+
+It imports libraries that not everybody has with `needed`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 from zipfile import is_zipfile
 
-from stlc.trace.formats.csv import read_csv
-from stlc.trace.formats.npz import read_npz, unreadable
-from stlc.trace.formats.table import of_table
-from stlc.trace.meta import read_meta
-from stlc.trace.recording import Recording, of_arrays
+from stlc.diagnostics import Diagnostic, MissingError, StlcError, TraceError, UsageError
 
-Reader = Callable[[Path], Recording]
+if TYPE_CHECKING:
+    from stlc.trace.recording import Recording
 
-TABLES = (".csv", ".tsv")
-SUFFIXES = (".npz", *TABLES, ".parquet", ".pq", ".mat", ".mcap", ".bag", ".db3")
+MAX_BYTES = 4_000_000_000
+_ROOM = 500_000_000
+_RATIO = 200
+"""A packed file may unpack to `_ROOM`, or to so many times its size; records of sensors take a tenth."""
 
-_LAZY: Mapping[str, str] = {
-    ".parquet": "stlc.trace.formats.parquet:read_parquet",
-    ".pq": "stlc.trace.formats.parquet:read_parquet",
-    ".mat": "stlc.trace.formats.mat:read_mat",
-    ".mcap": "stlc.trace.formats.mcap:read_mcap",
-    ".bag": "stlc.trace.formats.bag:read_bag",
-    ".db3": "stlc.trace.formats.bag:read_bag2",
-}
-_FOLDER = "stlc.trace.formats.bag:read_bag2"
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A format of trace files.
+
+    Attributes:
+        module: of this package.
+        suffixes: of its files, in lower case; files are written with the first.
+        extra: of the package `stlc`, that installs what the format needs.
+        packages: modules of that extra.
+        writes: traces can be written.
+        chunked: files can be read a number of samples at a time.
+        folder: a folder may be one recording.
+    """
+
+    module: str
+    suffixes: tuple[str, ...]
+    extra: str = ""
+    packages: tuple[str, ...] = ()
+    writes: bool = False
+    chunked: bool = False
+    folder: bool = False
+
+    def function(self, name: str) -> Any:
+        """A function of the module, imported now."""
+        return getattr(import_module(f"{__package__}.{self.module}"), name)
+
+
+FORMATS = (
+    Format("npz", (".npz",), writes=True, chunked=True),
+    Format("csv", (".csv", ".tsv"), writes=True, chunked=True),
+    Format("parquet", (".parquet", ".pq"), "parquet", ("pyarrow",), chunked=True),
+    Format("mat", (".mat",), "mat", ("h5py",)),
+    Format("mcap", (".mcap",), "mcap", ("mcap", "google"), writes=True),
+    Format("bag", (".bag", ".db3"), "bag", ("rosbags", "lz4", "zstandard"), folder=True),
+)
+SUFFIXES = tuple(suffix for each in FORMATS for suffix in each.suffixes)
+WRITTEN = tuple(each.suffixes[0] for each in FORMATS if each.writes)
+_PACKAGES = {"google": "protobuf"}
+"""Names of packages that differ from those of their modules."""
+
+
+def format_of(path: Path) -> Format:
+    """The format of a file, by its suffix; what is not known is taken for the first."""
+    if path.is_dir():
+        return next(each for each in FORMATS if each.folder)
+    return next((each for each in FORMATS if path.suffix.lower() in each.suffixes), FORMATS[0])
 
 
 def read_recording(path: Path) -> Recording:
@@ -37,23 +87,61 @@ def read_recording(path: Path) -> Recording:
         MissingError: R301, the format needs a package that is not installed.
         TraceError: the file cannot be read (E603) or does not fit together (E605).
     """
-    suffix = path.suffix.lower()
-    if suffix in TABLES:
-        return of_table(path, read_csv(path))
-    where = _FOLDER if path.is_dir() else _LAZY.get(suffix)
-    if where is None:
-        return _from_npz(path)
-    module, _, function = where.partition(":")
-    reader: Reader = getattr(import_module(module), function)
-    return reader(path)
-
-
-def _from_npz(path: Path) -> Recording:
     if path.suffix.lower() not in SUFFIXES and path.is_file() and not is_zipfile(path):
         why = f"its suffix is none of {' '.join(SUFFIXES)}"
         raise unreadable(path, why, advice="give it the suffix of its format")
-    arrays = read_npz(path)
-    meta, columns = read_meta(path, arrays.pop("meta", None))
-    recording = of_arrays(path, arrays, meta)
-    (strand,) = recording.strands
-    return Recording(str(path), (strand,), columns, meta, recording.extras)
+    found: Recording = format_of(path).function("read")(path)
+    return found
+
+
+# ----------------------------------------------------------------------- what readers share
+
+
+def needed(module: str) -> Any:
+    """The module, imported.
+
+    Raises:
+        MissingError: R301, its package is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError:
+        package = module.partition(".")[0]
+        extra = next((each.extra for each in FORMATS if package in each.packages), "all")
+        message = f"this needs the package `{_PACKAGES.get(package, package)}`, which is not installed"
+        raise MissingError(Diagnostic("R301", message, help=(f"pip install 'stlc[{extra}]'",))) from None
+
+
+def unreadable(path: Path | str, why: str, *, advice: str = "") -> TraceError:
+    """E603: the file cannot be read, or is not safe to read."""
+    return TraceError(
+        Diagnostic("E603", f"cannot read `{path}`: {why}", help=(advice,) if advice else ()),
+    )
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[None]:
+    """What the system says about a file that cannot be opened, as UsageError (U102)."""
+    try:
+        yield
+    except OSError as error:
+        reason = (error.strerror or type(error).__name__).lower()
+        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: {reason}")) from None
+
+
+@contextmanager
+def damage(path: Path) -> Iterator[None]:
+    """What a library says about a file that it cannot read, as TraceError (E603)."""
+    try:
+        yield
+    except StlcError:
+        raise
+    except Exception as error:
+        lines = str(error).strip().splitlines()
+        why = lines[0][:100] if lines else type(error).__name__
+        raise unreadable(path, f"it is damaged or of another format ({why})") from None
+
+
+def room_for(path: Path) -> int:
+    """Bytes that a packed file may unpack to."""
+    return min(MAX_BYTES, max(_ROOM, _RATIO * path.stat().st_size))

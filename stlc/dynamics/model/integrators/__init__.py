@@ -1,12 +1,8 @@
-"""Integrators by name: every module of this package that holds a `TABLEAU` is one."""
+"""Integrators: every module of this package is one, and holds a `TABLEAU`."""
 
-from collections.abc import Mapping
-from importlib import import_module
-from pkgutil import iter_modules
+from stlc.dynamics.model.integrators._tableau import Tableau
+from stlc.registry import PackageRegistry
 
-from stlc.dynamics.model.integrators.tableau import Tableau
-
-_MODULES = {each.name: import_module(f"{__name__}.{each.name}") for each in iter_modules(__path__)}
-INTEGRATORS: Mapping[str, Tableau] = {
-    name: module.TABLEAU for name, module in _MODULES.items() if hasattr(module, "TABLEAU")
-}
+INTEGRATORS: PackageRegistry[Tableau] = PackageRegistry(
+    "integrator", "stlc.dynamics.model.integrators", "TABLEAU", default="euler"
+)

@@ -1,5 +1,5 @@
 """Heun's method: second order, two evaluations."""
 
-from stlc.dynamics.model.integrators.tableau import Tableau
+from stlc.dynamics.model.integrators._tableau import Tableau
 
 TABLEAU = Tableau(stages=((), (1,)), weights=(1, 1), divisor=2)

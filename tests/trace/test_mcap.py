@@ -18,7 +18,7 @@ from stlc.trace import Reading, Trace, TraceMeta, load_trace, save_trace
 from stlc.units import parse_unit
 
 writers = pytest.importorskip("mcap.writer")
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
 
 import robot_logs  # noqa: E402
 

@@ -22,7 +22,7 @@ scipy_io = pytest.importorskip("scipy.io")
 h5py = pytest.importorskip("h5py")
 mcap_writer = pytest.importorskip("mcap_ros2.writer")
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
 
 import robot_logs  # noqa: E402
 
@@ -177,7 +177,7 @@ def test_mat5_that_declares_more_than_it_holds(tmp_path: Path, monkeypatch: pyte
     (tmp_path / "a.mat").write_bytes(raw)
     assert "declares 1 x 2147483647 values" in message_of(tmp_path / "a.mat")
     bomb = zlib.compress(b"\0" * 10_000_000)
-    monkeypatch.setattr("stlc.trace.formats.npz.MAX_BYTES", 1_000_000)
+    monkeypatch.setattr("stlc.trace.formats.registry.MAX_BYTES", 1_000_000)
     head = b"MATLAB 5.0".ljust(124) + b"\x00\x01IM"
     (tmp_path / "b.mat").write_bytes(head + struct.pack("<II", 15, len(bomb)) + bomb)
     assert "unpacks to" in message_of(tmp_path / "b.mat")

@@ -18,7 +18,7 @@ from stlc.trace import Reading, Trace, load_trace
 from stlc.trace.formats.messages import DamageError
 from stlc.trace.formats.ros import decoder
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
 
 import robot_logs
 

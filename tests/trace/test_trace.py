@@ -208,7 +208,7 @@ def test_a_huge_declared_shape_asks_for_no_memory(tmp_path: Path) -> None:
 
 
 def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stlc.trace.formats.npz.MAX_BYTES", 1_000_000)
+    monkeypatch.setattr("stlc.trace.formats.registry.MAX_BYTES", 1_000_000)
     np.savez_compressed(tmp_path / "a.npz", t=np.zeros(1_000_000))
     assert (tmp_path / "a.npz").stat().st_size < 20_000
     assert "unpacks to" in message_of(tmp_path / "a.npz")
@@ -218,7 +218,7 @@ def test_a_small_archive_that_unpacks_to_a_large_one(tmp_path: Path, monkeypatch
     path = tmp_path / "a.npz"
     np.savez_compressed(path, t=np.arange(1_000_000.0), x=np.zeros(1_000_000))
     assert load_trace(path).samples == 1_000_000
-    monkeypatch.setattr("stlc.trace.formats.npz._ROOM", 1_000_000)
+    monkeypatch.setattr("stlc.trace.formats.registry._ROOM", 1_000_000)
     assert load_trace(path).samples == 1_000_000, "what is not all alike is packed far less"
     np.savez_compressed(path, t=np.zeros(1_000_000), x=np.zeros(1_000_000))
     assert "unpacks to" in message_of(path)
