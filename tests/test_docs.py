@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import re
 import shlex
 import shutil
@@ -14,15 +15,17 @@ from typing import Any
 import pytest
 import typer
 
-from stlc.cli.framework.app import app, main
-from stlc.cli.framework.pages import read_page
+from benchmarks.__main__ import PROGRAM as MEASURE
+from stlc.cli.commands.explain import read_page
+from stlc.cli.framework.app import PROGRAM as STLC
+from stlc.cli.framework.app import main
 from stlc.diagnostics import CODES
 from stlc.dynamics.declaration.load import SystemKeys
 from stlc.dynamics.schema.record import reference
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
-PROGRAM: Any = typer.main.get_command(app)
+PROGRAM: Any = typer.main.get_command(STLC.made())
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PLACEHOLDERS = re.compile(r"…|\.\.\.")
 
@@ -59,7 +62,7 @@ def hold(page: Path, marker: str, wanted: str, *, regenerate: bool) -> None:
 
 
 def test_the_reference_is_what_help_says(regenerate):
-    everywhere = [row(param) for param in PROGRAM.params if param.name in ("color", "version")]
+    everywhere = [row(param) for param in PROGRAM.params if param.name in ("color", "quiet", "version")]
     head = "\n".join(["| | default | |", "|---|---|---|", *everywhere, "", ""])
     text = head + "\n".join(command_section(name, command) for name, command in every_command())
     hold(ROOT / "docs/cli.md", "commands", text, regenerate=regenerate)
@@ -224,6 +227,19 @@ def test_running_text_names_commands_that_exist(page):
     assert {word for word in words if word.isidentifier()} <= set(PROGRAM.commands)
 
 
+BENCHMARKS: Any = typer.main.get_command(MEASURE.made())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_a_command_line_of_the_benchmarks_can_be_parsed(page):
+    text = page.read_text(encoding="utf-8")
+    for line in re.findall(r"(?:`|^\$ )python -m benchmarks ([^`\n]+)", text, re.MULTILINE):
+        if not PLACEHOLDERS.search(line):
+            name, command, words = BENCHMARKS.resolve_command(None, shlex.split(line, comments=True))
+            with contextlib.suppress(typer.Exit):  # --help
+                command.make_context(name, list(words))
+
+
 def test_command_lines_were_found():
     assert len(LINES) > 12
 
@@ -330,9 +346,9 @@ ROOMS = {
     "controller": "controller: who acts",
     "export": "export: a controller taken away",
     "view": "view: what is drawn",
-    "bench": "bench: the tables of the paper, and how fast the library is",
     "editor": "editor: what an editor asks",
     "cli": "cli: the terminal",
+    "../benchmarks": "benchmarks: the tables of the documentation, beside the package",
 }
 
 
@@ -346,14 +362,16 @@ def test_every_file_is_listed_with_its_first_line(regenerate):
         for folder in folders:
             files = [path for path in sorted(folder.glob("*.py")) if not path.stem.startswith("__")]
             if folder != folders[0]:
-                name = folder.relative_to(ROOT / "stlc").as_posix()
+                name = folder.relative_to(ROOT / "stlc" / room).as_posix()
+                name = name if room.startswith("..") else f"{room}/{name}"
                 parts += [f"### `{name}`", "", first_line(folder / "__init__.py"), ""]
             if files:
                 rows = [f"| `{path.name}` | {first_line(path)} |" for path in files]
                 parts += ["| file | purpose |", "|---|---|", *rows, ""]
             listed += len(files)
     hold(ROOT / "docs/files.md", "files", "\n".join(parts), regenerate=regenerate)
-    assert listed == sum(not path.stem.startswith("__") for path in (ROOT / "stlc").rglob("*.py"))
+    code = [path for room in ("stlc", "benchmarks") for path in (ROOT / room).rglob("*.py")]
+    assert listed == sum(not path.stem.startswith("__") for path in code)
 
 
 def first_line(path: Path) -> str:
@@ -375,7 +393,7 @@ def test_the_architecture_names_files_that_exist():
         for name in re.findall(r"`([\w/*]+\.(?:py|lark))`", line.split("|")[1]):
             folder = name.rpartition("/")[0] or folder
             full = name if "/" in name or not folder else f"{folder}/{name}"
-            assert list((ROOT / "stlc").glob(full)), full
+            assert [*(ROOT / "stlc").glob(full), *ROOT.glob(full)], full
 
 
 def test_the_architecture_lists_the_decisions():

@@ -101,13 +101,13 @@ def seen(name: str) -> str:
 
 
 def test_a_tree_has_as_many_nodes_and_every_name(judged: list[str], said: Said) -> None:
-    _, tree = said("parse", "h.stl")
+    _, tree = said("compile", "h.stl", "--show", "ast")
     assert len(re.findall(r"^ *Require ", tree, re.M)) == len(judged)
     assert len(re.findall(r"^ *\w+\b.*$", tree, re.M)) == tree.count("\n")
-    _, found = document(said, "parse", "h.stl", "--json")
+    _, found = document(said, "compile", "h.stl", "--show", "ast", "--json")
     items = found["result"]["tree"]["items"]
     assert [item["name"] for item in items if item["node"] == "Require"] == judged
-    _, dot = said("parse", "h.stl", "--ast", "dot")
+    _, dot = said("compile", "h.stl", "--show", "dot")
     nodes = re.findall(r'^  n\d+ \[label="(?:[^"\\]|\\["\\])*"\];$', dot, re.M)
     edges = re.findall(r"^  n\d+ -> n\d+;$", dot, re.M)
     assert dot.count("\n") == len(nodes) + len(edges) + 3
@@ -277,7 +277,7 @@ def test_files_of_any_name_are_named_in_one_line(name: str, folder: Path, said: 
     assert words[:2] == ["stlc", "check"]
     assert [Path(word).name for word in words[2:4]] == [spec, trace]
     assert main(words[1:]) in (0, 1, 4)
-    for command in (("lint", "--format", "github"), ("fmt", "--check"), ("parse", "--json"), ("explain",)):
+    for command in (("lint", "--format", "github"), ("fmt", "--check"), ("explain",)):
         said(*command, "--", spec)
 
 
@@ -359,7 +359,7 @@ def test_new_specifications_and_systems_have_names_that_mean_themselves(
     name: str, folder: Path, said: Said
 ) -> None:
     for kind in ("spec", "system"):
-        code, text = said("new", kind, "--", name)
+        code, text = said("init", f"--{kind}", name)
         assert code in (0, 2), text
     written = [path for path in folder.rglob("*") if path.is_file()]
     specs = [str(path) for path in written if path.suffix == ".stl"]

@@ -120,7 +120,7 @@ def test_a_system_is_shown_in_lines(name: str, folder: Path, capsys: pytest.Capt
 def test_a_specification_from_a_system_means_its_words(folder: Path) -> None:
     for name in ("a b", "always", "x # y", "</b>", "T", "dt"):
         (folder / "s.yaml").write_text(system_of(name), encoding="utf-8")
-        assert main(["new", "spec", "made", "--from", "s.yaml", "--force"]) == 0
+        assert main(["init", "--spec", "made", "--from", "s.yaml", "--force"]) == 0
         enum = next(item for item in parse(read_source("made.stl")).items if type(item).__name__ == "Enum")
         assert [member for member, _ in enum.members] == [name, "other"]
 

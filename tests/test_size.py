@@ -10,7 +10,9 @@ ROOT = Path(__file__).resolve().parent.parent
 FILE_LINES = 800
 SYSTEM_LINES = 150
 
-CODE = sorted(path for folder in ("stlc", "tools", "examples") for path in (ROOT / folder).rglob("*.py"))
+CODE = sorted(
+    path for folder in ("stlc", "benchmarks", "tools", "examples") for path in (ROOT / folder).rglob("*.py")
+)
 NAMES = [str(path.relative_to(ROOT)) for path in CODE]
 
 

@@ -173,11 +173,10 @@ def worker(plan, indices, limits, results):
     os.chdir(folder)
     tempfile.tempdir = str(folder)  # crash reports
     limit_address_space(4 * limits.memory)
-    from stlc.cli.framework import app
+    from stlc.cli.framework.program import Program
 
-    app._asked = functools.cache(
-        app._asked
-    )  # to describe the commands takes a third of the time of most inputs
+    # to describe the commands takes a third of the time of most inputs
+    Program.made = functools.cache(Program.made)
     typer.main.get_command = functools.cache(typer.main.get_command)
     base = peak()
     try:

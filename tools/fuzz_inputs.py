@@ -140,18 +140,16 @@ def _on_spec(rng: random.Random) -> list[str]:
 
 _READERS = (
     *(("lint", ()), ("lint", ("--json",)), ("lint", ("--fix",)), ("fmt", ()), ("fmt", ("--check",))),
-    *(("parse", ()), ("parse", ("--json",)), ("explain", ())),
+    *(("compile", ("--show", "ast")), ("compile", ("--show", "ast", "--json")), ("explain", ())),
 )
 
 
 @cache
 def commands() -> frozenset[str]:
     """Names of the commands that there are."""
-    import typer
+    from stlc.cli.framework.app import PROGRAM
 
-    from stlc.cli.framework.app import app
-
-    return frozenset(typer.main.get_command(app).commands)
+    return frozenset(PROGRAM.names())
 
 
 def _system(rng: random.Random) -> Input:
@@ -266,7 +264,7 @@ nonexistent/a.stl a.stl/b E203 E999 precedence -- T_red=3s k=v=w
 VALUES = (*_VALUES.split(), "", " ", "\n", "9" * 4000, "x" * 5000, "\udc80", "a\x00b")
 
 
-_BUSY = frozenset({"train", "simulate", "lsp", "doctor", "bench"})
+_BUSY = frozenset({"train", "simulate", "lsp", "doctor"})
 """Commands that may work, or wait, for longer than any input is worth."""
 
 

@@ -112,7 +112,6 @@ KINDS = (
     Kind("explain", ("explain", "{trace}", "--spec", "{long}"), 6.0, 2),
     Kind("export", ("export", "{copy}", "--to", "onnx", "--out", "{runs}/export"), 15.0, 3),
     Kind("report", ("report", "{copy}"), 8.0, 2),
-    Kind("bench", ("bench", "step", "--seconds", "2"), 15.0, 2),
 )
 
 

@@ -270,7 +270,7 @@ def documents(place: Place) -> Pins:
             "dump": "compile {}",
             "lint": "lint {} --select ALL --json",
             "explain": "explain {} --json",
-            "parse": "parse {} --json",
+            "parse": "compile {} --show ast --json",
             "fmt": "fmt {} --check --json",
         }.items():
             yield f"{stem(spec)}/{name}", place.stlc(words.format(spec))

@@ -20,7 +20,8 @@ import typer
 from documents import misfits
 
 from stlc.cli.commands.schema import load_schema
-from stlc.cli.framework.app import app, main
+from stlc.cli.framework.app import PROGRAM, main
+from stlc.cli.framework.program import Program
 from stlc.diagnostics import (
     Diagnostic,
     MissingError,
@@ -35,7 +36,7 @@ from stlc.version import __version__
 
 COMMANDS = (
     *("train", "simulate", "check", "explain", "plot", "report", "runs"),
-    *("init", "new", "lint", "fmt", "parse", "compile", "system", "lsp", "schema", "doctor", "bench"),
+    *("init", "lint", "fmt", "compile", "system", "lsp", "schema", "doctor", "help"),
     "export",
 )
 HEAVY = {"torch", "numpy", "matplotlib", "lark", "yaml", "rich"}
@@ -57,7 +58,7 @@ def boundary(monkeypatch, tmp_path):
             action()
             assert not as_json
 
-        monkeypatch.setattr("stlc.cli.framework.app.app", fake)
+        monkeypatch.setattr(Program, "made", lambda _self, _only="": fake)
         return main(["act", *options])
 
     return run
@@ -260,14 +261,14 @@ def test_help_opens_with_a_sentence_and_examples(capsys, flag):
         assert f"\n  {name} " in out
 
 
-@pytest.mark.parametrize("group", [[], ["new"], ["runs"], ["system"]])
+@pytest.mark.parametrize("group", [[], ["runs"], ["system"]])
 def test_sentences_of_a_list_of_commands_are_whole(capsys, group):
     assert main([*group, "--help"]) == 0
     listed = capsys.readouterr().out.partition("\nCommands:\n")[2].splitlines()
     assert [line for line in listed if not line.endswith(".") or line.endswith("...")] == []
 
 
-@pytest.mark.parametrize("group", [[], ["new"], ["system"]])
+@pytest.mark.parametrize("group", [[], ["system"]])
 def test_nothing_asked_shows_the_help(capsys, group):
     assert main(group) == 2
     out, err = capsys.readouterr()
@@ -386,4 +387,33 @@ def test_help_is_fast():
 
 
 def test_every_command_is_there():
-    assert {command.name for command in typer.main.get_command(app).commands.values()} == set(COMMANDS)
+    assert set(PROGRAM.names()) == set(COMMANDS)
+    assert set(typer.main.get_command(PROGRAM.made()).commands) == set(COMMANDS)
+
+
+@pytest.mark.parametrize(("name", "instead"), [("bench", "python -m benchmarks"), ("parse", "--show ast")])
+def test_a_command_that_moved_says_where(name, instead, capsys):
+    assert main([name, "--any"]) == 2
+    err = capsys.readouterr().err
+    assert f"there is no command `{name}`" in err
+    assert instead in err
+
+
+def test_quiet_leaves_results_and_errors(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.stl").write_text("signal x [m]\nrequire low: x < 3 m\n")
+    assert main(["fmt", "a.stl", "-q"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert main(["--quiet", "lint", "b.stl"]) == 2
+    assert "b.stl" in capsys.readouterr().err
+    assert main(["lint", "a.stl", "--json", "-q"]) == 0
+    assert json.loads(capsys.readouterr().out)["ok"]
+    assert main(["fmt", "a.stl"]) == 0
+    assert capsys.readouterr().err
+
+
+def test_help_is_a_command(capsys):
+    for words in ([], ["lint"], ["runs", "list"]):
+        assert main(["help", *words]) == main([*words, "--help"]) == 0
+        first, second = capsys.readouterr().out.split("Usage: ")[1:]
+        assert first.rstrip() == second.rstrip()

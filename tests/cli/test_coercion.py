@@ -11,14 +11,20 @@ from typing import Annotated, Literal
 import pytest
 import typer
 
-from stlc.cli.framework.coercion import spare_adapters
+from stlc.cli.framework.program import spare_adapters
 
 ROOT = Path(__file__).resolve().parents[2]
 HEAVY = ("torch", "numpy", "pydantic", "yaml", "rich", "matplotlib")
 
 
 @pytest.mark.parametrize(
-    "words", [["lint", "specs/traffic.stl"], ["parse", "specs/traffic.stl"], ["explain", "E203"], ["schema"]]
+    "words",
+    [
+        ["lint", "specs/traffic.stl"],
+        ["compile", "specs/traffic.stl", "--show", "ast"],
+        ["explain", "E203"],
+        ["schema"],
+    ],
 )
 def test_a_light_command_imports_little(words):
     program = (

@@ -107,12 +107,13 @@ def test_sarif(capsys):
     assert all(run["tool"]["driver"]["rules"][r["ruleIndex"]]["id"] == r["ruleId"] for r in run["results"])
 
 
-@pytest.mark.parametrize("layout", ["tree", "json", "dot"])
+@pytest.mark.parametrize("layout", ["ast", "json", "dot"])
 def test_trees(layout, capsys):
-    assert main(["parse", "a.stl", "--ast", layout]) == 0
+    words = ["--show", "ast", "--json"] if layout == "json" else ["--show", layout]
+    assert main(["compile", "a.stl", *words]) == 0
     out = capsys.readouterr().out
     match layout:
-        case "tree":
+        case "ast":
             assert out.splitlines()[:2] == ["Spec", "  Signal x unit=m"]
             assert "      Temporal always alias=G" in out
         case "json":
@@ -127,8 +128,8 @@ def test_trees(layout, capsys):
 def test_a_deep_tree(capsys):
     text = "not " * 140
     Path("deep.stl").write_text(f"signal x [m]\nrequire deep: {text}x > 0 m\n")
-    for layout in ("tree", "json", "dot"):
-        assert main(["parse", "deep.stl", "--ast", layout]) == 0
+    for words in (["ast"], ["dot"], ["ast", "--json"]):
+        assert main(["compile", "deep.stl", "--show", *words]) == 0
     assert main(["fmt", "deep.stl"]) == 0
     assert main(["explain", "deep.stl"]) == 0
     assert capsys.readouterr().out
@@ -155,7 +156,7 @@ def test_lint_watches(monkeypatch, capsys):
     assert "warning[W106]" in capsys.readouterr().out
 
 
-# ---------------------------------------------------------------------- init, new, system
+# ---------------------------------------------------------------------- init, system
 
 
 def test_a_project_is_valid_and_formatted(capsys):
@@ -170,12 +171,12 @@ def test_a_project_is_valid_and_formatted(capsys):
 
 
 def test_nothing_is_overwritten(capsys):
-    assert main(["new", "spec", "parking"]) == 0
+    assert main(["init", "--spec", "parking"]) == 0
     text = Path("parking.stl").read_text()
-    assert main(["new", "spec", "parking"]) == 2
+    assert main(["init", "--spec", "parking"]) == 2
     assert "parking.stl is there already" in capsys.readouterr().err
     assert Path("parking.stl").read_text() == text
-    assert main(["new", "spec", "parking", "--force"]) == 0
+    assert main(["init", "--spec", "parking", "--force"]) == 0
 
 
 @pytest.mark.parametrize("arguments", [[], ["--from", "systems/wagon.yaml"], ["--from", "car"]])
@@ -183,8 +184,8 @@ def test_a_new_specification_is_valid(arguments, capsys):
     for folder in ("specs", "systems", "examples"):
         Path(folder).mkdir()
     (Path("examples") / "car.yaml").write_text((ROOT / "examples/car.yaml").read_text())
-    assert main(["new", "system", "wagon"]) == 0
-    assert main(["new", "spec", "parking", *arguments]) == 0
+    assert main(["init", "--system", "wagon"]) == 0
+    assert main(["init", "--spec", "parking", *arguments]) == 0
     path = Path("specs/parking.stl")
     assert main(["fmt", str(path), "--check"]) == 0
     system = ["--system", arguments[1]] if arguments else []

@@ -43,9 +43,9 @@ def _project(tmp_path, monkeypatch):
 
 
 DOCUMENTS = {
-    "parse": ["parse", "good.stl"],
-    "parse two": ["parse", "good.stl", "unclear.stl"],
-    "parse bad": ["parse", "bad.stl", "missing.stl"],
+    "tree": ["compile", "good.stl", "--show", "ast"],
+    "trees": ["compile", "good.stl", "unclear.stl", "--show", "ast"],
+    "trees of bad files": ["compile", "bad.stl", "missing.stl", "--show", "ast"],
     "lint": ["lint", "good.stl", "unclear.stl", "bad.stl"],
     "lint usage": ["lint", "--sellect", "W1"],
     "fmt": ["fmt", "good.stl", "unclear.stl", "--check"],
@@ -65,9 +65,9 @@ DOCUMENTS = {
     "explain trace": ["explain", "drive.csv", "--spec", "good.stl"],
     "plot": ["plot", "drive.csv", "--spec", "good.stl"],
     "init": ["init", "elsewhere"],
-    "new": ["new", "spec", "parking", "--from", "systems/cart.yaml"],
+    "init spec": ["init", "--spec", "parking", "--from", "systems/cart.yaml"],
+    "init system": ["init", "--system", "wagon"],
     "doctor": ["doctor", "--quick"],
-    "bench": ["bench", "robustness", "--samples", "20", "--traces", "1", "--seconds", "0"],
     "runs": ["runs", "list"],
     "runs show": ["runs", "show", "7"],
     "runs diff": ["runs", "diff", "first", "second"],

@@ -39,7 +39,6 @@ def _project(tmp_path, monkeypatch, capsys):
 
 
 CODES = {
-    "parse": {0: ["good.stl"], 2: ["none.stl"], 3: ["bad.stl"]},
     "lint": {
         0: ["good.stl", "unclear.stl"],
         1: ["unclear.stl", "--strict"],
@@ -80,8 +79,8 @@ CODES = {
         5: ["drive.csv", "--spec", "good.stl", "-o", "/proc/picture.svg"],
     },
     "init": {0: ["fresh"], 2: ["."], 5: ["/proc/fresh"]},
-    "new spec": {0: ["parking"], 2: ["always"], 3: ["parking", "--from", "broken.yaml"]},
-    "new system": {0: ["wagon"], 2: ["cart"], 5: ["/proc/wagon"]},
+    "init --spec": {0: ["parking"], 2: ["always"], 3: ["parking", "--from", "broken.yaml"]},
+    "init --system": {0: ["wagon"], 2: ["cart"], 5: ["/proc/wagon"]},
     "system show": {0: ["systems/cart.yaml"], 2: ["none.yaml"], 3: ["broken.yaml"]},
     "system check": {0: ["systems/cart.yaml", "--steps", "2"], 2: ["none.yaml"], 3: ["broken.yaml"]},
     "system list": {0: [], 2: ["--none"]},
@@ -119,21 +118,24 @@ def test_missing_packages_are_told(monkeypatch, capsys):
     assert main(["plot", "drive.csv", "--spec", "good.stl"]) == 5
 
 
-@pytest.mark.parametrize("command", ["lint", "fmt", "parse"])
+@pytest.mark.parametrize("command", ["lint", "fmt", "compile"])
 def test_a_bug_is_told_as_one(command, monkeypatch, capsys):
     def fail(*_):
         raise ZeroDivisionError("oh")
 
     monkeypatch.setattr("stlc.files.read_source", fail)
-    assert main([command, "good.stl"]) == 70
+    words = [command, "good.stl", *(["--show", "ast"] if command == "compile" else [])]
+    assert main(words) == 70
     assert "B001" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("command", "result"), [("lint", 0), ("fmt", 0), ("parse", 0), ("explain", 0)])
+@pytest.mark.parametrize(
+    ("command", "result"), [("lint", 0), ("fmt", 0), ("compile --show ast", 0), ("explain", 0)]
+)
 def test_the_standard_input(command, result, monkeypatch, capsys):
     stream = io.TextIOWrapper(io.BytesIO(GOOD.encode()))
     monkeypatch.setattr(sys, "stdin", stream)
-    assert main([command, "-"]) == result
+    assert main([*command.split(), "-"]) == result
     out = capsys.readouterr().out
     if command == "fmt":
         assert out == GOOD
@@ -146,7 +148,7 @@ def test_the_standard_input_cannot_be_written(option, capsys):
 
 
 @pytest.mark.parametrize(
-    "words", [["lint", "none.stl", "--format", "json"], ["parse", "none.stl", "--ast=json"]]
+    "words", [["lint", "none.stl", "--format", "json"], ["compile", "none.stl", "--show=ast", "--json"]]
 )
 def test_json_by_another_option_holds_for_failures_too(words, capsys):
     assert main(words) == 2

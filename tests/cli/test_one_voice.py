@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import typer
 
-from stlc.cli.framework.one_voice import one_voice
+from stlc.cli.commands.train import one_voice
 from stlc.cli.framework.output import emit, say
 from stlc.diagnostics import Diagnostic, MissingError, SpecError, StlcError
 

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from stlc.cli.framework.options import describe, parse_overrides
+from stlc.cli.framework.options import parse_overrides
+from stlc.cli.framework.program import describe
 from stlc.diagnostics import UsageError
 
 

@@ -14,8 +14,8 @@ import pytest
 from exported import exported
 from several import ENVIRONMENT, free_port
 
+from stlc.cli.commands.explain import FOLDER, Example, read_page
 from stlc.cli.framework.app import main
-from stlc.cli.framework.pages import FOLDER, Example, read_page
 from stlc.controller.training.config import TrainConfig
 from stlc.diagnostics import CODES, StlcError
 from stlc.grammar.parse.tables import load_parser

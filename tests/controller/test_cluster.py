@@ -6,9 +6,11 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from benchmarks.__main__ import main as measure
 from stlc.cli.framework.app import main
 from stlc.controller.parallel.jobs import Job
 from stlc.controller.parallel.ray_cluster import Cluster, on_cluster
@@ -25,12 +27,18 @@ def without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("without_ray")
-@pytest.mark.parametrize("command", [["train", *SPECS], ["bench", "paper", "--only", "traffic"]])
+@pytest.mark.parametrize(
+    ("program", "command"), [(main, ["train", *SPECS]), (measure, ["paper", "--only", "traffic"])]
+)
 def test_without_ray_it_is_said_how_to_get_it(
-    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    program: Any,
+    command: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main([*command, "--steps", "5", "--cluster", "local"]) == 5
+    assert program([*command, "--steps", "5", "--cluster", "local"]) == 5
     assert "pip install 'stlc[cluster]'" in capsys.readouterr().err
     assert list(tmp_path.glob("*")) == []
 

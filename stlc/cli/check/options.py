@@ -73,4 +73,3 @@ Chunk = Annotated[
     int, typer.Option(min=0, metavar="SAMPLES", help="Read in pieces of this size; 0: if it has to be.")
 ]
 Runs = Annotated[Path, typer.Option(help="Folder of all runs.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing; the exit code answers.")]

@@ -1,60 +1,94 @@
-"""`stlc compile`: what the solver sees of a specification."""
+"""`stlc compile`: a specification as the solver sees it, or its syntax tree."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from stlc.cli.framework.options import JsonOption, SetOption, SystemOption, describe, parse_overrides
+from stlc.cli.framework.options import JsonOption, SetOption, SystemOption, parse_overrides, spec_files
 from stlc.cli.framework.output import emit, emit_json, say, show_diagnostics
+from stlc.cli.framework.program import command
 
 if TYPE_CHECKING:
     from stlc.compile.augment.timers import Timer
     from stlc.compile.ir import typed
     from stlc.compile.pipeline import Compiled, CompiledRequirement
     from stlc.dynamics.declaration.decl import SystemDecl
+    from stlc.grammar import ast
 
-Part = Literal["all", "steps", "states", "ir"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command(
-        "compile",
-        help=describe(
-            "Show what the solver sees of a specification.",
-            "stlc compile specs/traffic.stl",
-            "stlc compile specs/traffic.stl --system car.yaml --set T_red=3s --show ir",
-            note="Each interval in seconds and in steps, added states, the safety part, the horizon.",
-        ),
-    )(compile_)
+Part = Literal["all", "steps", "states", "ir", "ast", "dot"]
 
 
+@command(
+    "stlc compile specs/traffic.stl",
+    "stlc compile specs/traffic.stl --system car.yaml --set T_red=3s --show ir",
+    "stlc compile specs/traffic.stl --show dot | dot -Tsvg > traffic.svg",
+)
 def compile_(
-    spec: Annotated[Path, typer.Argument(metavar="SPEC", help="The specification, a .stl file.")],
+    files: Annotated[
+        list[str], typer.Argument(metavar="SPEC", help="The specification; for ast and dot several, or -.")
+    ],
     system: SystemOption = None,
     set_: SetOption = None,
-    show: Annotated[Part, typer.Option("--show", help="One part only.")] = "all",
+    show: Annotated[
+        Part, typer.Option("--show", metavar="PART", help="all, steps, states, ir, ast, or dot.")
+    ] = "all",
     watch: Annotated[bool, typer.Option("--watch", help="Compile again whenever a file changes.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Compile `spec` for a system and print the result."""
+    """Show a specification as the solver sees it, or its syntax tree.
+
+    Each interval in seconds and in steps, added states, the safety part, the horizon. With --show ast the
+    syntax tree, with --show dot the same for Graphviz: syntax only, names, types and units are looked at by
+    `stlc lint`.
+    """
+    from stlc.diagnostics import Diagnostic, StlcError, UsageError
+
+    if show == "ast" or show == "dot":
+        _trees(spec_files(files), show, as_json=as_json)
+        return
+    if len(files) > 1:
+        help_ = ("stlc compile SPEC", "stlc compile SPEC SPEC --show ast")
+        raise UsageError(Diagnostic("U101", "one specification is compiled at a time", help=help_))
+    spec = Path(files[0])
     if not watch:
-        _show(spec, system, (set_, show), as_json=as_json)
+        _show(spec, system, set_, show, as_json=as_json)
         return
     from stlc.cli.framework.watch import watch as watch_files
-    from stlc.diagnostics import StlcError
 
     def again() -> None:
         try:
-            _show(spec, system, (set_, show), as_json=as_json)
+            _show(spec, system, set_, show, as_json=as_json)
         except StlcError as error:
             show_diagnostics(error.diagnostics)
 
     watch_files(_files(spec, system), again)
+
+
+def _trees(names: Sequence[str], show: Part, *, as_json: bool) -> None:
+    """Print syntax trees; the findings of all files that have none are raised together."""
+    from stlc.cli.framework.tree_text import as_dot, as_tree, as_values
+    from stlc.diagnostics import Diagnostic, SpecError
+    from stlc.files import read_source
+    from stlc.grammar.parse.parser import parse
+
+    specs: list[ast.Spec] = []
+    findings: list[Diagnostic] = []
+    for name in names:
+        try:
+            specs.append(parse(read_source(name)))
+        except SpecError as error:
+            findings += error.diagnostics
+    if findings:
+        raise SpecError(*findings)
+    if as_json:
+        trees = [{"file": name, "tree": as_values(spec)} for name, spec in zip(names, specs, strict=True)]
+        emit_json("compile/1", ok=True, exit_code=0, result=trees[0] if len(trees) == 1 else {"files": trees})
+    else:
+        emit(as_dot(specs) if show == "dot" else "\n\n".join(map(as_tree, specs)))
 
 
 def _files(spec: Path, system: str | None) -> list[str]:
@@ -71,10 +105,16 @@ def _files(spec: Path, system: str | None) -> list[str]:
         return [str(spec)]
 
 
-def _show(spec: Path, system: str | None, how: tuple[list[str] | None, Part], *, as_json: bool) -> None:
+def _show(
+    spec: Path,
+    system: str | None,
+    set_: list[str] | None,
+    show: Literal["all", "steps", "states", "ir"],
+    *,
+    as_json: bool,
+) -> None:
     from stlc.compile.dump import dump
 
-    set_, show = how
     compiled, decl = _compiled(spec, system, parse_overrides(set_))
     if as_json:
         result = _result(compiled, decl)

@@ -12,26 +12,15 @@ from typing import Annotated, Literal
 
 import typer
 
-from stlc.cli.framework.options import JsonOption, describe
+from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.output import emit, emit_json, say, table
+from stlc.cli.framework.program import command
 
 State = Literal["ok", "missing", "off"]
 MISSING = 5
 
 _SLOWER = "torch does its work, about ten times slower"
 _NEEDED = ("torch", "numpy", "lark", "pyyaml", "safetensors", "typer", "rich")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command(
-        help=describe(
-            "Look at the installation: versions, devices, packages.",
-            "stlc doctor",
-            note="Completion of the shell too. Exit code: 0, or 5 if something that is always needed is "
-            "missing.",
-        )
-    )(doctor)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +38,15 @@ class Finding:
     detail: str
 
 
+@command("stlc doctor")
 def doctor(
     quick: Annotated[bool, typer.Option("--quick", help="Do not import torch to look for devices.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Print what is there and what is not."""
+    """Look at the installation: versions, devices, packages.
+
+    Completion of the shell too. Exit code: 0, or 5 if something that is always needed is missing.
+    """
     findings = [*_python(), *_packages(), *_devices(quick=quick), *_tools()]
     missing = [finding.name for finding in findings if finding.state == "missing"]
     code = MISSING if missing else 0

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from textwrap import fill
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,35 +17,27 @@ from stlc.cli.framework.options import (
     RequireOption,
     SetOption,
     SystemOption,
-    describe,
     parse_overrides,
 )
 from stlc.cli.framework.output import emit, emit_json, table
+from stlc.cli.framework.program import command
 from stlc.diagnostics import CODES, Diagnostic, UsageError
 from stlc.registry import closest
+
+if TYPE_CHECKING:
+    from stlc.controller.guard.coverage import Axis, Chance
 
 _CODE = re.compile(r"[A-Za-z]\d{3}")
 _TOPICS = ("precedence",)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command(
-        help=describe(
-            "Explain a code, a specification, or the violations of a trace.",
-            "stlc explain E203",
-            "stlc explain precedence",
-            "stlc explain specs/traffic.stl",
-            "stlc explain trace.npz --require give_way",
-            "stlc explain latest --guarantee",
-            note="A code's page has a wrong and a right example; without an argument all codes are listed. "
-            "`precedence` tells how operators bind. A specification is told in English, requirement "
-            "by requirement. Of a trace each violated requirement is traced back to the sub-formula, "
-            "the instant, the signal and its value.",
-        )
-    )(explain)
-
-
+@command(
+    "stlc explain E203",
+    "stlc explain precedence",
+    "stlc explain specs/traffic.stl",
+    "stlc explain trace.npz --require give_way",
+    "stlc explain latest --guarantee",
+)
 def explain(
     what: Annotated[
         str | None,
@@ -69,11 +63,14 @@ def explain(
     runs: Annotated[Path, typer.Option(help="Folder of all runs.")] = Path("runs"),
     as_json: JsonOption = False,
 ) -> None:
-    """Say what `what` means."""
-    if guarantee:
-        from stlc.cli.commands.explain_guarantee import explain_guarantee
+    """Explain a code, a specification, or the violations of a trace.
 
-        explain_guarantee(what or "latest", runs, parse_overrides(set_), as_json=as_json)
+    A code's page has a wrong and a right example; without an argument all codes are listed. `precedence`
+    tells how operators bind. A specification is told in English, requirement by requirement. Of a trace
+    each violated requirement is traced back to the sub-formula, the instant, the signal and its value.
+    """
+    if guarantee:
+        _guarantee(what or "latest", runs, parse_overrides(set_), as_json=as_json)
     elif what is None:
         _list_codes(as_json=as_json)
     elif _CODE.fullmatch(what):
@@ -116,8 +113,6 @@ def _code(code: str) -> str:
 
 
 def _page(name: str, *, as_json: bool) -> None:
-    from stlc.cli.framework.pages import in_terminal, read_page
-
     page = read_page(name)
     assert page is not None, f"{name} has no page"
     if as_json:
@@ -165,8 +160,6 @@ def _spec(name: str, wanted: list[str], *, as_json: bool) -> None:
 
 
 def _told(entry: Mapping[str, object]) -> str:
-    from textwrap import fill
-
     tags, doc, where = entry["tags"], entry["doc"], entry["where"]
     head = f"{entry['name']}" if entry["kind"] == "require" else f"{entry['name']} (assumed)"
     lines = [head + (f"  [{', '.join(tags)}]" if isinstance(tags, list) and tags else "")]
@@ -177,3 +170,145 @@ def _told(entry: Mapping[str, object]) -> str:
             text = f"{name}: {meaning}"
             lines.append(fill(text, 96, initial_indent="    where ", subsequent_indent="          "))
     return "\n".join(lines)
+
+
+# -------------------------------------------------------------------------- pages of codes
+
+FOLDER = Path(__file__).parents[2] / "pages"
+
+_FENCE = re.compile(r"^```(?P<language>\w*)(?P<notes>[^\n]*)\n(?P<body>.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class Example:
+    """A block of a page.
+
+    Attributes:
+        language: `stl`, `yaml`, `csv` or `console`.
+        notes: `wrong`, `right`, and what else stands behind the language.
+        body: the text.
+    """
+
+    language: str
+    notes: tuple[str, ...]
+    body: str
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A page: its headline and its Markdown."""
+
+    title: str
+    text: str
+
+    @property
+    def examples(self) -> tuple[Example, ...]:
+        """The blocks, in order."""
+        return tuple(
+            Example(match["language"], tuple(match["notes"].split()), match["body"])
+            for match in _FENCE.finditer(self.text)
+        )
+
+    def having(self, note: str) -> tuple[Example, ...]:
+        """The blocks with this note."""
+        return tuple(example for example in self.examples if note in example.notes)
+
+
+def read_page(name: str) -> Page | None:
+    """The page of a code, or `precedence`; None if there is none."""
+    path = FOLDER / f"{name}.md"
+    if not path.is_file():
+        return None
+    title, _, text = path.read_text(encoding="utf-8").partition("\n")
+    return Page(title.removeprefix("# "), text.strip("\n") + "\n")
+
+
+def in_terminal(page: Page) -> str:
+    """The page as plain text: blocks indented, marks taken away."""
+    return "\n".join([page.title, "", *_plain_lines(page.text)]).rstrip() + "\n"
+
+
+def _plain_lines(text: str) -> Iterator[str]:
+    inside = False
+    for line in text.splitlines():
+        if line.startswith("```"):
+            inside = not inside
+            notes = line.strip("`").split()
+            if inside and notes[1:2] in (["wrong"], ["right"]):
+                yield f"{notes[1]}:"
+                yield ""
+        elif inside:
+            yield f"    {line}".rstrip()
+        else:
+            yield line.replace("**", "").removeprefix("## ")
+
+
+# -------------------------------------------------------------------------- guarantees
+
+ASSUMED = (
+    "there is a prefix of T0 actions such that every prefix within the radius of it, in every control at "
+    "every step, leads to a plan that satisfies the specification when the policy finishes it",
+    "that prefix lies anywhere in the ranges of the controls with equal probability, independently of the "
+    "grid",
+)
+
+
+def _guarantee(run: str, runs: Path, overrides: Mapping[str, str], *, as_json: bool) -> None:
+    """Print the probabilities for the grid of a run's system, and what they assume."""
+    from stlc.controller.guard.coverage import axes_of, chances
+    from stlc.controller.guard.shooting import grid_of
+    from stlc.controller.training.run import load_task
+    from stlc.rundir import RunDir
+
+    folder = RunDir.open(run, runs)
+    task = load_task(folder, overrides)
+    grid = grid_of(task)
+    axes, found = axes_of(task, grid), chances(task, grid)
+    if as_json:
+        result = {
+            "run": folder.name,
+            "assumptions": list(ASSUMED),
+            "controls": [asdict(axis) for axis in axes],
+            "chances": [asdict(each) for each in found],
+        }
+        emit_json("explain/1", ok=True, exit_code=0, result=result)
+    else:
+        emit("\n".join(_guarantee_lines(folder.name, axes, found)))
+
+
+def _guarantee_lines(run: str, axes: Sequence[Axis], found: Sequence[Chance]) -> list[str]:
+    tried = ", ".join(f"{len(axis.values)} of {axis.name} in [{axis.low:g}, {axis.high:g}]" for axis in axes)
+    lines = [f"run {run}: the backup policy tries {tried} at every step of a prefix", "", "Suppose that"]
+    lines += [fill(each, 96, initial_indent="  - ", subsequent_indent="    ") for each in ASSUMED]
+    lines += ["", "Then a prefix of the grid leads to satisfaction with a probability of at least", ""]
+    radii = list(dict.fromkeys(each.radius for each in found))
+    rows = []
+    for length in dict.fromkeys(each.length for each in found):
+        group = [each for each in found if each.length == length]
+        head = (f"T0={length}", f"{group[0].candidates:,}")
+        rows.append((*head, "Theorem 1", *(f"{each.bound:.3g}" for each in group)))
+        rows.append(
+            ("", "", "at least" if group[0].sampled else "exact", *(f"{each.exact:.3g}" for each in group))
+        )
+    header = ("", "prefixes", "radius, share of each range", *(f"{radius:.0%}" for radius in radii))
+    lines += [table(rows, header=header)]
+    lines += ["", *_guarantee_notes(found)]
+    return lines
+
+
+def _guarantee_notes(found: Sequence[Chance]) -> list[str]:
+    notes = [
+        "Theorem 1 (Meng & Fan 2023) leaves out the cells at the ends of each range, so it is 0 where a "
+        "control has two values; `exact` is the share of prefixes that have a grid point within the radius."
+    ]
+    if any(each.sampled for each in found):
+        notes.append(
+            "Of a grid that has more prefixes than `samples` as many are tried. `at least` counts one "
+            "neighbour of a prefix that works, and that it is tried with the probability of a random sample."
+        )
+    if any(each.theorem > each.exact + 1e-12 and not each.sampled for each in found):
+        notes.append(
+            "The paper takes the minimum with 1 over the product of all controls, which promises more than "
+            "the truth where one control is covered more than once; here it is taken control by control."
+        )
+    return [fill(each, 100) for each in notes]

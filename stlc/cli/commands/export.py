@@ -7,27 +7,15 @@ from typing import Annotated
 
 import typer
 
-from stlc.cli.framework.options import JsonOption, RunArgument, RunsOption, describe
+from stlc.cli.framework.options import JsonOption, RunArgument, RunsOption
 from stlc.cli.framework.output import emit, emit_json, say
+from stlc.cli.framework.program import command
 from stlc.escape import visible
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command(
-        help=describe(
-            "Export a trained controller, monitor included.",
-            "stlc export latest --to c",
-            "stlc export latest --to onnx -o controller",
-            "stlc export latest --to torch",
-            note="`torch` is a torch.export program: states in, plans and their robustness out. `c` is one "
-            "C99 header that needs nothing but libm, with the backup policy inside, and an example program. "
-            "`onnx` are graphs for onnxruntime, which `stlc.runtime` drives without torch, the backup policy "
-            "included. What is written has been checked against the run on random states.",
-        )
-    )(export)
-
-
+@command(
+    "stlc export latest --to c", "stlc export latest --to onnx -o controller", "stlc export latest --to torch"
+)
 def export(
     run: RunArgument = "latest",
     to: Annotated[str, typer.Option("--to", metavar="TARGET", help="torch, c or onnx.")] = "torch",
@@ -38,7 +26,13 @@ def export(
     runs: RunsOption = Path("runs"),
     as_json: JsonOption = False,
 ) -> None:
-    """Export `run` and print where it is."""
+    """Export a trained controller, monitor included.
+
+    `torch` is a torch.export program: states in, plans and their robustness out. `c` is one C99 header
+    that needs nothing but libm, with the backup policy inside, and an example program. `onnx` are graphs
+    for onnxruntime, which `stlc.runtime` drives without torch, the backup policy included. What is
+    written has been checked against the run on random states.
+    """
     from stlc.controller.training.run import Run
     from stlc.export.write import export as write
     from stlc.export.write import target_of

@@ -10,26 +10,12 @@ from typing import Annotated
 
 import typer
 
-from stlc.cli.framework.options import JsonOption, describe
+from stlc.cli.framework.options import STDIN, JsonOption, SpecsArgument, spec_files
 from stlc.cli.framework.output import emit, emit_json, say, show_diagnostics
+from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, SpecError
 
 DIFFERS, INVALID = 1, 3
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command(
-        help=describe(
-            "Give specifications their one layout; what they mean stays.",
-            "stlc fmt specs/traffic.stl --check",
-            "stlc fmt specs --diff",
-            "stlc fmt - < specs/traffic.stl",
-            note="Comments and groups of lines stay. Words and signs of other tools (G, &&, =>, □) become "
-            "those of the language; where other tools read a formula differently, parentheses are added. A "
-            "second run changes nothing. Exit code: 0, or 1 if --check or --diff found a difference.",
-        ),
-    )(fmt)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,18 +32,22 @@ class _Formatted:
         return self.before != self.after
 
 
+@command("stlc fmt specs/traffic.stl --check", "stlc fmt specs --diff", "stlc fmt - < specs/traffic.stl")
 def fmt(
-    files: Annotated[list[str], typer.Argument(metavar="FILE…", help="Specifications, folders, or -.")],
+    files: SpecsArgument = None,
     check: Annotated[
         bool, typer.Option("--check", help="Write nothing; exit with 1 if a file differs.")
     ] = False,
     diff: Annotated[bool, typer.Option("--diff", help="Write nothing; print what would change.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Format `files` in place; the standard input goes to the standard output."""
-    from stlc.cli.framework.spec_files import spec_files
+    """Give specifications their one layout; what they mean stays.
 
-    names = spec_files(files)
+    Comments and groups of lines stay. Words and signs of other tools (G, &&, =>, □) become those of the
+    language; where other tools read a formula differently, parentheses are added. A second run changes
+    nothing. Exit code: 0, or 1 if --check or --diff found a difference.
+    """
+    names = spec_files(files or ["."])
     findings: list[Diagnostic] = []
     results = [result for name in names if (result := _format(name, findings))]
     changed = [result for result in results if result.differs]
@@ -89,7 +79,6 @@ def _format(name: str, findings: list[Diagnostic]) -> _Formatted | None:
 
 
 def _write(results: Sequence[_Formatted], *, as_json: bool) -> None:
-    from stlc.cli.framework.spec_files import STDIN
     from stlc.files import write_atomic
 
     for result in results:

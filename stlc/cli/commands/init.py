@@ -1,77 +1,260 @@
-"""`stlc init`: a project of one's own."""
+"""`stlc init`: a project, or one specification or system of it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.examples import EMPTY, FIRST, example_files, examples, judges
-from stlc.cli.framework.options import JsonOption, describe
+from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.output import emit, emit_json, say
+from stlc.cli.framework.program import command
+from stlc.diagnostics import Diagnostic, UsageError
 from stlc.escape import operand, shell, visible
+from stlc.files import SPECS, SYSTEMS, write_atomic
+from stlc.registry import closest
+
+if TYPE_CHECKING:
+    from stlc.dynamics.declaration.decl import SystemDecl
+    from stlc.signature import Column
+
+FIRST, EMPTY = "cart", "empty"
+FOLDER = Path(__file__).parents[2] / "templates"
+
+_SETTINGS = {
+    ".gitattributes": "*.stl linguist-language=Text diff\n",
+    ".gitignore": "runs/\n__pycache__/\n",
+    ".vscode/settings.json": '{\n  "files.associations": {"*.stl": "stlc"}\n}\n',
+}
+_NAME = re.compile(r"[^\W\d]\w*")
+_SYSTEM = re.compile(r'^(system\s+")[^"\n]*?([^"/\n]+\.yaml)"', re.MULTILINE)
+_JUDGE = re.compile(r"^ *judge: *(?:[^\s#]*/)?([\w-]+\.stl)\b", re.MULTILINE)
+_BESIDE = re.compile(r"[\w-]+\.(?:py|urdf)\b")
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command(
-        help=describe(
-            "Begin a project with an example that trains in a minute.",
-            "stlc init my-project",
-            "stlc init my-project --example car",
-            note="Settings of git and of the editor come with it. Nothing that is there is overwritten "
-            "unless --force is given.",
-        )
-    )(init)
+def examples(incomplete: str = "") -> list[str]:
+    """Names of all examples that begin so: those of the installed systems that specifications name."""
+    found = {system.removesuffix(".yaml") for _, system in _pairs()}
+    return [name for name in (FIRST, *sorted(found), EMPTY) if name.startswith(incomplete)]
 
 
+@command(
+    "stlc init my-project",
+    "stlc init my-project --example car",
+    "stlc init --spec parking --from car.yaml",
+    "stlc init --system cart",
+)
 def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the project.")] = Path(),
     example: Annotated[
-        str,
-        typer.Option(metavar="NAME", help="cart, car, …, or empty.", autocompletion=examples),
-    ] = "cart",
+        str | None,
+        typer.Option(metavar="NAME", help="cart (if not given), car, …, or empty.", autocompletion=examples),
+    ] = None,
+    spec: Annotated[
+        str | None, typer.Option("--spec", metavar="NAME", help="Write this specification only.")
+    ] = None,
+    from_: Annotated[
+        str | None,
+        typer.Option("--from", metavar="SYSTEM", help="Of --spec: a system whose states are the signals."),
+    ] = None,
+    system: Annotated[
+        str | None, typer.Option("--system", metavar="NAME", help="Write this system file only.")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite files that are there.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Write the files of a project into `folder`."""
-    from stlc.cli.framework.templates import require_new
-    from stlc.files import write_atomic
+    """Begin a project, or a specification or system of one.
 
-    files = {folder / name: text for name, text in _files(example).items()}
-    require_new(list(files), force=force)
+    The example trains in a minute. Settings of git and of the editor come with it. Nothing that is there is
+    overwritten unless --force is given. --spec and --system write one file, into `specs/` and `systems/`
+    where there are such folders.
+    """
+    if sum(given is not None for given in (example, spec, system)) > 1:
+        raise UsageError(Diagnostic("U101", "`--example`, `--spec` and `--system` contradict each other"))
+    if from_ is not None and spec is None:
+        raise UsageError(Diagnostic("U101", "`--from` needs `--spec NAME`"))
+    if spec is not None:
+        files, following = _specification(folder, spec, from_)
+    elif system is not None:
+        files, following = _system_file(folder, system)
+    else:
+        files = {folder / name: text for name, text in _project(example or FIRST).items()}
+        here = "" if folder == Path() else f"{shell(('cd', operand(str(folder))))} && "
+        following = here + _following(files)
+    _require_new(files, force=force)
     for path, text in files.items():
         write_atomic(path, text)
-    for name in ("specs", "systems"):
-        (folder / name).mkdir(parents=True, exist_ok=True)
+    if spec is None and system is None:
+        for name in ("specs", "systems"):
+            (folder / name).mkdir(parents=True, exist_ok=True)
     if as_json:
         emit_json("init/1", ok=True, exit_code=0, result={"files": [str(path) for path in files]})
         return
     for path in files:
         emit(visible(str(path)))
-    here = "" if folder == Path() else f"{shell(('cd', operand(str(folder))))} && "
-    say(f"next: {here}{_following(files)}")
+    say(f"next: {following}")
+
+
+def _require_new(paths: Iterable[Path], *, force: bool) -> None:
+    """Raise UsageError (U101) if one of the files is there already, unless `force` is given."""
+    there = [str(path) for path in paths if path.exists()]
+    if there and not force:
+        verb = "is" if len(there) == 1 else "are"
+        finding = Diagnostic("U101", f"{', '.join(there)} {verb} there already", help=("overwrite: --force",))
+        raise UsageError(finding)
+
+
+# ------------------------------------------------------------------------ a project
+
+
+def _project(example: str) -> dict[str, str]:
+    """Path within the project -> text. Raises UsageError (U101) where there is no such example."""
+    if example == EMPTY:
+        return dict(_SETTINGS)
+    if example == FIRST:
+        cart = {"specs/cart.stl": _template("cart.stl"), "systems/cart.yaml": _template("cart.yaml")}
+        return _SETTINGS | cart
+    return _SETTINGS | _example_files(example)
 
 
 def _following(files: Mapping[Path, str]) -> str:
     """The command to go on with: training for the first specification that plans are made for."""
-    judging = judges(text for path, text in files.items() if path.suffix == ".yaml")
+    systems = (text for path, text in files.items() if path.suffix == ".yaml")
+    judging = {name for text in systems for name in _JUDGE.findall(text)}
     for path in files:
         if path.suffix == ".stl" and path.name not in judging:
             return shell(("stlc", "train", f"specs/{path.name}", "--budget", "60s"))
-    return "stlc new system cart"
+    return "stlc init --system cart"
 
 
-def _files(example: str) -> dict[str, str]:
-    """Path within the project -> text."""
-    from stlc.cli.framework.templates import ATTRIBUTES, EDITOR, IGNORED, read_template
+def _example_files(name: str) -> dict[str, str]:
+    """An installed system, what it needs, and its specifications: path within the project -> text."""
+    specs = [path for path, system in _pairs() if name in (system.removesuffix(".yaml"), path.stem)]
+    if not specs:
+        near = closest(name, examples())
+        advice = (f"did you mean `{near}`?",) if near else ()
+        note = (f"there are {', '.join(examples())}",)
+        raise UsageError(Diagnostic("U101", f"there is no example `{name}`", help=advice, note=note))
+    files: dict[str, str] = {}
+    judges = [SPECS / judge for _, system in _pairs(specs) for judge in _JUDGE.findall(_installed(system))]
+    for path in dict.fromkeys((*specs, *judges)):
+        text = path.read_text(encoding="utf-8")
+        system = next(found[2] for found in _SYSTEM.finditer(text))
+        files[f"specs/{path.name}"] = _SYSTEM.sub(r'\1../systems/\2"', text)
+        beside = [
+            word for word in dict.fromkeys(_BESIDE.findall(_installed(system))) if (SYSTEMS / word).is_file()
+        ]
+        files |= {f"systems/{file}": _installed(file) for file in (system, *beside)}
+    return files
 
-    files = {".gitattributes": ATTRIBUTES, ".gitignore": IGNORED, ".vscode/settings.json": EDITOR}
-    if example == EMPTY:
-        return files
-    if example == FIRST:
-        specs = {"specs/cart.stl": read_template("cart.stl"), "systems/cart.yaml": read_template("cart.yaml")}
-        return files | specs
-    return files | example_files(example)
+
+def _pairs(specs: Iterable[Path] | None = None) -> Iterator[tuple[Path, str]]:
+    """Every specification (of those given) whose system is installed, and the name of that file."""
+    for path in sorted(SPECS.glob("*.stl")) if specs is None else specs:
+        named = _SYSTEM.search(path.read_text(encoding="utf-8"))
+        if named and (SYSTEMS / named[2]).is_file():
+            yield path, named[2]
+
+
+def _installed(name: str) -> str:
+    return (SYSTEMS / name).read_text(encoding="utf-8")
+
+
+def _template(name: str) -> str:
+    return (FOLDER / name).read_text(encoding="utf-8")
+
+
+# ------------------------------------------------------------------------- one file
+
+
+def _specification(folder: Path, name: str, from_: str | None) -> tuple[dict[Path, str], str]:
+    """`NAME.stl` with a signal line for each state of a system, and the command to go on with."""
+    from stlc.grammar.format.format import format_text
+    from stlc.source import Source
+
+    path, decl, reference = _path(folder, name, "specs", ".stl"), None, ""
+    if from_ is not None:
+        from stlc.dynamics.declaration.load import load_system_decl
+        from stlc.files import find_system
+
+        decl = load_system_decl(find_system(from_))
+        reference = Path(os.path.relpath(decl.path, path.parent)).as_posix()
+    text = format_text(Source(str(path), _spec_text(path.stem, decl, reference)))
+    return {path: text}, shell(("stlc", "lint", operand(str(path))))
+
+
+def _system_file(folder: Path, name: str) -> tuple[dict[Path, str], str]:
+    """`NAME.yaml`, and the command to go on with."""
+    path = _path(folder, name, "systems", ".yaml")
+    text = _template("system.yaml").format(name=path.stem)
+    return {path: text}, shell(("stlc", "system", "show", operand(str(path))))
+
+
+def _path(folder: Path, name: str, kind: str, suffix: str) -> Path:
+    """The path as given, or in the folder of its kind.
+
+    Raises:
+        UsageError: U101, it is no name of the language.
+    """
+    from stlc.grammar.words import BUILT_IN, RESERVED
+
+    given = Path(name)
+    path = given if given.suffix in (suffix, ".stlc", ".yml") else given.with_name(f"{given.name}{suffix}")
+    if not _NAME.fullmatch(path.stem) or path.stem in RESERVED or path.stem in BUILT_IN:
+        advice = ("letters, digits and `_`, none of the words of the language",)
+        raise UsageError(Diagnostic("U101", f"`{path.stem}` cannot be a name", help=advice))
+    return folder / kind / path if path.parent == Path() and (folder / kind).is_dir() else folder / path
+
+
+def _spec_text(name: str, system: SystemDecl | None, reference: str) -> str:
+    """A specification to begin with.
+
+    Args:
+        name: of the specification.
+        system: whose states are its signals.
+        reference: the path of that system as the specification writes it.
+    """
+    if system is None:
+        signals, predicate = "signal x [m] in [-5, 5]", "x < 4 m"
+    else:
+        columns = system.signature.columns
+        signals = "\n".join(map(_signal, columns))
+        predicate = _predicate(columns[0])
+    return _template("spec.stl").format(
+        name=name,
+        system=f'system "{reference}"\n' if reference else "",
+        signals=signals,
+        requirement="stays",
+        predicate=predicate,
+    )
+
+
+def _signal(column: Column) -> str:
+    from stlc.grammar.show.expressions import own_name
+
+    role = column.role if column.role in ("input", "output", "state", "env") else "state"
+    head = f"{role} signal {own_name(column.name)}"
+    if column.kind == "bool":
+        return f"{head} : bool"
+    if column.labels:
+        members = ", ".join(f"{own_name(label)} = {value:g}" for label, value in column.labels)
+        kind = column.name.capitalize()
+        return f"enum {kind} {{ {members} }}\n{head} : {kind}"
+    unit = f" [{column.unit}]" if column.unit.text else ""
+    limits = "" if column.low is None or column.high is None else f" in [{column.low:g}, {column.high:g}]"
+    return f"{head}{unit}{limits}"
+
+
+def _predicate(column: Column) -> str:
+    from stlc.grammar.show.expressions import own_name
+
+    if column.kind == "bool":
+        return own_name(column.name)
+    if column.labels:
+        return f"{own_name(column.name)} == {own_name(column.labels[0][0])}"
+    high = 0.0 if column.high is None else column.high
+    return f"{own_name(column.name)} <= {high:g}" + (f" {column.unit}" if column.unit.text else "")

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from stlc.cli.framework.options import JsonOption, SystemOption, describe
+from stlc.cli.framework.options import STDIN, JsonOption, SpecsArgument, SystemOption, spec_files
 from stlc.cli.framework.output import emit, emit_json, say, show_diagnostics, wants_color
-from stlc.diagnostics import Diagnostic, SpecError, StlcError, UsageError
+from stlc.cli.framework.program import command
+from stlc.diagnostics import CODES, Diagnostic, SpecError, StlcError, UsageError
+from stlc.escape import sarif_message, uri, workflow_data, workflow_property
+from stlc.source import Span
+from stlc.version import __version__
 
 if TYPE_CHECKING:
     from stlc.lint.lint import Selection, Surroundings
@@ -21,21 +25,6 @@ if TYPE_CHECKING:
 Format = Literal["text", "json", "github", "sarif"]
 
 CLEAN, FOUND, INVALID = 0, 1, 3
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command(
-        help=describe(
-            "Say what is wrong with specifications, or worth a thought.",
-            "stlc lint specs/traffic.stl",
-            "stlc lint specs --strict --format github",
-            "stlc lint specs/traffic.stl --system car.yaml --fix",
-            note="Syntax, types, units, parentheses, unused names, requirements that say nothing; with "
-            "--system also what only the system knows. Exit code: 0 nothing wrong, 1 warnings and --strict, "
-            "3 errors. `stlc explain CODE` says what a code means.",
-        ),
-    )(lint)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +51,13 @@ class _Result:
         return FOUND if strict and self.findings else CLEAN
 
 
+@command(
+    "stlc lint specs/traffic.stl",
+    "stlc lint specs --strict --format github",
+    "stlc lint specs/traffic.stl --system car.yaml --fix",
+)
 def lint(
-    files: Annotated[list[str], typer.Argument(metavar="FILE…", help="Specifications, folders, or -.")],
+    files: SpecsArgument = None,
     fix: Annotated[bool, typer.Option("--fix", help="Repair what can be repaired, in place.")] = False,
     select: Annotated[
         str | None,
@@ -76,12 +70,16 @@ def lint(
     watch: Annotated[bool, typer.Option("--watch", help="Look again whenever a file changes.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Look at `files` and print the findings."""
-    from stlc.cli.framework.spec_files import STDIN, spec_files
+    """Say what is wrong with specifications, or worth a thought.
+
+    Syntax, types, units, parentheses, unused names, requirements that say nothing; with --system also
+    what only the system knows. Exit code: 0 nothing wrong, 1 warnings and --strict, 3 errors. `stlc
+    explain CODE` says what a code means.
+    """
     from stlc.lint.lint import Selection
 
     layout: Format = "json" if as_json else format_
-    names = spec_files(files)
+    names = spec_files(files or ["."])
     job = _Job(Selection(_codes(select), _codes(ignore)), system, fix)
     if watch or fix:
         for option, wanted in (("--watch", watch), ("--fix", fix)):
@@ -167,12 +165,9 @@ def _show(result: _Result, layout: Format, code: int) -> None:
             entry = {"files": result.files, "findings": len(findings), "fixed": result.fixed}
             emit_json("lint/1", ok=code == CLEAN, exit_code=code, diagnostics=findings, result=entry)
         case "github":
-            from stlc.cli.framework.annotations import github
-
             if findings:
                 emit(github(findings))
         case "sarif":
-            from stlc.cli.framework.annotations import sarif
             from stlc.jsontext import dumps
 
             emit(dumps(sarif(findings), indent=2))
@@ -201,3 +196,70 @@ def _summary(result: _Result) -> str:
 
 def _several(number: int, word: str) -> str:
     return f"{number} {word}" if number == 1 else f"{number} {word}s"
+
+
+# ------------------------------------------------------- findings for other programs
+
+_SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
+
+
+def github(findings: Iterable[Diagnostic]) -> str:
+    """One `::error …` or `::warning …` line for each finding."""
+    return "\n".join(map(_command, findings))
+
+
+def _command(finding: Diagnostic) -> str:
+    places = [f"title={workflow_property(finding.code)}"]
+    if finding.span is not None:
+        (line, column), (end_line, end_column) = _ends(finding.span)
+        places += [
+            f"file={workflow_property(finding.span.source.name)}",
+            f"line={line}",
+            f"endLine={end_line}",
+        ]
+        if line == end_line:
+            places += [f"col={column}", f"endColumn={end_column}"]
+    text = "\n".join([finding.message, *finding.help])
+    return f"::{finding.severity} {','.join(places)}::{workflow_data(text)}"
+
+
+def sarif(findings: Sequence[Diagnostic]) -> dict[str, Any]:
+    """The findings as a SARIF log with one run."""
+    codes = sorted({finding.code for finding in findings})
+    driver = {
+        "name": "stlc",
+        "version": __version__,
+        "rules": [{"id": code, "shortDescription": {"text": CODES[code]}} for code in codes],
+    }
+    results = [_result(finding, codes.index(finding.code)) for finding in findings]
+    run = {"tool": {"driver": driver}, "columnKind": "unicodeCodePoints", "results": results}
+    return {"$schema": _SCHEMA, "version": "2.1.0", "runs": [run]}
+
+
+def _result(finding: Diagnostic, rule: int) -> dict[str, Any]:
+    text = "\n".join([finding.message, *finding.help, *finding.note])
+    result: dict[str, Any] = {
+        "ruleId": finding.code,
+        "ruleIndex": rule,
+        "level": finding.severity,
+        "message": {"text": sarif_message(text)},
+    }
+    if finding.span is not None:
+        result["locations"] = [_location(finding.span)]
+    related = [
+        {**_location(label.span), "message": {"text": sarif_message(label.text)}} for label in finding.labels
+    ]
+    if related:
+        result["relatedLocations"] = related
+    return result
+
+
+def _location(span: Span) -> dict[str, Any]:
+    (line, column), (end_line, end_column) = _ends(span)
+    region = {"startLine": line, "startColumn": column, "endLine": end_line, "endColumn": end_column}
+    artifact = {"uri": uri(span.source.name)}
+    return {"physicalLocation": {"artifactLocation": artifact, "region": region}}
+
+
+def _ends(span: Span) -> tuple[tuple[int, int], tuple[int, int]]:
+    return span.source.position(span.start), span.source.position(span.end)

@@ -6,28 +6,20 @@ from typing import Annotated
 
 import typer
 
-from stlc.cli.framework.options import describe
+from stlc.cli.framework.program import command
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command(
-        "lsp",
-        help=describe(
-            "Serve an editor: findings, hover, completion, rename, format.",
-            "stlc lsp",
-            note="Speaks the language server protocol over the standard input and output. Editors start it. "
-            "Needs `pip install 'stlc[lsp]'`. docs/editors.md says how to set up which.",
-        ),
-    )(lsp)
-
-
+@command("stlc lsp")
 def lsp(
     _stdio: Annotated[
         bool, typer.Option("--stdio", help="Over the standard input and output, which is the only way.")
     ] = True,
 ) -> None:
-    """Serve until the editor says that it is done."""
+    """Serve an editor: findings, hover, completion, rename, format.
+
+    Speaks the language server protocol over the standard input and output. Editors start it. Needs `pip
+    install 'stlc[lsp]'`. docs/editors.md says how to set up which.
+    """
     from stlc.editor.server import make_server
 
     make_server().start_io()

@@ -14,10 +14,10 @@ from stlc.cli.framework.options import (
     RequireOption,
     SetOption,
     SystemOption,
-    describe,
     parse_overrides,
 )
 from stlc.cli.framework.output import emit, emit_json, say
+from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, StlcError, UsageError
 from stlc.escape import visible
 
@@ -31,21 +31,11 @@ if TYPE_CHECKING:
 _FORMATS = (".svg", ".png", ".pdf")
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command(
-        help=describe(
-            "Draw signals, and the robustness of requirements beneath them.",
-            "stlc plot trace.npz",
-            "stlc plot latest --require give_way -o give_way.svg",
-            "stlc plot latest --places -o map.png",
-            note="A run stands for the trace in its folder. The worst and a typical trace are shown unless "
-            "--trace names one. With --places all paths are drawn over the places of the requirements: "
-            "`[x, y] in dock` names one. The suffix of -o says what is written: .svg, .png or .pdf.",
-        )
-    )(plot)
-
-
+@command(
+    "stlc plot trace.npz",
+    "stlc plot latest --require give_way -o give_way.svg",
+    "stlc plot latest --places -o map.png",
+)
 def plot(
     what: Annotated[str, typer.Argument(metavar="TRACE|RUN", help="A trace, or a run with one.")],
     output: Annotated[
@@ -68,7 +58,12 @@ def plot(
     runs: Annotated[Path, typer.Option(help="Folder of all runs.")] = Path("runs"),
     as_json: JsonOption = False,
 ) -> None:
-    """Draw a trace and print where the picture is."""
+    """Draw signals, and the robustness of requirements beneath them.
+
+    A run stands for the trace in its folder. The worst and a typical trace are shown unless --trace names
+    one. With --places all paths are drawn over the places of the requirements: `[x, y] in dock` names
+    one. The suffix of -o says what is written: .svg, .png or .pdf.
+    """
     from stlc.cli.check.judge import Question, laid_out, monitor_of, names_of, specification, time_step
     from stlc.trace import read_recording
     from stlc.view import require_drawing

@@ -4,32 +4,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import typer
-
-from stlc.cli.framework.options import JsonOption, RunArgument, RunsOption, describe
+from stlc.cli.framework.options import JsonOption, RunArgument, RunsOption
 from stlc.cli.framework.output import emit, emit_json, say
+from stlc.cli.framework.program import command
 from stlc.escape import visible
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command(
-        help=describe(
-            "Write a self-contained report.html with the pictures of a run.",
-            "stlc report latest",
-            note="It goes into the run's folder: training curves, signals with the robustness of each "
-            "requirement, and the animation of a simulation, as far as the run has them. The page "
-            "opens without a network.",
-        )
-    )(report)
-
-
+@command("stlc report latest")
 def report(
     run: RunArgument = "latest",
     runs: RunsOption = Path("runs"),
     as_json: JsonOption = False,
 ) -> None:
-    """Write the report of `run` and print where it is."""
+    """Write a self-contained report.html with the pictures of a run.
+
+    It goes into the run's folder: training curves, signals with the robustness of each requirement, and
+    the animation of a simulation, as far as the run has them. The page opens without a network.
+    """
     from stlc.rundir import RunDir
     from stlc.view.learning import Commands, driven_lines, learning_of_run, recommended
     from stlc.view.report import write_report

@@ -3,45 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
 from stlc.cli.framework.completion import run_names
-from stlc.cli.framework.options import JsonOption, RunArgument, describe
+from stlc.cli.framework.options import JsonOption, RunArgument
 from stlc.cli.framework.output import emit, emit_json, say, table
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.cli.framework.program import group, subcommand
+from stlc.diagnostics import Diagnostic, StlcError, UsageError
 from stlc.escape import visible
+from stlc.rundir import RunDir, every_run
 
 Sort = Literal["time", "acc", "name"]
 
 _Runs = Annotated[Path, typer.Option("--runs", help="Folder of all runs.")]
 RUNS = Path("runs")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    group = typer.Typer(
-        name="runs",
-        help=describe("List, show, compare and remove runs.", "stlc runs"),
-        invoke_without_command=True,
-        rich_markup_mode=None,
-    )
-    group.callback()(_default)
-    group.command("list", help=describe("List all runs.", "stlc runs list --sort acc"))(list_)
-    group.command(help=describe("Show what a run was, and what came of it.", "stlc runs show latest"))(show)
-    group.command(
-        help=describe("Say in what two runs differ: options, inputs, results.", "stlc runs diff 1 2")
-    )(diff)
-    group.command(
-        help=describe(
-            "Remove the folders of runs.",
-            "stlc runs rm 3",
-            note="A run that is still going needs --force. The links to the newest run follow.",
-        )
-    )(rm)
-    app.add_typer(group)
 
 
 def _default(context: typer.Context) -> None:
@@ -50,14 +29,16 @@ def _default(context: typer.Context) -> None:
         list_()
 
 
+GROUP = group("List, show, compare and remove runs.", "stlc runs", default=_default)
+
+
+@subcommand(GROUP, "list", "stlc runs list --sort acc")
 def list_(
     sort: Annotated[Sort, typer.Option(help="Newest last, best last, or by name.")] = "time",
     runs: _Runs = RUNS,
     as_json: JsonOption = False,
 ) -> None:
-    """Print a table of all runs."""
-    from stlc.cli.commands.run_table import overview
-
+    """List all runs."""
     rows = overview(runs, sort)
     if as_json:
         emit_json("runs/1", ok=True, exit_code=0, result={"runs": [row.values() for row in rows]})
@@ -68,10 +49,9 @@ def list_(
         say(f"there is no run in {runs}; train one: stlc train specs/traffic.stl --system car.yaml")
 
 
+@subcommand(GROUP, "show", "stlc runs show latest")
 def show(run: RunArgument = "latest", runs: _Runs = RUNS, as_json: JsonOption = False) -> None:
-    """Print the record of `run`."""
-    from stlc.rundir import RunDir
-
+    """Show what a run was, and what came of it."""
     folder = RunDir.open(run, runs)
     record = folder.record()
     files = sorted(str(path.relative_to(folder.path)) for path in folder.path.rglob("*") if path.is_file())
@@ -86,16 +66,17 @@ def show(run: RunArgument = "latest", runs: _Runs = RUNS, as_json: JsonOption = 
     emit("files\n" + "\n".join(visible(f"  {name}") for name in files))
 
 
+@subcommand(GROUP, "diff", "stlc runs diff 1 2")
 def diff(
     first: RunArgument,
     second: Annotated[str, typer.Argument(metavar="OTHER", help="The run to compare with.")] = "latest",
     runs: _Runs = RUNS,
     as_json: JsonOption = False,
 ) -> None:
-    """Print in what two runs differ. Exit with 1 if they do."""
-    from stlc.cli.commands.run_table import differences
-    from stlc.rundir import RunDir
+    """Say in what two runs differ: options, inputs, results.
 
+    Exit code: 0, or 1 if they do.
+    """
     one, other = RunDir.open(first, runs), RunDir.open(second, runs)
     facts = differences(flattened(one.record()), flattened(other.record()))
     texts = [
@@ -113,6 +94,7 @@ def diff(
     raise typer.Exit(code)
 
 
+@subcommand(GROUP, "rm", "stlc runs rm 3")
 def rm(
     names: Annotated[
         list[str], typer.Argument(metavar="RUN…", help="Runs to remove.", autocompletion=run_names)
@@ -121,8 +103,11 @@ def rm(
     runs: _Runs = RUNS,
     as_json: JsonOption = False,
 ) -> None:
-    """Remove the folders of runs."""
-    from stlc.rundir import RunDir, remove_run
+    """Remove the folders of runs.
+
+    A run that is still going needs --force. The links to the newest run follow.
+    """
+    from stlc.rundir import remove_run
 
     folders = [RunDir.open(name, runs) for name in names]
     going = [folder.shown for folder in folders if folder.status == "running"]
@@ -155,3 +140,75 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError:
         return ""
+
+
+# -------------------------------------------------------------------------- table
+
+_VOLATILE = ("started", "finished", "command", "result.seconds", "seconds")
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One run.
+
+    Attributes:
+        run: `spec/number-words`.
+        path: of its folder.
+        record: of `run.json`; empty where it is damaged.
+        status: of the run, or "damaged".
+    """
+
+    run: str
+    path: str
+    record: Mapping[str, Any]
+    status: str
+
+    @property
+    def accuracy(self) -> float | None:
+        """Share of held-out starts whose plan satisfies the specification."""
+        result = self.record.get("result")
+        value = result.get("accuracy") if isinstance(result, Mapping) else None
+        return float(value) if isinstance(value, int | float) else None
+
+    def cells(self) -> tuple[str, ...]:
+        """As text."""
+        record, accuracy = self.record, self.accuracy
+        result = record.get("result")
+        seconds = result.get("seconds") if isinstance(result, Mapping) else None
+        return (
+            self.run,
+            Path(str(record.get("system_path", ""))).name,
+            self.status,
+            "" if accuracy is None else f"{accuracy:.4f}",
+            str(record.get("steps") or ""),
+            f"{seconds:.0f} s" if isinstance(seconds, int | float) else "",
+            str(record.get("started", "")),
+        )
+
+    def values(self) -> dict[str, Any]:
+        """For JSON."""
+        kept = {key: self.record.get(key) for key in ("spec", "system_path", "steps", "seed", "started")}
+        return {"run": self.run, "path": self.path, "status": self.status, "accuracy": self.accuracy, **kept}
+
+
+def overview(root: Path, sort: str) -> list[Row]:
+    """All runs below a folder; a damaged one is listed, not raised."""
+    rows = [_row(run) for run in every_run(root)]
+    if sort == "acc":
+        return sorted(rows, key=lambda row: -1.0 if row.accuracy is None else row.accuracy)
+    return sorted(rows, key=lambda row: str(row.record.get("started", ""))) if sort == "time" else rows
+
+
+def _row(run: RunDir) -> Row:
+    name = f"{run.path.parent.name}/{run.name}"
+    try:
+        record = run.record()
+    except StlcError:
+        return Row(name, run.shown, {}, "damaged")
+    return Row(name, run.shown, record, str(record.get("status", "running")))
+
+
+def differences(one: Mapping[str, str], other: Mapping[str, str]) -> list[tuple[str, str, str]]:
+    """(key, value, other value) where two flat records differ; times of day are left out."""
+    keys = [key for key in {**one, **other} if key not in _VOLATILE]
+    return [(key, one.get(key, ""), other.get(key, "")) for key in keys if one.get(key) != other.get(key)]

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from stlc.cli.framework.options import describe
 from stlc.cli.framework.output import emit
+from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.registry import closest
 
@@ -18,24 +18,16 @@ SYSTEM_FILE = "system-file"
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command(
-        help=describe(
-            "Print the JSON Schema of what --json prints, or list them.",
-            "stlc schema",
-            "stlc schema check/1",
-            note="Within a major number schemas only grow.",
-        )
-    )(schema)
-
-
+@command("stlc schema", "stlc schema check/1")
 def schema(
     name: Annotated[
         str | None, typer.Argument(metavar="SCHEMA", help="Such as check/1; a command's name is its newest.")
     ] = None,
 ) -> None:
-    """Print a schema, or the names of all."""
+    """Print the JSON Schema of what --json prints, or list them.
+
+    Within a major number schemas only grow.
+    """
     if name is None:
         emit("\n".join(names()))
         return

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stlc.cli.framework.options import JsonOption, SetOption, describe, only_help, parse_overrides
+from stlc.cli.framework.options import JsonOption, SetOption, parse_overrides
 from stlc.cli.framework.output import emit, emit_json, say, show_diagnostics, table
+from stlc.cli.framework.program import group, subcommand
 from stlc.escape import visible
 
 if TYPE_CHECKING:
@@ -22,39 +23,12 @@ _File = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    group = typer.Typer(
-        name="system",
-        help=describe("Show, check and list system files.", "stlc system show car.yaml"),
-        invoke_without_command=True,
-        rich_markup_mode=None,
-    )
-    group.callback()(only_help)
-    group.command(
-        help=describe(
-            "Show what a system file declares, from states to scenarios.",
-            "stlc system show car.yaml",
-        )
-    )(show)
-    group.command(
-        help=describe(
-            "Validate a system file, draw initial states, and let it move.",
-            "stlc system check car.yaml",
-            "stlc system check examples/car.yaml --steps 64",
-            note="The file is read without torch; with --steps above 0 states are drawn and driven with "
-            "random controls: initial sets that reject nearly all and dynamics that explode are found. "
-            "Kinematics from a URDF are compared with pytorch-kinematics where that is installed.",
-        )
-    )(check)
-    group.command("list", help=describe("List the systems that are found by name.", "stlc system list"))(
-        list_
-    )
-    app.add_typer(group)
+GROUP = group("Show, check and list system files.", "stlc system show car.yaml")
 
 
+@subcommand(GROUP, "show", "stlc system show car.yaml")
 def show(system: _File, set_: SetOption = None, as_json: JsonOption = False) -> None:
-    """Print `system` in a table."""
+    """Show what a system file declares, from states to scenarios."""
     from stlc.dynamics.declaration.describe import describe as in_words
 
     decl = _load(system, parse_overrides(set_))
@@ -66,6 +40,7 @@ def show(system: _File, set_: SetOption = None, as_json: JsonOption = False) -> 
     emit(in_words(decl))
 
 
+@subcommand(GROUP, "check", "stlc system check car.yaml", "stlc system check examples/car.yaml --steps 64")
 def check(
     system: _File,
     steps: Annotated[int, typer.Option(min=0, help="How far to drive random starts; 0 reads only.")] = 32,
@@ -73,7 +48,12 @@ def check(
     set_: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Validate `system`; findings are raised by what finds them."""
+    """Validate a system file, draw initial states, and let it move.
+
+    The file is read without torch; with --steps above 0 states are drawn and driven with random controls:
+    initial sets that reject nearly all and dynamics that explode are found. Kinematics from a URDF are
+    compared with pytorch-kinematics where that is installed.
+    """
     decl = _load(system, parse_overrides(set_))
     warnings = [*decl.warnings, *(_drive(decl, steps, seed) if steps else ())]
     looked = _kinematics(decl) if steps else []
@@ -95,8 +75,9 @@ def check(
     emit(f"{visible(str(decl.path))} is valid: {size}{moved}")
 
 
+@subcommand(GROUP, "list", "stlc system list")
 def list_(as_json: JsonOption = False) -> None:
-    """Print the systems in `examples/`, in `systems/` and among the installed ones."""
+    """List the systems that are found by name."""
     found = list(_all_systems())
     if as_json:
         rows = [{"name": name, "path": path, "doc": doc} for name, path, doc in found]
@@ -104,7 +85,7 @@ def list_(as_json: JsonOption = False) -> None:
     elif found:
         emit(table(found, header=("name", "file", "")))
     else:
-        say("no system here; write one: stlc new system cart")
+        say("no system here; write one: stlc init --system cart")
 
 
 _DRAWN = 256

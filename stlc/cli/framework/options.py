@@ -1,15 +1,14 @@
-"""Options that several commands share, and how their help is laid out."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from stlc.cli.framework.completion import requirement_names, run_names
-from stlc.cli.framework.output import emit
 from stlc.diagnostics import Diagnostic, UsageError
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on the standard output.")]
@@ -39,25 +38,15 @@ RequireOption = Annotated[
         autocompletion=requirement_names,
     ),
 ]
+SpecsArgument = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="FILE…", help="Specifications, folders, or -; the current folder if none."),
+]
 RunsOption = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Folder of all runs.")]
 SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="Change a constant of the spec or a key of the system."),
 ]
-
-
-def describe(sentence: str, *examples: str, note: str = "") -> str:
-    """The help of a command: one sentence, examples as they are typed, then what else is to be known."""
-    shown = "\b\nExample:\n" if len(examples) == 1 else "\b\nExamples:\n"
-    lines = "\n".join(f"  {example}" for example in examples)
-    return "\n\n".join(part for part in (sentence, shown + lines, note) if part)
-
-
-def only_help(context: typer.Context) -> None:
-    """A group of commands without one of them: its help and exit code 2, as for `stlc` alone."""
-    if context.invoked_subcommand is None:
-        emit(context.get_help())
-        raise typer.Exit(2)
 
 
 def parse_overrides(pairs: Sequence[str] | None) -> dict[str, str]:
@@ -78,3 +67,34 @@ def parse_overrides(pairs: Sequence[str] | None) -> dict[str, str]:
             raise UsageError(Diagnostic("U101", f"`--set {name}=…` is given twice"))
         values[name] = value
     return values
+
+
+SUFFIXES = (".stl", ".stlc")
+STDIN = "-"
+
+
+def spec_files(names: Sequence[str]) -> tuple[str, ...]:
+    """The files that are meant, in order and once; a folder stands for all specifications below it.
+
+    Raises:
+        UsageError: U102, a folder without a specification; U101, nothing is named.
+    """
+    if not names:
+        raise UsageError(Diagnostic("U101", "which file?", help=("a .stl file, a folder, or - for a pipe",)))
+    return tuple(dict.fromkeys(path for name in names for path in _below(name)))
+
+
+def _below(name: str) -> Iterator[str]:
+    folder = Path(name)
+    if name == STDIN or not folder.is_dir():
+        yield name
+        return
+    found = sorted(path for path in folder.rglob("*") if path.suffix in SUFFIXES and _shown(path, folder))
+    if not found:
+        raise UsageError(Diagnostic("U102", f"there is no specification in `{name}`"))
+    yield from map(str, found)
+
+
+def _shown(path: Path, folder: Path) -> bool:
+    """Whether no part of the path below the folder is hidden."""
+    return path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)

@@ -27,6 +27,8 @@ WIDEST = 80
 """Columns up to which a cell of a table makes room for itself in the others."""
 
 COLOR: ContextVar[ColorMode] = ContextVar("stlc_color", default="auto")
+QUIET: ContextVar[bool] = ContextVar("stlc_quiet", default=False)
+"""Whether remarks and progress are left out."""
 
 
 def emit(text: str, *, styled: bool = False) -> None:
@@ -40,7 +42,8 @@ def emit(text: str, *, styled: bool = False) -> None:
 
 def say(text: str, *, styled: bool = False) -> None:
     """Write a line to the standard error; what is `styled` may be several, with colours, as for `emit`."""
-    _write(sys.stderr, screen(text, styled=True) if styled else visible(text))
+    if not QUIET.get():
+        _write(sys.stderr, screen(text, styled=True) if styled else visible(text))
 
 
 def emit_json(
@@ -79,7 +82,8 @@ def show_diagnostics(diagnostics: Sequence[Diagnostic]) -> None:
     from stlc.cli.framework.render import render_text
 
     if diagnostics:
-        say(render_text(tuple(diagnostics), color=wants_color(sys.stderr)).rstrip("\n"), styled=True)
+        text = render_text(tuple(diagnostics), color=wants_color(sys.stderr)).rstrip("\n")
+        _write(sys.stderr, screen(text, styled=True))
 
 
 @contextmanager
@@ -128,6 +132,7 @@ def console(*, stderr: bool = False, width: int | None = None) -> Console:
         no_color=not colored,
         highlight=False,
         markup=False,
+        quiet=stderr and QUIET.get(),
         width=width,
         soft_wrap=not stream.isatty(),
     )

@@ -274,10 +274,7 @@ def as_json(
         "interval": "95 %, Student's t over the deployment seeds",
         "guards": {
             name: {
-                "metrics": {
-                    key: {"mean": m.mean, "low": m.low, "high": m.high, "values": list(m.values)}
-                    for key, m in found.metrics.items()
-                },
+                "metrics": {key: metric.summary() for key, metric in found.metrics.items()},
                 "drives": drives_json(found.drives, setting.seeds, setting.agents),
                 "units": dict(found.recording.units),
                 "decisions": dict(found.decisions),

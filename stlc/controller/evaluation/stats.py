@@ -29,6 +29,10 @@ class Interval:
         half = student(len(values) - 1) * stdev(values) / math.sqrt(len(values))
         return cls(mean, mean - half, mean + half, tuple(values))
 
+    def summary(self) -> dict[str, object]:
+        """For JSON documents."""
+        return {"mean": self.mean, "low": self.low, "high": self.high, "values": list(self.values)}
+
     @property
     def half(self) -> float | None:
         """Half its width."""

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Judged, Task
 
 Mode: TypeAlias = Literal["none", "paper", "full"]
+GUARD_VERSION = 1
+"""Raised with every change of a guard's decisions; benchmarks drive anew what older guards drove."""
 SOURCES = ("policy", "backup", "safest", "polished")
 
 

@@ -1,0 +1,1 @@
+"""Tables of the documentation: `python -m benchmarks` measures and writes them."""

@@ -1,0 +1,106 @@
+"""Accuracy of the benchmarks over training time, a panel each, below the known feasible share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from stlc.view.style import BLUE, INK, MUTED, ORANGE, Picture, look, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from benchmarks.store import Result
+
+COLORS = {"guided": BLUE, "gradient": ORANGE}
+COLUMNS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """One training.
+
+    Attributes:
+        method: of it.
+        seconds: of the points.
+        accuracies: of the points, on fresh states.
+        end: seconds and accuracy of the verdict on held-out states.
+    """
+
+    method: str
+    seconds: tuple[float, ...]
+    accuracies: tuple[float, ...]
+    end: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """One benchmark.
+
+    Attributes:
+        title: of the panel.
+        curves: one a training.
+        feasible: known feasible share, if there is one.
+    """
+
+    title: str
+    curves: tuple[Curve, ...]
+    feasible: float | None
+
+
+def curve_of(result: Result) -> Curve:
+    """The curve of the result of a training."""
+    points = result["curve"]
+    return Curve(
+        result["key"]["method"],
+        tuple(float(point["seconds"]) for point in points),
+        tuple(float(point["accuracy"]) for point in points),
+        (float(result["seconds"]), float(result["accuracy"])),
+    )
+
+
+def draw_benchmarks(panels: Sequence[Panel]) -> Picture | None:
+    """All panels, three in a row; None where there is nothing to draw."""
+    shown = [panel for panel in panels if panel.curves]
+    if not shown:
+        return None
+    rows, columns = -(-len(shown) // COLUMNS), min(len(shown), COLUMNS)
+    with look():
+        figure = new_figure(3.1 * columns + 0.4, 2.3 * rows + 0.3)
+        grid = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
+        for axes, panel in zip(grid, shown, strict=False):
+            _draw_panel(axes, panel)
+        for axes in grid[::columns]:
+            axes.set_ylabel("plan accuracy, share of starts")
+        for axes in grid[len(shown) :]:
+            axes.set_visible(False)
+        grid[0].legend(loc="lower right", handlelength=1.2)
+    reached = (f"{panel.title} {max(curve.end[1] for curve in panel.curves):.3f}" for panel in shown)
+    return Picture(figure, f"Plan accuracy over training time; the best at the end: {', '.join(reached)}.")
+
+
+def _draw_panel(axes: Axes, panel: Panel) -> None:
+    axes.set_title(panel.title)
+    axes.set_xlabel("training time [s]")
+    named: set[str] = set()
+    for curve in panel.curves:
+        color = COLORS.get(curve.method, INK)
+        label = None if curve.method in named else curve.method
+        named.add(curve.method)
+        axes.plot(curve.seconds, curve.accuracies, color=color, lw=0.9, alpha=0.7, label=label)
+        axes.plot(*curve.end, "o", color=color, ms=3.2, zorder=3)
+    top = max(accuracy for curve in panel.curves for accuracy in (*curve.accuracies, curve.end[1]))
+    if panel.feasible is not None:
+        axes.axhline(panel.feasible, color=MUTED, lw=1.0, ls=(0, (4, 2)))
+        axes.annotate(
+            f"known feasible {panel.feasible:.3f}",
+            (0.02, panel.feasible),
+            xycoords=("axes fraction", "data"),
+            xytext=(0, 3),
+            textcoords="offset points",
+            color=MUTED,
+        )
+        top = max(top, panel.feasible)
+    axes.set_xlim(left=0)
+    axes.set_ylim(0, min(1.08, 1.15 * top + 0.01))

@@ -1,0 +1,297 @@
+"""Deployments behind tables: policies driven and recorded under guards and scenarios, each kept once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Annotated, Any
+
+import torch
+import typer
+
+from benchmarks.options import ResultsOption, SeedsOption, TrainedOption
+from benchmarks.store import BENCHMARKS, Key, Result, ResultStore
+from benchmarks.training import Place, benchmark_order
+from stlc.cli.framework.output import say
+from stlc.cli.framework.ranges import parse_limit, parse_seeds
+from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
+from stlc.controller.evaluation.deployment import decided, feasible_states, measure
+from stlc.controller.evaluation.executed import judge_executed
+from stlc.controller.guard.feasibility import savable
+from stlc.controller.guard.guard import GUARD_VERSION, Guard, Mode
+from stlc.controller.guard.margin_request import Asked, parse_margins
+from stlc.controller.guard.plan_repair import Limits
+from stlc.controller.training.run import SPEC, SYSTEM, Run
+from stlc.controller.world import world_type
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.dynamics.declaration.deployment import ErrorsDecl
+from stlc.dynamics.scenarios.scenario import DISTURBED
+from stlc.provenance import sha256
+from stlc.registry import closest
+from stlc.rundir import RunDir
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from stlc.controller.problem.task import Task
+
+NOMINAL = "as it is"
+SCENARIOS = (NOMINAL, *DISTURBED)
+GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
+USUAL = (*GUARDS, "full+auto")
+"""Guards, and behind a `+` the margin that they ask of safety requirements; see `guard.margin_request`."""
+KEPT = (
+    *("saved", "saved_starts", "savable", "executed_safe", "executed_starts", "executed_safe_starts"),
+    *("foreseen_safe_starts", "quiet", "quiet_safe_starts", "plan_accuracy", "plan_safety"),
+    *("policy_accuracy", "feasible", "feasible_followed"),
+)
+"""The metrics that are kept; see `stlc.controller.evaluation.metrics`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drives:
+    """Options of deployments."""
+
+    seeds: SeedsOption = "0..9"
+    agents: Annotated[
+        int | None, typer.Option("--agents", metavar="N", min=1, help="In each deployment, at most.")
+    ] = None
+    steps: Annotated[
+        int | None, typer.Option("--steps", metavar="N", min=1, help="Of each deployment, at most.")
+    ] = None
+    time_limit: Annotated[
+        str, typer.Option("--time-limit", metavar="TIME", help="Of a decision of the full guard, or `none`.")
+    ] = "100ms"
+    out: ResultsOption = Path("benchmarks/results")
+    runs_folder: TrainedOption = Path("runs/benchmarks")
+
+    def setting(self, run: Run, ceiling: int) -> Setting:
+        """The setting of a run's deployments, at most as large as its system says."""
+        test = run.task.system.decl.test
+        agents = min(self.agents or test.agents, test.agents)
+        steps = min(self.steps or test.steps, test.steps)
+        limit = parse_limit(self.time_limit)
+        return Setting(parse_seeds(self.seeds), agents, steps, test.replan, limit, ceiling)
+
+    def runs(self, names: Sequence[str] | None) -> list[RunDir]:
+        """The runs that are named, else those of the most accurate policies. Raises UsageError (U101)."""
+        if names:
+            return [RunDir.open(name) for name in names]
+        place = Place(ResultStore("paper", self.out), self.runs_folder)
+        results = place.valid()
+        own = [[each for each in results if each["key"]["benchmark"] == name] for name in BENCHMARKS]
+        found = [run for each in own if each and (run := place.best_run(each)) is not None]
+        if not found:
+            help_ = ("python -m benchmarks paper  trains them", "or name runs")
+            message = f"there are no policies of the benchmarks in `{self.runs_folder}`"
+            raise UsageError(Diagnostic("U101", message, help=help_))
+        return found
+
+
+def recorded(guard: Guard, setting: Setting) -> Recording:
+    """A deployment under a guard in the world of its system."""
+    recorder = Recorder(setting.agents)
+    drive(guard, world_type(guard.task.system.decl), setting, recorder)
+    recording = recorder.recording()
+    assert recording is not None
+    return recording
+
+
+def guard_of(name: str) -> tuple[Mode, Asked]:
+    """The guard of a name such as `full`, `full+0.2` or `full+auto`, and the margin that it asks for.
+
+    Raises:
+        UsageError: U101, there is none.
+    """
+    mode, _, margin = name.partition("+")
+    for known in GUARDS:
+        if mode == known:
+            return known, parse_margins([margin] if margin else [])
+    near = closest(name, USUAL)
+    help_ = (f"did you mean `{near}`?",) if near else (", ".join(USUAL),)
+    raise UsageError(Diagnostic("U101", f"there is no guard `{name}`", help=help_))
+
+
+@dataclass(slots=True)
+class Deployments:
+    """Deployments of one table; each is kept as soon as it is over, and never driven twice.
+
+    Attributes:
+        store: of the results.
+        options: seeds and sizes.
+        ceiling: visited states that are searched for a plan.
+        driven: how many were driven now.
+        kept: how many were there.
+        results: all of them, in order.
+    """
+
+    store: ResultStore
+    options: Drives
+    ceiling: int = 0
+    driven: int = 0
+    kept: int = 0
+    results: list[Result] = field(default_factory=list)
+    _viable: list[tuple[Tensor, Tensor]] = field(default_factory=list)
+
+    def add(self, folder: RunDir, scenarios: Sequence[str], guards: Sequence[str]) -> None:
+        """Deploy the policy of a run under scenarios and guards.
+
+        Raises:
+            RunError, SystemFileError: the run is damaged, or a world fails.
+        """
+        for scenario in scenarios:
+            run = Run.open(folder.path, scenario=None if scenario == NOMINAL else scenario)
+            setting = self.options.setting(run, self.ceiling)
+            for guard in guards:
+                self._add(key_of(run, scenario, guard, setting), run, guard, setting)
+
+    def _add(self, key: Key, run: Run, guard: str, setting: Setting) -> None:
+        driven = self.driven
+
+        def deploy() -> Result:
+            say(f"deploying {key.name}")
+            self.driven += 1
+            return self._deploy(run, guard, setting)
+
+        result = self.store.get(key, deploy)
+        self.results.append(result)
+        self.kept += self.driven == driven
+        say(f"{key.name}  {'kept' if self.driven == driven else format(result['seconds'], '.0f') + ' s'}")
+
+    def _deploy(self, run: Run, name: str, setting: Setting) -> Result:
+        """Drive, and measure what was driven."""
+        begin = perf_counter()
+        mode, asked = guard_of(name)
+        margin = asked.of(run.task, run.policy, mode, setting.replan)
+        guard = Guard(run.task, run.policy, mode, limits=Limits(seconds=setting.limit, margin=margin))
+        recording = recorded(guard, setting)
+        seconds = perf_counter() - begin
+        known = self.viable(run.task, torch.from_numpy(recording.states[:, 0]))
+        executed = judge_executed(run.task, recording, savable=known.numpy())
+        metrics = measure(recording, executed, feasible_states(run.task, recording, setting.ceiling))
+        return {
+            "run": run.dir.name,
+            "policy": _policy_of(run.dir),
+            **({"margin": dict(margin)} if margin else {}),
+            "metrics": {name: metrics[name].summary() for name in KEPT if name in metrics},
+            "progress": {name: metrics[name].summary() for name in recording.progress[0] if name in metrics},
+            "acted": 1.0 - decided(recording)["policy"],
+            "seconds": seconds,
+        }
+
+    def viable(self, task: Task, x0: Tensor) -> Tensor:
+        """Starts from which a search finds a safe plan, (rows,); searched once for the same starts."""
+        for known, found in self._viable:
+            if known.shape == x0.shape and bool((known == x0).all()):
+                return found
+        found = savable(task, x0)
+        self._viable.append((x0, found))
+        return found
+
+
+def key_of(run: Run, scenario: str, guard: str, setting: Setting) -> Key:
+    """All that a deployment depends on."""
+    folder, decl = run.dir.path, run.task.system.decl
+    world, laid = decl.test.world, decl.scenario
+    mode, asked = guard_of(guard)
+    errors = laid.errors if laid is not None and laid.errors != ErrorsDecl() else None
+    spec, system, policy = (
+        sha256((folder / name).read_text(encoding="utf-8")) for name in (SPEC, SYSTEM, "ckpt/last.json")
+    )
+    name = run.task.compiled.name
+    return Key(
+        f"{name}-{scenario.replace(' ', '_')}-{guard}",
+        {
+            **{"spec": name, "spec_sha256": spec, "system_sha256": system, "policy_sha256": policy},
+            "world_sha256": None if world is None else sha256(world.path.read_text(encoding="utf-8")),
+            **{"guard": guard, "guard_version": GUARD_VERSION, "margin_share": asked.share},
+            **{"scenario": scenario, "errors": None if errors is None else str(errors)},
+            **{"seeds": list(setting.seeds), "agents": setting.agents, "steps": setting.steps},
+            **{"replan": setting.replan, "time_limit": setting.limit if mode == "full" else None},
+            "ceiling": setting.ceiling,
+        },
+    )
+
+
+def _policy_of(folder: RunDir) -> dict[str, Any]:
+    """How the policy of a run was trained, and how much of the held-out starts it solves."""
+    record = folder.record()
+    result = record.get("result") or {}
+    return {
+        "method": (record.get("engine") or {}).get("method"),
+        "seed": record.get("seed"),
+        **{name: result.get(name) for name in ("accuracy", "seconds")},
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A policy under a scenario, by guard.
+
+    Attributes:
+        spec: name of the specification.
+        scenario: name.
+        seeds: number of deployments.
+        agents: in each.
+        steps: of each.
+        guards: guard -> its result.
+    """
+
+    spec: str
+    scenario: str
+    seeds: int
+    agents: int
+    steps: int
+    guards: Mapping[str, Result]
+
+    def metric(self, guard: str, name: str) -> Mapping[str, Any] | None:
+        """Mean and interval of a metric under a guard; None where that was not driven, or is undefined."""
+        found: Mapping[str, Any] | None = (self.guards.get(guard) or {}).get("metrics", {}).get(name)
+        return found
+
+    @property
+    def size(self) -> str:
+        """Seeds x agents x steps."""
+        return f"{self.seeds} x {self.agents} x {self.steps}"
+
+
+def rows_of(results: Iterable[Result]) -> list[Row]:
+    """Specifications in the paper's order, then others; scenarios in that of `SCENARIOS`."""
+    groups: dict[tuple[str, str, int, int, int], dict[str, Result]] = {}
+    for each in results:
+        key = each["key"]
+        group = (key["spec"], key["scenario"], len(key["seeds"]), int(key["agents"]), int(key["steps"]))
+        groups.setdefault(group, {})[key["guard"]] = each
+    return sorted((Row(*key, guards) for key, guards in groups.items()), key=_place)
+
+
+def _place(row: Row) -> tuple[Any, ...]:
+    scenario = SCENARIOS.index(row.scenario) if row.scenario in SCENARIOS else len(SCENARIOS)
+    return *benchmark_order(row.spec), scenario, row.scenario, row.seeds, row.agents, row.steps
+
+
+def policy_lines(rows: Iterable[Row]) -> list[str]:
+    """How the policy of each deployment was trained, as bullets."""
+    lines = []
+    for result in (each for row in rows for each in row.guards.values()):
+        known = result["policy"]
+        accuracy, seconds = (
+            f"{known[name]:.{digits}f}" if known[name] is not None else "?"
+            for name, digits in (("accuracy", 3), ("seconds", 0))
+        )
+        lines.append(
+            f"- {result['key']['spec']}: run {result['run']}, method {known['method'] or '?'}, seed "
+            f"{known['seed']}, {seconds} s of training, plan accuracy {accuracy} on held-out starts"
+        )
+    return list(dict.fromkeys(lines))
+
+
+def mean_and_half(metric: Mapping[str, Any] | None) -> str:
+    """A mean and half its interval: `.957 ± .012`; empty where there is none."""
+    if metric is None:
+        return ""
+    mean, high = float(metric["mean"]), metric["high"]
+    text = f"{mean:.3f}" if high is None else f"{mean:.3f} ± {float(high) - mean:.3f}"
+    return " ".join(part.removeprefix("0") if part.startswith("0.") else part for part in text.split(" "))

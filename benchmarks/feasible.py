@@ -1,0 +1,193 @@
+"""Known feasible share of a benchmark: a long search for plans of the states where every policy failed.
+
+It is the share of the held-out states for which some satisfying plan is known, of a policy or of this search:
+a lower bound of what is feasible. It never falls, and what was searched is kept, so a search goes on where it
+stopped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from benchmarks.store import Key, Result, ResultStore, load
+from benchmarks.training import benchmark_order, pack, unpack
+from stlc.cli.framework.output import say
+from stlc.controller.evaluation.held_out import wilson
+from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.training.config import HELD_OUT_SEED
+from stlc.controller.training.local_search import Searcher
+from stlc.controller.training.run import Run
+from stlc.diagnostics import StlcError
+
+if TYPE_CHECKING:
+    from stlc.rundir import RunDir
+
+PASSES = 10
+"""Searches for every state that is still open."""
+TRIES = 20_000
+"""Plans of a search for one state, at most."""
+LIBRARY = 4096
+"""Plans of other states that a search may try, at most."""
+
+_INPUTS = ("spec_sha256", "system_sha256", "held_out", "held_out_seed")
+
+
+@dataclass(frozen=True, slots=True)
+class KnownFeasible:
+    """The known feasible share of one benchmark.
+
+    Attributes:
+        benchmark: name.
+        share: of the held-out states that a satisfying plan is known for.
+        interval: its 95 % Wilson interval.
+        open: states without one.
+        by_search: states that only the search here has solved.
+        passes: searches so far.
+        tries: plans that were tried for each open state.
+    """
+
+    benchmark: str
+    share: float
+    interval: tuple[float, float]
+    open: int
+    by_search: int
+    passes: int
+    tries: int
+
+
+def key_of(result: Result) -> Key:
+    """The inputs that the states of a result depend on."""
+    return Key(result["key"]["benchmark"], {name: result["key"][name] for name in _INPUTS})
+
+
+def known_feasible(store: ResultStore, results: Iterable[Result]) -> dict[str, KnownFeasible]:
+    """The known feasible shares of the benchmarks of `results`; nothing is searched."""
+    groups: dict[str, list[Result]] = {}
+    for result in results:
+        groups.setdefault(result["key"]["benchmark"], []).append(result)
+    return {
+        name: _known(name, store.find(key_of(own[0])) or _blank(own[0]), own)
+        for name, own in sorted(groups.items(), key=lambda item: benchmark_order(item[0]))
+    }
+
+
+def search_on(
+    own: Sequence[Result], store: ResultStore, *, passes: int = PASSES, run: RunDir | None = None
+) -> None:
+    """Search for plans of the states that no policy solves, and keep what is found after every pass.
+
+    Args:
+        own: results of one benchmark, at least one, all on the same held-out states.
+        store: of what was searched.
+        passes: in all, those of earlier calls included.
+        run: whose policy's plans are where the search begins; without one, from plans that do nothing.
+    """
+    key = key_of(own[0])
+    entry: Mapping[str, Any] = store.find(key) or _blank(own[0])
+    count = int(own[0]["key"]["held_out"])
+    task = load(key.name)
+    states = task.sample(count, seed=HELD_OUT_SEED, dtype=torch.float64)
+    search = _Search.begin(task, states, torch.tensor(_solved(entry, own)), run)
+    found = torch.tensor(unpack(entry["found"], count))
+    for number in range(int(entry["passes"]) + 1, passes + 1):
+        found[search.go_on(number)] = True
+        tries = int(entry["tries"]) + TRIES
+        entry = store.put(key, {"passes": number, "tries": tries, "found": pack(found.tolist())})
+        say(f"{key.name}: search {number}, {len(search.open)} states without a plan")
+
+
+@dataclass(slots=True)
+class _Search:
+    """The states that are still open and the best plan of each.
+
+    Attributes:
+        task: of the benchmark.
+        states: all of them, (n, dim) float64.
+        open: indices of those without a satisfying plan, (k,).
+        plans: the best so far of each open one, (k, T, m) float32.
+        rho: of these, (k,).
+        library: plans of solved states, (b, T, m) float32.
+    """
+
+    task: Task
+    states: Tensor
+    open: Tensor
+    plans: Tensor
+    rho: Tensor
+    library: Tensor
+
+    @classmethod
+    def begin(cls, task: Task, states: Tensor, known: Tensor, run: RunDir | None) -> _Search:
+        """A search in which nothing was tried yet."""
+        still = (~known).nonzero()[:, 0]
+        plans = _first_plans(task, states, run)
+        rho = task.judge(states[still], plans[still].double(), states=False).rho
+        return cls(task, states, still, plans[still].float(), rho, plans[known][:LIBRARY].float())
+
+    def go_on(self, number: int) -> Tensor:
+        """One pass; returns the indices of the states that it solved.
+
+        Every other pass starts at plans of other states instead of the best so far: a local search that is
+        stuck stays stuck.
+        """
+        if not len(self.open):
+            return self.open
+        generator = torch.Generator().manual_seed(HELD_OUT_SEED + number)
+        x0, start = self.states[self.open], self.plans
+        if number % 2 == 0 and len(self.library):
+            start = self.library[torch.randint(len(self.library), (len(self.open),), generator=generator)]
+        searcher = Searcher(self.task, generator, enough=1e-4)
+        plans = searcher.repair(x0.float(), start, self.library, tries=TRIES).plans
+        rho = self.task.judge(x0, plans.double(), states=False).rho
+        better = rho > self.rho
+        self.plans = torch.where(better[:, None, None], plans, self.plans)
+        self.rho = torch.where(better, rho, self.rho)
+        done = satisfied(self.rho)
+        solved, self.library = self.open[done], torch.cat((self.plans[done], self.library))[:LIBRARY]
+        self.open, self.plans, self.rho = self.open[~done], self.plans[~done], self.rho[~done]
+        return solved
+
+
+def _first_plans(task: Task, states: Tensor, run: RunDir | None) -> Tensor:
+    """Initial plans, (n, T, m): a policy's, else the middle of every control."""
+    if run is not None:
+        try:
+            return Run.open(run.path).policy.plan(states)
+        except StlcError:
+            pass  # the run was removed, or is damaged: the search only takes longer
+    middle = 0.5 * (task.system.control_low + task.system.control_high)
+    return middle.expand(len(states), task.horizon, -1)
+
+
+def _blank(result: Result) -> Result:
+    return {"passes": 0, "tries": 0, "found": pack([False] * int(result["key"]["held_out"]))}
+
+
+def _union(digits: Iterable[str], count: int) -> list[bool]:
+    """Where any of the packed sets of `count` truth values holds."""
+    return [any(flags) for flags in zip(*(unpack(each, count) for each in digits), strict=True)]
+
+
+def _solved(entry: Mapping[str, Any], own: Sequence[Result]) -> list[bool]:
+    """Where the search or any policy knows a plan."""
+    return _union((entry["found"], *(each["solved"] for each in own)), int(own[0]["key"]["held_out"]))
+
+
+def _known(benchmark: str, entry: Mapping[str, Any], own: Sequence[Result]) -> KnownFeasible:
+    same = [each for each in own if key_of(each) == key_of(own[0])]
+    count = int(own[0]["key"]["held_out"])
+    known = sum(_solved(entry, same))
+    return KnownFeasible(
+        benchmark=benchmark,
+        share=known / count,
+        interval=wilson(known / count, count),
+        open=count - known,
+        by_search=known - sum(_union((each["solved"] for each in same), count)),
+        passes=int(entry["passes"]),
+        tries=int(entry["tries"]),
+    )

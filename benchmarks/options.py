@@ -1,0 +1,133 @@
+"""Option groups that tables share: a dataclass each, whose fields are the options."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stlc.cli.framework.options import JsonOption
+from stlc.cli.framework.ranges import parse_clock, parse_seconds, parse_seeds
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.registry import closest
+
+if TYPE_CHECKING:
+    from benchmarks.training import Length, Place
+    from stlc.rundir import RunDir
+
+OnlyOption = Annotated[
+    str | None, typer.Option("--only", metavar="NAMES", help="Some of them; all if not given.")
+]
+SeedsOption = Annotated[str, typer.Option("--seeds", metavar="SEEDS", help="Such as 0..2 or 0,3.")]
+RunsArgument = Annotated[
+    list[str] | None, typer.Argument(metavar="RUN…", help="Runs; the newest one if none.")
+]
+ResultsOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the results.")]
+TrainedOption = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Folder of the runs behind them.")]
+PageOption = Annotated[
+    Path | None, typer.Option("--page", metavar="FILE", help="The page that takes the table.")
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """Where a table is written."""
+
+    page: PageOption = None
+    as_json: JsonOption = False
+
+
+@dataclass(frozen=True, slots=True)
+class Training:
+    """Trainings behind a table."""
+
+    budget: Annotated[
+        list[str] | None,
+        typer.Option("--budget", metavar="TIME", help="Time of a training, such as 60s or 5min; repeatable."),
+    ] = None
+    clock: Annotated[
+        str,
+        typer.Option(
+            "--clock",
+            metavar="wall|processor",
+            help="What budgets count; processor time as on an idle machine, for busy ones.",
+        ),
+    ] = "wall"
+    steps: Annotated[
+        int | None,
+        typer.Option("--steps", metavar="N", min=1, help="Steps of the optimiser instead of budgets."),
+    ] = None
+    seeds: SeedsOption = "0..2"
+    jobs: Annotated[
+        int,
+        typer.Option(
+            "--jobs", "-j", metavar="N", min=1, help="Trainings side by side, a share of the cores each."
+        ),
+    ] = 1
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            "--cluster",
+            metavar="auto|local|HOST:PORT",
+            help="Train on a Ray cluster instead, as many at a time as it has cores for.",
+        ),
+    ] = None
+    threads: Annotated[
+        int, typer.Option("--threads", metavar="N", min=1, help="Threads of torch in each training.")
+    ] = 1
+    held_out: Annotated[
+        int,
+        typer.Option("--held-out", metavar="N", min=1, help="Held-out states that policies are judged on."),
+    ] = 5000
+    out: ResultsOption = Path("benchmarks/results")
+    runs: TrainedOption = Path("runs/benchmarks")
+
+    def seeds_and_lengths(self, usual: Sequence[float]) -> list[tuple[int, Length]]:
+        """Seed and length of each training, short ones first, then early seeds: a table fills evenly.
+
+        Raises:
+            UsageError: U101, for budgets and steps at once.
+        """
+        from benchmarks.training import Length
+
+        if self.budget and self.steps is not None:
+            raise UsageError(Diagnostic("U101", "`--budget` and `--steps` contradict each other"))
+        clock = parse_clock(self.clock)
+        seconds = [parse_seconds(text) for text in dict.fromkeys(self.budget or ())] or usual
+        lengths = [Length(each, clock=clock) for each in seconds]
+        if self.steps is not None:
+            lengths = [Length(steps=self.steps)]
+        return [(seed, length) for length in lengths for seed in parse_seeds(self.seeds)]
+
+    def place(self, table: str) -> Place:
+        """Where the results of a table and their runs lie, and how they are made."""
+        from benchmarks.store import ResultStore
+        from benchmarks.training import Place
+
+        store = ResultStore(table, self.out)
+        return Place(store, self.runs, self.jobs, self.threads, self.cluster)
+
+
+def chosen(text: str | None, known: Sequence[str], what: str) -> tuple[str, ...]:
+    """Names in a comma-separated list, all of them without one. Raises UsageError (U101) for others."""
+    if text is None:
+        return tuple(known)
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    for name in names:
+        if name not in known:
+            near = closest(name, known)
+            help_ = (f"did you mean `{near}`?",) if near else (", ".join(known),)
+            raise UsageError(Diagnostic("U101", f"there is no {what} `{name}`", help=help_))
+    if not names:
+        raise UsageError(Diagnostic("U101", f"no {what} is named", help=(", ".join(known),)))
+    return names
+
+
+def opened(names: Sequence[str] | None) -> list[RunDir]:
+    """The runs that are named, else the newest one."""
+    from stlc.rundir import RunDir
+
+    return [RunDir.open(name) for name in names or ["latest"]]

@@ -1,0 +1,250 @@
+"""One policy for all values of a parameter, judged at single values inside and outside of its range.
+
+A family is a specification in `specs/families/`: that of a benchmark with one constant made a `param`. A
+policy is trained once, on values drawn from the declared range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from benchmarks.options import OnlyOption, Output, Training, chosen
+from stlc.cli.framework.program import command
+
+if TYPE_CHECKING:
+    from benchmarks.store import Key, Result, ResultStore
+    from benchmarks.table import Table
+    from benchmarks.training import Place
+
+BUDGETS = (60.0,)
+TEXT = """\
+Specifications in `specs/families/`, each that of a benchmark with one constant made a `param`. A policy is
+trained once, on values drawn evenly from the range in the title, and judged at single values; those outside
+of the range are in italics. `known feasible` is the share of the same states for which a satisfying plan is
+known, the policy's own or one that a search has found, and `share of feasible` the accuracy as a share of
+that.
+"""
+_TRAINING = Training(seeds="0", held_out=2000)
+_OUTPUT = Output(Path("docs/results.md"))
+
+
+@dataclass(frozen=True, slots=True)
+class Family:
+    """A specification with one parameter, and the values at which its policy is judged.
+
+    Attributes:
+        name: of the specification in `specs/families/`.
+        parameter: its name.
+        unit: of the parameter and of `values`.
+        title: what is varied, for people.
+        values: in order, some inside of the range that is trained on and some outside.
+    """
+
+    name: str
+    parameter: str
+    unit: str
+    title: str
+    values: tuple[float, ...]
+
+    def sampled(self) -> tuple[float, float]:
+        """The range that training draws from, as the specification declares it."""
+        from benchmarks.store import load
+
+        (each,) = load(self.name).compiled.parameters
+        assert each.column.low is not None
+        assert each.column.high is not None
+        return each.column.low, each.column.high
+
+
+FAMILIES = (
+    Family(
+        "ship_radius",
+        "radius",
+        "m",
+        "ship-safe, the radius of the obstacles",
+        (0.4, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4),
+    ),
+    Family(
+        "stop_time",
+        "stop_time",
+        "s",
+        "traffic, how long to stand at a stop sign",
+        (0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0),
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A family at one value of its parameter for one length of training, over all seeds.
+
+    Attributes:
+        family: name.
+        value: of the parameter, in the family's unit.
+        inside: whether training drew such values.
+        length: of training, such as `60 s`.
+        seeds: of training.
+        accuracy: mean over seeds.
+        interval: its 95 % Wilson interval, over the states of all seeds.
+        feasible: share of the states for which some satisfying plan is known, mean over seeds.
+    """
+
+    family: str
+    value: float
+    inside: bool
+    length: str
+    seeds: tuple[int, ...]
+    accuracy: float
+    interval: tuple[float, float]
+    feasible: float
+
+    @property
+    def share(self) -> float | None:
+        """Of the known feasible states."""
+        return self.accuracy / self.feasible if self.feasible else None
+
+
+COLUMNS: dict[str, Callable[[Row], str]] = {
+    "value": lambda row: (
+        f"{row.value:g} {_named(row.family).unit}"
+        if row.inside
+        else f"*{row.value:g} {_named(row.family).unit}*"
+    ),
+    "budget": lambda row: row.length,
+    "seeds": lambda row: ", ".join(map(str, row.seeds)),
+    "accuracy": lambda row: f"{row.accuracy:.4f} [{row.interval[0]:.4f}, {row.interval[1]:.4f}]",
+    "known feasible": lambda row: f"{row.feasible:.4f}",
+    "share of feasible": lambda row: "" if row.share is None else f"{row.share:.3f}",
+}
+
+
+def _named(name: str) -> Family:
+    return next(family for family in FAMILIES if family.name == name)
+
+
+def key_of(training: Result, value: float) -> Key:
+    """The inputs of the verdict on a trained policy at one value."""
+    from benchmarks.store import Key
+
+    values = {"training": training["key"], "trained": training["made"]["date"], "value": value}
+    return Key(f"{training['name']} at {value:g}", values)
+
+
+def judge_all(trainings: Sequence[Result], place: Place, verdicts: ResultStore) -> list[dict[str, str]]:
+    """Judge policies at the values where they were not judged yet; name and reason of those that cannot."""
+    from benchmarks.training import Cell
+    from stlc.cli.framework.output import say
+
+    failed = []
+    for training in trainings:
+        cell = Cell.of(training)
+        family, run = _named(cell.benchmark), place.newest_run(cell.key)
+        missing = [value for value in family.values if verdicts.find(key_of(training, value)) is None]
+        if missing and run is None:
+            why = f"its run is gone: remove it from {place.store.path} to train anew"
+            say(f"{cell.name}: {why}")
+            failed.append({"name": cell.name, "why": why})
+            continue
+        for value in missing:
+            assert run is not None
+            say(f"judging {cell.name} at {family.parameter} = {value:g} {family.unit}")
+            verdicts.put(key_of(training, value), _verdict(run.path, family, value, cell.held_out))
+    return failed
+
+
+def _verdict(run: Path, family: Family, value: float, held_out: int) -> Mapping[str, Any]:
+    """Held-out accuracy of a policy where the parameter has one value."""
+    from stlc.controller.evaluation.held_out import score
+    from stlc.controller.training.run import Run
+
+    opened = Run.open(run, overrides={family.parameter: f"{value}{family.unit}"})
+    return score(opened.task, opened.policy, n=held_out).summary()
+
+
+def table(trainings: Sequence[Result], verdicts: ResultStore) -> Table[Any, Row]:
+    """Families, then lengths, then values."""
+    from benchmarks.table import Table
+    from benchmarks.training import grouped
+
+    cells = [
+        (family, length, value, found)
+        for (benchmark, length), own in grouped(
+            trainings, lambda cell: (cell.benchmark, cell.length.text)
+        ).items()
+        for family in [_named(benchmark)]
+        for value in family.values
+        if (found := [(each, verdict) for each in own if (verdict := verdicts.find(key_of(each, value)))])
+    ]
+    cells.sort(key=lambda cell: (FAMILIES.index(cell[0]), cell[1], cell[2]))
+    return Table("family", cells, lambda cell: _row(*cell), COLUMNS)
+
+
+def _row(family: Family, length: str, value: float, found: Sequence[tuple[Result, Result]]) -> Row:
+    from stlc.controller.evaluation.held_out import wilson
+
+    low, high = family.sampled()
+    accuracy = fmean(float(verdict["accuracy"]) for _, verdict in found)
+    return Row(
+        *(family.name, value, low <= value <= high, length),
+        tuple(int(training["key"]["seed"]) for training, _ in found),
+        accuracy,
+        wilson(accuracy, sum(int(verdict["held_out"]) for _, verdict in found)),
+        fmean(float(verdict["feasible"]) for _, verdict in found),
+    )
+
+
+def section(trainings: Sequence[Result], made: Table[Any, Row]) -> list[str]:
+    """The section of the page: a table for each family."""
+    from benchmarks.table import provenance
+
+    lines = ["## One policy for a family", "", TEXT.rstrip()]
+    for family in FAMILIES:
+        if own := [row for row in made.rows if row.family == family.name]:
+            low, high = family.sampled()
+            title = family.title[0].upper() + family.title[1:]
+            lines += ["", f"### {title}, trained on {low:g} to {high:g} {family.unit}", ""]
+            renamed = {
+                f"`{family.parameter}`" if name == "value" else name: each for name, each in COLUMNS.items()
+            }
+            lines += replace(made, columns=renamed).markdown(own)
+    return [*lines, "", *provenance(trainings, "trainings")]
+
+
+@command(
+    "python -m benchmarks family",
+    "python -m benchmarks family --only stop_time --budget 60s --seeds 0..2 --jobs 2",
+)
+def family(only: OnlyOption = None, training: Training = _TRAINING, output: Output = _OUTPUT) -> None:
+    """Train one policy for all values of a parameter, and judge it inside and outside of its range.
+
+    60 s if no budget is given. Results of the same inputs are kept, verdicts at single values too; a training
+    that was cut short goes on where it stopped. Exit code 1 if a training broke off.
+    """
+    from benchmarks.store import ResultStore
+    from benchmarks.table import show, write_section
+    from benchmarks.training import Cell, filled
+
+    names = chosen(only, [each.name for each in FAMILIES], "family")
+    cells = [
+        Cell(name, "guided", seed, length, training.held_out)
+        for seed, length in training.seeds_and_lengths(BUDGETS)
+        for name in names
+    ]
+    place, verdicts = training.place("family"), ResultStore("family_verdicts", training.out)
+    filling = filled(cells, place)
+    failed = [*filling.failed, *judge_all(filling.results, place, verdicts)]
+    results, page = place.valid(), output.page or _OUTPUT.page
+    assert page is not None
+    write_section(page, "family", section(results, table(results, verdicts)))
+    code = 1 if failed else 0
+    facts = {"page": str(page), "results": len(results), **filling.facts, "failed": failed}
+    made = table(filling.results, verdicts)
+    shown = replace(made, columns={"family": lambda row: row.family, **COLUMNS})
+    show("family", {"rows": shown}, as_json=output.as_json, code=code, **facts)
+    raise typer.Exit(code)

@@ -1,0 +1,280 @@
+"""Time of the parts of a training step, and of rollouts with verdicts and gradients.
+
+Processor time on one thread. The parts of a step are run again one by one, in turn, on a trainer that has
+taken some steps: forward and backward through the network, the verdict on all of its plans, rollout and
+robustness of the chosen ones with their gradient, the optimiser.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import TYPE_CHECKING, Annotated
+
+import torch
+import typer
+from torch import Tensor
+
+from benchmarks.options import OnlyOption, Output, chosen
+from benchmarks.store import BENCHMARKS, load
+from benchmarks.table import Table, measured_here, show, write_section
+from benchmarks.timing import interleaved, one_thread
+from stlc.cli.framework.program import command
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.semantics.switch import StraightThrough
+from stlc.controller.problem.task import rank, satisfied
+from stlc.controller.training.config import TrainConfig, resolve_config
+from stlc.controller.training.learner import Trainer
+from stlc.controller.training.objective import loss
+
+if TYPE_CHECKING:
+    from stlc.controller.problem.task import Task
+
+WARM = 120
+"""Steps before the measurement: by then the search has found plans to learn from."""
+MOST_STEPS = 100_000
+ROLLOUTS, VERDICTS = 2_000, 16_384
+REPORTED = dict(zip(BENCHMARKS, (59.0, 79.0, 83.0, 81.0, 115.0, 181.0), strict=True))
+"""Milliseconds of processor time that one step of the authors' code takes with 2,000 states, on one thread:
+rollout, smooth robustness, backward and optimiser."""
+TEXT = """## A training step
+
+Written by `python -m benchmarks step`. Milliseconds of processor time on one thread, after {warm} steps;
+`states` of a step and `plans` for each of them. `network`: its forward pass; `verdict`: rollout, robustness
+and cost of all plans; `gradient`: rollout and robustness of the chosen plans, with gradients; `backward`:
+of the network; `step`: all of it, drawing states and imitation included. `search` runs beside it, on
+another core.
+"""
+SPEED_TEXT = """
+2,000 rollouts with exact robustness and its gradient, in milliseconds, as C and in torch; beside them what
+a step of the authors' code takes with 2,000 states (with its optimiser). Verdicts are rollouts with
+robustness alone.
+"""
+_OUTPUT = Output()
+
+
+@dataclass(frozen=True, slots=True)
+class StepTiming:
+    """Milliseconds of processor time of one training step, and of what it is made of.
+
+    Attributes:
+        benchmark: name of the specification.
+        batch: states of a step.
+        plans: of the network for each of them.
+        forward: of the network.
+        verdict: rollout, robustness and cost of all plans, and the choice among them.
+        gradient: rollout and robustness of the chosen plans, with gradients.
+        backward: of the network.
+        optimiser: clipping, Adam, and the average of the weights.
+        whole: the step, what is not listed above included.
+        search: beside it, in a thread of its own: a round of search by the steps between two.
+    """
+
+    benchmark: str
+    batch: int
+    plans: int
+    forward: float
+    verdict: float
+    gradient: float
+    backward: float
+    optimiser: float
+    whole: float
+    search: float
+
+
+@dataclass(frozen=True, slots=True)
+class Speed:
+    """Rollouts, verdicts and gradients of one task.
+
+    Attributes:
+        benchmark: name of the specification.
+        steps: of a rollout.
+        native: milliseconds of 2,000 rollouts with robustness and gradient as C; None where torch does it.
+        torch: the same in torch.
+        reported: of a step of the authors' code with as many states.
+        verdicts: rollouts with verdict a second, without gradient.
+    """
+
+    benchmark: str
+    steps: int
+    native: float | None
+    torch: float
+    reported: float | None
+    verdicts: float
+
+    @property
+    def share(self) -> float | None:
+        """Of the authors' time."""
+        ours = self.torch if self.native is None else self.native
+        return None if self.reported is None else ours / self.reported
+
+
+def _one(value: float | None, digits: int = 1) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+STEPS: dict[str, Callable[[StepTiming], str]] = {
+    "benchmark": lambda row: row.benchmark,
+    "states": lambda row: str(row.batch),
+    "plans": lambda row: str(row.plans),
+    "network": lambda row: _one(row.forward),
+    "verdict": lambda row: _one(row.verdict),
+    "gradient": lambda row: _one(row.gradient),
+    "backward": lambda row: _one(row.backward),
+    "optimiser": lambda row: _one(row.optimiser),
+    "step": lambda row: _one(row.whole),
+    "search": lambda row: _one(row.search),
+}
+SPEEDS: dict[str, Callable[[Speed], str]] = {
+    "benchmark": lambda row: row.benchmark,
+    "steps": lambda row: str(row.steps),
+    "C": lambda row: _one(row.native),
+    "torch": lambda row: _one(row.torch),
+    "authors": lambda row: _one(row.reported, 0),
+    "share of the authors'": lambda row: "" if row.share is None else f"{100 * row.share:.1f} %",
+    "verdicts a second": lambda row: f"{row.verdicts / 1e6:.1f} million",
+}
+
+
+@command("python -m benchmarks step", "python -m benchmarks step --only traffic --page docs/benchmarks.md")
+def step(
+    only: OnlyOption = None,
+    seconds: Annotated[
+        float, typer.Option("--seconds", metavar="S", min=0.0, help="Seconds of measurement for a benchmark.")
+    ] = 2.0,
+    warm: Annotated[int, typer.Option("--warm", metavar="N", min=1, help="Training steps before it.")] = WARM,
+    output: Output = _OUTPUT,
+) -> None:
+    """Time the parts of a training step, and rollouts with verdicts and gradients.
+
+    Milliseconds of processor time on one thread; the search beside it runs on another core.
+    """
+    names = chosen(only, BENCHMARKS, "benchmark")
+    steps = Table(
+        "step",
+        names,
+        lambda name: step_timing(name, load(name), seconds=seconds, warm=warm),
+        STEPS,
+        lambda row: f"{row.benchmark}: {row.whole:.1f} ms a step",
+    )
+    speeds = Table("speed", names, lambda name: speed(name, load(name), seconds=seconds), SPEEDS)
+    with one_thread():
+        show("step", {"steps": steps, "speeds": speeds}, as_json=output.as_json)
+    if output.page is not None:
+        lines = [
+            TEXT.format(warm=warm),
+            *steps.markdown(),
+            SPEED_TEXT,
+            *speeds.markdown(),
+            "",
+            measured_here(),
+        ]
+        write_section(output.page, "step", lines)
+
+
+def step_timing(name: str, task: Task, *, seconds: float, warm: int) -> StepTiming:
+    """The parts of a training step of the engine."""
+    engine = resolve_config(task, TrainConfig(seed=0, threads=1))
+    trainer = Trainer(task, engine, steps=MOST_STEPS, device=torch.device("cpu"))
+    for _ in range(warm):
+        if trainer.step >= trainer.next_validation:
+            trainer.validate()
+        trainer.advance()
+    if trainer.repairing is not None:
+        trainer.repairing.result()
+    x0 = trainer.training.take(engine.batch)
+    if engine.hard and len(trainer.buffer):
+        x0 = torch.cat((x0, trainer.buffer.draw(engine.hard, trainer.generator)[0]))
+    search = _searched(trainer)
+    parts = [*_parts(trainer, x0), trainer.advance]
+    times = [median(each) * 1e3 for each in interleaved(parts, seconds)]
+    forward, verdict, gradient, backward, optimiser, whole = times
+    return StepTiming(
+        *(name, len(x0), engine.plans, forward, verdict, gradient),
+        *(max(backward - forward, 0.0), optimiser, whole, search / engine.every),
+    )
+
+
+def _parts(trainer: Trainer, x0: Tensor) -> Sequence[Callable[[], object]]:
+    """Forward; verdict; gradient; forward and backward; optimiser."""
+    task, network, count = trainer.task, trainer.network, trainer.config.plans
+    plans = network(x0).detach()
+    direction = torch.ones_like(plans)
+    chosen = plans[:, 0].clone().requires_grad_()
+    states = x0.repeat_interleave(count, 0)
+
+    def verdict() -> None:
+        with torch.no_grad():
+            judged = task.judge(states, plans.flatten(0, 1))
+            rank(judged.rho, task.cost(judged)).view(-1, count).argmax(1)
+
+    def gradient() -> None:
+        value = loss(task, trainer.objective, x0, chosen).total.mean()
+        torch.autograd.grad(value, chosen)
+
+    def both() -> None:
+        trainer.optimizer.zero_grad()
+        network(x0).backward(direction)
+
+    def optimise() -> None:
+        torch.nn.utils.clip_grad_norm_(network.parameters(), trainer.config.clip)
+        trainer.optimizer.step()
+        with torch.no_grad():
+            for averaged, current in zip(trainer.average.parameters(), network.parameters(), strict=True):
+                averaged.lerp_(current, 0.01)
+
+    return (lambda: network(x0)), verdict, gradient, both, optimise
+
+
+def _searched(trainer: Trainer) -> float:
+    """Milliseconds of a round of search for the states on which the network fails."""
+    with torch.no_grad():
+        x0 = trainer.supply.take(trainer.config.pool)
+        plans, judged = trainer.policy.plan_judged(x0)
+        bad = (~satisfied(judged.rho)).nonzero()[:, 0][: trainer.config.most]
+    states, start, bank = x0[bad], plans[bad], trainer.buffer.bank
+    before = time.process_time()
+    trainer.searcher.repair(states, start, bank)
+    return (time.process_time() - before) * 1e3
+
+
+def speed(name: str, task: Task, *, seconds: float) -> Speed:
+    """Rollouts with verdicts, and with gradients."""
+    x0 = task.sample(VERDICTS, seed=1)
+    generator = torch.Generator().manual_seed(2)
+    low, high = task.system.control_low, task.system.control_high
+    u = low + (high - low) * torch.rand(VERDICTS, task.horizon, len(low), generator=generator)
+    some, plan = x0[:ROLLOUTS], u[:ROLLOUTS].clone().requires_grad_()
+    slope = 5.0
+
+    def in_torch() -> None:
+        columns = task.system.rollout_columns(some, plan, StraightThrough(slope))
+        torch.autograd.grad(task.graph.columns(columns, ops=TORCH).sum(), plan)
+
+    def as_c() -> None:
+        assert task.gradient is not None
+        each, _ = task.gradient(some, plan, slope=slope)
+        torch.autograd.grad(task.graph.overall(each).sum(), plan)
+
+    double = x0.double().numpy(), u.double().numpy()
+
+    def verdict() -> None:
+        if task.native is None:
+            task.judge(x0, u, states=False)
+        else:
+            task.native.kernel.judge(*double)
+
+    todo: list[Callable[[], object]] = [in_torch, verdict]
+    if task.gradient is not None:
+        todo.append(as_c)
+    torch_time, judging, *native = (median(times) for times in interleaved(todo, seconds))
+    return Speed(
+        name,
+        task.horizon,
+        native[0] * 1e3 if native else None,
+        torch_time * 1e3,
+        REPORTED.get(name),
+        VERDICTS / judging,
+    )

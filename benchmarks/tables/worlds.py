@@ -1,0 +1,142 @@
+"""Policies in the worlds of their systems, without a guard and with each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from statistics import fmean
+from textwrap import wrap
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from benchmarks.drives import GUARDS, NOMINAL, Deployments, Drives, mean_and_half, policy_lines, rows_of
+from benchmarks.options import Output, chosen
+from benchmarks.store import Result, ResultStore
+from benchmarks.table import WIDTH, Table, provenance, show, write_section
+from stlc.cli.framework.program import command
+
+if TYPE_CHECKING:
+    from benchmarks.drives import Row
+
+TEXT = """\
+Written by `python -m benchmarks worlds` from `benchmarks/results/worlds.json`: one policy for each
+specification, the most accurate of `python -m benchmarks paper`, in its world. `share of feasible` is the
+share of visited states with a known satisfying plan, the followed one or one that a search of up to 80,000
+plans finds, whose followed plan satisfies the specification. `viable` agents were driven safely, or a
+search finds a plan from their start that is safe through the horizon. `model-consistent` are starts from
+which the world did as the model says through the window; some worlds never do. Means over deployment seeds
+with half of their 95 % intervals (Student's t).
+"""
+_DRIVES, _OUTPUT = Drives(), Output(Path("docs/worlds.md"))
+
+Line = tuple["Row", str]
+"""A row and one of its guards."""
+
+
+def _share(metric: str) -> Callable[[Line], str]:
+    return lambda line: mean_and_half(line[0].metric(line[1], metric))
+
+
+def _named(line: Line) -> str:
+    row, guard = line
+    return f"{row.spec}, {row.scenario}, {row.size}" if guard == next(iter(row.guards)) else ""
+
+
+def _progress(line: Line) -> str:
+    """What the world tells, means alone: `mean speed 4.28, junctions passed 76`."""
+    told = line[0].guards[line[1]]["progress"].items()
+    return ", ".join(f"{name.replace('_', ' ')} {float(metric['mean']):.3g}" for name, metric in told)
+
+
+COLUMNS: Mapping[str, Callable[[Line], str]] = {
+    "": _named,
+    "guard": lambda line: line[1],
+    "plan accuracy": _share("plan_accuracy"),
+    "share of feasible": _share("feasible_followed"),
+    "plans that are safe": _share("plan_safety"),
+    "safe among viable": _share("saved"),
+    "safe starts, model-consistent": _share("foreseen_safe_starts"),
+    "progress": _progress,
+}
+
+
+def table(rows: Sequence[Row]) -> Table[Line, Line]:
+    """A line for every guard; the first one names the deployment and its seeds x agents x steps."""
+    lines = [(row, guard) for row in rows for guard in row.guards]
+    return Table("worlds", lines, lambda line: line, COLUMNS)
+
+
+def section(results: Sequence[Result]) -> list[str]:
+    """The section of the page: all deployments, seeds without lost starts, policies and machines."""
+    rows = rows_of(results)
+    told = [line for row in rows for line in wholly_viable(row)]
+    made = provenance(results, "deployments (seeds x agents x steps)")
+    return [TEXT, *table(rows).markdown(), "", *told, *policy_lines(rows), *made]
+
+
+def wholly_viable(row: Row) -> Iterator[str]:
+    """The figures of the seeds in which every start is viable, where there are others."""
+    first = next(iter(row.guards.values()))["metrics"].get("savable") or {"values": ()}
+    whole = [index for index, share in enumerate(first["values"]) if share == 1.0]
+    if not whole or len(whole) == len(first["values"]):
+        return
+    parts = []
+    for guard, document in row.guards.items():
+        accuracy, saved = (document["metrics"][name]["values"] for name in ("plan_accuracy", "saved"))
+        chosen_ = [fmean(values[index] for index in whole) for values in (accuracy, saved)]
+        parts.append(f"{guard} {chosen_[0]:.3f} and {chosen_[1]:.3f}")
+    where = f"in the {len(whole)} of {len(first['values'])} seeds in which every start is viable"
+    line = f"- {row.spec}, {row.scenario}: {where}, plan accuracy and share driven safely: {'; '.join(parts)}"
+    yield from wrap(line, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+
+
+@command(
+    "python -m benchmarks worlds",
+    "python -m benchmarks worlds runs/ship_track/latest --seeds 0..9 --guards none,full",
+)
+def worlds(
+    runs: Annotated[
+        list[str] | None, typer.Argument(metavar="RUN…", help="Runs; the best of `paper` if none.")
+    ] = None,
+    guards: Annotated[
+        str, typer.Option("--guards", metavar="NAMES", help="Some of none,paper,full.")
+    ] = "none,paper,full",
+    ceiling: Annotated[
+        int,
+        typer.Option("--ceiling", metavar="N", min=0, help="Visited states that are searched for a plan."),
+    ] = 1000,
+    drives: Drives = _DRIVES,
+    output: Output = _OUTPUT,
+) -> None:
+    """Deploy policies in their worlds, without a guard and with each, and write the table.
+
+    What was driven with the same policy, system and setting is kept. A system's scenarios that have worlds of
+    their own are driven, too.
+    """
+    from stlc.controller.training.run import Run
+
+    modes = [mode for mode in GUARDS if mode in chosen(guards, GUARDS, "guard")]
+    deployments = Deployments(ResultStore("worlds", drives.out), drives, ceiling)
+    for folder in drives.runs(runs):
+        declared = Run.open(folder.path).task.system.decl.scenarios
+        deployments.add(folder, (NOMINAL, *(each.name for each in declared if each.world)), modes)
+    conclude("worlds", deployments, output.page or _OUTPUT.page, section, table, as_json=output.as_json)
+
+
+def conclude(
+    what: str,
+    deployments: Deployments,
+    page: Path | None,
+    section: Callable[[Sequence[Result]], list[str]],
+    table: Callable[[Sequence[Row]], Table[Any, Any]],
+    *,
+    as_json: bool,
+) -> None:
+    """Write the page from all results in the store, and show those that were asked for."""
+    assert page is not None
+    write_section(page, what, section(list(deployments.store.all().values())))
+    rows = rows_of(deployments.results)
+    shown = Table(what, rows, lambda row: row, {}) if as_json else table(rows)
+    driven, kept = deployments.driven, deployments.kept
+    show(what, {"rows": shown}, as_json=as_json, page=str(page), driven=driven, kept=kept)

@@ -1,0 +1,89 @@
+"""Times of functions, measured in turn so that a busy machine slows all of them alike."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from statistics import median
+
+import numpy as np
+import torch
+
+from stlc.dynamics.model.memory import keep_freed_memory
+
+_SLICE = 0.01
+"""Seconds that one measurement takes at least."""
+WARM = 5
+"""Measurements that are repeated, because the first ones warm the caches."""
+
+
+@dataclass(frozen=True, slots=True)
+class Times:
+    """Milliseconds of decisions.
+
+    Attributes:
+        median: of them.
+        p99: 99th percentile.
+        samples: how many.
+    """
+
+    median: float
+    p99: float
+    samples: int
+
+    @classmethod
+    def of(cls, seconds: Sequence[float]) -> Times | None:
+        """None of nothing."""
+        if not seconds:
+            return None
+        median, p99 = np.quantile(1e3 * np.asarray(seconds), (0.5, 0.99))
+        return cls(float(median), float(p99), len(seconds))
+
+
+def interleaved(functions: Sequence[Callable[[], object]], seconds: float) -> list[list[float]]:
+    """Processor times of each function in seconds, over rounds in which every one has its turn.
+
+    Args:
+        functions: what to time.
+        seconds: how long to go on; at least three rounds are made.
+    """
+    often = [_repeats(function) for function in functions]
+    samples: list[list[float]] = [[] for _ in functions]
+    stop = time.monotonic() + seconds
+    while len(samples[0]) < 3 or time.monotonic() < stop:
+        for function, repeats, found in zip(functions, often, samples, strict=True):
+            found.append(_timed(function, repeats) / repeats)
+    return samples
+
+
+def ratio(some: Sequence[float], others: Sequence[float]) -> float:
+    """How many times longer some took than others: the median over rounds."""
+    return median(a / b for a, b in zip(some, others, strict=True))
+
+
+def _repeats(function: Callable[[], object]) -> int:
+    """How often a function is called in one measurement; the first calls are not counted."""
+    function()
+    once = _timed(function, 1)
+    return max(int(_SLICE / max(once, 1e-9)), 1)
+
+
+def _timed(function: Callable[[], object], repeats: int) -> float:
+    start = time.process_time()
+    for _ in range(repeats):
+        function()
+    return time.process_time() - start
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch computes in one thread, and freed memory stays: what is timed is arithmetic, not fresh pages."""
+    keep_freed_memory()
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,334 @@
+"""Trainings behind tables: those that are kept, those that were cut short, and the others, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from benchmarks.store import BENCHMARKS, Key, Result, ResultStore, inputs_of, load, spec_path
+from stlc.cli.framework.output import say
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.parallel.jobs import Job, JobResult, side_by_side
+from stlc.controller.problem.task import satisfied
+from stlc.controller.training.checkpoint import load_checkpoint
+from stlc.controller.training.config import (
+    ENGINE_VERSION,
+    HELD_OUT,
+    HELD_OUT_SEED,
+    Clock,
+    TrainConfig,
+)
+from stlc.controller.training.inputs import input_files
+from stlc.controller.training.run import Run, spec_hash, system_hash
+from stlc.diagnostics import StlcError
+from stlc.rundir import RunDir, every_run
+from stlc.view.held_out import load_held_out
+
+CURVE_POINTS = 80
+
+
+@dataclass(frozen=True, slots=True)
+class Length:
+    """Length of a training: a budget in seconds of a clock, or a number of steps."""
+
+    seconds: float | None = None
+    steps: int | None = None
+    clock: Clock = "wall"
+
+    @property
+    def name(self) -> str:
+        """Such as `60s` or `200steps`."""
+        return f"{self.steps}steps" if self.steps is not None else f"{self.seconds:g}s"
+
+    @property
+    def text(self) -> str:
+        """The same for people."""
+        if self.steps is not None:
+            return f"{self.steps:,} steps"
+        return f"{self.seconds:g} s" + (" of processor time" if self.clock == "processor" else "")
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """For `stlc train`."""
+        if self.steps is not None:
+            return ("--steps", str(self.steps))
+        return ("--budget", f"{self.seconds:g}s", "--clock", self.clock)
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """A benchmark trained once.
+
+    Attributes:
+        benchmark: name of the specification.
+        method: of training.
+        seed: of training.
+        length: of training.
+        held_out: number of held-out states that the policy is judged on.
+        axis: hyperparameter that an ablation varies here; "" outside of ablations.
+        value: of that hyperparameter.
+        overrides: of the system file.
+    """
+
+    benchmark: str
+    method: str
+    seed: int
+    length: Length
+    held_out: int = HELD_OUT
+    axis: str = ""
+    value: str = ""
+    overrides: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Of its result, such as `traffic-guided-60s-seed0`."""
+        first = ("ablation", self.axis, self.value) if self.axis else (self.benchmark, self.method)
+        return "-".join([*filter(None, first), self.length.name, f"seed{self.seed}"])
+
+    @property
+    def key(self) -> Key:
+        """Its inputs. Raises UsageError, SpecError, SystemFileError where a file is missing or invalid."""
+        return Key(
+            self.name,
+            {
+                **inputs_of(load(self.benchmark, tuple(self.overrides.items()))),
+                **{"benchmark": self.benchmark, "method": self.method, "method_version": ENGINE_VERSION},
+                **{"seed": self.seed, "budget": self.length.seconds, "steps": self.length.steps},
+                **{"clock": self.length.clock, "held_out": self.held_out, "held_out_seed": HELD_OUT_SEED},
+                **{"axis": self.axis, "value": self.value, "overrides": dict(self.overrides)},
+            },
+        )
+
+    @classmethod
+    def of(cls, result: Result) -> Cell:
+        """The cell of a result."""
+        key = result["key"]
+        length = Length(key["budget"], key["steps"], key["clock"])
+        return cls(
+            *(key["benchmark"], key["method"], key["seed"], length, key["held_out"]),
+            *(key["axis"], key["value"], key["overrides"]),
+        )
+
+    def config(self) -> TrainConfig:
+        """The configuration of `stlc train`."""
+        return TrainConfig(
+            method=self.method,
+            budget=self.length.seconds,
+            steps=self.length.steps,
+            seed=self.seed,
+            held_out=self.held_out,
+            clock=self.length.clock,
+            drives=0,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where results and runs lie, and how many processes make them.
+
+    Attributes:
+        store: of the results.
+        runs: folder of the runs behind them.
+        jobs: processes at a time.
+        threads: of torch in each.
+        cluster: address of a cluster that trains instead of this machine.
+    """
+
+    store: ResultStore
+    runs: Path = Path("runs/benchmarks")
+    jobs: int = 1
+    threads: int = 1
+    cluster: str | None = None
+
+    def runs_of(self, key: Key) -> Path:
+        """The folder of the runs of one cell; other inputs have another one."""
+        return self.runs / f"{key.name}-{key.digest}"
+
+    def newest_run(self, key: Key) -> RunDir | None:
+        """The newest run of a cell that can be collected or resumed."""
+        runs = every_run(self.runs_of(key))
+        if not runs or not (runs[-1].path / "ckpt" / "last.json").is_file():
+            return None
+        try:
+            return None if runs[-1].status == "failed" else runs[-1]
+        except StlcError:
+            return None
+
+    def best_run(self, results: Sequence[Result]) -> RunDir | None:
+        """The run of the most accurate of some results, where it is still there."""
+        best = max(results, key=lambda result: float(result["accuracy"]))
+        return self.newest_run(Cell.of(best).key)
+
+    def valid(self) -> list[Result]:
+        """The results whose specification, system and method are those of today."""
+        return [each for each in self.store.all().values() if each["key"] == Cell.of(each).key.values]
+
+
+@dataclass(frozen=True, slots=True)
+class Filling:
+    """Outcome of the trainings of a table.
+
+    Attributes:
+        results: in the order of the cells.
+        trained: how many were trained now.
+        kept: how many were there.
+        failed: name and reason of those that broke off.
+    """
+
+    results: tuple[Result, ...]
+    trained: int
+    kept: int
+    failed: tuple[dict[str, str], ...]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """For the JSON document."""
+        return {"trained": self.trained, "kept": self.kept, "failed": list(self.failed)}
+
+
+def filled(cells: Sequence[Cell], place: Place) -> Filling:
+    """Results of cells: those that are kept, and the others as they are trained; says how it goes."""
+    found: dict[str, Result] = {}
+    failed: list[dict[str, str]] = []
+    kept = 0
+    for number, (cell, result, note) in enumerate(_fill(cells, place), start=1):
+        counted = f"[{number}/{len(cells)}] {cell.name}"
+        if result is None:
+            failed.append({"name": cell.name, "why": note})
+            say(f"{counted}  broke off: {note}")
+            continue
+        found[cell.name] = result
+        kept += note == "kept"
+        done = (*found, *(each["name"] for each in failed))
+        told = note or ("" if place.cluster is not None else remaining(cells, done, place.jobs))
+        say(f"{counted}  accuracy {result['accuracy']:.4f}  {result['seconds']:.0f} s  {told}".rstrip())
+    results = tuple(found[cell.name] for cell in cells if cell.name in found)
+    return Filling(results, len(results) - kept, kept, tuple(failed))
+
+
+def remaining(cells: Sequence[Cell], done: Sequence[str], jobs: int) -> str:
+    """About how long the other trainings take, by their budgets; "" where these are steps."""
+    lengths = [cell.length.seconds for cell in cells if cell.name not in done]
+    if not lengths or None in lengths:
+        return ""
+    minutes = sum(length or 0.0 for length in lengths) / jobs / 60.0
+    return f"{len(lengths)} left, about {minutes:.0f} min"
+
+
+def _fill(cells: Sequence[Cell], place: Place) -> Iterator[tuple[Cell, Result | None, str]]:
+    """(cell, result, "kept" or ""), or (cell, None, why it broke off)."""
+    wanted: dict[str, Cell] = {}
+    for cell in cells:
+        kept = place.store.find(cell.key)
+        if kept is not None:
+            yield cell, kept, "kept"
+        else:
+            wanted[cell.name] = cell
+    jobs = []
+    for cell in wanted.values():
+        run = place.newest_run(cell.key)
+        if run is not None and run.status == "finished":
+            yield cell, place.store.put(cell.key, collect(run)), ""
+        else:
+            jobs.append(_job(cell, place, run))
+    for back in _sent(jobs, place, lambda job: say(f"training {job.name}")):
+        cell = wanted[back.errand.name]
+        run = place.newest_run(cell.key)
+        if back.code not in (0, 1) or run is None or run.status != "finished":
+            yield cell, None, f"exit code {back.code}\n{back.why}".strip()
+        else:
+            yield cell, place.store.put(cell.key, collect(run, cores=back.cores)), ""
+
+
+def _sent(jobs: Sequence[Job], place: Place, begun: Callable[[Job], None]) -> Iterator[JobResult]:
+    """Jobs run on this machine or on the cluster."""
+    if place.cluster is None or not jobs:
+        return side_by_side(jobs, jobs=place.jobs, begun=begun)
+    from stlc.controller.parallel.ray_cluster import Cluster, on_cluster
+
+    return on_cluster(jobs, Cluster(place.cluster, place.threads), begun=begun)
+
+
+def _job(cell: Cell, place: Place, run: RunDir | None) -> Job:
+    """A training as a command of `stlc train`, new or resumed, with what another machine needs for it."""
+    runs = place.runs_of(cell.key)
+    if run is not None:
+        arguments: tuple[str, ...] = ("--resume", str(run.path), "--no-pictures")
+    else:
+        overrides = [word for key, value in cell.overrides.items() for word in ("--set", f"{key}={value}")]
+        arguments = (
+            str(spec_path(cell.benchmark)),
+            *("--method", cell.method, "--seed", str(cell.seed), *cell.length.options),
+            *("--threads", str(place.threads), "--held-out", str(cell.held_out), "--drives", "0"),
+            *("--runs", str(runs), "--no-pictures", *overrides),
+        )
+    if place.cluster is None:
+        return Job(cell.name, arguments)
+    read = input_files(spec_path(cell.benchmark), overrides=cell.overrides)
+    return Job(cell.name, arguments, read if run is None else (run.path,), runs)
+
+
+def collect(run: RunDir, *, cores: int | None = None) -> Result:
+    """Everything that is known about the run of a training."""
+    record = run.record()
+    held = load_held_out(run.path / "eval" / "held_out.npz")
+    solved = [] if held is None else [rho >= -TOLERANCE for rho in held.rho.tolist()]
+    made = {key: record[key] for key in ("versions", "git", "hardware", "threads")}
+    return {
+        **record["result"],
+        **{key: record[key] for key in ("spec_path", "system_path", "engine", "steps", "margin")},
+        "training_accuracy": training_accuracy(run),
+        "solved": pack(solved),
+        "curve": _curve(run),
+        "command": ["stlc", *record["command"]],
+        "made": {**made, "cores": cores, "started": record["started"], "date": record["finished"]},
+    }
+
+
+def training_accuracy(folder: RunDir) -> float | None:
+    """Share of its training states that a run's policy satisfies the specification on.
+
+    None where training drew fresh states in every step.
+    """
+    saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
+    states = saved.tensors.get("training.states")
+    if states is None:
+        return None
+    _, judged = Run.open(folder.path).plan_judged(states.double())
+    return float(satisfied(judged.rho).double().mean())
+
+
+def _curve(run: RunDir) -> list[dict[str, float | None]]:
+    """Accuracy on fresh states over time, at most `CURVE_POINTS` points."""
+    rows = [row for row in run.rows() if row.get("accuracy") is not None]
+    every = max(1, -(-len(rows) // CURVE_POINTS))
+    kept = rows[::-1][::every][::-1]
+    return [{key: row.get(key) for key in ("seconds", "step", "accuracy", "feasible")} for row in kept]
+
+
+def grouped(
+    results: Sequence[Result], key: Callable[[Cell], tuple[Any, ...]]
+) -> dict[tuple[Any, ...], list[Result]]:
+    """Results of the trainings that have a key in common, by seed."""
+    groups: dict[tuple[Any, ...], list[Result]] = {}
+    for result in sorted(results, key=lambda each: int(each["key"]["seed"])):
+        groups.setdefault(key(Cell.of(result)), []).append(result)
+    return groups
+
+
+def benchmark_order(name: str) -> tuple[int, str]:
+    """Sort key: the paper's order, then others by name."""
+    return BENCHMARKS.index(name) if name in BENCHMARKS else len(BENCHMARKS), name
+
+
+def pack(flags: Sequence[bool]) -> str:
+    """Truth values as hexadecimal digits, the first one in the highest place."""
+    bits = "".join("1" if flag else "0" for flag in flags)
+    return f"{int(bits or '0', 2):0{-(-len(flags) // 4)}x}"
+
+
+def unpack(digits: str, count: int) -> list[bool]:
+    """The `count` truth values that `pack` wrote."""
+    return [bit == "1" for bit in f"{int(digits or '0', 16):0{count}b}"]

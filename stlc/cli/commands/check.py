@@ -1,0 +1,170 @@
+"""`stlc check`: recorded traces in, a verdict per requirement and its reasons out."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from stlc.cli.check import options as given
+from stlc.cli.check.judge import Question, names_of, time_step, usage
+from stlc.cli.framework.options import JsonOption, SetOption, SystemOption, parse_overrides
+from stlc.cli.framework.output import COLOR, QUIET, emit, emit_json, say, show_diagnostics, wants_color
+from stlc.cli.framework.program import command
+
+if TYPE_CHECKING:
+    from stlc.cli.check.outcome import Outcome
+
+_SPECS = (".stl", ".stlc")
+_STREAM = "-"
+
+
+@command(
+    "stlc check trace.npz",
+    "stlc check specs/traffic.stl drive.csv --require give_way",
+    "stlc check specs/traffic.stl drives/*.parquet --jobs 0 --junit checks.xml",
+    "stlc check specs/traffic.stl bag.mcap --resample 0.1s --map dx=lead.gap",
+)
+def check(
+    files: given.Files,
+    spec: given.Spec = None,
+    system: SystemOption = None,
+    set_: SetOption = None,
+    require: given.Require = None,
+    at: given.When = None,
+    end: given.Ending = "open",
+    semantics: given.Robustness = "exact",
+    tolerance: given.Tolerance = 1e-6,
+    map_: given.Names = None,
+    resample: given.Resample = None,
+    max_gap: given.MaxGap = None,
+    dt: given.Step = None,
+    fail_under: given.FailUnder = None,
+    out: given.Out = None,
+    junit: given.Junit = None,
+    jobs: given.Jobs = 1,
+    chunk: given.Chunk = 0,
+    runs: given.Runs = Path("runs"),
+    json: JsonOption = False,
+) -> None:
+    """Judge recorded traces: verdicts, and the reasons of violations.
+
+    A trace is looked up as given, then in the newest run. It carries its specification, and constants
+    that were set; a specification before it, or --spec, is taken instead. With - the samples come from
+    the standard input, as a table with a header or as JSON, one a line. A file that is larger than memory
+    is judged in pieces. Exit code: 0 all satisfied, 1 violated,
+    4 a trace is too short to say; with -q nothing else is said.
+    """
+    from stlc.cli.check.many import Work, all_outcomes, out_paths
+    from stlc.cli.check.outcome import exit_code
+
+    spec, traces = _split_files(files, spec)
+    question = Question(
+        spec,
+        system,
+        names_of(map_),
+        tuple(require or ()),
+        at,
+        end,
+        _tolerance(tolerance),
+        time_step("--resample", resample),
+        parse_overrides(set_),
+        semantics,
+        time_step("--dt", dt),
+        time_step("--max-gap", max_gap),
+    )
+    talk = not (QUIET.get() or json)
+    if _STREAM in traces:
+        if out is not None:
+            raise usage("`--out` needs the whole trace, and the standard input is judged line by line")
+        outcomes = [_stream(traces, question, talk=talk)]
+    else:
+        color, paths = wants_color(sys.stdout), out_paths(out, traces)
+        works = [
+            Work(name, question, runs, path, chunk, color, COLOR.get())
+            for name, path in zip(traces, paths, strict=True)
+        ]
+        outcomes = list(all_outcomes(works, jobs))
+    code = exit_code(outcomes, fail_under)
+    if junit is not None:
+        _write_junit(junit, outcomes)
+    if json:
+        _print_document(outcomes, code)
+    elif talk:
+        _print(outcomes)
+    raise typer.Exit(code)
+
+
+def _stream(traces: Sequence[str], question: Question, *, talk: bool) -> Outcome:
+    from stlc.cli.check.stream import outcome_of_stream
+
+    if len(traces) > 1:
+        raise usage("the standard input is judged alone", "stlc check SPEC -")
+    return outcome_of_stream(question, talk=talk)
+
+
+# -------------------------------------------------------------------------- results
+
+
+def _print(outcomes: Sequence[Outcome]) -> None:
+    """What is to be said, what is not satisfied in full, and of several files a table."""
+    from stlc.cli.check.many import summary
+
+    told = set()
+    for outcome in outcomes:
+        for line in outcome.said:
+            say(line)
+        show_diagnostics(outcome.errors)
+        fresh = [warning for warning in outcome.warnings if warning not in told]
+        show_diagnostics(fresh)
+        told.update(fresh)
+    if len(outcomes) == 1:
+        emit(outcomes[0].text, styled=True)
+        return
+    parts = [outcome.text for outcome in outcomes if outcome.text and outcome.status != "satisfied"]
+    emit("\n\n".join([*parts, summary(outcomes)]), styled=True)
+
+
+def _print_document(outcomes: Sequence[Outcome], code: int) -> None:
+    from stlc.cli.check.document import document
+
+    findings = [f for outcome in outcomes for f in (*outcome.errors, *outcome.warnings)]
+    emit_json(
+        "check/1",
+        ok=code == 0,
+        exit_code=code,
+        diagnostics=dict.fromkeys(findings),
+        result=document(outcomes),
+    )
+
+
+def _write_junit(path: Path, outcomes: Sequence[Outcome]) -> None:
+    from stlc.cli.check.junit import junit
+    from stlc.files import write_atomic
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, junit(outcomes))
+
+
+# ------------------------------------------------------------------------ arguments
+
+
+def _split_files(files: Sequence[str], spec: Path | None) -> tuple[Path | None, list[str]]:
+    """The specification, if one stands in front, and the traces."""
+    specs = [name for name in files if Path(name).suffix in _SPECS]
+    traces = [name for name in files if name not in specs]
+    if len(specs) > 1 or (specs and spec is not None):
+        raise usage(f"more than one specification: {', '.join([*specs, *([str(spec)] if spec else [])])}")
+    if not traces:
+        raise usage("which trace?", "stlc check SPEC TRACE")
+    return (Path(specs[0]) if specs else spec), traces
+
+
+def _tolerance(value: float) -> float:
+    if not 0 <= value < math.inf:
+        raise usage(f"`--tolerance {value}` is not a number from 0 on")
+    return value

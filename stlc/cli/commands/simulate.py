@@ -1,0 +1,356 @@
+"""`stlc simulate`: a trained policy in closed loop, in the world of its system."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+
+import typer
+
+from stlc.cli.framework.options import (
+    JsonOption,
+    RunArgument,
+    RunsOption,
+    SetOption,
+    parse_overrides,
+)
+from stlc.cli.framework.program import command
+from stlc.cli.framework.ranges import parse_limit
+from stlc.diagnostics import Diagnostic, RunError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from stlc.cli.simulate.watch import Watching
+    from stlc.controller.deployment.simulator import Setting
+    from stlc.controller.evaluation.deployment import Deployment
+    from stlc.controller.evaluation.rules import Rules
+    from stlc.controller.guard.guard import Mode
+    from stlc.controller.guard.margin_request import Asked
+    from stlc.controller.training.run import Run
+    from stlc.dynamics.declaration.deployment import ScenarioDecl
+
+Record: TypeAlias = "dict[str, Any]"
+
+ALL, USUAL = "all", "disturbed"
+SCENARIOS = "eval/scenarios.json"
+GUARDS: dict[Mode, tuple[Mode, ...]] = {
+    "none": ("none",),
+    "paper": ("none", "paper"),
+    "full": ("none", "full"),
+}
+
+GuardOption = Annotated[
+    str | None,
+    typer.Option(metavar="none|paper|full", help="What guards the policy; `full` polishes plans first."),
+]
+LimitOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="TIME",
+        help="Of a guard's decision, per agent, or `none`; 100ms for the full guard if not given.",
+    ),
+]
+
+WindowsOption = Annotated[bool, typer.Option("--windows", help="Show how plans fared window by window, too.")]
+MarginOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="M|NAME=M|auto",
+        help="What a guard asks safety requirements to spare; repeatable. `auto` measures it.",
+    ),
+]
+RecordOption = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Write the trace there too (.npz, .csv, .mcap).")
+]
+FailUnderOption = Annotated[
+    float | None, typer.Option(metavar="SHARE", help="Exit with 1 if the plan accuracy is less.")
+]
+ScenarioOption = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="An overlay of the system file; all of them, or `disturbed`."),
+]
+LiveOption = Annotated[bool, typer.Option("--live", help="Show margins and decisions as it runs.")]
+MarginsOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE", help="Write the margins there, a JSON object per agent and step; `-` prints them."
+    ),
+]
+
+
+@command(
+    "stlc simulate --backup",
+    "stlc simulate latest --backup --seeds 20 --record trace.npz",
+    "stlc simulate specs/ship_track.stl --backup --scenario all",
+    "stlc simulate --backup --seeds 1 --live --margins margins.jsonl",
+)
+def simulate(
+    run: RunArgument = "latest",
+    backup: Annotated[
+        bool | None, typer.Option("--backup/--no-backup", help="The paper's backup policy.")
+    ] = None,
+    guard: GuardOption = None,
+    time_limit: LimitOption = None,
+    ceiling: Annotated[
+        int, typer.Option(min=0, help="Visited states to search for a plan, where the followed one fails.")
+    ] = 0,
+    margin: MarginOption = None,
+    seeds: Annotated[int, typer.Option(min=1, help="How many deployments.")] = 10,
+    seed: Annotated[int, typer.Option(min=0, max=2**62, help="Seed of the first; the others follow.")] = 0,
+    steps: Annotated[int | None, typer.Option(min=1, help="Of each; by default the system's.")] = None,
+    agents: Annotated[int | None, typer.Option(min=1, help="In each; by default the system's.")] = None,
+    record: RecordOption = None,
+    fail_under: FailUnderOption = None,
+    scenario: ScenarioOption = None,
+    live: LiveOption = False,
+    margins: MarginsOption = None,
+    windows: WindowsOption = False,
+    set_: SetOption = None,
+    runs: RunsOption = Path("runs"),
+    pictures: Annotated[bool, typer.Option(help="Draw the animation and the report.")] = True,
+    window: Annotated[bool, typer.Option("--window", help="Show robots in PyBullet's window, too.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Deploy a trained policy in the world of its system.
+
+    The newest run unless one is named. With --backup the paper's backup policy guards it, and the same
+    seeds are driven without it too, to compare. Trace, scene and figures go into the run's folder.
+    Drives, one agent over one seed each, are judged by the specification that the system names (test:
+    judge). Means over seeds come with 95 % intervals (Student's t). Every system has the scenarios
+    mismatch, disturb and noise, also with a number of per cent (mismatch-20); --scenario disturbed drives
+    them all.
+    """
+    chosen = _guard(backup, guard)
+    printed = _printed(json=json, margins=margins)
+    from stlc.cli.framework.output import emit_json, show_diagnostics
+    from stlc.cli.simulate.pictures import draw, require_robots
+    from stlc.cli.simulate.text import closing, screen
+    from stlc.cli.simulate.watch import require_writable
+    from stlc.controller.deployment.simulator import Setting
+    from stlc.controller.training.run import Run
+    from stlc.trace import check_writable
+
+    if record is not None:
+        check_writable(record)
+    require_writable(margins)
+    opened = Run.open(run, root=runs, overrides=parse_overrides(set_))
+    show_diagnostics(_longer(opened, steps or opened.task.system.decl.test.steps))
+    if window:
+        require_robots(opened)
+    test, which = opened.task.system.decl.test, tuple(range(seed, seed + seeds))
+    size = agents or test.agents, steps or test.steps
+    setting = _hurried(Setting(which, *size, test.replan, ceiling=ceiling), time_limit)
+    several = _several(opened, scenario)
+    order = _Order(opened, chosen, setting, record, live, margins, parse_overrides(set_), _asked(margin))
+    document = _all(order, several) if several else _driven(order, scenario)
+    code = 1 if fail_under is not None and _accuracy(document, chosen) < fail_under else 0
+    if not json:  # before the pictures: they must not change what was measured
+        _print(screen(document, windows=windows), printed)
+    drawn = draw(opened) if pictures else {}
+    if json:
+        emit_json("simulate/1", ok=code == 0, exit_code=code, result=document | drawn)
+    else:
+        _print(closing(document["trace"], drawn, record, _needed_system(opened)), printed)
+    _end(opened, window=window, code=code)
+
+
+def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
+    """W604 where what is required for ever is driven for longer than the policy was judged."""
+    result = run.dir.record().get("result")
+    judged = result.get("judged_seconds") if isinstance(result, dict) else None
+    seconds = steps * run.task.dt
+    if not isinstance(judged, int | float) or seconds <= judged:
+        return ()
+    message = f"{seconds:g} s are driven, and training judged the policy on missions of {judged:g} s"
+    note = "what is required has no end: nothing is known of it beyond that but what is driven now"
+    return (Diagnostic("W604", message, note=(note,)),)
+
+
+def _end(run: Run, *, window: bool, code: int) -> None:
+    from stlc.cli.simulate.pictures import show
+
+    if window:
+        show(run)
+    if code:
+        raise typer.Exit(code)
+
+
+@dataclass(frozen=True, slots=True)
+class _Order:
+    """What is to be deployed and kept."""
+
+    run: Run
+    guard: Mode
+    setting: Setting
+    record: Path | None
+    live: bool
+    margins: str | None
+    overrides: Mapping[str, str]
+    asked: Asked
+
+
+def _driven(order: _Order, name: str | None, *, kept: bool = True) -> Record:
+    """Deploy without and with the guard under a scenario; margins are written where it is `kept`."""
+    from stlc.cli.framework.output import show_diagnostics
+    from stlc.cli.simulate.text import TITLES
+    from stlc.cli.simulate.watch import Watching
+    from stlc.controller.evaluation.rules import rules_of
+    from stlc.controller.training.run import Run
+
+    run, found = order.run, {}
+    if name is not None:
+        run = Run.open(run.dir.path, overrides=order.overrides, scenario=name)
+    rules = rules_of(run)
+    margin = order.asked.of(run.task, run.policy, order.guard, order.setting.replan)
+    setting = replace(order.setting, margin=margin)
+    for mode in GUARDS[order.guard]:
+        title = " · ".join((run.task.compiled.name, TITLES[mode], *([name] if name else [])))
+        last = kept and mode == order.guard
+        watching = Watching(title, order.live, order.margins if last else None)
+        try:
+            found[mode] = _deploy(run, replace(order, setting=setting), mode, watching, rules)
+        except RunError as error:
+            if mode == order.guard:
+                raise
+            show_diagnostics(error.diagnostics)  # only the comparison is missing: the guard may go on
+    return _save(run, replace(order, setting=setting), found, rules)
+
+
+def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
+    """Where what a person reads goes: the standard output, unless the margins are wanted there."""
+    from stlc.cli.framework.output import emit, say
+    from stlc.cli.simulate.watch import STANDARD_OUTPUT
+
+    if margins != STANDARD_OUTPUT:
+        return emit
+    if json:
+        message = "`--json` and `--margins -` both want the standard output"
+        raise UsageError(Diagnostic("U101", message, help=("--margins margins.jsonl",)))
+    return say
+
+
+def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
+    """The scenarios that are driven beside the deployment as it is; none where one is named."""
+    from stlc.dynamics.scenarios.scenario import DISTURBED, find_scenario
+
+    decl = run.task.system.decl
+    declared = {each.name: each for each in decl.scenarios}
+    if scenario in declared:
+        return {}
+    if scenario == ALL:
+        return declared
+    return {name: find_scenario(decl, name) for name in DISTURBED} if scenario == USUAL else {}
+
+
+def _needed_system(run: Run) -> str | None:
+    """The system file that a trace cannot be judged without: functions are not in traces."""
+    return f"{run.dir.shown}/system.yaml" if run.task.system.decl.functions else None
+
+
+def _accuracy(document: Record, guard: Mode) -> float:
+    """The plan accuracy, the least one over all scenarios that were driven."""
+    each = [document, *document.get("scenarios", {}).values()]
+    return min(float(one["guards"][guard]["metrics"]["plan_accuracy"]["mean"]) for one in each)
+
+
+def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Record:
+    """The deployment as it is, and scenarios beside it; the trace is that of the former."""
+    found = {
+        name: {
+            "doc": scenario.doc,
+            "expect": scenario.expect,
+            **{key: document[key] for key in ("judge", "guards")},
+        }
+        for name, scenario in scenarios.items()
+        for document in [_driven(order, name, kept=False)]
+    }
+    document = {**_driven(order, None), "scenarios": found}
+    order.run.dir.write_json(SCENARIOS, document)
+    return document
+
+
+def _print(lines: Iterator[str], printed: Callable[[str], None]) -> None:
+    for line in lines:
+        printed(line)
+
+
+def _hurried(setting: Setting, given: str | None) -> Setting:
+    """With the time limit that is given; the paper's guard has none of its own."""
+    if given is None:
+        return setting
+    limit = parse_limit(given)
+    return replace(setting, limit=limit, paper_limit=limit)
+
+
+def _asked(margins: list[str] | None) -> Asked:
+    from stlc.controller.guard.margin_request import parse_margins
+
+    return parse_margins(margins or ())
+
+
+def _guard(backup: bool | None, guard: str | None) -> Mode:
+    if guard not in (None, *GUARDS):
+        raise UsageError(
+            Diagnostic("U101", f"there is no guard `{guard}`", help=("--guard none, paper or full",))
+        )
+    if backup is not None and guard is not None and backup != (guard == "paper"):
+        option = "--backup" if backup else "--no-backup"
+        raise UsageError(Diagnostic("U101", f"`{option}` and `--guard {guard}` contradict each other"))
+    for mode in GUARDS:
+        if mode == guard:
+            return mode
+    return "paper" if backup else "none"
+
+
+def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rules | None) -> Deployment:
+    """One deployment that is watched; what was driven before a failure or Ctrl-C is saved."""
+    from stlc.cli.framework.output import say
+    from stlc.controller.evaluation.archive import save_trace_of
+    from stlc.controller.evaluation.deployment import InterruptedDeploymentError, deploy
+
+    try:
+        with watching.of(run.task, order.setting) as watch:
+            return deploy(run.task, run.policy, order.setting, mode, watch=watch, rules=rules)
+    except InterruptedDeploymentError as error:
+        if error.recording is not None:
+            paths = save_trace_of(run, error.recording, order.setting, order.record, rules=rules)
+            say(f"the first {error.recording.steps} steps are in {paths[0]}")
+        raise (error.__cause__ or error) from None
+
+
+def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rules | None) -> Record:
+    """Write trace, scene and figures into the run's folder; returns what was measured."""
+    from stlc.controller.deployment.disturbance import errors_of
+    from stlc.controller.evaluation.archive import RESULT, SCENE, save_scene, save_trace_of, save_unguarded
+    from stlc.controller.evaluation.deployment import as_json
+
+    last = list(found.values())[-1]
+    save_trace_of(run, last.recording, order.setting, order.record, rules=rules)
+    save_scene(run.dir.path / SCENE, last.recording.scene)
+    beside = found["none"].recording if "none" in found and len(found) > 1 else None
+    save_unguarded(run, beside, order.setting, rules)
+    world = run.task.system.decl.test.world
+    facts = {
+        "spec": run.task.compiled.name,
+        "system": run.task.system.name,
+        "run": run.dir.name,
+        "world": world.path.name if world is not None else None,
+        "scenario": _laid_over(run),
+        "starts": run.task.system.decl.test.starts,
+        "redrawn": last.recording.redrawn,
+        "errors": errors_of(run.task.plain.truth),
+        "judge": None if rules is None else {"spec": rules.name, "path": rules.path, "rules": rules.docs},
+        "safety": [rule.name for rule in run.task.compiled.safety],
+        "trace": f"{run.dir.shown}/trace.npz",
+        "overrides": dict(order.overrides),
+    }
+    document = as_json(found, order.setting, facts)
+    run.dir.write_json(RESULT, document)
+    return document
+
+
+def _laid_over(run: Run) -> str | None:
+    scenario = run.task.system.decl.scenario
+    return None if scenario is None else scenario.name

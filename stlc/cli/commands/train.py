@@ -1,0 +1,318 @@
+"""`stlc train`: a specification and a system in, a run folder with a trained policy out."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+import typer
+
+from stlc.cli.framework.options import JsonOption, SetOption, SystemOption, parse_overrides
+from stlc.cli.framework.output import say, show_diagnostics
+from stlc.cli.framework.program import command
+from stlc.cli.framework.ranges import parse_clock, parse_count, parse_seconds, parse_seeds
+from stlc.cli.train import options as o
+from stlc.cli.train.many import Many, train_many
+from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError
+from stlc.registry import METHODS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from stlc.cli.train.sitting import Sitting
+    from stlc.controller.problem.task import Task
+    from stlc.controller.training.budget import StepSchedule
+    from stlc.controller.training.config import TrainConfig
+    from stlc.controller.training.launch import Launch
+    from stlc.controller.training.tensorboard import Opener
+
+
+@dataclass(frozen=True, slots=True)
+class Length:
+    """How far a resumed run is to go; what is left of it where neither is given.
+
+    Attributes:
+        steps: a new total of steps.
+        more: seconds of training more.
+    """
+
+    steps: int | None
+    more: float | None
+
+
+@command(
+    "stlc train specs/traffic.stl --system car.yaml --budget 60s",
+    "stlc train --resume latest --budget 5min",
+    "stlc train specs/traffic.stl --seeds 0..2 --jobs 2",
+    "stlc train specs/traffic.stl specs/ship_safe.stl --seeds 0..2 --cluster auto",
+)
+def train(
+    spec: o.SpecsArgument = None,
+    system: SystemOption = None,
+    budget: o.BudgetOption = None,
+    clock: o.ClockOption = "wall",
+    steps: o.StepsOption = None,
+    seed: o.SeedOption = None,
+    seeds: o.SeedsOption = None,
+    jobs: o.JobsOption = 1,
+    cluster: o.ClusterOption = None,
+    method: o.MethodOption = None,
+    resume: o.ResumeOption = None,
+    name: o.NameOption = None,
+    device: o.DeviceOption = "cpu",
+    threads: o.ThreadsOption = None,
+    plans: o.PlansOption = None,
+    lr: o.RateOption = None,
+    batch: o.BatchOption = None,
+    held_out: o.HeldOutOption = None,
+    drives: o.DrivesOption = None,
+    log: o.LogOption = None,
+    runs: o.RunsOption = Path("runs"),
+    pictures: o.PicturesOption = True,
+    set_: SetOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Learn a policy that satisfies a specification.
+
+    The run's folder holds everything that repeats it. Ctrl-C saves a checkpoint and stops.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads of torch must not spin
+    specs = tuple(dict.fromkeys(spec or ()))
+    _check_together(seed=seed, seeds=seeds, budget=budget, steps=steps)
+    _check_many(specs, seeds=seeds, system=system, jobs=jobs, cluster=cluster)
+    logbook = _logbook(log)
+    if resume is not None:
+        _refuse_on_resume(
+            {"SPEC": spec or None, "--system": system, "--seed": seed, "--method": method}
+            | {"--name": name, "--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch}
+            | {
+                "--set": set_,
+                "--seeds": seeds,
+                "--held-out": held_out,
+                "--drives": drives,
+                "--cluster": cluster,
+            }
+        )
+        total = parse_count(steps, "--steps") if steps is not None else None
+        more = parse_seconds(budget) if budget is not None else None
+        length = Length(total, more)
+        _go_on(resume, runs=runs, length=length, device=device, logbook=logbook, pictures=pictures, json=json)
+    from stlc.controller.training.config import DRIVES, HELD_OUT, TrainConfig
+
+    config = TrainConfig(
+        method=_method(method) if method is not None else None,
+        budget=parse_seconds(budget) if budget is not None else None,
+        steps=_steps(steps) if steps is not None else None,
+        seed=seed,
+        device=device,
+        threads=threads,
+        plans=plans,
+        lr=_rate(lr) if lr is not None else None,
+        batch=batch,
+        held_out=held_out or HELD_OUT,
+        clock=parse_clock(clock),
+        drives=DRIVES if drives is None else drives,
+    )
+    launch = _launch(runs, name, set_)
+    if len(specs) > 1 or seeds is not None or cluster is not None:
+        drawn = parse_seeds(seeds) if seeds is not None else (seed,)
+        _train_many(Many(specs, system, config, launch, drawn, jobs, cluster, log, pictures), json=json)
+    with one_voice():
+        task = _task(specs, system, launch.overrides)
+        _train(task, config, launch, logbook).conclude(pictures=pictures, json=json)
+
+
+def _check_together(*, seed: int | None, seeds: str | None, budget: str | None, steps: str | None) -> None:
+    """Options that exclude each other."""
+    if budget is not None and steps is not None:
+        raise UsageError(Diagnostic("U101", "`--budget` and `--steps` contradict each other"))
+    if seeds is not None and seed is not None:
+        raise UsageError(Diagnostic("U101", "`--seed` and `--seeds` contradict each other"))
+
+
+def _check_many(
+    specs: Sequence[Path], *, seeds: str | None, system: str | None, jobs: int, cluster: str | None
+) -> None:
+    """Options that mean nothing for one run, or for several, or where a cluster divides the work."""
+    if len(specs) > 1 and system is not None:
+        help_ = ('a line `system "FILE"` in every specification',)
+        raise UsageError(Diagnostic("U101", "`--system` is for one specification", help=help_))
+    if cluster is not None and jobs > 1:
+        help_ = ("a cluster runs as many as it has cores for; --threads says how many a run has",)
+        raise UsageError(Diagnostic("U101", "`--jobs` and `--cluster` contradict each other", help=help_))
+    if len(specs) < 2 and seeds is None and jobs > 1:
+        help_ = ("stlc train SPEC --seeds 0..2 --jobs 2",)
+        raise UsageError(Diagnostic("U101", "`--jobs` needs several runs", help=help_))
+
+
+def _logbook(name: str | None) -> Opener | None:
+    """What `--log` asks for. Raises MissingError R301 where it is not installed."""
+    if name is None:
+        return None
+    if name != "tensorboard":
+        raise UsageError(Diagnostic("U101", f"there is no log `{name}`", help=("--log tensorboard",)))
+    from stlc.controller.training.tensorboard import find_writer
+
+    return find_writer()
+
+
+def _method(name: str) -> str:
+    """A method by its name. Raises UsageError (U101) where there is none."""
+    if name not in METHODS:
+        raise UsageError(Diagnostic("U101", f"there is no method `{name}`", help=(METHODS.suggest(name),)))
+    return name
+
+
+def _steps(text: str) -> int | StepSchedule:
+    """A number of steps, or the schedule that a run with a budget has on record."""
+    from stlc.controller.training.budget import StepSchedule
+
+    if text.strip().isdecimal():
+        return parse_count(text, "--steps")
+    try:
+        return StepSchedule.parse(text)
+    except ValueError as error:
+        help_ = ("--steps 1200", "the schedule of a run is in its report and in its run.json")
+        raise UsageError(
+            Diagnostic("U101", f"`--steps {text}` is no number of steps", help=help_, note=(str(error),))
+        ) from None
+
+
+def _rate(value: float) -> float:
+    """A learning rate: a positive number."""
+    if not 0.0 < value < math.inf:
+        raise UsageError(Diagnostic("U101", f"`--lr {value:g}` is not a learning rate", help=("--lr 1e-3",)))
+    return value
+
+
+def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str]) -> Task:
+    """Read, compile, and say which system file was taken."""
+    from stlc.controller.problem.task import Task
+    from stlc.dynamics.model.feedback import unstable
+    from stlc.dynamics.model.system import System
+    from stlc.files import find_spec, find_system, read_source
+    from stlc.grammar.parse.parser import parse
+
+    if not specs:
+        example = "stlc train specs/traffic.stl --system car.yaml"
+        raise UsageError(Diagnostic("U101", "which specification is to be trained for?", help=(example,)))
+    path = find_spec(*specs)
+    spec = parse(read_source(path))
+    wanted = system or spec.system
+    if wanted is None:
+        help_ = ("stlc train SPEC --system FILE", 'or a line `system "FILE"` in the specification')
+        raise UsageError(Diagnostic("U101", f"`{path}` names no system", help=help_))
+    found = find_system(wanted, path)
+    say(f"system {found}")
+    loaded = System.load(found, overrides)
+    task = Task.of(spec, loaded, overrides=overrides)
+    show_diagnostics([*task.compiled.warnings, *unstable(loaded.decl)])
+    return task
+
+
+def _launch(runs: Path, name: str | None, changes: Sequence[str] | None) -> Launch:
+    """Where a run is made, and what `--set` changes in it."""
+    from stlc.controller.training.launch import Launch
+
+    return Launch(root=runs, name=name, overrides=parse_overrides(changes), command=sys.argv[1:])
+
+
+def _go_on(
+    where: str,
+    *,
+    runs: Path,
+    length: Length,
+    device: str,
+    logbook: Opener | None,
+    pictures: bool,
+    json: bool,
+) -> NoReturn:
+    """Resume a run and conclude it."""
+    with one_voice():
+        sitting = _resume(where, runs=runs, length=length, device=device, logbook=logbook)
+        sitting.conclude(pictures=pictures, json=json)
+
+
+def _train_many(many: Many, *, json: bool) -> NoReturn:
+    """Several runs; what is wrong with an only specification is said once, before any begins."""
+    if len(many.specs) < 2:
+        with one_voice():
+            _task(many.specs, many.system, many.launch.overrides)
+    train_many(many, json=json)
+
+
+def _train(task: Task, config: TrainConfig, launch: Launch, logbook: Opener | None) -> Sitting:
+    """A new run, from its folder to its verdict."""
+    from stlc.cli.train.sitting import Sitting
+    from stlc.controller.parallel.ddp import joined
+    from stlc.controller.training.launch import open_folder
+    from stlc.controller.training.loop import find_device, train
+    from stlc.rundir import RunDir
+
+    with joined(config.device) as ranks:
+        find_device(ranks.device(config.device))
+        made = str(open_folder(task, config, launch).path) if ranks.first else ""
+        folder = RunDir(Path(ranks.agree_text(made)))
+        with Sitting(folder, logbook=logbook, keeps=ranks.first) as sitting:
+            sitting.outcome = train(task, config, folder, sitting.watch, ranks=ranks)
+    return sitting
+
+
+def _resume(where: str, *, runs: Path, length: Length, device: str, logbook: Opener | None) -> Sitting:
+    """An old run, from its last checkpoint to its verdict."""
+    from stlc.cli.train.sitting import Sitting
+    from stlc.controller.parallel.ddp import joined
+    from stlc.controller.training.loop import resume
+    from stlc.rundir import RunDir
+
+    folder = RunDir.open(where, runs)
+    with joined(device) as ranks, Sitting(folder, logbook=logbook, keeps=ranks.first) as sitting:
+        sitting.outcome = resume(
+            folder, steps=length.steps, budget=length.more, device=device, watch=sitting.watch, ranks=ranks
+        )
+    return sitting
+
+
+def _refuse_on_resume(given: Mapping[str, object]) -> None:
+    """A resumed run goes on with what it was started with; how far it goes and `--device` may change."""
+    named = [option for option, value in given.items() if value is not None]
+    if named:
+        raise UsageError(
+            Diagnostic(
+                "R104",
+                f"{', '.join(named)} cannot change when a run is resumed",
+                help=("stlc train --resume RUN [--steps N | --budget TIME]", "a new run takes any option"),
+            )
+        )
+
+
+# ------------------------------------------------------------------- several ranks
+
+LOST = "R403"
+
+
+@contextmanager
+def one_voice() -> Iterator[None]:
+    """Let the first rank of those that `torchrun` started speak; the others only of what is theirs alone.
+
+    What is wrong with a specification all of them find; what a machine lacks perhaps one, which says so.
+    """
+    rank, local = (int(os.environ.get(name, "0")) for name in ("RANK", "LOCAL_RANK"))
+    if rank == 0:
+        yield
+        return
+    try:
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            yield
+    except StlcError as error:
+        lost = any(finding.code == LOST for finding in error.diagnostics)
+        if not lost and (local == 0 or isinstance(error, MissingError)):
+            show_diagnostics([finding.with_note(f"on rank {rank}") for finding in error.diagnostics])
+        raise typer.Exit(error.exit_code) from error
