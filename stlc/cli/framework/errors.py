@@ -15,6 +15,7 @@ import typer
 from stlc.cli.framework.output import emit_json, show_diagnostics
 from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError
 
+SCHEMAS = Path(__file__).parents[2] / "schemas"
 INTERNAL_ERROR = 70
 INTERRUPTED = 130
 TERMINATED = 143
@@ -72,10 +73,8 @@ def wants_json(argv: Sequence[str]) -> bool:
 
 def _schema(argv: Sequence[str]) -> str:
     """That of the command, where it has one; `stlc/1` is the frame with no result."""
-    from stlc.cli.commands.schema import names
-
-    wanted = f"{argv[0]}/1" if argv else ""
-    return wanted if wanted in names() else "stlc/1"
+    known = {path.stem for path in SCHEMAS.glob("*.json")}
+    return f"{argv[0]}/1" if argv and argv[0] in known else "stlc/1"
 
 
 def _known(error: BaseException) -> StlcError | None:
