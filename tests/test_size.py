@@ -13,18 +13,13 @@ SYSTEM_LINES = 150
 CODE = sorted(
     path for folder in ("stlc", "benchmarks", "tools", "examples") for path in (ROOT / folder).rglob("*.py")
 )
-NAMES = [str(path.relative_to(ROOT)) for path in CODE]
+SYSTEMS = sorted((ROOT / "examples").glob("*.yaml"))
 
 
-@pytest.mark.parametrize("path", CODE, ids=NAMES)
-def test_a_file_fits(path):
-    count = len(path.read_text(encoding="utf-8").splitlines())
-    assert count <= FILE_LINES, f"{count} lines"
-
-
-@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.yaml")), ids=lambda path: path.name)
-def test_a_system_file_fits(path):
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= SYSTEM_LINES
+@pytest.mark.parametrize(("paths", "limit"), [(CODE, FILE_LINES), (SYSTEMS, SYSTEM_LINES)])
+def test_files_fit(paths, limit):
+    lines = {str(path.relative_to(ROOT)): len(path.read_bytes().splitlines()) for path in paths}
+    assert {name: count for name, count in lines.items() if count > limit} == {}
 
 
 def test_the_code_was_found():

@@ -185,10 +185,15 @@ def test_resampling_and_units_and_the_name_of_the_clock(capsys: pytest.CaptureFi
     assert check("s.stl", name, "-q") == 3
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".csv", ".parquet"])
 @pytest.mark.parametrize("end", ["open", "truncate"])
 @pytest.mark.parametrize(
-    "at", [(), ("--at", "all", "--require", "window", "--require", "soon"), ("--at", "2.5s"), ("--at", "31")]
+    ("suffix", "at"),
+    [
+        *((".npz", at) for at in ((), ("--at", "2.5s"), ("--at", "31"))),
+        (".npz", ("--at", "all", "--require", "window", "--require", "soon")),
+        (".csv", ()),
+        (".parquet", ()),
+    ],
 )
 @pytest.mark.parametrize("peak", [1.0, 3.0])
 def test_pieces_give_what_the_whole_gives(

@@ -370,7 +370,10 @@ def test_an_interruption_while_it_is_judged_keeps_everything(
     assert "the first 6 steps are in" in capsys.readouterr().err
 
 
-def test_pictures_are_drawn(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pictures_are_drawn(
+    there: RunDir, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("stlc.view.player.MOST_FRAMES", 4)
     assert main(["simulate", "--backup", *SMALL[:-1]]) == 0
     out = capsys.readouterr().out
     assert "report.html" in out

@@ -78,7 +78,8 @@ def test_an_interrupted_run_is_saved_and_told(
         return advance(self)
 
     monkeypatch.setattr(Trainer, "advance", interrupted)
-    assert main([*TRAIN, "--steps", "5", "--runs", "elsewhere", "--json"]) == code
+    few = ["--steps", "5", "--batch", "16", "--held-out", "40"]
+    assert main([*TRAIN, *few, "--runs", "elsewhere", "--json"]) == code
     told = capsys.readouterr()
     document = json.loads(told.out)
     assert (document["ok"], document["exit_code"]) == (False, code)

@@ -236,7 +236,7 @@ formulas = st.deferred(
 )
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     texts=formulas,
     rows=st.lists(st.tuples(TENTHS, TENTHS, TENTHS, st.booleans()), min_size=4, max_size=6),

@@ -194,7 +194,7 @@ def test_patterns_are_what_they_say(short: str, long: str) -> None:
 
 
 @pytest.mark.parametrize("text", [short for short, _ in PATTERNS.values()], ids=PATTERNS)
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(env=traces(low=2, batch=1))
 def test_patterns_by_the_definition(text: str, env: dict[str, np.ndarray]) -> None:
     formula = pattern(text)

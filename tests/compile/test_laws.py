@@ -56,19 +56,19 @@ def test_laws_of_the_exact_semantics_do_not_hold_under_the_others() -> None:
             assert (abs(one[0] - other[0]) < 1e-9) is (name in law.holds), (law, name)
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(st.data(), short)
 def test_what_is_constant_is_moved_out_of_windows(data: st.DataObject, env: dict[str, Any]) -> None:
     laws.check_moved(data.draw, env)
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(st.data(), short)
 def test_at_the_first_sample_the_clock_is_the_time_from_now(data: st.DataObject, env: dict[str, Any]) -> None:
     laws.check_clock(data.draw, env)
 
 
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(formulas() | formulas(held=()), short)
 def test_a_compiled_formula_has_the_robustness_of_the_definition(
     formula: Formula, env: dict[str, Any]

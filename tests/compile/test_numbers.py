@@ -102,7 +102,7 @@ def test_folding_equals_python_arithmetic(case) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name, f in FUNCTIONS.items() if f.kind == "function"])
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(args=st.lists(st.floats(-3, 3, allow_subnormal=False), min_size=3, max_size=3))
 def test_functions_fold_to_what_they_mean(name: str, args: list[float]) -> None:
     function = FUNCTIONS[name]

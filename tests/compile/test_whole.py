@@ -59,7 +59,7 @@ def monitor(text: str) -> Monitor:
     b=st.integers(0, 1),
     other=st.integers(-4, 4),
 )
-@settings(max_examples=20)
+@settings(max_examples=12)
 def test_a_whole_number_is_compared_exactly(text: str, **drawn: float) -> None:
     signals = {name: np.array([value]) for name, value in drawn.items()}
     found = {

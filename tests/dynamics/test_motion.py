@@ -235,7 +235,7 @@ def test_plans_of_the_wrong_shape_are_refused(car: System) -> None:
         car.rollout(torch.zeros(3, 6), torch.zeros(3, 25, 1))
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(st.lists(st.sampled_from("abcd"), min_size=1, max_size=4, unique=True), st.data())
 def test_any_net_of_dependencies_is_scheduled_right(
     make: Make, names: list[str], data: st.DataObject

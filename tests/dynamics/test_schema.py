@@ -137,7 +137,7 @@ def test_a_system_is_found_by_name(monkeypatch: pytest.MonkeyPatch, car: System)
     assert System.load("car.yaml").hash == car.hash
 
 
-@settings(max_examples=150)
+@settings(max_examples=75)
 @given(st.data())
 def test_damaged_files_give_diagnostics_and_nothing_else(data: st.DataObject) -> None:
     text = GOOD

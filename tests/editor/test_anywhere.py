@@ -39,7 +39,7 @@ def ask_everything(text: str, offset: int) -> None:
 @pytest.mark.parametrize("name", TEXTS)
 def test_in_every_line_of_a_finished_text(name):
     text = TEXTS[name]
-    for offset in range(0, len(text), 97):
+    for offset in range(0, len(text), 193):
         ask_everything(text, offset)
 
 
@@ -50,7 +50,7 @@ def test_while_a_text_is_typed(name):
         ask_everything(text[:length], length)
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(st.sampled_from(sorted(TEXTS)), st.data())
 def test_in_a_damaged_text(name, data):
     text = TEXTS[name]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-import subprocess
+import runpy
 import sys
 
 import pytest
@@ -16,11 +16,11 @@ PATH = ROOT / "examples" / "gym_loop.py"
 SPEC = str(ROOT / "specs" / "traffic.stl")
 
 
-def test_the_program_runs() -> None:
+def test_the_program_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     _, folder = exported("traffic", "car")
-    command = [sys.executable, str(PATH), str(folder), SPEC, "--episodes", "2", "--guard", "paper"]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT)
-    lines = done.stdout.splitlines()
+    monkeypatch.setattr(sys, "argv", [str(PATH), str(folder), SPEC, "--episodes", "2", "--guard", "paper"])
+    runpy.run_path(str(PATH), run_name="__main__")
+    lines = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in lines] == ["seed 0", "seed 1"]
     assert all("satisfied" in line or "violated" in line for line in lines)
 

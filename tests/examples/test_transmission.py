@@ -115,7 +115,7 @@ def test_a_jittered_log_with_holes(
 def test_a_clock_that_nobody_recorded(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lines = [line.partition(",")[2] for line in a_log(4, seconds=2)]
+    lines = [line.partition(",")[2] for line in a_log(4, seconds=1)]
     found = agree(*both(capsys, monkeypatch, lines, "--dt", "0.01s"))
     assert found["top_speed"] == "satisfied"
     agree(*both(capsys, monkeypatch, lines, "--dt", "10ms", "--resample", "25ms"))

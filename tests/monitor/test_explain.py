@@ -32,7 +32,7 @@ def nodes(blame: Blame) -> Iterator[Blame]:
         yield from nodes(part)
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(formula=formulas(), env=traces(low=3, batch=1))
 def test_every_node_is_what_it_is_said_to_be(formula: typed.Formula, env: dict[str, np.ndarray]) -> None:
     trace = reference.Trace({name: column[:, 0] for name, column in env.items()}, GRID, "open")
@@ -52,7 +52,7 @@ def test_every_node_is_what_it_is_said_to_be(formula: typed.Formula, env: dict[s
         assert all(name in env for name in node.signals)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(formula=formulas(), env=traces(low=3, batch=1))
 def test_the_cause_is_the_value_behind_the_number(formula: typed.Formula, env: dict[str, np.ndarray]) -> None:
     """The path of minima and maxima ends at it; where it decides alone, changing it changes the number."""
@@ -79,7 +79,7 @@ def test_the_cause_is_the_value_behind_the_number(formula: typed.Formula, env: d
     assert max(found) > value
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(formula=formulas(bounded_only=True), env=traces(low=3, batch=1))
 def test_an_operator_that_never_succeeds_is_explained_by_its_best(
     formula: typed.Formula, env: dict[str, np.ndarray]

@@ -34,7 +34,7 @@ def filled(trace: dict[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:
     return {name: np.where(np.isnan(x), rng.integers(-40, 40, x.shape) / 8, x) for name, x in trace.items()}
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     written=random_formulas.formulas(held=()),
     trace=random_formulas.traces(1, 14, 2),
@@ -66,7 +66,7 @@ def test_bounds_hold_for_every_filling(written, trace, ends, window, seed, share
     assert (high >= most).all()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     written=random_formulas.formulas(held=()),
     trace=random_formulas.traces(1, 14, 1),
@@ -108,7 +108,7 @@ REQUIREMENTS = {
 
 
 @pytest.mark.parametrize("name", REQUIREMENTS)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     samples=st.integers(1, 25),

@@ -38,7 +38,7 @@ def monitor(formulas: list[str]) -> Monitor:
     return Monitor("\n".join(["signal x, y", *lines]), dt=1, horizon=4)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=15)
 @given(names, st.integers(0, 2**32 - 1), st.integers(1, 14))
 def test_margins_are_those_of_monitors_side_by_side(formulas: list[str], seed: int, samples: int) -> None:
     judge = monitor(formulas)

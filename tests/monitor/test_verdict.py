@@ -64,7 +64,7 @@ def by_definition(monitor: Monitor, columns: dict[str, np.ndarray], k: int, end:
 
 @pytest.mark.parametrize("name", FORMULAS)
 @pytest.mark.parametrize("end", ["strict", "truncate"])
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(samples=st.integers(1, 16), seed=st.integers(0, 2**32 - 1))
 def test_every_sample_is_the_definition(name: str, end: str, samples: int, seed: int) -> None:
     monitor = monitor_of(FORMULAS[name])
@@ -82,7 +82,7 @@ def test_every_sample_is_the_definition(name: str, end: str, samples: int, seed:
 
 
 @pytest.mark.parametrize("name", FORMULAS)
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(samples=st.integers(1, 12), seed=st.integers(0, 2**32 - 1))
 def test_bounds_are_the_definition(name: str, samples: int, seed: int) -> None:
     monitor = monitor_of(FORMULAS[name])
@@ -94,7 +94,7 @@ def test_bounds_are_the_definition(name: str, samples: int, seed: int) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in FORMULAS if "end" not in name])
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(known=st.integers(1, 12), more=st.integers(0, 30), seed=st.integers(0, 2**32 - 1))
 def test_bounds_hold_every_continuation(name: str, known: int, more: int, seed: int) -> None:
     monitor = monitor_of(FORMULAS[name])
@@ -108,7 +108,7 @@ def test_bounds_hold_every_continuation(name: str, known: int, more: int, seed: 
 
 
 @pytest.mark.parametrize("name", FORMULAS)
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(samples=st.integers(1, 14), seed=st.integers(0, 2**32 - 1))
 def test_verdicts_follow_from_the_bounds(name: str, samples: int, seed: int) -> None:
     monitor = monitor_of(FORMULAS[name])
@@ -179,7 +179,7 @@ def test_strictness_under_negation_and_windows() -> None:
     assert monitor.check({"a": [-1.0, -1.0]}, tolerance=0).satisfied is None
 
 
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_clear_robustness_decides_without_tolerance(seed: int) -> None:
     for name, formula in FORMULAS.items():

@@ -10,7 +10,7 @@ import pytest
 
 FULL = 10_000
 BLOCK = 500
-FAST = 60
+FAST = 30
 """Cases of the ordinary suite, of each kind."""
 
 FIRST = random.SystemRandom().randrange(1 << 40) if os.environ.get("STLC_EXPLORE") else 0

@@ -7,7 +7,7 @@ from proof.amounts import FULL, seeds
 from proof.slopes import SMOOTHED, check_gradient
 
 
-@pytest.mark.parametrize("numbers", seeds(FULL, 60))
+@pytest.mark.parametrize("numbers", seeds(FULL, 30))
 def test_the_gradient_is_the_central_difference(numbers: range) -> None:
     few_are_left_out(numbers, "exact")
 

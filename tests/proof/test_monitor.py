@@ -23,7 +23,7 @@ def test_every_value_is_the_definition(numbers: range) -> None:
         monitored.check_values(seed)
 
 
-@pytest.mark.parametrize("numbers", seeds(FULL // 5, 60))
+@pytest.mark.parametrize("numbers", seeds(FULL // 5, 30))
 def test_the_other_evaluator_says_the_same(numbers: range) -> None:
     for seed in numbers:
         monitored.check_other(seed)
@@ -41,7 +41,7 @@ def test_the_mission_clock(numbers: range) -> None:
         monitored.check_clock(seed)
 
 
-@pytest.mark.parametrize("numbers", seeds(FULL // 5, 40))
+@pytest.mark.parametrize("numbers", seeds(FULL // 5, 20))
 def test_planning_windows(numbers: range) -> None:
     for seed in numbers:
         monitored.check_windows(seed)

@@ -18,7 +18,7 @@ FORMER = tuple(replace(taste, bools=False) for taste in TASTES)
 """Of the cases that are known by their seed."""
 
 
-@pytest.mark.parametrize("numbers", seeds(FULL, 40))
+@pytest.mark.parametrize("numbers", seeds(FULL, 20))
 def test_samples_one_by_one(numbers: range) -> None:
     assert sum(map(check_online, numbers)) > len(numbers) / 2
 
@@ -47,6 +47,6 @@ def test_a_case_that_was_wrong_once(seed: int) -> None:
     check_stream(*found)
 
 
-@pytest.mark.parametrize("numbers", seeds(FULL, 40))
+@pytest.mark.parametrize("numbers", seeds(FULL, 20))
 def test_what_was_said_stays_true(numbers: range) -> None:
     assert sum(map(check_promise, numbers)) > len(numbers) / 2

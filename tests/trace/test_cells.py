@@ -80,7 +80,7 @@ def outcome(data: bytes) -> object:
 
 @pytest.mark.usefixtures("reader")
 @given(st.lists(st.one_of(DECIMALS, HALVES), min_size=1, max_size=60))
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=25)
 def test_every_number_is_the_nearest_double(cells: list[str]) -> None:
     room = [*cells, *["0"] * (40 * len(cells))]  # a few may be doubts
     columns = read_lines(Lines("\n".join(room).encode(), 0, 1, ","))
@@ -107,7 +107,7 @@ def texts(draw: st.DrawFn) -> bytes:
 @pytest.mark.usefixtures("reader")
 def test_large_tables_are_read_like_small_ones(choose: Callable[[int], None]) -> None:
     @given(texts())
-    @settings(deadline=None, max_examples=400)
+    @settings(deadline=None, max_examples=150)
     def agree(data: bytes) -> None:
         choose(NEVER)
         careful = outcome(data)

@@ -13,7 +13,8 @@ import pytest
 from stlc.trace import load_trace, save_trace
 from stlc.view import player
 from stlc.view.animate import UNGUARDED, WITH, WITHOUT, shots_of
-from stlc.view.report import write_report
+from stlc.view.material import gather
+from stlc.view.report import render_report, write_report
 
 WORLD = """
 from stlc.controller.sketch import violations
@@ -82,7 +83,7 @@ def test_both_drives_are_shown_with_what_was_violated(compared):
 
 
 def test_the_page_runs_its_own_script_and_no_other_and_has_a_still_without_it(compared):
-    html = write_report(compared).read_text(encoding="utf-8")
+    html = render_report(gather(compared), [])
     scripts = re.findall(r"<script([^>]*)>(.*?)</script>", html, re.DOTALL)
     assert len(scripts) == 2
     (_, data), (attributes, code) = scripts

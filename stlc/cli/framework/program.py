@@ -159,6 +159,14 @@ class Program:
             self._add(app, name)
         return app
 
+    def _parser(self, name: str) -> Any:
+        """The parser of one command, made once in a process."""
+        key = (self.package, name)
+        if key not in _PARSERS:
+            _PARSERS[key] = typer.main.get_command(self.made(name))
+            spare_adapters(_PARSERS[key])
+        return _PARSERS[key]
+
     def _add(self, app: typer.Typer, name: str) -> None:
         module = import_module(f"{self.package}.{name}")
         if hasattr(module, "GROUP"):
@@ -184,13 +192,15 @@ class Program:
                 if name in self.moved:
                     finding = Diagnostic("U101", f"there is no command `{name}`", help=(self.moved[name],))
                     raise UsageError(finding)
-                parser = typer.main.get_command(self.made(name))
-                spare_adapters(parser)
-                code = parser.main(args=[*front, *rest], prog_name=self.name, standalone_mode=False)
+                code = self._parser(name).main(args=[*front, *rest], prog_name=self.name, standalone_mode=False)
         except BaseException as error:  # the boundary
             code = report_error(SystemExit(stopped[0]) if stopped else error, rest)
         _flush()
         return code if isinstance(code, int) else 0
+
+
+_PARSERS: dict[tuple[str, str], Any] = {}
+"""(package, command) -> its parser."""
 
 
 def _show_version(wanted: bool) -> None:
