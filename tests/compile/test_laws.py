@@ -19,7 +19,7 @@ short = traces(high=9, batch=1)
 
 
 @pytest.mark.parametrize("name", LAWS)
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.data(), short, st.booleans())
 def test_a_law_keeps_the_robustness(name: str, data: st.DataObject, env: dict[str, Any], flip: bool) -> None:
     laws.check_law(LAWS[name], data.draw, env, flip=flip)

@@ -161,7 +161,7 @@ def test_twice_as_many_errors_take_twice_the_work(line: str) -> None:
         assert f"{count - 20} more errors" in error.diagnostics[-1].note[-1]
         return spent
 
-    assert found(600) < 2.5 * found(300)
+    assert found(300) < 2.5 * found(150)
 
 
 def test_twice_as_many_warnings_take_twice_the_work() -> None:
@@ -173,4 +173,4 @@ def test_twice_as_many_warnings_take_twice_the_work() -> None:
         assert [finding.code for finding in warnings] == ["W101"] * (count - 1)
         return spent
 
-    assert found(600) < 2.5 * found(300)
+    assert found(300) < 2.5 * found(150)

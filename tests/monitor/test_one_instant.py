@@ -26,8 +26,7 @@ SAMPLES = 40
 
 
 @pytest.mark.parametrize("name", REQUIREMENTS)
-@pytest.mark.parametrize("end", ["open", "truncate"])
-@pytest.mark.parametrize("at", [0, 9, 39])
+@pytest.mark.parametrize(("end", "at"), [("open", 0), ("truncate", 0), ("truncate", 9), ("open", 39)])
 def test_it_is_judged_as_the_recording_is(name: str, end, at: int) -> None:
     text = f"signal a\nsignal b\nrequire r: {REQUIREMENTS[name]}\n"
     monitor = Monitor(text, dt=0.1, horizon=0.6)

@@ -164,7 +164,7 @@ def signals(samples: int, seed: int) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", REQUIREMENTS)
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(
     tolerance=st.sampled_from([1e-6, 0.0]),
     samples=st.integers(1, 30),
@@ -297,10 +297,10 @@ def lasting(formula: ir.Formula, known: dict[str, np.ndarray], start: int) -> tu
 
 def test_memory_is_bounded_by_the_horizon() -> None:
     names = [name for name in REQUIREMENTS if name not in ("end_under_a_window",)]
-    monitor, whole = monitor_of(*names), signals(150, 0)
+    monitor, whole = monitor_of(*names), signals(90, 0)
     online = monitor.online()
     most = 0
-    for k in range(150):
+    for k in range(90):
         online.push({key: values[k] for key, values in whole.items()})
         most = max(most, online.kept, *(len(online.open_starts("r_" + name)) for name in names))
         rows = [
@@ -450,7 +450,7 @@ def test_no_more_rows_for_windows_that_are_longer_than_the_stream(name: str) -> 
     rows = []
     for wide in ("1e5 s", "1e8 s"):
         online = Monitor(f"signal x\nrequire r: {WIDE[name].replace('W', wide)}", dt=1.0).online()
-        for k in range(40):
+        for k in range(20):
             online.push({"x": float(k % 3)})
         (watched,) = online._watched
         assert isinstance(watched.values, Paced)
