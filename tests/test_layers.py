@@ -114,7 +114,9 @@ MODULES = {module_name(path): path for package in PACKAGES for path in sorted(pa
 def nodes_of(name: str) -> list[ast.AST]:
     """The nodes of a module that may import something, guard an import or call a function."""
     tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
-    return [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom | ast.If | ast.Call)]
+    return [
+        node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom | ast.If | ast.Call)
+    ]
 
 
 def imports_of(name: str) -> Iterator[Import]:
