@@ -58,7 +58,7 @@ def boundary(monkeypatch, tmp_path):
             action()
             assert not as_json
 
-        monkeypatch.setattr(Program, "made", lambda _self, _only="": fake)
+        monkeypatch.setattr(Program, "parser", lambda _self, _name: typer.main.get_command(fake))
         return main(["act", *options])
 
     return run

@@ -159,7 +159,7 @@ class Program:
             self._add(app, name)
         return app
 
-    def _parser(self, name: str) -> Any:
+    def parser(self, name: str) -> Any:
         """The parser of one command, made once in a process."""
         key = (self.package, name)
         if key not in _PARSERS:
@@ -192,7 +192,9 @@ class Program:
                 if name in self.moved:
                     finding = Diagnostic("U101", f"there is no command `{name}`", help=(self.moved[name],))
                     raise UsageError(finding)
-                code = self._parser(name).main(args=[*front, *rest], prog_name=self.name, standalone_mode=False)
+                code = self.parser(name).main(
+                    args=[*front, *rest], prog_name=self.name, standalone_mode=False
+                )
         except BaseException as error:  # the boundary
             code = report_error(SystemExit(stopped[0]) if stopped else error, rest)
         _flush()
