@@ -8,9 +8,9 @@ from fractions import Fraction
 import numpy as np
 from hypothesis import strategies as st
 
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.support import reach, uses_end
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.monitor.verdict import Monitor

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from stlc.compile.augment.timers import Timer
 from stlc.compile.backends.array.arith import Program
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.semantics.switch import Hard
 from stlc.grammar.parse.parser import parse_expr
 from stlc.source import Source

@@ -22,7 +22,7 @@ from stlc import escape
 from stlc.cli.framework.app import main
 from stlc.compile.backends.c.adjoint import emit_adjoint
 from stlc.compile.backends.c.emit import Motion, emit
-from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import TraceError
 from stlc.grammar.parse.parser import parse

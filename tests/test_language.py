@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from doc_examples import BOUNDS, VALUE, Claim, Example, Recorded, codes, examples, recorded
 
-from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.dynamics.declaration.load import load_system_decl

@@ -12,7 +12,7 @@ import reference
 import torch
 
 from stlc.compile.backends.array.graph import RobustnessGraph
-from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import Compiled, compile_spec
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source

@@ -21,7 +21,7 @@ def laws(source, limit: float, *, one_in: int = 1) -> int:
         limit: seconds of processor time that one stage may take.
         one_in: of so many texts one is laid out, which takes longer than everything else.
     """
-    from stlc.compile.frontend.interface import Grid
+    from stlc.compile.ir.discretize import Grid
     from stlc.compile.pipeline import compile_spec
     from stlc.diagnostics import StlcError
     from stlc.grammar.parse.parser import parse

@@ -10,9 +10,8 @@ from textwrap import wrap
 from typing import Literal, TypeAlias
 
 from stlc.compile.augment.timers import Timer
-from stlc.compile.frontend.bounds import in_words
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.discretize import Grid, in_words
 from stlc.compile.ir.support import columns
 from stlc.compile.ir.text import show_formula, shown
 from stlc.compile.ir.traverse import nodes

@@ -1,11 +1,14 @@
 """The stages of the compiler, in order. Read first.
 
     resolve   ast.Spec      -> typed.Spec                 names, sorts, units; time in seconds
+    place     typed.Formula -> typed.Formula              delays in samples: here the grid of time comes in
     augment   typed.Formula -> typed.Formula, Timer…      absolute intervals and the past become states
     lower     typed.Formula -> ir.Formula                 negation normal form; time in steps
     simplify  ir.Formula    -> ir.Formula                 fewer nodes, no constants
     horizon   ir.Formula    -> int                        how far it looks
 
+A text goes down these stages once. `resolve_for` is the first one, `compile_resolved` runs all others, so
+that a monitor that learns the grid of time later, or meets several grids, resolves once.
 `stlc.compile.backends.array.graph` evaluates what comes out. torch is not needed for any of this.
 """
 
@@ -24,12 +27,12 @@ from stlc.compile.augment.guidance import pull
 from stlc.compile.augment.lift import recorded
 from stlc.compile.augment.mission import Goal, endless, mission_steps
 from stlc.compile.augment.timers import Ledger, Timer
-from stlc.compile.frontend.bounds import in_words
-from stlc.compile.frontend.interface import Grid, Interface
+from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.resolve import resolve
 from stlc.compile.frontend.scales import nominal
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.discretize import Grid, in_samples, in_words
 from stlc.compile.ir.support import columns, defined, reach, uses_end
 from stlc.compile.ir.traverse import absolute, margin_unit, mentions_horizon
 from stlc.compile.lowering.lower import lower
@@ -162,41 +165,56 @@ def compile_spec(
     Raises:
         SpecError: with all errors of a stage.
     """
-    sink: list[Diagnostic] = []
+    return compile_resolved(resolve_for(spec, interface, overrides, purpose), grid, purpose)
+
+
+def resolve_for(
+    spec: ast.Spec, interface: Interface | None, overrides: Mapping[str, str] | None, purpose: Purpose
+) -> typed.Spec:
+    """The first stage: all that does not depend on the grid of time. Arguments as of `compile_spec`."""
+    overrides = overrides or {}
     if interface is not None and purpose == "check":
-        given = {item.name for item in spec.items if isinstance(item, ast.Param)} & (overrides or {}).keys()
+        given = {item.name for item in spec.items if isinstance(item, ast.Param)} & overrides.keys()
         interface = _without(interface, given)
-    resolved = resolve(spec, interface=interface, overrides=overrides or {}, grid=grid, sink=sink)
+    return resolve(spec, interface=interface, overrides=overrides)
+
+
+def compile_resolved(spec: typed.Spec, grid: Grid, purpose: Purpose = "train") -> Compiled:
+    """All stages but the first, for one grid of time.
+
+    Raises:
+        SpecError: with all errors of a stage.
+    """
+    sink = list(spec.warnings)
     if purpose == "check":
-        resolved = replace(
-            resolved,
-            requirements=tuple(map(as_written, resolved.requirements)),
-            assumptions=tuple(map(as_written, resolved.assumptions)),
+        spec = replace(
+            spec,
+            requirements=tuple(map(as_written, spec.requirements)),
+            assumptions=tuple(map(as_written, spec.assumptions)),
         )
-    ranges = nominal(resolved.signature.columns)
-    stage = _Stage(grid, purpose, Ledger(_taken(resolved, interface)), sink, ranges)
-    requirements = tuple(map(stage.rule, resolved.requirements))
+    stage = _Stage(grid, purpose, Ledger(spec.taken), sink, nominal(spec.signature.columns))
+    requirements = tuple(map(stage.rule, spec.requirements))
     goals = tuple(stage.goals)
-    assumptions = tuple(map(stage.rule, resolved.assumptions))
+    assumptions = tuple(map(stage.rule, spec.assumptions))
     errors = [finding for finding in sink if finding.severity == "error"]
     if not errors and purpose == "train":
         errors = [_too_far(rule, grid) for rule in requirements if _leaves(rule, grid)]
     if errors:
         raise SpecError(*errors)
     return Compiled(
-        name=resolved.name,
-        spec=spec,
-        signature=_signature(resolved, (*requirements, *assumptions), stage.ledger.timers),
+        name=spec.name,
+        spec=spec.source_ast,
+        signature=_signature(spec, (*requirements, *assumptions), stage.ledger.timers),
         requirements=requirements,
         assumptions=assumptions,
         timers=stage.ledger.timers,
-        parameters=tuple(each for each in resolved.parameters if not each.carried),
+        parameters=tuple(each for each in spec.parameters if not each.carried),
         pull=pull(goals),
         mission=max(map(mission_steps, goals), default=None),
         recurring=_remembered(stage.ledger.timers) if any(map(endless, goals)) else None,
         grid=grid,
         warnings=tuple(sink),
-        typed=resolved,
+        typed=spec,
     )
 
 
@@ -214,7 +232,8 @@ class _Stage:
 
     def rule(self, requirement: typed.Requirement) -> CompiledRequirement:
         """One requirement, compiled."""
-        written = requirement.formula
+        written = in_samples(requirement.formula, self.grid, self.sink)
+        requirement = replace(requirement, formula=written)
         if self.purpose == "train":
             self.sink.extend(jumps(written, self.ranges))
         rewritten = self._rewritten(requirement)
@@ -265,12 +284,6 @@ def _signature(spec: typed.Spec, rules: Iterable[CompiledRequirement], timers: I
     read = frozenset().union(*(columns(rule.formula) for rule in rules))
     kept = Signature(tuple(column for column in spec.signature.columns if column.name in read))
     return kept.extended(*(timer.column for timer in timers))
-
-
-def _taken(spec: typed.Spec, interface: Interface | None) -> frozenset[str]:
-    """Names that a timer must not have."""
-    offered = () if interface is None else interface.signature.names
-    return frozenset((*spec.signature.names, *offered))
 
 
 def _leaves(rule: CompiledRequirement, grid: Grid) -> bool:

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.frontend.modules import Module, load_modules
+from stlc.compile.ir.discretize import Grid
 from stlc.diagnostics import Diagnostic, Label, StlcError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.load import load_system_decl

@@ -6,11 +6,10 @@ from collections.abc import Iterator
 from dataclasses import fields, replace
 from fractions import Fraction
 
-from stlc.compile.frontend.bounds import in_words
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.frontend.modules import STD
 from stlc.compile.frontend.values import Number, Value, Vector, describe
 from stlc.compile.ir import typed
+from stlc.compile.ir.discretize import Grid, in_words
 from stlc.compile.ir.nodes import Window
 from stlc.editor.document import Document
 from stlc.editor.modules import borrowed_at

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from stlc.compile.frontend.interface import Grid, Interface
+from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.resolve import resolve
+from stlc.compile.ir.discretize import Grid
 from stlc.diagnostics import CODES, Diagnostic, SpecError, UsageError
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
@@ -79,16 +80,12 @@ def _compiled(spec: ast.Spec, within: Surroundings | None) -> Sequence[Diagnosti
     """What the compiler says."""
     warnings: list[Diagnostic] = []
     try:
+        resolved = resolve(spec, interface=None if within is None else within.interface, sink=warnings)
         if within is None:
-            resolve(spec, sink=warnings)
             return warnings
-        resolve(spec, interface=within.interface, grid=within.grid, sink=warnings)
-    except SpecError as error:
-        return [*warnings, *error.diagnostics]
-    from stlc.compile.pipeline import compile_spec
+        from stlc.compile.pipeline import compile_resolved
 
-    try:
-        return compile_spec(spec, grid=within.grid, interface=within.interface).warnings
+        return compile_resolved(resolved, within.grid).warnings
     except SpecError as error:
         return [*warnings, *error.diagnostics]
 

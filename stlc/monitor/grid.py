@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
-from stlc.compile.frontend.interface import Grid, Interface
+from stlc.compile.frontend.interface import Interface
+from stlc.compile.ir.discretize import Grid
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.files import find_system
 from stlc.grammar import ast

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.namespace import Array
-from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.support import defined
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.schedule.schedule import End

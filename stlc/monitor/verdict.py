@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from stlc.compile.backends.array.namespace import Array
-from stlc.compile.frontend.interface import Grid
-from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_spec
+from stlc.compile.ir.discretize import Grid, lacks
+from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolved, resolve_for
 from stlc.compile.schedule.schedule import End
 from stlc.compile.semantics.semantics import TOLERANCE, Exact, Semantics, semantics_of
 from stlc.diagnostics import Diagnostic, SpecError, UsageError
@@ -83,13 +83,11 @@ class Monitor:
         self._system, self._interface = Times(), None
         if system is not None:
             self._system, self._interface = system_of(str(system), self.spec, self._overrides)
+        self._resolved = resolve_for(self.spec, self._interface, self._overrides, "check")
         self._compiled: dict[Grid, Compiled] = {}
-        try:
-            self._compile(Times(self._asked.dt, self._asked.horizon).or_else(self._system))
-        except SpecError as error:
-            wrong = [finding for finding in error.diagnostics if finding.code != "E311"]
-            if wrong:  # the time step may still be said by the first trace
-                raise SpecError(*wrong) from error
+        known = Times(self._asked.dt, self._asked.horizon).or_else(self._system)
+        if not self._lacks(known):  # else the first trace may say the time step
+            self._compile(known)
 
     @property
     def requirements(self) -> tuple[str, ...]:
@@ -253,15 +251,20 @@ class Monitor:
         step = recorded.or_else(Times(self._asked.dt)).or_else(Times(self._system.dt))
         whole = Times(None, self._asked.horizon).or_else(self._system).or_else(recorded)
         known = Times(step.dt, whole.horizon, step.trace)
+        if not self._lacks(known):
+            return self._compile(known)
+        named = named_times(self.spec, self._overrides)
+        if named is not None:
+            return self._compile(known.or_else(named))
         try:
             return self._compile(known)
         except SpecError as error:
-            if all(finding.code != "E311" for finding in error.diagnostics):
-                raise
-            named = named_times(self.spec, self._overrides)
-            if named is None:
-                raise SpecError(*(self._who_knows(finding) for finding in error.diagnostics)) from None
-            return self._compile(known.or_else(named))
+            raise SpecError(*(self._who_knows(finding) for finding in error.diagnostics)) from None
+
+    def _lacks(self, times: Times) -> bool:
+        """Whether a time in the specification needs a step or a horizon that nobody has said."""
+        grid, spec = times.grid(), self._resolved
+        return any(lacks(grid, each.formula) for each in (*spec.requirements, *spec.assumptions))
 
     def _who_knows(self, finding: Diagnostic) -> Diagnostic:
         """E311 with what became of the system that the specification names."""
@@ -272,13 +275,7 @@ class Monitor:
     def _compile(self, times: Times) -> Compiled:
         grid = times.grid()
         if grid not in self._compiled:
-            self._compiled[grid] = compile_spec(
-                self.spec,
-                grid=grid,
-                interface=self._interface,
-                overrides=self._overrides,
-                purpose="check",
-            )
+            self._compiled[grid] = compile_resolved(self._resolved, grid, "check")
         return self._compiled[grid]
 
 

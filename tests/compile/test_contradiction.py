@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor

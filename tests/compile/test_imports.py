@@ -14,10 +14,10 @@ from hypothesis import given, settings
 
 from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.frontend.modules import file_of, library_of, spec_sha256
 from stlc.compile.frontend.resolve import resolve
 from stlc.compile.ir import typed
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.lowering.lower import lower
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import Diagnostic, SpecError, StlcError

@@ -10,9 +10,9 @@ from formula_strategies import GRID, SPAN
 
 from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.support import defined, reach
 from stlc.compile.ir.text import show_formula
 from stlc.compile.lowering.lower import lower

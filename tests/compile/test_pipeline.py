@@ -13,8 +13,8 @@ from stlc.compile.backends.array.arith import Program
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.dump import dump
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.text import show_formula
 from stlc.compile.pipeline import Compiled, Purpose, compile_spec
 from stlc.diagnostics import SpecError
@@ -286,7 +286,7 @@ def test_torch_is_not_needed() -> None:
     code = (
         "import sys; from pathlib import Path; from fractions import Fraction\n"
         "from stlc.grammar.parse.parser import parse; from stlc.source import Source\n"
-        "from stlc.compile.pipeline import compile_spec; from stlc.compile.frontend.interface import Grid\n"
+        "from stlc.compile.pipeline import compile_spec; from stlc.compile.ir.discretize import Grid\n"
         "from stlc.compile.dump import dump; import stlc.compile.backends.array.graph\n"
         "text = Path('specs/traffic.stl').read_text()\n"
         "dump(compile_spec(parse(Source('a', text)), grid=Grid(Fraction(1, 10), 25)))\n"

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar.parse.parser import parse

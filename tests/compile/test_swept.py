@@ -15,9 +15,9 @@ from resolving import formula, margin
 from stlc.compile.backends.array.graph import evaluate, robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.lowering.lower import lower
 
 GRID = Grid()

@@ -12,8 +12,8 @@ from resolving import codes, formula, spec
 
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import typed
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.support import columns_of
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.lowering.lower import lower

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import SpecError, StlcError, SystemFileError, UsageError

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import StlcError
 from stlc.dynamics.declaration.load import parse_system

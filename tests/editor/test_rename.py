@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import SpecError
 from stlc.editor.document import Systems, look_at

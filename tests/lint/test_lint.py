@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from stlc.compile.frontend.interface import Grid
+from stlc.compile.ir.discretize import Grid
 from stlc.diagnostics import UsageError
 from stlc.dynamics.declaration.load import load_system_decl
 from stlc.files import read_source

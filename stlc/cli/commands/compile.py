@@ -127,7 +127,7 @@ def _show(
 
 def _compiled(path: Path, system: str | None, overrides: Mapping[str, str]) -> tuple[Compiled, SystemDecl]:
     """Read both files and run the compiler; torch is not needed."""
-    from stlc.compile.frontend.interface import Grid
+    from stlc.compile.ir.discretize import Grid
     from stlc.compile.pipeline import compile_spec
     from stlc.diagnostics import Diagnostic, UsageError
     from stlc.dynamics.declaration.load import load_system_decl

@@ -148,7 +148,7 @@ def _surroundings(system: str | None, source: Source) -> Surroundings | None:
     """The system to look with; without one nothing of it is read."""
     if system is None:
         return None
-    from stlc.compile.frontend.interface import Grid
+    from stlc.compile.ir.discretize import Grid
     from stlc.dynamics.declaration.load import load_system_decl
     from stlc.files import find_system
     from stlc.lint.lint import Surroundings

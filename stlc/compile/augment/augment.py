@@ -20,14 +20,11 @@ from stlc.compile.augment.mission import (
 from stlc.compile.augment.nested import TooFarError, unnested
 from stlc.compile.augment.past import Past
 from stlc.compile.augment.timers import Ledger, Timer, tolerant
-from stlc.compile.frontend.bounds import report, to_window
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.normal_form import normal
+from stlc.compile.ir.discretize import Grid, report, to_window
+from stlc.compile.ir.normal_form import condition, normal
 from stlc.compile.ir.traverse import absolute, at_hand, is_state, looks_back
-from stlc.compile.lowering.lower import lower
-from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
@@ -114,7 +111,7 @@ class _Goals:
                 return self.of(typed.Truth(node.span, True))
         if window.hi is None and op in ("eventually", "until"):
             report(self.sink, _without_deadline(node.span))
-        left, right = (simplify(lower(at_hand(body), self.grid, self.sink)) for body in operands)
+        left, right = (condition(at_hand(body), flat=True) for body in operands)
         formula = Absolute(op, window, node.span, *operands, tolerant(left), tolerant(right), right)
         clock = self.ledger.clock(last_step(formula) + (self.grid.horizon or 0) + 1)
         draft = Timer(self.name, "status", 0.0, ir.Const(0.0), -1.0, 1.0, _about(formula))

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
-from stlc.compile.frontend.bounds import report
 from stlc.compile.ir import typed
+from stlc.compile.ir.discretize import report
 from stlc.compile.ir.traverse import absolute, from_now, map_children, nodes, on_clock, operands
 from stlc.diagnostics import Diagnostic
 from stlc.source import Span

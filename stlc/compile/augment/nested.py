@@ -17,10 +17,9 @@ from typing import Literal, TypeAlias, final
 from stlc.compile.augment.mission import typed_inside
 from stlc.compile.augment.past import REGISTER
 from stlc.compile.augment.timers import Ledger, guard
-from stlc.compile.frontend.bounds import to_window
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.discretize import Grid, to_window
 from stlc.compile.ir.normal_form import normal
 from stlc.compile.ir.traverse import nodes, operands
 from stlc.diagnostics import Diagnostic

@@ -25,14 +25,11 @@ from stlc.compile.augment.timers import (
     recalled,
     tolerant,
 )
-from stlc.compile.frontend.bounds import report, to_window
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.normal_form import Sign, flip, negate, normal
+from stlc.compile.ir.discretize import Grid, report, to_window
+from stlc.compile.ir.normal_form import Sign, condition, flip, negate, normal
 from stlc.compile.ir.traverse import at_hand, is_state, looks_back
-from stlc.compile.lowering.lower import lower
-from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
@@ -330,7 +327,7 @@ class Past:
         return Timer(f"{self.name}_{what}", kind, initial, _ZERO, 0.0, high, about)
 
     def _condition(self, body: typed.Formula) -> ir.Formula:
-        return tolerant(simplify(lower(at_hand(body), self.grid, self.sink)))
+        return tolerant(condition(at_hand(body), flat=True))
 
     def _body(self, body: typed.Formula) -> typed.Formula | None:
         """A body without operators of the past, if it is about one instant alone by then."""

@@ -4,21 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from fractions import Fraction
 from typing import Any, Protocol
 
 from stlc.compile.ir.nodes import Body
 from stlc.signature import Signature
 from stlc.source import Span
 from stlc.units import Unit
-
-
-@dataclass(frozen=True, slots=True)
-class Grid:
-    """The steps of time: `dt` in seconds, `horizon` (what `T` means) in steps; None where unknown."""
-
-    dt: Fraction | None = None
-    horizon: int | None = None
 
 
 class Function(Protocol):

@@ -22,7 +22,7 @@ from stlc.compile.frontend.declare import Declared
 from stlc.compile.frontend.expressions import evaluate
 from stlc.compile.frontend.formulas import resolve_formula
 from stlc.compile.frontend.imported import File, declared, signature_of, with_facts
-from stlc.compile.frontend.interface import Grid, Interface
+from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.modules import load_modules
 from stlc.compile.frontend.names import check_names
 from stlc.compile.frontend.overrides import read_overrides
@@ -46,18 +46,15 @@ def resolve(
     *,
     interface: Interface | None = None,
     overrides: Mapping[str, str] | None = None,
-    grid: Grid | None = None,
-    sink: list[Diagnostic],
+    sink: list[Diagnostic] | None = None,
 ) -> typed.Spec:
-    """Bind names, check sorts and units, expand macros.
+    """Bind names, check sorts and units, expand macros. What comes out holds for every grid of time.
 
     Args:
         spec: as parsed.
         interface: what the system offers; signals and constants are matched with it.
         overrides: constant -> expression that replaces its value (`--set`).
-        grid: of time, as far as it is known; None where what comes out is not compiled further, so that
-            times among samples (`shift(x, 0.1 s)`) need not be whole numbers of steps.
-        sink: warnings are appended here.
+        sink: warnings are appended here, where errors are raised too; they are those of the result.
 
     Raises:
         SpecError: with every independent error of the file, in source order, at most `MAX_ERRORS`.
@@ -66,7 +63,7 @@ def resolve(
     values = read_overrides(overrides or {}, spec, interface)
     findings = Findings()
     elsewhere = _elsewhere(interface)
-    scope = Scope(sink=findings, temporal=True, time_unit=spec.time_unit, elsewhere=elsewhere, grid=grid)
+    scope = Scope(sink=findings, temporal=True, time_unit=spec.time_unit, elsewhere=elsewhere)
     file = declared(spec, load_modules(spec), interface, values, scope)
     _adopt_units(spec, values, file.found, file.scope)
     signature, parameters = signature_of(file, interface)
@@ -77,11 +74,22 @@ def resolve(
     ranges = nominal(signature.columns)
     requirements = _requirements(spec, ast.Require, scope, ranges)
     assumptions = _requirements(spec, ast.Assume, scope, ranges)
-    _finish(findings, spec, sink)
+    warnings: list[Diagnostic] = [] if sink is None else sink
+    _finish(findings, spec, warnings)
     for requirement, item in zip(requirements, _items(spec, ast.Require), strict=True):
-        sink.extend(_warnings(requirement, item, signature, scope))
-    name = spec.name or PurePath(spec.source.name).stem
-    return typed.Spec(name, signature, constants, requirements, assumptions, spec, parameters)
+        warnings.extend(_warnings(requirement, item, signature, scope))
+    offered = () if interface is None else interface.signature.names
+    return typed.Spec(
+        name=spec.name or PurePath(spec.source.name).stem,
+        signature=signature,
+        constants=constants,
+        requirements=requirements,
+        assumptions=assumptions,
+        source_ast=spec,
+        parameters=parameters,
+        taken=frozenset((*signature.names, *offered)),
+        warnings=tuple(warnings),
+    )
 
 
 def _finish(findings: Sequence[Diagnostic], spec: ast.Spec, sink: list[Diagnostic]) -> None:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, Literal, NoReturn, TypeAlias
 
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.frontend.meter import Cost, Meter
 from stlc.compile.frontend.values import Label, Number, Origin, Value, Vector
 from stlc.compile.ir import nodes as ir
@@ -116,7 +115,6 @@ class Scope:
         elsewhere: names that only the system knows, with the advice to give.
         modules: what imported files know, by alias.
         product: `x in [lo, hi]` is `(x - lo) (hi - x)` (`@product`).
-        grid: of time, as far as it is known; None where nobody asks for what depends on it.
         locals: arguments of the macro and quantifier variables at hand, with what they cost.
     """
 
@@ -130,7 +128,6 @@ class Scope:
     elsewhere: Mapping[str, str] = field(default_factory=dict)
     modules: Mapping[str, Scope] = field(default_factory=dict, compare=False)
     product: bool = False
-    grid: Grid | None = None
     locals: Mapping[str, tuple[Value, Cost]] = field(default_factory=dict)
     meter: Meter = field(default_factory=Meter, compare=False, repr=False)
     cache: dict[str, tuple[Value, Cost] | None] = field(default_factory=dict, compare=False, repr=False)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from itertools import chain
 from typing import Any, Literal, TypeAlias, assert_never
 
 from stlc.compile.ir import nodes as ir
@@ -81,26 +82,34 @@ def _unless(node: typed.Until) -> typed.Formula:
 # ---------------------------------------------------------------------------- state formulas
 
 
-def condition(formula: typed.Formula, *, negated: bool = False) -> ir.Formula:
+def condition(formula: typed.Formula, *, negated: bool = False, flat: bool = False) -> ir.Formula:
     """A state formula as a condition of the IR, constants folded.
 
     Args:
         formula: one for which `is_state` holds.
         negated: take its negation.
+        flat: nested `and`s and nested `or`s become one, without repetitions.
     """
-    return _folded(normal(formula, -1 if negated else 1))
+    return _folded(normal(formula, -1 if negated else 1), flat)
 
 
-def _folded(formula: typed.Formula) -> ir.Formula:
+def _folded(formula: typed.Formula, flat: bool) -> ir.Formula:
     match formula:
         case typed.Truth(span, value):
             return ir.Truth(value, span)
         case typed.Predicate() | typed.Not(_, typed.Predicate()):
-            return replace(literal(formula), guard=False)
+            return literal(formula)
         case typed.Logic(span, "and" | "or" as op, items):
-            return joined(op, map(_folded, items), ir.Truth(op == "and", span))
+            parts = [_folded(item, flat) for item in items]
+            return joined(op, flattened(op, parts) if flat else parts, ir.Truth(op == "and", span))
         case _:
             raise AssertionError("not a state formula")
+
+
+def flattened(op: Literal["and", "or"], items: Iterable[ir.Formula]) -> list[ir.Formula]:
+    """The items of an `and` or `or`, those of nested ones in their places, each once."""
+    nested = ((item.items if isinstance(item, ir.BoolOp) and item.op == op else (item,)) for item in items)
+    return list(dict.fromkeys(chain.from_iterable(nested)))
 
 
 def literal(formula: typed.Predicate | typed.Not) -> ir.Predicate:

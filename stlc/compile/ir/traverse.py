@@ -171,11 +171,17 @@ def frozen_in(num: ir.Num) -> frozenset[str]:
     return frozenset(leaf.name for leaf in leaves(num) if isinstance(leaf, ir.FrozenVar))
 
 
-def shifted(num: ir.Num, steps: int, *, clamped: bool = False) -> ir.Num:
-    """The value of a number `steps` samples later; `clamped`: the first or last sample beyond the ends."""
+def shifted(num: ir.Num, steps: int, *, clamped: bool = False, delay: typed.Time | None = None) -> ir.Num:
+    """The value of a number some samples, or a `delay`, later; `clamped`: beyond the ends that at the end."""
 
     def moved(leaf: ir.Num) -> ir.Num:
         match leaf:
+            case typed.DelayedSignal(name, before, end, known):
+                return typed.DelayedSignal(name, before + steps, clamped or end, known.plus(delay))
+            case ir.Signal(name) if delay is not None:
+                return typed.DelayedSignal(name, steps, clamped, delay)
+            case ir.ShiftedSignal(name, before, end) if delay is not None:
+                return typed.DelayedSignal(name, before + steps, clamped or end, delay)
             case ir.Signal(name):
                 return ir.ShiftedSignal(name, steps, clamped) if steps else leaf
             case ir.ShiftedSignal(name, before, end):

@@ -10,6 +10,7 @@ from fractions import Fraction
 from typing import Literal, TypeAlias
 
 from stlc.compile.ir import nodes as ir
+from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.signature import Column, Signature
 from stlc.source import Span
@@ -24,6 +25,27 @@ class Time:
     steps: Fraction = Fraction(0)
     horizons: Fraction = Fraction(0)
     span: Span | None = field(default=None, compare=False, repr=False)
+
+    def plus(self, other: Time | None) -> Time:
+        """The sum of two times."""
+        if other is None:
+            return self
+        return Time(
+            self.seconds + other.seconds,
+            self.steps + other.steps,
+            self.horizons + other.horizons,
+            other.span or self.span,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class DelayedSignal(ir.ShiftedSignal):
+    """A signal some time away, `shift(x, 0.1 s)`, besides the samples that are known already.
+
+    The grid of time says how many samples the delay is (`stlc.compile.ir.discretize.in_samples`).
+    """
+
+    delay: Time = field(default_factory=Time)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,11 +125,12 @@ class Until(Node):
 
 @dataclass(frozen=True, slots=True)
 class Shift(Node):
-    """`next(p)` (+1), `prev(p)` (-1); `outside` as in `ir.Shift`."""
+    """`next(p)` (+1), `prev(p)` (-1); `outside` as in `ir.Shift`; `delay` is a time instead of the steps."""
 
     steps: int
     body: Formula
     outside: bool | None = None
+    delay: Time | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,6 +225,8 @@ class Spec:
         assumptions: `assume`s, in order.
         source_ast: as parsed.
         parameters: every `param`, by component.
+        taken: names that states added by the compiler must not have.
+        warnings: findings that are no errors.
     """
 
     name: str
@@ -211,3 +236,5 @@ class Spec:
     assumptions: tuple[Requirement, ...]
     source_ast: ast.Spec = field(compare=False, repr=False)
     parameters: tuple[Parameter, ...] = ()
+    taken: frozenset[str] = frozenset()
+    warnings: tuple[Diagnostic, ...] = field(default=(), compare=False, repr=False)

@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import final
 
-from stlc.compile.frontend.bounds import to_window
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.discretize import Grid, to_window
 from stlc.compile.ir.normal_form import DUAL, Sign, flip, literal, normal
 from stlc.compile.ir.traverse import from_now, on_clock, operands
 from stlc.diagnostics import Diagnostic

@@ -23,7 +23,7 @@ from stlc.compile.lowering.lower import lower
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from stlc.compile.frontend.interface import Grid
+    from stlc.compile.ir.discretize import Grid
     from stlc.compile.pipeline import Compiled
 
 HELD = 0.5

@@ -12,8 +12,8 @@ from torch import Tensor
 from stlc.compile.backends.array.arith import Program
 from stlc.compile.backends.array.graph import RobustnessGraph, evaluate
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.frontend.parameters import fixed
+from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics.semantics import TOLERANCE

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 
-from stlc.compile.frontend.interface import Grid, Interface
+from stlc.compile.frontend.interface import Interface
+from stlc.compile.ir.discretize import Grid
 from stlc.diagnostics import Diagnostic
 from stlc.dynamics.declaration.columns import ControlDecl
 from stlc.dynamics.declaration.deployment import BackupDecl, JudgeRef, ScenarioDecl, TestDecl, WorldRef

@@ -1,4 +1,4 @@
-"""Bounds in seconds -> windows in steps.
+"""Times in seconds -> whole samples: the grid of time, windows, and delays.
 
 An interval covers the samples inside it. A bound that falls between two samples is rounded so that what holds
 on the samples holds as written: `always` and `release` take the neighbour outside as well, `eventually` and
@@ -8,11 +8,13 @@ on the samples holds as written: `always` and `release` take the neighbour outsi
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
-from stlc.compile.frontend.interface import Grid
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.traverse import leaves, map_children, map_leaves, nodes, numbers
 from stlc.diagnostics import Diagnostic, tell
 from stlc.source import Span
 from stlc.units import nearest
@@ -20,8 +22,40 @@ from stlc.units import nearest
 MAX_STEPS = 10**12
 """Bounds beyond are longer than any trace, and sums of them would not fit into 64 bits."""
 
+MAX_DELAY = 1_000_000
+"""Samples that `shift` goes at most."""
+
 _EMPTY = ir.Window(0, 0)
 """Stands for a window that could not be made; an error was reported."""
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """The steps of time: `dt` in seconds, `horizon` (what `T` means) in steps; None where unknown."""
+
+    dt: Fraction | None = None
+    horizon: int | None = None
+
+
+def lacks(grid: Grid, formula: typed.Formula) -> bool:
+    """Whether a time in a formula needs a step or a horizon that the grid does not say."""
+    return any(
+        (time.seconds and grid.dt is None) or (time.horizons and grid.horizon is None)
+        for time in _times(formula)
+    )
+
+
+def _times(formula: typed.Formula) -> Iterator[typed.Time]:
+    for node in nodes(formula):
+        if isinstance(node, (typed.Temporal, typed.Until)):
+            yield from (end for end in (node.interval.lo, node.interval.hi) if end is not None)
+        elif isinstance(node, typed.Shift) and node.delay is not None:
+            yield node.delay
+    read = (leaf for num in numbers(formula) for leaf in leaves(num))
+    yield from (leaf.delay for leaf in read if isinstance(leaf, typed.DelayedSignal))
+
+
+# ------------------------------------------------------------------------------------ windows
 
 
 def to_window(interval: typed.Interval, grid: Grid, sink: list[Diagnostic], *, outward: bool) -> ir.Window:
@@ -150,3 +184,55 @@ def _needs_grid(text: str, span: Span | None) -> Diagnostic:
         span,
         help=('name the system (`system "…"` in the file, or --system), or give dt and the horizon',),
     )
+
+
+# ------------------------------------------------------------------------------------- delays
+
+
+def in_samples(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> typed.Formula:
+    """The formula with delays counted in samples. E205 and E311 go to `sink`; then 1 stands for the delay."""
+
+    def leaf(num: ir.Num) -> ir.Num:
+        if not isinstance(num, typed.DelayedSignal):
+            return num
+        steps = num.steps + _samples(num.delay, grid, sink)
+        return ir.ShiftedSignal(num.name, steps, num.clamped) if steps else ir.Signal(num.name)
+
+    def below(node: typed.Formula) -> typed.Formula:
+        node = map_children(node, formulas=below, numbers=lambda num: map_leaves(num, leaf))
+        if isinstance(node, typed.Shift) and node.delay is not None:
+            return replace(node, steps=_samples(node.delay, grid, sink), delay=None)
+        return node
+
+    return below(formula)
+
+
+def _samples(delay: typed.Time, grid: Grid, sink: list[Diagnostic]) -> int:
+    steps = in_steps(delay, grid, sink, delay.span)
+    if steps is None:
+        return 1
+    finding = delay_fault(steps, delay.span, grid)
+    if finding is not None:
+        report(sink, finding)
+        return 1
+    return int(steps)
+
+
+def delay_fault(steps: Fraction, span: Span | None, grid: Grid) -> Diagnostic | None:
+    """E205 for a delay between two samples, or too long."""
+    if steps.denominator != 1 and grid.dt is not None:
+        low, high = (in_words(Fraction(n), grid) for n in (math.floor(steps), math.ceil(steps)))
+        message = f"{in_words(steps, grid)} is not a whole number of {float(grid.dt):g} s steps"
+        help_ = (f"use {low} or {high}, or a dt that fits",)
+        return Diagnostic("E205", message, span, "there is no sample at this time", help=help_)
+    if steps.denominator != 1:
+        return no_delay("`shift` goes a whole number of samples, known at compile time", span)
+    if abs(steps) > MAX_DELAY:
+        return no_delay(f"`shift` goes {MAX_DELAY:,} samples at most", span)
+    return None
+
+
+def no_delay(message: str, span: Span | None) -> Diagnostic:
+    """E205 for what is no number of samples."""
+    help_ = ("shift(x, 2) is x two samples later, shift(x, -0.1 s) what it was a tenth of a second before",)
+    return Diagnostic("E205", message, span, help=help_)
