@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.safe_prefix import prefix_robustness
-from stlc.controller.guard.shooting import best, eligible, finite, grid_of
+from stlc.controller.guard.shooting import best, finite, grid_of
 from stlc.export.programs import Deciding, judged_openly, unmoved
 from stlc.runtime.prefixes import Grid
 
@@ -70,7 +70,8 @@ class Guarding(nn.Module):
         for length, prefixes in zip(self.grid.lengths, self._prefixes, strict=True):
             last = length == self.grid.lengths[-1]
             tried = self._tried(x, own, prefixes, falls=last)
-            allowed = eligible(tried.rho, tried.safe >= -TOLERANCE, guarded=bool(self._formulas))
+            good = tried.rho >= -TOLERANCE
+            allowed = torch.where(good.any(1, keepdim=True), good, tried.safe >= -TOLERANCE)
             done = allowed.any(1)
             pick = best(allowed, (tried.rho, -tried.cost))
             if tried.falls is not None:

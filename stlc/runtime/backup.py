@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.runtime.facts import FALL, Quantity
+from stlc.runtime.facts import Quantity
 from stlc.runtime.graphs import Graphs, Judged, Numbers, joined
 
 POLICY, BACKUP, SAFEST = range(3)
@@ -29,7 +29,6 @@ def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = Non
     """A better plan for a state whose own one was found wanting.
 
     T0 grows until a plan satisfies phi, or else phi_safe; where none does the longest safe prefix decides.
-    Where no plan satisfies phi and the policy's own beginning is safe, it stays.
 
     Args:
         graphs: of the controller.
@@ -42,14 +41,11 @@ def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = Non
     """
     own, grid = finite(plan, graphs.facts.controls), graphs.facts.grid
     begun = [] if rest is None else [graphs.judged(x[None], finite(rest, graphs.facts.controls)[None])[0]]
-    guarded = FALL in graphs.facts.graphs
     candidates = None
     for length in grid.lengths:
         candidates = joined([_candidates(graphs, x, own, length), *begun])
-        good, safe = candidates.rho >= -TOLERANCE, candidates.safe >= -TOLERANCE
-        allowed = good if good.any() else safe
-        if guarded and safe[0] and not good.any():
-            allowed = np.arange(len(safe)) == 0
+        good = candidates.rho >= -TOLERANCE
+        allowed = good if good.any() else candidates.safe >= -TOLERANCE
         if allowed.any():
             pick = best(allowed, (candidates.rho, -candidates.cost))
             return Found(candidates.of([pick]), BACKUP, length)

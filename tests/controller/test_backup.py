@@ -52,8 +52,6 @@ def slow_choice(task: Task, x: Tensor, action: float, g: Grid) -> tuple[int, flo
         judged = task.judge(x.expand(len(heads), -1), plans[..., None])
         good = [float(r) for r in judged.rho if r >= -1e-6]
         safe = [float(r) for r, s in zip(judged.rho, judged.safe, strict=True) if s >= -1e-6]
-        if not good and judged.safe[0] >= -1e-6:
-            return length, float(judged.rho[0]), True
         if good or safe:
             return length, max(good or safe), True
     return g.lengths[-1], float("nan"), False
@@ -120,21 +118,10 @@ def at(task: Task, state: Mapping[str, float]) -> torch.Tensor:
     return torch.tensor([[state[name] for name in task.names]], dtype=F64)
 
 
-@pytest.mark.parametrize("action", [-10.0, 0.0])
-def test_a_safe_beginning_of_the_policy_stays_where_nothing_satisfies(car_task: Task, action: float) -> None:
-    """Others are no better for the specification; the guard has nothing to gain."""
-    x = at(car_task, QUEUE)
-    plan = torch.full((1, car_task.horizon, 1), action, dtype=F64)
-    found = Backup(car_task, Constant(car_task, action), grid=grid()).search(x, plan)
-    assert bool(found.safe[0])
-    assert float(found.rho[0]) < 0
-    assert float(found.plan[0, 0, 0]) == action
-
-
 def test_flat_robustness_does_not_make_a_car_brake_for_ever(car_task: Task) -> None:
-    """The policy's own plan runs into the leader; of the safe ones the one that moves up is taken."""
+    """In a queue before a stop sign the deadline cannot be met; the car moves up all the same."""
     x = at(car_task, QUEUE)
-    plan = torch.full((1, car_task.horizon, 1), 10.0, dtype=F64)
+    plan = torch.full((1, car_task.horizon, 1), -10.0, dtype=F64)
     found = Backup(car_task, Constant(car_task, -10.0), grid=grid()).search(x, plan)
     assert bool(found.safe[0])
     assert float(found.rho[0]) < 0

@@ -3,9 +3,8 @@
 For T0 = 1, 2, … every sequence of T0 actions on a grid of L values a control, M = L^(m T0), or a sample of
 them where they are too many, is followed from the state at hand, and the policy plans on from where it ends.
 The first T0 with a plan that satisfies phi, or else phi_safe, decides; where none has, the plan with the
-longest safe prefix at the last T0. Two things go beyond the paper (decision 37): where no plan satisfies phi
-and the policy's own beginning is safe, it stays; and what is left of the plan followed before is one more
-choice, so that a safe plan is not lost because its first action was taken.
+longest safe prefix at the last T0. One thing goes beyond the paper (decision 37): what is left of the plan
+followed before is one more choice, so that a safe plan is not lost because its first action was taken.
 """
 
 from __future__ import annotations
@@ -185,7 +184,8 @@ class Backup:
 
     def _enter(self, found: Found, candidates: Candidates, group: Tensor, length: int) -> Tensor:
         """Take the best plan where one satisfies phi, or else phi_safe; returns where that was so."""
-        allowed = eligible(candidates.rho, candidates.safe, guarded=bool(self._formulas))
+        good = candidates.rho >= -TOLERANCE
+        allowed = torch.where(good.any(1, keepdim=True), good, candidates.safe)
         done = allowed.any(1)
         chosen = _at(candidates, done)
         _take(found, chosen, best(allowed[done], (chosen.rho, -chosen.cost)), group[done], (1, length))
@@ -219,23 +219,6 @@ def finite(plan: Tensor, task: Task) -> Tensor:
     """Plans (B, T, m) with every entry that is no number replaced by the control's value nearest to 0."""
     low, high = task.system.control_low.to(plan), task.system.control_high.to(plan)
     return torch.where(torch.isfinite(plan), plan, torch.zeros_like(plan).clamp(low, high))
-
-
-def eligible(rho: Tensor, safe: Tensor, *, guarded: bool) -> Tensor:
-    """Choices that may decide: those that satisfy phi, else the policy's own if safe, else all safe ones.
-
-    Args:
-        rho: (agents, choices), robustness; choice 0 begins as the policy's own plan does.
-        safe: (agents, choices), whether phi_safe holds.
-        guarded: whether there are safety requirements; without any robustness alone decides.
-
-    Returns:
-        (agents, choices) booleans; none in a row where nothing is even safe.
-    """
-    good = rho >= -TOLERANCE
-    own = safe & (torch.arange(safe.shape[1], device=safe.device) == 0) & guarded
-    fallback = torch.where(own.any(1, keepdim=True), own, safe)
-    return torch.where(good.any(1, keepdim=True), good, fallback)
 
 
 def best(allowed: Tensor, keys: Sequence[Tensor]) -> Tensor:
