@@ -19,10 +19,10 @@ from stlc.cli.framework.ranges import parse_limit, parse_seeds
 from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
 from stlc.controller.evaluation.deployment import decided, feasible_states, measure
 from stlc.controller.evaluation.executed import judge_executed
-from stlc.controller.guard.feasibility import savable
+from stlc.controller.guard.candidates import Limits
+from stlc.controller.guard.feasibility import viable
 from stlc.controller.guard.guard import GUARD_VERSION, Guard, Mode
 from stlc.controller.guard.margin_request import Asked, parse_margins
-from stlc.controller.guard.plan_repair import Limits
 from stlc.controller.training.run import SPEC, SYSTEM, Run
 from stlc.controller.world import world_type
 from stlc.diagnostics import Diagnostic, UsageError
@@ -186,7 +186,7 @@ class Deployments:
         for known, found in self._viable:
             if known.shape == x0.shape and bool((known == x0).all()):
                 return found
-        found = savable(task, x0)
+        found = viable(task, x0)
         self._viable.append((x0, found))
         return found
 

@@ -67,8 +67,8 @@ from stlc import Monitor, Run, System, Task, load
 from stlc.cli.framework.app import main as stlc_main
 from stlc.compile.backends.c.adjoint import emit_adjoint
 from stlc.compile.backends.c.emit import emit
+from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
-from stlc.controller.guard.plan_repair import Limits
 from stlc.controller.problem.native import motion_of
 
 NO_LIMIT = Limits(seconds=None, paper=None)

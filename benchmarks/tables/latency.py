@@ -23,8 +23,8 @@ from benchmarks.timing import WARM, Times, one_thread
 from stlc.cli.framework.program import command
 from stlc.cli.framework.ranges import parse_seeds
 from stlc.controller.deployment.simulator import Recording, Setting
+from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
-from stlc.controller.guard.plan_repair import Limits
 from stlc.controller.training.run import Run
 
 TEXT = """## A decision

@@ -26,10 +26,11 @@ from stlc.cli.framework.program import command
 from stlc.cli.framework.ranges import parse_seeds
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.simulator import Setting
-from stlc.controller.guard.feasibility import savable, solvable
-from stlc.controller.guard.gradient_refine import Ascent
+from stlc.controller.guard.candidates import TO_SPARE, Limits
+from stlc.controller.guard.feasibility import solvable, viable
 from stlc.controller.guard.guard import Guard
-from stlc.controller.guard.plan_repair import SEED, TO_SPARE, FullBackup, Limits
+from stlc.controller.guard.search import StagedSearch
+from stlc.controller.guard.stages.gradient_refine import SEED, GradientAscent
 from stlc.controller.training.local_search import Searcher
 from stlc.controller.training.run import Run
 
@@ -126,10 +127,10 @@ def repair(
     show("repair", {"rows": table}, as_json=output.as_json)
 
 
-def ways_of(task: Task, backup: FullBackup) -> dict[str, Way]:
+def ways_of(task: Task, backup: StagedSearch) -> dict[str, Way]:
     """The ways by name."""
     enough = TO_SPARE * task.system.decl.objective.gamma
-    ascent = Ascent(task, torch.Generator().manual_seed(SEED), enough=enough)
+    ascent = GradientAscent(task, torch.Generator().manual_seed(SEED), enough=enough)
     searcher = Searcher(task, torch.Generator().manual_seed(SEED), enough=enough)
 
     def local_search(x: Tensor, places: Tensor, tries: int) -> Tensor:
@@ -146,7 +147,7 @@ def ways_of(task: Task, backup: FullBackup) -> dict[str, Way]:
         "local search": lambda x, plan, rest: local_search(x, torch.cat((plan, rest)), SHORT),
         "long local search": lambda x, plan, rest: local_search(x, torch.cat((plan, rest)), LONG),
         "steps, then search": steps_and_search,
-        "full guard": lambda x, plan, rest: backup.search(x, plan, rest).plan,
+        "full guard": lambda x, plan, rest: backup.search(x, plan, rest).plans,
     }
 
 
@@ -166,12 +167,12 @@ def _rejected(run: Run, samples: int, seeds: tuple[int, ...]) -> list[tuple[Tens
 
 def _rows(run: Run, states: list[tuple[Tensor, Tensor, Tensor]], scenario: str) -> Iterator[Mended]:
     task = run.task
-    ways = ways_of(task, FullBackup(task, run.policy, limits=Limits(seconds=None)))
+    ways = ways_of(task, StagedSearch(task, run.policy, "full", limits=Limits(seconds=None)))
     if not states:
         return
     verdicts = {name: _tried(task, way, states) for name, way in ways.items()}
     x = torch.cat([state for state, _, _ in states])
-    can, safely = solvable(task, x), savable(task, x)
+    can, safely = solvable(task, x), viable(task, x)
     for met, safe, _ in verdicts.values():
         can, safely = can | met, safely | safe
     for name, (met, safe, times) in verdicts.items():

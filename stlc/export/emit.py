@@ -12,8 +12,8 @@ from stlc.compile.backends.c.formulas import Forward
 from stlc.compile.backends.c.numbers import literal
 from stlc.compile.backends.c.parts import declared, in_parts
 from stlc.compile.backends.c.plan import plan_of
+from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
-from stlc.controller.guard.shooting import grid_of
 from stlc.controller.problem.native import motion_of
 from stlc.dynamics.model.controls import raw_width
 from stlc.escape import c_comment, c_string

@@ -1,6 +1,6 @@
 """The paper's backup policy as a module that can be recorded: every T0 is tried, the first that does decides.
 
-`stlc.controller.guard.shooting` goes on to a longer T0 only where a shorter one found nothing. A recorded
+`guard.stages.prefix_shooting` goes on to a longer T0 only where a shorter one found nothing. A recorded
 program has no such turns, so it costs what its longest prefixes cost, and gives the same plans.
 """
 
@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.guard.candidates import best, finite, grid_of
 from stlc.controller.guard.safe_prefix import prefix_robustness
-from stlc.controller.guard.shooting import best, finite, grid_of
 from stlc.export.programs import Deciding, judged_openly, unmoved
 from stlc.runtime.prefixes import Grid
 
@@ -48,7 +48,7 @@ class Guarding(nn.Module):
 
     The outputs are plan (B, T, m), rho and safe (B,), requirements (B, R), and int64 source (1 where phi or
     phi_safe holds, 2 where the longest safe prefix decided) and t0 (B,), as
-    `stlc.controller.guard.shooting.Found`.
+    `stlc.controller.guard.candidates.Candidates`.
     """
 
     def __init__(self, task: Task, network: PlanNetwork, grid: Grid | None = None) -> None:
@@ -60,7 +60,7 @@ class Guarding(nn.Module):
         self._prefixes = [torch.from_numpy(self.grid.prefixes(length)) for length in self.grid.lengths]
 
     def forward(self, x: Tensor, plan: Tensor) -> tuple[Tensor, ...]:
-        """Choose as `stlc.controller.guard.shooting.Backup.search` does where no plan was followed before."""
+        """Choose as the stages of the paper's guard do where no plan was followed before."""
         own = finite(plan, self._task)
         nobody = torch.zeros_like(x[:, 0])
         if not self._prefixes:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from stlc.compile.backends.c.numbers import Untranslatable
-from stlc.controller.guard import shooting as backup
+from stlc.controller.guard import candidates as backup
 from stlc.controller.training.run import spec_hash, system_hash
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.export.onnx_file import model_of, require_onnx

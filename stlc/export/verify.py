@@ -13,7 +13,7 @@ from torch import Tensor
 from stlc import toolchain
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.safe_prefix import prefix_robustness
-from stlc.controller.guard.shooting import Backup
+from stlc.controller.guard.search import StagedSearch
 from stlc.controller.problem.task import rank
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.export.programs import unmoved
@@ -125,12 +125,12 @@ def backup_agreement(policy: BestOfKPolicy, path: Path, *, states: int, seed: in
     with unmoved():
         module = torch.export.load(path).module()
     with torch.no_grad():
-        wanted = Backup(task, policy).search(x, policy.plan(x))
+        wanted = StagedSearch(task, policy, "paper").search(x, policy.plan(x))
         rows = [module(one[None], policy.plan(one[None])) for one in x]
     plan, rho, safe, each, source, t0 = (torch.cat(column) for column in zip(*rows, strict=True))
-    if not (bool((source == wanted.source).all()) and bool((t0 == wanted.t0).all())):
+    if not (bool((source == wanted.source).all()) and bool((t0 == wanted.prefix_length).all())):
         raise RunError(_disagreement("the backup policy decides by another rule"))
-    return _compared(task, x, wanted.plan, (plan, rho, safe, each))
+    return _compared(task, x, wanted.plans, (plan, rho, safe, each))
 
 
 def by_onnx(graphs: Graphs) -> Callable[[Tensor], Answer]:

@@ -1,4 +1,4 @@
-"""The paper's backup policy over the graphs of a controller, as `guard.shooting` is over torch."""
+"""The paper's backup policy over the graphs of a controller, as `guard.stages` are over torch."""
 
 from __future__ import annotations
 

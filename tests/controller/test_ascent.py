@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.controller.guard import gradient_refine as ascent
-from stlc.controller.guard.gradient_refine import APART, KEPT, Ascent
+from stlc.controller.guard.stages import gradient_refine as ascent
+from stlc.controller.guard.stages.gradient_refine import APART, KEPT, GradientAscent
 from stlc.controller.problem.task import Task
 from stlc.dynamics.model.system import System
 from stlc.files import read_source
@@ -22,8 +22,8 @@ ROOT = Path(__file__).parents[2]
 ENOUGH = 0.01
 
 
-def made(task: Task, *, by_torch: bool = False) -> Ascent:
-    found = Ascent(task, torch.Generator().manual_seed(0), enough=ENOUGH)
+def made(task: Task, *, by_torch: bool = False) -> GradientAscent:
+    found = GradientAscent(task, torch.Generator().manual_seed(0), enough=ENOUGH)
     if by_torch:
         found._native = None
     return found

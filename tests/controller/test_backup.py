@@ -11,8 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from stlc.controller.guard.candidates import Limits, best, finite, grid_of
 from stlc.controller.guard.safe_prefix import prefix_robustness
-from stlc.controller.guard.shooting import Backup, best, finite, grid_of
+from stlc.controller.guard.search import StagedSearch
+from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.runtime.prefixes import Grid
 
@@ -29,6 +31,11 @@ class Constant:
     def plan(self, x0: Tensor) -> Tensor:
         self.rows.append(len(x0))
         return torch.full((len(x0), self.task.horizon, 1), self.action, dtype=x0.dtype)
+
+
+def paper_search(task: Task, policy: Policy, grid: Grid, seconds: float | None = None) -> StagedSearch:
+    """The stages of the paper's guard."""
+    return StagedSearch(task, policy, "paper", grid=grid, limits=Limits(paper=seconds))
 
 
 def grid(**changed: object) -> Grid:
@@ -61,11 +68,11 @@ def slow_choice(task: Task, x: Tensor, action: float, g: Grid) -> tuple[int, flo
 def test_the_search_is_that_of_the_paper(car_task: Task, action: float) -> None:
     x, plan = failing(car_task, action)
     g = grid()
-    found = Backup(car_task, Constant(car_task, action), grid=g).search(x, plan)
+    found = paper_search(car_task, Constant(car_task, action), g).search(x, plan)
     met = 0
     for i in range(min(len(x), 120)):
         t0, rho, done = slow_choice(car_task, x[i], action, g)
-        assert int(found.t0[i]) == t0
+        assert int(found.prefix_length[i]) == t0
         assert int(found.source[i]) == (1 if done else 2)
         if done:
             met += 1
@@ -75,21 +82,21 @@ def test_the_search_is_that_of_the_paper(car_task: Task, action: float) -> None:
 
 def test_what_is_found_is_what_it_says(car_task: Task) -> None:
     x, plan = failing(car_task, 10.0)
-    found = Backup(car_task, Constant(car_task, 10.0), grid=grid()).search(x, plan)
-    judged = car_task.judge(x, found.plan)
+    found = paper_search(car_task, Constant(car_task, 10.0), grid()).search(x, plan)
+    judged = car_task.judge(x, found.plans)
     assert torch.equal(judged.rho, found.rho)
-    assert torch.equal(judged.safe >= -1e-6, found.safe)
-    assert (found.safe | (found.rho >= -1e-6) | (found.source == 2)).all()
-    assert ((found.source == 1) == (found.safe | (found.rho >= -1e-6))).all()
+    assert torch.equal(judged.safe >= -1e-6, found.is_safe)
+    assert (found.is_safe | (found.rho >= -1e-6) | (found.source == 2)).all()
+    assert ((found.source == 1) == (found.is_safe | (found.rho >= -1e-6))).all()
 
 
 def test_batches_do_not_change_the_choice_and_bound_the_memory(car_task: Task) -> None:
     x, plan = failing(car_task, 10.0, n=40)
-    whole = Backup(car_task, Constant(car_task, 10.0), grid=grid()).search(x, plan)
+    whole = paper_search(car_task, Constant(car_task, 10.0), grid()).search(x, plan)
     policy = Constant(car_task, 10.0)
-    pieces = Backup(car_task, policy, grid=grid(batch=20)).search(x, plan)
+    pieces = paper_search(car_task, policy, grid(batch=20)).search(x, plan)
     assert max(policy.rows) <= 20
-    for name in ("plan", "source", "t0", "rho", "safe"):
+    for name in ("plans", "source", "prefix_length", "rho", "safe"):
         assert torch.equal(getattr(whole, name), getattr(pieces, name))
 
 
@@ -97,17 +104,21 @@ def test_batches_do_not_change_the_choice_and_bound_the_memory(car_task: Task) -
 def test_a_decision_without_time_takes_the_best_of_what_it_has(car_task: Task) -> None:
     """The clock is looked at after each batch; one of them is always judged."""
     x, plan = failing(car_task, 10.0, n=60)
-    whole = Backup(car_task, Constant(car_task, 10.0), grid=grid(batch=3)).search(x, plan)
-    backup = Backup(car_task, Constant(car_task, 10.0), grid=grid(batch=3), seconds=0.0)
+    whole = paper_search(car_task, Constant(car_task, 10.0), grid(batch=3)).search(x, plan)
+    backup = StagedSearch(
+        car_task, Constant(car_task, 10.0), "paper", grid=grid(batch=3), limits=Limits(paper=0.0)
+    )
     hurried = backup.search(x, plan)
-    assert len(hurried.plan) == len(x)
-    judged = car_task.judge(x, hurried.plan)
+    assert len(hurried.plans) == len(x)
+    judged = car_task.judge(x, hurried.plans)
     assert torch.equal(judged.rho, hurried.rho)
-    assert bool((whole.safe.long() >= hurried.safe.long()).all())
-    assert bool((whole.safe & ~hurried.safe).any())
-    assert bool((hurried.t0 == 1).all())
-    calm = Backup(car_task, Constant(car_task, 10.0), grid=grid(batch=3), seconds=1e9).search(x, plan)
-    assert torch.equal(calm.plan, whole.plan)
+    assert bool((whole.is_safe.long() >= hurried.is_safe.long()).all())
+    assert bool((whole.is_safe & ~hurried.is_safe).any())
+    assert bool((hurried.prefix_length == 1).all())
+    calm = StagedSearch(
+        car_task, Constant(car_task, 10.0), "paper", grid=grid(batch=3), limits=Limits(paper=1e9)
+    ).search(x, plan)
+    assert torch.equal(calm.plans, whole.plans)
 
 
 QUEUE = {"x": -6.0, "v": 0.0, "sign": 0.0, "tau": 0.0, "dx": 4.0, "v_lead": 0.0, "yielding": 1.0}
@@ -122,10 +133,10 @@ def test_flat_robustness_does_not_make_a_car_brake_for_ever(car_task: Task) -> N
     """In a queue before a stop sign the deadline cannot be met; the car moves up all the same."""
     x = at(car_task, QUEUE)
     plan = torch.full((1, car_task.horizon, 1), -10.0, dtype=F64)
-    found = Backup(car_task, Constant(car_task, -10.0), grid=grid()).search(x, plan)
-    assert bool(found.safe[0])
+    found = paper_search(car_task, Constant(car_task, -10.0), grid()).search(x, plan)
+    assert bool(found.is_safe[0])
     assert float(found.rho[0]) < 0
-    assert float(found.plan[0, 0, 0]) > 0
+    assert float(found.plans[0, 0, 0]) > 0
 
 
 def test_a_safe_plan_that_was_begun_is_not_lost(car_task: Task) -> None:
@@ -134,27 +145,27 @@ def test_a_safe_plan_that_was_begun_is_not_lost(car_task: Task) -> None:
     x = at(car_task, state)
     fast = torch.full((1, car_task.horizon, 1), 10.0, dtype=F64)
     brake = torch.full((1, car_task.horizon, 1), -10.0, dtype=F64)
-    backup = Backup(car_task, Constant(car_task, 10.0), grid=grid())
-    assert not bool(backup.search(x, fast).safe[0])
+    backup = paper_search(car_task, Constant(car_task, 10.0), grid())
+    assert not bool(backup.search(x, fast).is_safe[0])
     found = backup.search(x, fast, brake)
-    assert bool(found.safe[0])
-    assert torch.equal(found.plan, brake)
+    assert bool(found.is_safe[0])
+    assert torch.equal(found.plans, brake)
 
 
 def test_an_unavoidable_collision_is_met_braking(car_task: Task) -> None:
     state = {"x": -8.0, "v": 8.0, "sign": 1.0, "tau": 5.0, "dx": 2.0, "v_lead": 0.0, "yielding": 0.0}
     x = torch.tensor([[state[name] for name in car_task.names]], dtype=F64)
     plan = torch.full((1, car_task.horizon, 1), 10.0, dtype=F64)
-    found = Backup(car_task, Constant(car_task, 10.0), grid=grid(lengths=(1, 2, 3))).search(x, plan)
+    found = paper_search(car_task, Constant(car_task, 10.0), grid(lengths=(1, 2, 3))).search(x, plan)
     assert int(found.source[0]) == 2
-    assert float(found.plan[0, 0, 0]) == -10.0
+    assert float(found.plans[0, 0, 0]) == -10.0
 
 
 def test_a_plan_that_is_no_number_is_replaced(car_task: Task) -> None:
     x, plan = failing(car_task, 10.0)
     policy = Constant(car_task, float("nan"))
-    found = Backup(car_task, policy, grid=grid()).search(x, torch.full_like(plan, torch.nan))
-    assert torch.isfinite(found.plan).all()
+    found = paper_search(car_task, policy, grid()).search(x, torch.full_like(plan, torch.nan))
+    assert torch.isfinite(found.plans).all()
     assert not torch.isnan(found.rho).any()
     assert finite(
         torch.tensor([torch.nan, torch.inf, 3.0], dtype=F64)[:, None], car_task

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from stlc.controller.guard.sampled_shooting import Beginnings
+from stlc.controller.guard.stages.sampled_shooting import SampledPrefixes
 from stlc.controller.problem.task import Task
 from stlc.runtime.prefixes import Grid
 from tests.controller.test_backup import F64, Constant, grid
@@ -25,11 +25,11 @@ class Reached:
 def test_they_are_finished_from_where_they_end(car_task: Task) -> None:
     x = car_task.sample(9, seed=1, dtype=F64)
     policy = Reached(car_task)
-    begun = Beginnings(car_task, policy, grid(lengths=(1, 2), batch=70), 30).finished(x)
+    begun = SampledPrefixes(car_task, policy, grid(lengths=(1, 2), batch=70), 30).finished(x)
     assert begun.plans.shape == (9, 5 + 25, car_task.horizon, 1)
-    assert begun.length.tolist() == [1] * 5 + [2] * 25
+    assert begun.prefix_length[0].tolist() == [1] * 5 + [2] * 25
     for agent, row in ((0, 0), (3, 4), (8, 5), (8, 29)):
-        length, plan = int(begun.length[row]), begun.plans[agent, row]
+        length, plan = int(begun.prefix_length[agent, row]), begun.plans[agent, row]
         start = x[agent : agent + 1]
         reached = car_task.rollout(start, plan[None, :length])[:, -1]
         tail = policy.plan(reached)[0, : car_task.horizon - length]
@@ -45,7 +45,7 @@ def test_they_are_finished_from_where_they_end(car_task: Task) -> None:
 
 def test_a_large_grid_is_sampled(car_task: Task) -> None:
     policy = Constant(car_task, 0.0)
-    some = Beginnings(car_task, policy, Grid(((-2.0, 0.0, 3.0, 4.0),), (1, 4), 64), 30)
+    some = SampledPrefixes(car_task, policy, Grid(((-2.0, 0.0, 3.0, 4.0),), (1, 4), 64), 30)
     assert some.lengths.tolist() == [1] * 4 + [4] * 30
     long = some.heads[4:, :, 0]
     assert set(long.flatten().tolist()) == {-2.0, 0.0, 3.0, 4.0}
@@ -54,12 +54,12 @@ def test_a_large_grid_is_sampled(car_task: Task) -> None:
 
 def test_no_more_than_a_batch_at_a_time(car_task: Task) -> None:
     policy = Constant(car_task, 0.0)
-    Beginnings(car_task, policy, grid(lengths=(1, 2), batch=70), 30).finished(
+    SampledPrefixes(car_task, policy, grid(lengths=(1, 2), batch=70), 30).finished(
         car_task.sample(5, seed=1, dtype=F64)
     )
     assert policy.rows == [60, 60, 30]
 
 
 def test_a_grid_without_lengths_has_none(car_task: Task) -> None:
-    none = Beginnings(car_task, Constant(car_task, 0.0), grid(lengths=()), 30)
+    none = SampledPrefixes(car_task, Constant(car_task, 0.0), grid(lengths=()), 30)
     assert len(none.heads) == 0

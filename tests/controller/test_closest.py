@@ -7,9 +7,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from stlc.controller.guard.candidates import REPAIRED, Limits
 from stlc.controller.guard.guard import Decision, Guard
-from stlc.controller.guard.plan_repair import POLISHED, FullBackup, Limits
-from stlc.controller.guard.relaxed import Closest
+from stlc.controller.guard.search import RelaxedSearch, StagedSearch
 from stlc.controller.guard.tightened import sparing
 from stlc.controller.problem.task import Task
 from stlc.dynamics.declaration.load import parse_system
@@ -58,7 +58,7 @@ def test_what_is_beside_the_wall_stays_as_far_from_it_as_it_is() -> None:
     task, x = cart(), torch.tensor([[1.9, 0.0], [1.7, -0.2]], dtype=torch.float64)
     found = decided(task, x)
     assert found.safe.all()
-    assert found.source.tolist() == [POLISHED, POLISHED]
+    assert found.source.tolist() == [REPAIRED, REPAIRED]
     spare = task.judge(x, found.plan).requirements[:, 0]
     torch.testing.assert_close(spare, 2.0 - x[:, 0], rtol=0, atol=0.01)
 
@@ -66,11 +66,11 @@ def test_what_is_beside_the_wall_stays_as_far_from_it_as_it_is() -> None:
 def test_whom_the_plain_guard_can_save_is_saved_with_a_margin_too() -> None:
     task = cart()
     x = task.sample(60, seed=1, dtype=torch.float64)
-    plain = FullBackup(task, Onward(), limits=Limits(seconds=None)).search(x, Onward().plan(x))
+    plain = StagedSearch(task, Onward(), "full", limits=Limits(seconds=None)).search(x, Onward().plan(x))
     found = decided(task, x)
     strict = sparing(task, LIMITS.margin)
-    assert 10 < int(plain.safe.sum()) < 60
-    assert bool((found.safe | ~plain.safe).all())
+    assert 10 < int(plain.is_safe.sum()) < 60
+    assert bool((found.safe | ~plain.is_safe).all())
     enough = strict.judge(x, found.plan).safe >= -1e-6
     assert 10 < int(enough.sum()) < int(found.safe.sum())
     lost = ~found.safe
@@ -81,12 +81,12 @@ def test_it_spares_more_than_a_guard_that_asks_for_nothing() -> None:
     task = cart()
     x = task.sample(60, seed=2, dtype=torch.float64)
     strict = sparing(task, LIMITS.margin)
-    guard = Closest(task, strict, Onward(), limits=LIMITS)
+    guard = RelaxedSearch(task, strict, Onward(), limits=LIMITS)
     found = guard.search(x, Onward().plan(x))
-    plain = FullBackup(task, Onward(), limits=Limits(seconds=None)).search(x, Onward().plan(x))
-    short = plain.safe & ~found.safe
+    plain = StagedSearch(task, Onward(), "full", limits=Limits(seconds=None)).search(x, Onward().plan(x))
+    short = plain.is_safe & ~found.is_safe
     assert int(short.sum()) > 5
-    spare, other = (task.judge(x, each.plan).safe[short] for each in (found, plain))
+    spare, other = (task.judge(x, each.plans).safe[short] for each in (found, plain))
     assert (spare >= -1e-6).all()
     assert float(spare.mean()) > float(other.mean())
-    torch.testing.assert_close(found.rho, strict.judge(x, found.plan).rho)
+    torch.testing.assert_close(found.rho, strict.judge(x, found.plans).rho)

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.coverage import RADII, Axis, axes_of, chance, chances
-from stlc.controller.guard.shooting import grid_of
 from stlc.controller.problem.task import Task
 from stlc.runtime.prefixes import SAMPLINGS, Grid, Sampling
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import torch
 
-from stlc.controller.guard.feasibility import MOST, extremes, savable
+from stlc.controller.guard.feasibility import MOST, extremes, viable
 from stlc.controller.problem.task import Task
 
 
@@ -16,7 +16,7 @@ def states(task: Task, **columns: list[float]) -> torch.Tensor:
 def test_who_can_still_brake_is_savable(car_task: Task) -> None:
     """Behind a leader at rest the gap must stay above 1 m, and braking from v takes about v^2 / 20."""
     x = states(car_task, dx=[1.2, 2.0, 3.0, 6.0], v=[5.0, 5.0, 5.0, 10.0], x=[-9.0] * 4)
-    assert savable(car_task, x).tolist() == [False, False, True, False]
+    assert viable(car_task, x).tolist() == [False, False, True, False]
 
 
 def test_liveness_does_not_count(car_task: Task) -> None:
@@ -24,13 +24,13 @@ def test_liveness_does_not_count(car_task: Task) -> None:
     x = states(car_task, sign=[0.0], tau=[0.0], x=[-0.01], v=[9.0])
     rho = car_task.judge(x, torch.full((1, 25, 1), -10.0, dtype=torch.float64)).rho
     assert float(rho) < 0.0
-    assert savable(car_task, x).tolist() == [True]
+    assert viable(car_task, x).tolist() == [True]
 
 
 def test_the_verdicts_repeat(car_task: Task) -> None:
     x = car_task.sample(100, seed=1).double()
-    first = savable(car_task, x)
-    assert torch.equal(first, savable(car_task, x))
+    first = viable(car_task, x)
+    assert torch.equal(first, viable(car_task, x))
     assert 0.9 < float(first.double().mean()) <= 1.0
 
 

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from stlc.controller.deployment.disturbance import Disturbance, errors_of
 from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
+from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.guard import Guard
-from stlc.controller.guard.shooting import grid_of
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.diagnostics import StlcError

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stlc.controller.guard.guard import SOURCES
+from stlc.controller.guard.candidates import SOURCES
 from stlc.controller.sketch import (
     DECIDED,
     DECIDERS,

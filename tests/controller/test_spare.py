@@ -10,8 +10,8 @@ from torch import Tensor
 
 from stlc.compile.ir.nodes import Predicate, Signal
 from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
+from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard, Mode
-from stlc.controller.guard.plan_repair import Limits
 from stlc.controller.guard.safe_prefix import prefix_robustness, robustness_until
 from stlc.controller.guard.tightened import sparing, tighter
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork

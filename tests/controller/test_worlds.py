@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from stlc.controller.deployment.batched import Setting, Worlds
-from stlc.controller.guard.feasibility import savable, solvable
+from stlc.controller.guard.feasibility import solvable, viable
 from stlc.controller.problem.task import Task
 from stlc.controller.world import ModelWorld, world_type
 from stlc.diagnostics import RunError, SystemFileError
@@ -57,7 +57,7 @@ def test_every_start_is_taken_unless_the_system_says_otherwise(tmp_path: Path) -
 def test_starts_without_a_plan_are_drawn_again(tmp_path: Path, starts: str, highest: float) -> None:
     task = cart(tmp_path, f"starts: {starts}")
     x, redrawn = begun(task, 0, 1)
-    assert bool((savable if starts == "savable" else solvable)(task, x).all())
+    assert bool((viable if starts == "savable" else solvable)(task, x).all())
     assert 0.75 * highest < float(x[:, 0].max()) < highest
     assert redrawn > 5
     drawn, _ = begun(cart(tmp_path, "starts: any"), 0, 1)

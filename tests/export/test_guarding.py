@@ -8,7 +8,8 @@ import pytest
 import torch
 from exported import run_of
 
-from stlc.controller.guard.shooting import Backup, grid_of
+from stlc.controller.guard.candidates import grid_of
+from stlc.controller.guard.search import StagedSearch
 from stlc.export import guarding
 from stlc.export.guarding import Guarding
 from stlc.runtime.prefixes import Grid
@@ -21,13 +22,13 @@ def test_every_rule_of_the_backup(at_once: int, tmp_path: Path, monkeypatch: pyt
     x = run.task.sample(60, seed=5, dtype=torch.float64)
     plan = run.policy.plan(x)
     plan[7] = torch.nan
-    wanted = Backup(run.task, run.policy).search(x, plan)
+    wanted = StagedSearch(run.task, run.policy, "paper").search(x, plan)
     assert {1, 2} <= set(wanted.source.tolist())
-    assert {1, 2, 3} <= set(wanted.t0.tolist())
+    assert {1, 2, 3} <= set(wanted.prefix_length.tolist())
     with torch.no_grad():
         mine, rho, safe, each, source, t0 = Guarding(run.task, run.network).eval()(x, plan)
-    assert (source.tolist(), t0.tolist()) == (wanted.source.tolist(), wanted.t0.tolist())
-    torch.testing.assert_close(mine, wanted.plan, rtol=0.0, atol=1e-6)
+    assert (source.tolist(), t0.tolist()) == (wanted.source.tolist(), wanted.prefix_length.tolist())
+    torch.testing.assert_close(mine, wanted.plans, rtol=0.0, atol=1e-6)
     judged = run.task.judge(x, mine)
     torch.testing.assert_close(rho, judged.rho, rtol=0.0, atol=1e-9)
     torch.testing.assert_close(safe, judged.safe, rtol=0.0, atol=1e-9)
@@ -39,9 +40,9 @@ def test_a_grid_without_lengths_hands_the_plan_back(tmp_path: Path) -> None:
     x = run.task.sample(3, seed=5, dtype=torch.float64)
     plan = run.policy.plan(x)
     grid = Grid(grid_of(run.task).values, (), 10)
-    wanted = Backup(run.task, run.policy, grid=grid).search(x, plan)
+    wanted = StagedSearch(run.task, run.policy, "paper", grid=grid).search(x, plan)
     with torch.no_grad():
         mine, rho, *_, source, t0 = Guarding(run.task, run.network, grid)(x, plan)
-    assert torch.equal(mine, wanted.plan)
+    assert torch.equal(mine, wanted.plans)
     assert torch.equal(rho, wanted.rho)
-    assert (source.tolist(), t0.tolist()) == (wanted.source.tolist(), wanted.t0.tolist())
+    assert (source.tolist(), t0.tolist()) == (wanted.source.tolist(), wanted.prefix_length.tolist())

@@ -17,7 +17,7 @@ from stlc import native
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
 from stlc.controller.guard.guard import Guard
-from stlc.controller.guard.shooting import Backup
+from stlc.controller.guard.search import StagedSearch
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.run import Run
@@ -153,10 +153,10 @@ def test_the_torch_program_needs_nothing_of_stlc(tmp_path: Path) -> None:
         torch.testing.assert_close(mine, plan, rtol=0.0, atol=1e-5)
         torch.testing.assert_close(rho, judged.rho, rtol=0.0, atol=1e-5)
         torch.testing.assert_close(each, judged.requirements, rtol=0.0, atol=1e-5)
-        wanted = Backup(run.task, run.policy).search(x, plan)
+        wanted = StagedSearch(run.task, run.policy, "paper").search(x, plan)
         mine, *_, source, t0 = backup(x, plan)
-        torch.testing.assert_close(mine, wanted.plan, rtol=0.0, atol=1e-5)
-        assert (source.tolist(), t0.tolist()) == (wanted.source.tolist(), wanted.t0.tolist())
+        torch.testing.assert_close(mine, wanted.plans, rtol=0.0, atol=1e-5)
+        assert (source.tolist(), t0.tolist()) == (wanted.source.tolist(), wanted.prefix_length.tolist())
 
 
 @compiled

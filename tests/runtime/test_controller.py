@@ -12,7 +12,8 @@ import pytest
 import torch
 from exported import ROOT, exported, mission, run_of
 
-from stlc.controller.guard.guard import SOURCES, Guard
+from stlc.controller.guard.candidates import SOURCES
+from stlc.controller.guard.guard import Guard
 from stlc.controller.training.run import Run
 from stlc.diagnostics import MissingError, RunError, UsageError
 from stlc.export.write import export

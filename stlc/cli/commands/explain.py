@@ -255,8 +255,8 @@ ASSUMED = (
 
 def _guarantee(run: str, runs: Path, overrides: Mapping[str, str], *, as_json: bool) -> None:
     """Print the probabilities for the grid of a run's system, and what they assume."""
+    from stlc.controller.guard.candidates import grid_of
     from stlc.controller.guard.coverage import axes_of, chances
-    from stlc.controller.guard.shooting import grid_of
     from stlc.controller.training.run import load_task
     from stlc.rundir import RunDir
 

@@ -15,7 +15,7 @@ from stlc.cli.check.text import percent, signed
 from stlc.cli.framework.output import table
 from stlc.compile.ir.traverse import margin_unit
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.guard.guard import SOURCES
+from stlc.controller.guard.candidates import SOURCES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

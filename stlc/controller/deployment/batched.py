@@ -13,7 +13,7 @@ from torch import Tensor
 
 from stlc.controller.deployment.disturbance import Disturbance
 from stlc.controller.deployment.world_errors import blamed, require_numbers, scene_of, states_of, wrong
-from stlc.controller.guard.feasibility import savable, solvable
+from stlc.controller.guard.feasibility import solvable, viable
 from stlc.controller.guard.tightened import Spare
 from stlc.controller.world import Charting, Choosing, Redrawing
 from stlc.diagnostics import Diagnostic, RunError, SystemFileError
@@ -99,7 +99,7 @@ class Worlds:
 
     def _with_plans(self, world: object, seed: int, x: Tensor) -> Tensor:
         """The first states of a seed, (agents, n), drawn again wherever no plan is known from them."""
-        known = savable if self.task.system.decl.test.starts == "savable" else solvable
+        known = viable if self.task.system.decl.test.starts == "savable" else solvable
         good = known(self.task, x)
         for _ in range(REDRAWN):
             if bool(good.all()):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.controller.evaluation.executed import as_driven
-from stlc.controller.guard.guard import SOURCES
+from stlc.controller.guard.candidates import SOURCES
 from stlc.monitor.online.margins import Margin, Margins
 
 if TYPE_CHECKING:

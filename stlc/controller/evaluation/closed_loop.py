@@ -20,8 +20,8 @@ from stlc.controller.deployment.simulator import Moment, Recorder, Recording, Se
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.evaluation.rules import Rules, drives_of_plans, obeying, rules_of, verdict_on_drives
+from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard, Mode
-from stlc.controller.guard.plan_repair import Limits
 from stlc.controller.training.config import DRIVES
 from stlc.controller.world import world_type
 from stlc.diagnostics import StlcError

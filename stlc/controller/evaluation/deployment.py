@@ -17,9 +17,9 @@ from stlc.controller.deployment.simulator import Recorder, Recording, Setting, W
 from stlc.controller.evaluation.executed import Executed, judge_executed
 from stlc.controller.evaluation.rules import Drives, Rules, drives_json, drives_of_plans, judge_drives
 from stlc.controller.evaluation.stats import Interval
+from stlc.controller.guard.candidates import SOURCES, Limits
 from stlc.controller.guard.feasibility import solvable
-from stlc.controller.guard.guard import SOURCES, Guard, Mode
-from stlc.controller.guard.plan_repair import Limits
+from stlc.controller.guard.guard import Guard, Mode
 from stlc.controller.world import world_type
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.batched import SURPRISE
-from stlc.controller.guard.feasibility import savable as search_safe
+from stlc.controller.guard.feasibility import viable as search_safe
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement

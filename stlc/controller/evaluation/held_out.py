@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from stlc.controller.guard.feasibility import Hunt
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.guard.feasibility import ENOUGH, solve
 from stlc.controller.policies.policy import plan_judged
 from stlc.controller.problem.task import satisfied
 from stlc.controller.training.config import HELD_OUT, HELD_OUT_SEED
 from stlc.controller.training.exploration import EFFORTS, Exploration
-from stlc.controller.training.local_search import Searcher
 from stlc.controller.training.missions import mission_steps, visited
 from stlc.files import write_atomic
 from stlc.native import never
@@ -36,7 +36,6 @@ MOST_SEARCHED = 1024
 """Failing states that are searched: they speak for the others, to 1.6 % in one standard error."""
 EXPLORED = 4
 """Failing states that are explored where no plan is known for any."""
-ENOUGH = 1e-4
 CHUNK = 256
 """Failing states that are searched together."""
 TORCH_CHUNK = 32
@@ -114,17 +113,15 @@ def score(
     failing = (~good).nonzero()[:, 0]
     failing = failing[torch.randperm(len(failing), generator=generator)]
     known, searched = good.clone(), good.clone()
-    searcher, hunt = Searcher(task, generator, enough=ENOUGH), Hunt(task)
     size = TORCH_CHUNK if task.native is None else CHUNK
     for number, chunk in enumerate(torch.split(failing[:MOST_SEARCHED], size)):
         if number and enough():
             break
-        start, bank = plans[chunk].float(), plans[good].float()
-        begun = states[chunk].float(), start, bank
-        found = searcher.repair(*begun, tries=CEILING_TRIES, stop=enough).solved
+        begun = states[chunk], plans[chunk], plans[good]
+        found = solve(task, *begun, 1, tries=CEILING_TRIES, generator=generator, stop=enough).solved
         left = torch.nonzero(~found)[:, 0]
         if len(left) and task.native is not None and not enough():
-            found[left] = hunt.plans(states[chunk[left]], enough)[1]
+            found[left] = solve(task, states[chunk[left]], stop=enough).rho >= -TOLERANCE
         if number and enough():
             break
         known[chunk], searched[chunk] = found, True

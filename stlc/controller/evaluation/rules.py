@@ -17,7 +17,7 @@ import torch
 from stlc.compile.frontend.modules import file_of, library_of
 from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.guard.feasibility import safely, solvable
+from stlc.controller.guard.feasibility import safety_task, solvable
 from stlc.controller.training.run import INDEX, read_library, save_library
 from stlc.diagnostics import Diagnostic, RunError, SystemFileError, UsageError
 from stlc.dynamics.declaration.load import load_system_decl
@@ -300,7 +300,7 @@ def _lost(
 ) -> Lost | None:
     """When a drive was lost that broke rules, by the first of those tagged `@safety`, else by the first."""
     row, unsafe = broken.row, not safety.isdisjoint(broken.rules)
-    asked = safely(task) if unsafe and task.compiled.safety else task
+    asked = safety_task(task) if unsafe and task.compiled.safety else task
     times = [time for name, time in broken.rules.items() if not unsafe or name in safety]
     looked = [time for time in times if time is not None]
     if not looked:  # nobody has looked when: by the start alone

@@ -1,4 +1,4 @@
-"""What can be done at all: a search for a satisfying plan, or a safe one, from each state."""
+"""Feasibility: a search for any satisfying plan, or any safe one, from each state."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.problem.task import Task
-from stlc.controller.training.local_search import THOROUGH, Searcher
+from stlc.controller.training.local_search import THOROUGH, Searcher, SearchResult
 from stlc.native import never
 
 if TYPE_CHECKING:
@@ -22,60 +22,77 @@ PASSES = 4
 TRIES = 20_000
 """Plans that are tried for one start in one pass, where native code judges them."""
 ENOUGH = 1e-4
+"""Robustness at which a start is left alone."""
 PIECES = 3
 MOST = 2048
-"""Plans in the bank, at most."""
+"""Plans of the library, at most."""
 
 
-def savable(task: Task, x0: Tensor) -> Tensor:
-    """Where some plan satisfies phi_safe, as far as a search finds one: (B, n) -> (B,) booleans."""
-    if not task.compiled.safety:
-        return torch.ones(len(x0), dtype=torch.bool)
-    return solvable(safely(task), x0)
+@torch.no_grad()
+def solve(
+    task: Task,
+    x0: Tensor,
+    start: Tensor | None = None,
+    library: Tensor | None = None,
+    passes: int = PASSES,
+    *,
+    tries: int | None = None,
+    generator: torch.Generator | None = None,
+    stop: Stop = never,
+) -> SearchResult:
+    """Search for a satisfying plan from each state; the same arguments give the same plans.
+
+    The first pass climbs from `start`, each later one from plans of the library, where none was found yet. A
+    state with a plan has it, judged exactly; one without may have a plan that was not found.
+
+    Args:
+        task: specification and system.
+        x0: states, (B, n).
+        start: plans, (B, T, m); the middle of every control if None.
+        library: plans that a climb also borrows from, (k, T, m); `extremes` if None.
+        passes: at most.
+        tries: plans of one pass for one state.
+        generator: of the changes; one of seed 0 if None.
+        stop: ends the search early.
+
+    Returns:
+        Plans and their robustness in float64; -inf where the search was stopped before it began.
+    """
+    generator = generator or torch.Generator().manual_seed(0)
+    if library is None:
+        library = extremes(task, torch.Generator().manual_seed(0))
+    if start is None:
+        middle = 0.5 * (task.system.control_low + task.system.control_high)
+        start = middle.expand(len(x0), task.horizon, -1)
+    tries = tries or (THOROUGH if task.native is None else TRIES)
+    searcher = Searcher(task, generator, enough=ENOUGH)
+    best = SearchResult(x0, start.double().clone(), x0.new_full((len(x0),), -torch.inf, dtype=torch.float64))
+    for number in range(passes):
+        if number:
+            start = library[torch.randint(len(library), (len(x0),), generator=generator)]
+        still = torch.nonzero(best.rho < -TOLERANCE).squeeze(1)
+        if not len(still) or stop():
+            break
+        begun = x0[still].float(), start[still].float()
+        plans = searcher.repair(*begun, library.float(), tries=tries, stop=stop).plans.double()
+        best.plans[still] = plans
+        best.rho[still] = task.judge(x0[still].double(), plans, states=False).rho
+    return best
 
 
 def solvable(task: Task, x0: Tensor) -> Tensor:
     """Where some plan satisfies phi, as far as a search finds one: (B, n) -> (B,) booleans."""
-    return Hunt(task).plans(x0)[1]
+    return solve(task, x0).rho >= -TOLERANCE
 
 
-class Hunt:
-    """A search for plans of one task that knows of no policy; the same one gives the same plans again.
-
-    Each pass climbs from another plan: from the middle of every control, then from plans that hold each
-    control at an end of its range or in the middle of it, thirds of the horizon long. A start without a
-    plan may have one that was not found; one with a plan has it, judged exactly.
-    """
-
-    def __init__(self, task: Task) -> None:
-        self.task = task
-        self.middle = 0.5 * (task.system.control_low + task.system.control_high)
-        self.bank = extremes(task, torch.Generator().manual_seed(0))
-
-    @torch.no_grad()
-    def plans(self, x0: Tensor, enough: Stop = never) -> tuple[Tensor, Tensor]:
-        """Plans (B, T, m) float64 from states (B, n), and which of them satisfy the specification, (B,).
-
-        It ends once `enough` says so.
-        """
-        generator = torch.Generator().manual_seed(0)
-        searcher = Searcher(self.task, generator, enough=ENOUGH)
-        tries = THOROUGH if self.task.native is None else TRIES
-        start = self.middle.expand(len(x0), self.task.horizon, -1)
-        best, found = start.double().clone(), torch.zeros(len(x0), dtype=torch.bool)
-        for _ in range(PASSES):
-            still = torch.nonzero(~found).squeeze(1)
-            if not len(still) or enough():
-                break
-            begun = x0[still].float(), start[still].clone()
-            plans = searcher.repair(*begun, self.bank, tries=tries, stop=enough).plans
-            best[still] = plans.double()
-            found[still] = self.task.judge(x0[still].double(), best[still], states=False).rho >= -TOLERANCE
-            start = self.bank[torch.randint(len(self.bank), (len(x0),), generator=generator)]
-        return best, found
+def viable(task: Task, x0: Tensor) -> Tensor:
+    """Where some plan satisfies phi_safe, as far as a search finds one: (B, n) -> (B,) booleans."""
+    if not task.compiled.safety:
+        return torch.ones(len(x0), dtype=torch.bool)
+    return solvable(safety_task(task), x0)
 
 
-def safely(task: Task) -> Task:
+def safety_task(task: Task) -> Task:
     """The task of phi_safe alone."""
     return Task(replace(task.compiled, requirements=task.compiled.safety), task.plain)
 

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import torch
 from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.guard.plan_repair import FullBackup, Limits
-from stlc.controller.guard.relaxed import Closest
+from stlc.controller.guard.candidates import Candidates, Limits, finite
 from stlc.controller.guard.safe_prefix import robustness_until
-from stlc.controller.guard.shooting import Backup, Found, finite
+from stlc.controller.guard.search import RelaxedSearch, StagedSearch
 from stlc.controller.guard.tightened import sparing
-from stlc.controller.policies.policy import Mlp
+from stlc.controller.policies.policy import BestOfKPolicy, plan_judged
 from stlc.controller.problem.task import rank
 from stlc.runtime.prefixes import Grid
 
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
 Mode: TypeAlias = Literal["none", "paper", "full"]
 GUARD_VERSION = 1
 """Raised with every change of a guard's decisions; benchmarks drive anew what older guards drove."""
-SOURCES = ("policy", "backup", "safest", "polished")
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,15 +74,8 @@ class Decision:
 _FIELDS = tuple(each.name for each in fields(Decision))
 
 
-@runtime_checkable
-class _JudgesItself(Protocol):
-    """A policy that has judged its plan while choosing it."""
-
-    def plan_judged(self, x0: Tensor) -> tuple[Tensor, Judged]: ...
-
-
 class Guard:
-    """Who stands between the policy and the actuators.
+    """Runtime safety filter: judges every plan of a policy, and replaces it where it is not safe.
 
     Args:
         task: specification and system.
@@ -107,20 +98,14 @@ class Guard:
     ) -> None:
         self.task, self.mode = task, mode
         self.strict = sparing(task, {} if mode == "none" or limits is None else limits.margin)
-        self.policy = policy
-        if isinstance(policy, Mlp) and self.strict is not task:
-            self.policy = Mlp(
-                self.strict, policy.network
-            )  # of its plans it takes one with that much to spare
-        self.backup: Backup | FullBackup | Closest | None = None
-        match mode:
-            case "paper":
-                seconds = None if limits is None else limits.paper
-                self.backup = Backup(self.strict, self.policy, grid=grid, seconds=seconds)
-            case "full" if self.strict is not task and limits is not None:
-                self.backup = Closest(task, self.strict, self.policy, grid=grid, limits=limits)
-            case "full":
-                self.backup = FullBackup(self.strict, self.policy, grid=grid, limits=limits)
+        self.policy: Policy = policy
+        if isinstance(policy, BestOfKPolicy):
+            self.policy = policy.for_task(self.strict)  # the choice among its plans keeps the margin
+        self.backup: StagedSearch | RelaxedSearch | None = None
+        if mode == "full" and self.strict is not task and limits is not None:
+            self.backup = RelaxedSearch(task, self.strict, self.policy, grid=grid, limits=limits)
+        elif mode != "none":
+            self.backup = StagedSearch(self.strict, self.policy, mode, grid=grid, limits=limits)
 
     @torch.no_grad()
     def decide(self, x: Tensor, begun: Decision | None = None) -> Decision:
@@ -138,17 +123,22 @@ class Guard:
             The decision. Without a guard a plan that is no number is handed on, with robustness -inf.
         """
         x = x.to(torch.float64)
-        fresh, judged = self._plan(x)
+        fresh, judged = plan_judged(self.strict, self.policy, x)
         found = self._kept(x, begun, fresh, judged)
-        plan, source, t0, rho, safe = found.plan, found.source, found.t0, found.rho, found.safe
-        failing = torch.nonzero(~(rho >= -TOLERANCE)).squeeze(1)
+        failing = torch.nonzero(~found.satisfies).squeeze(1)
         if self.backup is not None and len(failing):
-            rest = None if begun is None else begun.plan[failing]
-            found = self.backup.search(x[failing], fresh[failing], rest)
-            plan = plan.index_copy(0, failing, found.plan)
-            source, t0 = source.index_copy(0, failing, found.source), t0.index_copy(0, failing, found.t0)
-            rho, safe = rho.index_copy(0, failing, found.rho), safe.index_copy(0, failing, found.safe)
-        decision = Decision(plan[:, 0], plan, source, t0, rho, safe, judged.rho, fresh)
+            previous = None if begun is None else begun.plan[failing]
+            found.put(failing, self.backup.search(x[failing], fresh[failing], previous))
+        decision = Decision(
+            found.plans[:, 0],
+            found.plans,
+            found.source,
+            found.prefix_length,
+            found.rho,
+            found.is_safe,
+            judged.rho,
+            fresh,
+        )
         return decision if self.strict is self.task else self._plainly(decision, x, fresh)
 
     def _plainly(self, decision: Decision, x: Tensor, fresh: Tensor) -> Decision:
@@ -188,7 +178,7 @@ class Guard:
         """
         agents, count, _ = options.shape
         options = options.to(torch.float64)
-        _, judged = self._plan(options.flatten(0, 1))
+        _, judged = plan_judged(self.strict, self.policy, options.flatten(0, 1))
         score = self._score(judged).view(agents, count)
         if begun is not None:
             rest = self._score(self.strict.judge(options[:, 0], begun.plan))
@@ -216,34 +206,21 @@ class Guard:
             plan[rows] = torch.cat((plan[rows, :left], tail[:, : length - left]), 1)
         return replace(begun, plan=plan, action=plan[:, 0])
 
-    def _kept(self, x: Tensor, begun: Decision | None, fresh: Tensor, judged: Judged) -> Found:
+    def _kept(self, x: Tensor, begun: Decision | None, fresh: Tensor, judged: Judged) -> Candidates:
         """The policy's plans, or what is left of those that were begun."""
-        zero = torch.zeros(len(x), dtype=torch.int64, device=x.device)
-        safe = judged.safe >= -TOLERANCE
+        zero, free = torch.zeros(len(x), dtype=torch.int64, device=x.device), torch.zeros_like(judged.rho)
+        found = Candidates(fresh.clone(), judged.rho.clone(), judged.safe.clone(), free, zero, zero.clone())
         if begun is None:
-            return Found(fresh, zero, zero, judged.rho, safe)
+            return found
         rest = self.strict.judge(x, begun.plan)
         better = rank(rest.rho, self.strict.cost(rest)) >= rank(judged.rho, self.strict.cost(judged))
-        keep = (better | self._deepened(rest)) & (rest.rho >= -TOLERANCE)
-        return Found(
-            torch.where(keep[:, None, None], begun.plan, fresh),
-            torch.where(keep, begun.source, zero),
-            torch.where(keep, begun.t0, zero),
-            torch.where(keep, rest.rho, judged.rho),
-            torch.where(keep, rest.safe >= -TOLERANCE, safe),
-        )
+        keep = ((better | self._deepened(rest)) & (rest.rho >= -TOLERANCE)).nonzero()[:, 0]
+        before = Candidates(begun.plan, rest.rho, rest.safe, found.cost, begun.source, begun.t0)
+        found.put(keep, before.of(keep))
+        return found
 
     def _deepened(self, rest: Judged) -> Tensor:
-        """Whether what is left of a plan goes on with keeping a promise, (agents,)."""
+        """Whether what is left of a plan satisfies an open goal of the mission more and more, (agents,)."""
         if not self.task.promises.items:
             return torch.zeros_like(rest.rho, dtype=torch.bool)
         return self.task.promises.deepened(rest.columns)
-
-    def _plan(self, x: Tensor) -> tuple[Tensor, Judged]:
-        if isinstance(self.policy, _JudgesItself) and (
-            self.strict is self.task or isinstance(self.policy, Mlp)
-        ):
-            plan, judged = self.policy.plan_judged(x)
-            return plan.to(x.dtype), judged
-        plan = self.policy.plan(x).to(x.dtype)
-        return plan, self.strict.judge(x, plan)

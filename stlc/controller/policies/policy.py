@@ -31,7 +31,9 @@ class Policy(Protocol):
 
 @runtime_checkable
 class SelfJudging(Protocol):
-    """A policy that judges its plan while it chooses it."""
+    """A policy that judges its plan for a task while it chooses it."""
+
+    task: Task
 
     def plan_judged(self, x0: Tensor) -> tuple[Tensor, Judged]:
         """The plan to follow and its verdict: (B, n) -> (B, T, m), verdicts over (B,)."""
@@ -39,8 +41,9 @@ class SelfJudging(Protocol):
 
 def plan_judged(task: Task, policy: Policy, x0: Tensor) -> tuple[Tensor, Judged]:
     """The plans of a policy from states (B, n) in their dtype, (B, T, m), and their verdicts."""
-    if isinstance(policy, SelfJudging):
-        return policy.plan_judged(x0)
+    if isinstance(policy, SelfJudging) and policy.task is task:
+        plans, judged = policy.plan_judged(x0)
+        return plans.to(x0.dtype), judged
     plans = policy.plan(x0).to(x0.dtype)
     return plans, task.judge(x0, plans)
 
@@ -139,6 +142,10 @@ class BestOfKPolicy:
         self.task = task
         self.network = network
 
+    def for_task(self, task: Task) -> BestOfKPolicy:
+        """The same network, whose plans are chosen for another task of the same system."""
+        return self if task is self.task else BestOfKPolicy(task, self.network)
+
     @torch.no_grad()
     def candidates(self, x0: Tensor) -> Tensor:
         """All plans of the network in the dtype of `x0`: (B, n) -> (B, plans, T, m)."""
@@ -160,9 +167,6 @@ class BestOfKPolicy:
         best = rank(judged.rho, self.task.cost(judged), judged.safe).view(batch, count).argmax(1)
         index = rows * count + best
         return plans[rows, best], select(judged, index)
-
-
-Mlp = BestOfKPolicy
 
 
 def select(judged: Judged, index: Tensor) -> Judged:

@@ -16,9 +16,9 @@ from stlc.compile.analysis.ranges import bounds
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import numbers, subexpressions
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.guard.feasibility import ENOUGH, solve
 from stlc.controller.problem.task import Task
 from stlc.controller.training.exploration import EFFORTS, Exploration
-from stlc.controller.training.local_search import Searcher, SearchResult
 from stlc.diagnostics import Diagnostic, Label
 from stlc.native import never
 
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
     from stlc.compile.ir.functions import Bounds
     from stlc.compile.pipeline import CompiledRequirement
+    from stlc.controller.training.local_search import SearchResult
     from stlc.native import Stop
 
 STARTS = 64
 TRIES = 4000
-ENOUGH = 1e-4
 
 
 def conflict(task: Task, enough: Stop = never) -> Diagnostic:
@@ -71,12 +71,9 @@ def _starts(task: Task) -> torch.Tensor:
 
 def _climbed(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> SearchResult:
     """The best plans for these requirements alone."""
-    alone, generator = _alone(task, rules), torch.Generator().manual_seed(0)
-    x0 = _starts(task)
-    middle = 0.5 * (alone.system.control_low + alone.system.control_high)
-    start = middle.expand(STARTS, alone.horizon, -1)
-    searcher = Searcher(alone, generator, enough=ENOUGH)
-    return searcher.repair(x0, start, start[:0], tries=TRIES, stop=enough)
+    alone, x0 = _alone(task, rules), _starts(task)
+    nothing = x0.new_zeros(0, task.horizon, len(task.system.control_names))
+    return solve(alone, x0, library=nothing, passes=1, tries=TRIES, stop=enough)
 
 
 def _explored(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> bool:

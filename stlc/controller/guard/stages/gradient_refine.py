@@ -1,4 +1,4 @@
-"""Gradient steps on the exact robustness, for many plans of a state at once: what polishing begins with.
+"""Gradient refinement: gradient steps on the exact robustness, for many plans of a state at once.
 
 A gradient moves all of a plan at once, and a handful of steps mends most plans that miss by little. It sees
 nothing across an obstacle, so it starts from a batch: the plans at hand, and the same with a stretch of time
@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from time import perf_counter
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import numpy as np
 import torch
@@ -22,10 +22,14 @@ from torch import Tensor
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.compile.semantics.switch import StraightThrough
+from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline
 from stlc.controller.guard.feasibility import extremes
+from stlc.controller.guard.stages import Rejected, Setup, Stage, Tried
 from stlc.native import Outcome
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from stlc.controller.problem.native import NativeGradient
     from stlc.controller.problem.task import Task
 
@@ -46,6 +50,7 @@ STEEP = 1e100
 """What is steeper is no slope, nor is what is no number."""
 AGENTS = 256
 """Agents whose plans are raised side by side, at most."""
+SEED = 20_231
 APART = 1e6
 """Between plans that satisfy phi, those that satisfy phi_safe alone, and the rest."""
 
@@ -53,7 +58,7 @@ Numbers: TypeAlias = NDArray[np.float64]
 Pull: TypeAlias = Callable[[Numbers], Numbers]
 
 
-class Ascent:
+class GradientAscent:
     """Raises plans of one task; what it gives depends on states and plans alone.
 
     Args:
@@ -224,3 +229,29 @@ class Ascent:
         turned = self._low + np.remainder(plans - self._low, self._span)
         bounded: Numbers = np.where(self._turns, turned, clipped)
         return bounded
+
+
+class GradientRefine(Stage):
+    """Gradient steps from the policy's plan and from the one before, in half of the time."""
+
+    turns: ClassVar[Mapping[str, int]] = {"full": 10}
+
+    def __init__(self, setup: Setup) -> None:
+        self.task = setup.task
+        self.ascent = GradientAscent(setup.task, torch.Generator().manual_seed(SEED), enough=setup.enough)
+
+    def wanted(self, best: Candidates) -> Tensor:
+        """Everybody."""
+        return torch.ones_like(best.is_safe)
+
+    def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
+        """The better of two plans; both are left for the next stage."""
+        plans = [rejected.plan] if rejected.previous is None else [rejected.plan, rejected.previous]
+        x, starts = rejected.x[rows], torch.stack(plans, 1)[rows]
+        raised = self.ascent.rise(x, starts, 0.5 * (perf_counter() + deadline.until))
+        found = Candidates.judged(self.task, x, raised, REPAIRED)
+        rejected.tried.append(Tried(rows, found))
+        return found.pick(torch.zeros_like(rows))
+
+
+STAGE = GradientRefine

@@ -1,0 +1,207 @@
+"""Plans with their verdicts, and the one order in which guards prefer them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from math import inf
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.guard.tightened import Spare
+from stlc.runtime.prefixes import Grid
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from stlc.controller.problem.task import Task
+
+SOURCES = ("policy", "backup", "safest", "polished")
+TO_SPARE = 0.05
+"""Share of the paper's gamma that plan repair goes on for, beyond what satisfies."""
+POLICY, BACKUP, SAFEST, REPAIRED = range(len(SOURCES))
+"""Origins of a plan: the policy; a prefix that the policy finishes; the longest safe prefix; plan repair."""
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """Plans with their verdicts. All fields share their first dimensions: (agents,), or (agents, choices).
+
+    Attributes:
+        plans: (…, T, m) float64, physical units.
+        rho: robustness of phi, (…).
+        safe: robustness of phi_safe, (…); +inf where nothing is tagged `@safety`.
+        cost: performance terms, (…); 0 where they do not matter.
+        source: index into `SOURCES`, (…) int64.
+        prefix_length: T0, (…) int64; 0 where no prefix was drawn.
+    """
+
+    plans: Tensor
+    rho: Tensor
+    safe: Tensor
+    cost: Tensor
+    source: Tensor
+    prefix_length: Tensor
+
+    @classmethod
+    def judged(
+        cls, task: Task, x: Tensor, plans: Tensor, source: int, prefix_length: int = 0, *, cost: bool = False
+    ) -> Candidates:
+        """Judge plans (agents, …, T, m) from states (agents, n) float64; `cost`: whether it matters."""
+        shape, rows = plans.shape[:-2], plans.flatten(0, -3)
+        starts = x.repeat_interleave(len(rows) // max(len(x), 1), 0)
+        found = task.judge(starts, rows, states=cost)
+        number = torch.zeros(shape, dtype=torch.int64, device=plans.device)
+        return cls(
+            plans,
+            found.rho.view(shape),
+            found.safe.view(shape),
+            task.cost(found).view(shape) if cost else torch.zeros_like(found.rho).view(shape),
+            number + source,
+            number + prefix_length,
+        )
+
+    @classmethod
+    def unjudged(cls, plans: Tensor) -> Candidates:
+        """Plans (agents, T, m) that nobody has judged, source -1: all others rank higher."""
+        worst = torch.full(plans.shape[:-2], -torch.inf, dtype=plans.dtype, device=plans.device)
+        number = torch.zeros(worst.shape, dtype=torch.int64, device=plans.device)
+        return cls(plans.clone(), worst, worst.clone(), torch.zeros_like(worst), number - 1, number)
+
+    @property
+    def satisfies(self) -> Tensor:
+        """Where phi holds, (…) booleans."""
+        return self.rho >= -TOLERANCE
+
+    @property
+    def is_safe(self) -> Tensor:
+        """Where phi_safe holds, (…) booleans."""
+        return self.safe >= -TOLERANCE
+
+    def of(self, rows: Tensor) -> Candidates:
+        """Those of some agents, (k,) indices or (agents,) booleans."""
+        return Candidates(*(getattr(self, name)[rows] for name in _FIELDS))
+
+    def pick(self, choice: Tensor) -> Candidates:
+        """One choice an agent, (agents,), of (agents, choices)."""
+        rows = torch.arange(len(choice), device=choice.device)
+        return Candidates(*(getattr(self, name)[rows, choice] for name in _FIELDS))
+
+    def put(self, rows: Tensor, other: Candidates) -> None:
+        """Overwrite those of some agents, (k,) indices, by `other`, (k, …)."""
+        for name in _FIELDS:
+            getattr(self, name)[rows] = getattr(other, name)
+
+    def improve(self, rows: Tensor, other: Candidates) -> None:
+        """Overwrite those of some agents, (k,) indices, where `other`, (k,), ranks higher."""
+        better = (rank(other) > rank(self.of(rows))).nonzero()[:, 0]
+        self.put(rows[better], other.of(better))
+
+    @classmethod
+    def concatenated(cls, parts: Sequence[Candidates]) -> Candidates:
+        """The agents of all parts, one after the other."""
+        return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS))
+
+    def view(self, agents: int) -> Candidates:
+        """The same with the choices of each agent in a row: (agents * choices,) -> (agents, choices)."""
+        parts = (getattr(self, name) for name in _FIELDS)
+        return Candidates(*(part.view(agents, -1, *part.shape[1:]) for part in parts))
+
+    def beside(self, other: Candidates) -> Candidates:
+        """The choices of both for the same agents: (agents, j), (agents, k) -> (agents, j + k)."""
+        pairs = ((getattr(self, name), getattr(other, name)) for name in _FIELDS)
+        return Candidates(*(torch.cat(pair, 1) for pair in pairs))
+
+
+_FIELDS = tuple(each.name for each in fields(Candidates))
+
+
+def rank(plans: Candidates) -> Tensor:
+    """A number to prefer plans by, (…); larger is better.
+
+    Plans that satisfy phi come first, by robustness; then safe ones that begin with a prefix and go on as the
+    policy plans, as these lead back to the training distribution; then other safe ones; then those of the
+    longest safe prefix; then the rest, by the lesser of both robustnesses.
+    """
+    good, safe = plans.satisfies, plans.is_safe
+    within = torch.where(good | safe, plans.rho, torch.minimum(plans.rho, plans.safe)).nan_to_num(
+        -1e9, 1e9, -1e9
+    )
+    finished = plans.source == BACKUP
+    tier = torch.where(good, 8.0, torch.where(safe, torch.where(finished, 4.0, 2.0), -2.0))
+    tier = torch.where(~good & ~safe & (plans.source == SAFEST), 0.0, tier)
+    tier = torch.where(plans.source < 0, -4.0, tier)
+    return tier + within / (1.0 + within.abs())
+
+
+def best(allowed: Tensor, keys: Sequence[Tensor]) -> Tensor:
+    """Per row the first allowed choice that is best by the keys in order; (rows, choices) each -> (rows,)."""
+    for key in keys:
+        value = torch.where(allowed & ~key.isnan(), key, -torch.inf)
+        allowed = allowed & (value >= value.amax(1, keepdim=True) - TOLERANCE)
+    return allowed.to(torch.uint8).argmax(1)
+
+
+def finite(plan: Tensor, task: Task) -> Tensor:
+    """Plans (B, T, m) with every entry that is no number replaced by the control's value nearest to 0."""
+    low, high = task.system.control_low.to(plan), task.system.control_high.to(plan)
+    return torch.where(torch.isfinite(plan), plan, torch.zeros_like(plan).clamp(low, high))
+
+
+# ------------------------------------------------------------------------------------ what a search may cost
+
+
+class Deadline:
+    """The end of the time of a decision for some agents; never without a limit."""
+
+    def __init__(self, seconds: float | None = None, agents: int = 1) -> None:
+        self.until = inf if seconds is None else perf_counter() + seconds * agents
+
+    @property
+    def over(self) -> bool:
+        """Whether it has come."""
+        return perf_counter() >= self.until
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Cost that a decision may have.
+
+    Attributes:
+        seconds: per agent of the full guard; then the best plan so far is taken. None: no limit.
+        tries: plans that a local search tries per place that it starts from.
+        prefixes: of one length, at most, that the paper's rule tries where nothing safe was found.
+        drawn: prefixes of one length, at most, for sampled shooting; of more a sample.
+        places: of the plans of sampled shooting, how many local search starts from.
+        again: plans that each of these searches tries.
+        rescue: whether phi_safe alone is searched for, without the policy, where nothing else was safe.
+        margin: robustness that safety requirements must keep before the guard lets a plan pass, by their
+            names, in their units; of the paper's guard too.
+        paper: seconds per agent of the paper's guard, which nobody hurries by default.
+    """
+
+    seconds: float | None = 0.1
+    tries: int = 2000
+    prefixes: int = 1000
+    drawn: int = 256
+    places: int = 8
+    again: int = 2000
+    rescue: bool = True
+    margin: Spare = field(default_factory=dict)
+    paper: float | None = None
+
+
+def grid_of(task: Task) -> Grid:
+    """The grid of a system: `levels` of its backup, or of a control, else values evenly over its range."""
+    decl = task.system.decl
+    values = tuple(
+        decl.backup.levels.get(control.name)
+        or control.levels
+        or tuple(torch.linspace(control.low, control.high, decl.backup.bins).tolist())
+        for control in decl.controls
+    )
+    lengths = tuple(length for length in decl.backup.lengths if 0 < length < task.horizon)
+    return Grid(values, lengths, decl.backup.batch, decl.backup.samples, decl.backup.sampling)

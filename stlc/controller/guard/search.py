@@ -1,0 +1,160 @@
+"""Search for a better plan by the stages of a guard, and the same where plans must keep a margin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.guard.candidates import REPAIRED, SAFEST, Candidates, Deadline, Limits, finite, grid_of
+from stlc.controller.guard.feasibility import safety_task
+from stlc.controller.guard.safe_prefix import robustness_until
+from stlc.controller.guard.stages import Rejected, Setup, stages_of
+from stlc.controller.guard.stages.gradient_refine import SEED
+from stlc.controller.training.local_search import Searcher
+
+if TYPE_CHECKING:
+    from stlc.controller.policies.policy import Policy
+    from stlc.controller.problem.task import Task
+    from stlc.runtime.prefixes import Grid
+
+
+class StagedSearch:
+    """The stages of a guard, one after the other.
+
+    Args:
+        task: specification and system.
+        policy: finishes prefixes.
+        guard: name of the guard: "paper" or "full".
+        grid: values of the controls; by default what the system file says.
+        limits: of a decision; those of `Limits` if None.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        policy: Policy,
+        guard: str,
+        *,
+        grid: Grid | None = None,
+        limits: Limits | None = None,
+    ) -> None:
+        self.task, self.limits = task, limits or Limits()
+        self.seconds = self.limits.paper if guard == "paper" else self.limits.seconds
+        generator = torch.Generator().manual_seed(SEED)
+        setup = Setup(task, policy, grid or grid_of(task), self.limits, guard, generator)
+        self.stages = [stage(setup) for stage in stages_of(guard)]
+
+    @torch.no_grad()
+    def search(self, x: Tensor, plan: Tensor, previous: Tensor | None = None) -> Candidates:
+        """Better plans for states whose own plan was found wanting.
+
+        Args:
+            x: (agents, n) float64.
+            plan: (agents, T, m), the policy's plan; entries that are not finite are replaced.
+            previous: (agents, T, m), what is left of the plans that were followed until now.
+
+        Returns:
+            One plan an agent: the highest in rank that any stage has proposed.
+        """
+        deadline = Deadline(self.seconds, len(x))
+        plan = finite(plan.to(x.dtype), self.task)
+        previous = None if previous is None else finite(previous.to(x.dtype), self.task)
+        rejected = Rejected(x, plan, previous, Candidates.unjudged(plan))
+        for stage in self.stages:
+            rows = stage.wanted(rejected.best).nonzero()[:, 0]
+            if len(rows):
+                before = len(rejected.tried)
+                rejected.best.improve(rows, stage.propose(rejected, rows, deadline))
+                del rejected.tried[:before]
+        best = rejected.best
+        best.source[best.source < 0] = SAFEST
+        return best
+
+
+class RelaxedSearch:
+    """The full guard for a task with margins: where no plan keeps them, the one that comes closest counts.
+
+    A plan that is safe by less than was asked for is worth more than a prefix that keeps the whole margin for
+    as long as it can and then does not: a rover beside a wall can stay there.
+
+    Args:
+        task: the one that counts.
+        strict: the same with margins.
+        policy: finishes prefixes.
+        grid: values of the controls; by default what the system file says.
+        limits: of a decision.
+    """
+
+    def __init__(
+        self, task: Task, strict: Task, policy: Policy, *, grid: Grid | None = None, limits: Limits
+    ) -> None:
+        seconds = None if limits.seconds is None else limits.seconds / 2
+        half = replace(limits, seconds=seconds)
+        self.task, self.limits = strict, half
+        self._strict = StagedSearch(strict, policy, "full", grid=grid, limits=half)
+        self._plain = StagedSearch(task, policy, "full", grid=grid, limits=half)
+        generator = torch.Generator().manual_seed(SEED)
+        self._searcher = Searcher(safety_task(strict), generator, enough=0.0)
+        self._formulas = [rule.formula for rule in strict.compiled.safety]
+
+    @torch.no_grad()
+    def search(self, x: Tensor, plan: Tensor, previous: Tensor | None = None) -> Candidates:
+        """Better plans for states whose own plan was found wanting; verdicts are those of the strict task.
+
+        Args:
+            x: (agents, n) float64.
+            plan: (agents, T, m), the policy's plan.
+            previous: (agents, T, m), what is left of the plans that were followed until now.
+
+        Returns:
+            One plan an agent: what the full guard finds; where that keeps too small a margin, the plan that
+            is safe and keeps the largest, as far as one was found. Where already the present state lacks the
+            margin, every plan does, and what satisfies or is safe without a margin is begun with.
+        """
+        plan = finite(plan.to(x.dtype), self.task)
+        previous = plan if previous is None else finite(previous.to(x.dtype), self.task)
+        lacking = self._lacking(x, plan)
+        found = self._plain_found(x, plan, previous, lacking)
+        far = (~lacking).nonzero()[:, 0]
+        if len(far):
+            strict = self._strict.search(x[far], plan[far], previous[far])
+            found.put(far, strict)
+            short = far[~strict.is_safe]
+            close = self._closer(found, short, x, previous[short])
+            if len(close):
+                self._closer(found, close, x, self._plain.search(x[close], plan[close]).plans)
+        return found
+
+    def _lacking(self, x: Tensor, plan: Tensor) -> Tensor:
+        """Agents that lack the margin in their present state, (agents,)."""
+        columns = self.task.system.rollout_columns(x, plan)
+        return ~(robustness_until(self._formulas, columns, 0) >= -TOLERANCE)
+
+    def _plain_found(self, x: Tensor, plan: Tensor, previous: Tensor, lacking: Tensor) -> Candidates:
+        """For agents that lack the margin now what is found without one; unjudged plans for others."""
+        found = Candidates.unjudged(plan)
+        rows = lacking.nonzero()[:, 0]
+        if len(rows):
+            plain = self._plain.search(x[rows], plan[rows], previous[rows])
+            safe = plain.is_safe
+            found.put(rows, plain)
+            found.rho[rows] = self.task.judge(x[rows], plain.plans, states=False).rho
+            found.safe[rows] = -torch.inf
+            self._closer(found, rows[safe], x, plain.plans[safe])
+        return found
+
+    def _closer(self, found: Candidates, rows: Tensor, x: Tensor, start: Tensor) -> Tensor:
+        """Search from `start`, (rows, T, m), and enter what is safe; returns the rows where it is not."""
+        if not len(rows):
+            return rows
+        climbed = self._searcher.at_once(x[rows], start, tries=self.limits.tries).plans.to(x.dtype)
+        plain = Candidates.judged(self._plain.task, x[rows], climbed, REPAIRED)
+        strict = Candidates.judged(self.task, x[rows], climbed, REPAIRED)
+        safe = plain.is_safe
+        unsafe = torch.full_like(strict.safe[safe], -torch.inf)
+        found.put(rows[safe], replace(strict.of(safe), safe=unsafe))
+        return rows[~safe]

@@ -1,0 +1,112 @@
+"""Stages of guards: a file each, which says to which guards it belongs and when its turn comes.
+
+A guard takes its stages in turn. Each proposes plans for the agents that it may still help, and the plan that
+ranks highest (`stlc.controller.guard.candidates.rank`) is kept. A file holds a class `STAGE`; files whose
+names begin with `_` hold none.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar
+
+from stlc.controller.guard.candidates import TO_SPARE, Candidates, Deadline, Limits
+from stlc.registry import PackageRegistry
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+    from stlc.controller.policies.policy import Policy
+    from stlc.controller.problem.task import Task
+    from stlc.runtime.prefixes import Grid
+
+STAGES: PackageRegistry[type[Stage]] = PackageRegistry(
+    "stage", "stlc.controller.guard.stages", "STAGE", default=""
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """Everything that the stages of one guard share.
+
+    Attributes:
+        task: specification and system.
+        policy: finishes prefixes.
+        grid: values of the controls, and lengths of prefixes.
+        limits: of a decision.
+        guard: name of the guard.
+        generator: of the searches of all stages.
+    """
+
+    task: Task
+    policy: Policy
+    grid: Grid
+    limits: Limits
+    guard: str
+    generator: torch.Generator
+
+    @property
+    def enough(self) -> float:
+        """Robustness at which a plan is left alone."""
+        return TO_SPARE * self.task.system.decl.objective.gamma
+
+
+@dataclass(slots=True)
+class Rejected:
+    """Agents whose plans the monitor has rejected, and the best plans so far.
+
+    Attributes:
+        x: states, (agents, n) float64.
+        plan: the policy's plans, (agents, T, m); finite.
+        previous: remainders of the plans that were followed until now, (agents, T, m), or None.
+        best: the best plans so far, (agents,).
+        tried: plans that the stage before has judged, by groups of agents, where it keeps them.
+    """
+
+    x: Tensor
+    plan: Tensor
+    previous: Tensor | None
+    best: Candidates
+    tried: list[Tried] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """Plans of a group of agents: their rows (k,) among the rejected ones, and candidates (k, choices)."""
+
+    rows: Tensor
+    candidates: Candidates
+
+
+class Stage(ABC):
+    """A way to find a better plan.
+
+    Attributes:
+        turns: name of a guard -> place of the stage in its order.
+    """
+
+    turns: ClassVar[Mapping[str, int]]
+
+    @abstractmethod
+    def __init__(self, setup: Setup) -> None:
+        """Prepare everything that does not depend on the state."""
+
+    @abstractmethod
+    def wanted(self, best: Candidates) -> Tensor:
+        """Agents that the stage may help, given their best plans so far: (agents,) booleans."""
+
+    @abstractmethod
+    def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
+        """The stage's choice for some of the rejected agents: rows (k,) -> candidates (k,).
+
+        It may leave the plans that it has judged in `rejected.tried` for the next stage.
+        """
+
+
+def stages_of(guard: str) -> tuple[type[Stage], ...]:
+    """The stages of a guard in their order."""
+    found = [stage for stage in map(STAGES.get, STAGES) if guard in stage.turns]
+    return tuple(sorted(found, key=lambda stage: stage.turns[guard]))

@@ -1,0 +1,79 @@
+"""Local search: hill climbing on the exact robustness, from the plans of the stage before."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor
+
+from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline, rank
+from stlc.controller.guard.feasibility import safety_task
+from stlc.controller.guard.stages import Rejected, Setup, Stage
+from stlc.controller.training.local_search import Searcher
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from stlc.controller.problem.task import Task
+
+
+class LocalSearch(Stage):
+    """A search for phi, and for phi_safe alone where that finds nothing safe."""
+
+    turns: ClassVar[Mapping[str, int]] = {"full": 20}
+
+    def __init__(self, setup: Setup) -> None:
+        task, generator = setup.task, setup.generator
+        self.task, self.tries = task, setup.limits.tries
+        self.whole = self._safe = Searcher(task, generator, enough=setup.enough)
+        if 0 < len(task.compiled.safety) < len(task.rules):
+            self._safe = Searcher(safety_task(task), generator, enough=setup.enough)
+
+    def wanted(self, best: Candidates) -> Tensor:
+        """Agents whose plan satisfies phi by too little."""
+        return best.rho < self.whole.enough
+
+    def propose(self, rejected: Rejected, rows: Tensor, _deadline: Deadline) -> Candidates:
+        """The best plan from any start."""
+        x, found = rejected.x[rows], rejected.best.of(rows)
+        every = torch.arange(len(rows), device=rows.device)
+        found.improve(every, best_climbed(self.whole, x, _starts(rejected, rows), self.tries))
+        unsafe = (~found.is_safe).nonzero()[:, 0]
+        if len(unsafe) and self._safe is not self.whole:
+            starts = found.plans[unsafe][:, None]
+            climbed = best_climbed(self._safe, x[unsafe], starts, self.tries, self.task)
+            found.improve(unsafe, climbed)
+        return found
+
+
+def best_climbed(
+    searcher: Searcher, x: Tensor, starts: Tensor, tries: int, task: Task | None = None
+) -> Candidates:
+    """The best plan an agent of searches from each of its starts, (agents, k, T, m) -> (agents,).
+
+    `task`: judges the plans; that of the searcher if None.
+    """
+    found = climbed_from(searcher, x, starts, tries, task)
+    return found.pick(rank(found).argmax(1))
+
+
+def climbed_from(
+    searcher: Searcher, x: Tensor, starts: Tensor, tries: int, task: Task | None = None
+) -> Candidates:
+    """Plans of searches from each of the starts: (agents, k, T, m) -> candidates (agents, k)."""
+    rows = x.repeat_interleave(starts.shape[1], 0)
+    plans = searcher.at_once(rows, starts.flatten(0, 1), tries=tries).plans.to(x.device)
+    return Candidates.judged(task or searcher.task, x, plans.view(starts.shape), REPAIRED)
+
+
+def _starts(rejected: Rejected, rows: Tensor) -> Tensor:
+    """Plans that the stage before has tried for each of the rows, else those at hand: (k, starts, T, m)."""
+    if len(rejected.tried) == 1 and len(rejected.tried[0].rows) == len(rejected.x):
+        order = rejected.tried[0].rows.argsort()
+        return rejected.tried[0].candidates.plans[order][rows]
+    plans = [rejected.plan] if rejected.previous is None else [rejected.plan, rejected.previous]
+    return torch.stack(plans, 1)[rows]
+
+
+STAGE = LocalSearch

@@ -1,0 +1,74 @@
+"""Longest safe prefix: the last resort of the paper, where no plan is safe to its end."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor
+
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.guard.candidates import SAFEST, Candidates, Deadline, best
+from stlc.controller.guard.safe_prefix import prefix_robustness
+from stlc.controller.guard.stages import Rejected, Setup, Stage, Tried
+from stlc.controller.guard.stages.prefix_shooting import PrefixShooting
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+
+class LongestSafePrefix(Stage):
+    """The plan with the longest safe prefix; of several the most robust, then the latest to fail."""
+
+    turns: ClassVar[Mapping[str, int]] = {"paper": 20, "full": 60}
+
+    def __init__(self, setup: Setup) -> None:
+        self.task, self.batch = setup.task, setup.grid.batch
+        self._formulas = [rule.formula for rule in setup.task.compiled.safety]
+        self._shooting = PrefixShooting(setup)
+
+    def wanted(self, best: Candidates) -> Tensor:
+        """Agents without a safe plan."""
+        return ~best.is_safe
+
+    def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
+        """One plan an agent, of those that prefix shooting has tried."""
+        found = Candidates.unjudged(rejected.best.plans)
+        for tried in self._tried(rejected, rows, deadline):
+            found.put(tried.rows, self._safest(rejected.x[tried.rows], tried.candidates))
+        return found.of(rows)
+
+    def _tried(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Iterator[Tried]:
+        """Plans of prefix shooting for all rows: those that it has handed on, and the others made again."""
+        missing = torch.zeros(len(rejected.x), dtype=torch.bool, device=rows.device)
+        missing[rows] = True
+        for tried in rejected.tried:
+            missing[tried.rows] = False
+            yield tried
+        todo, lengths = torch.nonzero(missing)[:, 0], self._shooting.grid.lengths
+        if len(todo) and lengths:
+            every = torch.arange(len(todo), device=rows.device)
+            again = Deadline() if self._shooting.patient else deadline
+            for group, candidates in self._shooting.candidates(rejected, todo, every, lengths[-1], again):
+                yield Tried(todo[group], candidates)
+
+    def _safest(self, x: Tensor, candidates: Candidates) -> Candidates:
+        agents, choices = candidates.rho.shape
+        starts, plans = x.repeat_interleave(choices, 0), candidates.plans.flatten(0, 1)
+        size = max(self.batch // self.task.horizon, 1)  # as every prefix is a trajectory of its own
+        falls = torch.cat(
+            [
+                prefix_robustness(self._formulas, self.task.system.rollout_columns(start, plan))
+                for start, plan in zip(torch.split(starts, size), torch.split(plans, size), strict=True)
+            ],
+            1,
+        )
+        samples = (falls >= -TOLERANCE).sum(0).view(agents, choices)
+        depth = falls.clamp(max=0.0).mean(0).view(agents, choices)
+        longest = samples == samples.amax(1, keepdim=True)
+        chosen = candidates.pick(best(longest, (candidates.rho, depth, -candidates.cost)))
+        return replace(chosen, source=torch.full_like(chosen.source, SAFEST))
+
+
+STAGE = LongestSafePrefix

@@ -1,0 +1,111 @@
+"""Prefix shooting: sampled prefixes, finished by the policy (the paper, section "MPC-based Deployment").
+
+For T0 = 1, 2, … every sequence of T0 actions on a grid of L values a control, M = L^(m T0), or a sample of
+them where they are too many, is followed from the present state, and the policy plans on from its end. The
+first T0 with a plan that satisfies phi, or else phi_safe, decides. One thing goes beyond the paper (decision
+37): what is left of the plan before is one more choice, so that a safe plan is not lost because its first
+action was taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor
+
+from stlc.controller.guard.candidates import BACKUP, Candidates, Deadline, best, finite
+from stlc.controller.guard.stages import Rejected, Setup, Stage, Tried
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+HANDED_ON = 65_536
+"""Trajectories that are kept for the stage behind, at most; it makes the others again."""
+
+
+class PrefixShooting(Stage):
+    """The shortest prefix with a satisfying plan, or else a safe one.
+
+    Among plans of the same rank robustness decides, then the performance terms of the objective, because
+    robustness is flat where a deadline cannot be met, and then closeness to the policy.
+    """
+
+    turns: ClassVar[Mapping[str, int]] = {"paper": 10, "full": 50}
+
+    def __init__(self, setup: Setup) -> None:
+        self.task, self.policy, self.grid = setup.task, setup.policy, setup.grid
+        self.patient = setup.guard != "paper"
+        if self.patient:  # the last resort of another guard: short, but never cut off
+            grid = setup.grid
+            few = tuple(length for length in grid.lengths if grid.count(length) <= setup.limits.prefixes)
+            self.grid = replace(grid, lengths=few or grid.lengths[:1])
+
+    def wanted(self, best: Candidates) -> Tensor:
+        """Agents without a safe plan."""
+        return ~best.is_safe
+
+    def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
+        """The best plan of the first T0 that has one; agents for which none has keep an unjudged plan."""
+        deadline = Deadline() if self.patient else deadline
+        found, room = Candidates.unjudged(rejected.plan[rows]), HANDED_ON
+        todo = torch.arange(len(rows), device=rows.device)
+        for length in self.grid.lengths:
+            left = []
+            for group, candidates in self.candidates(rejected, rows, todo, length, deadline):
+                good = candidates.satisfies
+                allowed = torch.where(good.any(1, keepdim=True), good, candidates.is_safe)
+                done = allowed.any(1)
+                chosen = candidates.of(done)
+                found.put(group[done], chosen.pick(best(allowed[done], (chosen.rho, -chosen.cost))))
+                left.append(group[~done])
+                if deadline.over or length == self.grid.lengths[-1]:
+                    room -= int((~done).sum()) * candidates.rho.shape[1]
+                    if room >= 0 and not bool(done.all()):
+                        rejected.tried.append(Tried(rows[group[~done]], candidates.of(~done)))
+            todo = torch.cat(left) if left else todo
+            if deadline.over or not len(todo):
+                break
+        return found
+
+    def candidates(
+        self, rejected: Rejected, rows: Tensor, todo: Tensor, length: int, deadline: Deadline
+    ) -> Iterator[tuple[Tensor, Candidates]]:
+        """Candidates of one T0 for agents `rows[todo]`, group by group: positions (k,) and (k, choices).
+
+        Choice 0 begins as the policy's own plan does; the last one is what is left of the plan before.
+        """
+        prefixes = torch.from_numpy(self.grid.prefixes(length)).to(rejected.x)
+        for group in torch.split(todo, max(self.grid.batch // (len(prefixes) + 1), 1)):
+            agents = rows[group]
+            tried = prefixes[:0] if deadline.over else prefixes
+            found = self._finished(rejected.x[agents], rejected.plan[agents], tried, deadline)
+            if rejected.previous is not None:
+                before = rejected.previous[agents][:, None]
+                found = found.beside(
+                    Candidates.judged(self.task, rejected.x[agents], before, BACKUP, length, cost=True)
+                )
+            yield group, found
+
+    def _finished(self, x: Tensor, own: Tensor, prefixes: Tensor, deadline: Deadline) -> Candidates:
+        """All plans of one T0, judged; at most `grid.batch` trajectories at a time.
+
+        For one agent alone those that there was time for, and at least as many as are judged at a time.
+        """
+        agents, (count, length, _) = len(x), prefixes.shape
+        heads = torch.cat((own[:, None, :length], prefixes.expand(agents, -1, -1, -1)), 1).flatten(0, 1)
+        starts = x.repeat_interleave(count + 1, 0)
+        parts = []
+        size = self.grid.batch
+        for start, head in zip(torch.split(starts, size), torch.split(heads, size), strict=True):
+            reached = self.task.rollout(start, head)[:, -1]
+            tail = finite(self.policy.plan(reached).to(x.dtype), self.task)
+            plans = torch.cat((head, tail[:, : self.task.horizon - length]), 1)
+            parts.append(Candidates.judged(self.task, start, plans, BACKUP, length, cost=True))
+            if agents == 1 and deadline.over:
+                break
+        return Candidates.concatenated(parts).view(agents)
+
+
+STAGE = PrefixShooting

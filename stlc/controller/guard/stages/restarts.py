@@ -1,0 +1,37 @@
+"""Random restarts: a search for phi_safe alone that has nothing to do with the policy."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline
+from stlc.controller.guard.feasibility import safety_task, solve
+from stlc.controller.guard.stages import Rejected, Setup, Stage
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from torch import Tensor
+
+
+class Restarts(Stage):
+    """What `feasibility.solve` finds until the deadline."""
+
+    turns: ClassVar[Mapping[str, int]] = {"full": 30}
+
+    def __init__(self, setup: Setup) -> None:
+        self.task, self.rescue = setup.task, setup.limits.rescue
+        self._safety = safety_task(setup.task) if setup.task.compiled.safety else setup.task
+
+    def wanted(self, best: Candidates) -> Tensor:
+        """Agents without a safe plan."""
+        return ~best.is_safe & self.rescue
+
+    def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
+        """The plan of the search, whether it is safe or not."""
+        x = rejected.x[rows]
+        plans = solve(self._safety, x, stop=lambda: deadline.over).plans
+        return Candidates.judged(self.task, x, plans.to(x.device), REPAIRED)
+
+
+STAGE = Restarts

@@ -1,0 +1,108 @@
+"""Sampled shooting: plans that begin with a few sampled actions and go on as the policy plans from there.
+
+The paper's backup policy tries all prefixes, T0 by T0. Here is a sample of each length, judged in one batch,
+and local search goes on from the best.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor
+
+from stlc.controller.guard.candidates import BACKUP, Candidates, Deadline, finite, rank
+from stlc.controller.guard.stages import Rejected, Setup, Stage
+from stlc.controller.guard.stages.local_search import climbed_from
+from stlc.controller.training.local_search import Searcher
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from stlc.controller.policies.policy import Policy
+    from stlc.controller.problem.task import Task
+    from stlc.runtime.prefixes import Grid
+
+
+class SampledPrefixes:
+    """Prefixes for one task and policy, drawn once.
+
+    Args:
+        task: specification and system.
+        policy: finishes them.
+        grid: values of the controls, and lengths.
+        most: of one length; where the grid has more, a sample of them.
+    """
+
+    def __init__(self, task: Task, policy: Policy, grid: Grid, most: int) -> None:
+        self.task, self.policy = task, policy
+        few = replace(grid, samples=min(grid.samples, most))
+        longest = max(grid.lengths, default=0)
+        heads, lengths = [torch.zeros(0, longest, len(grid.values), dtype=torch.float64)], []
+        for length in grid.lengths:
+            some = torch.from_numpy(few.prefixes(length))
+            heads.append(torch.cat((some, some.new_zeros(len(some), longest - length, some.shape[2])), 1))
+            lengths += [length] * len(some)
+        self.heads, self.lengths = torch.cat(heads), torch.tensor(lengths, dtype=torch.int64)
+        self._most = max(grid.batch // max(len(self.heads), 1), 1)
+
+    def finished(self, x: Tensor) -> Candidates:
+        """All plans from states (agents, n) float64, (agents, k); `grid.batch` trajectories at a time."""
+        return Candidates.concatenated([self._finished(part) for part in torch.split(x, self._most)])
+
+    def _finished(self, x: Tensor) -> Candidates:
+        count, longest, controls = self.heads.shape
+        lengths = self.lengths.to(x.device).repeat(len(x))
+        heads = self.heads.to(x).repeat(len(x), 1, 1)
+        starts = x.repeat_interleave(count, 0)
+        rows = torch.arange(len(starts), device=x.device)
+        reached = self.task.rollout(starts, heads)[rows, lengths]
+        tails = finite(self.policy.plan(reached).to(x.dtype), self.task)
+        when = torch.arange(self.task.horizon, device=x.device)
+        after = (when - lengths[:, None]).clamp(min=0)[..., None].expand(-1, -1, controls)
+        plans = tails.gather(1, after)
+        head = (when[:longest] < lengths[:, None])[..., None]
+        plans[:, :longest] = torch.where(head, heads, plans[:, :longest])
+        shape = (len(x), count)
+        found = Candidates.judged(self.task, x, plans.view(*shape, *plans.shape[1:]), BACKUP)
+        return replace(found, prefix_length=lengths.view(shape))
+
+
+class SampledShooting(Stage):
+    """The best of sampled prefixes, and of searches from some of them, for agents whose plan is only safe."""
+
+    turns: ClassVar[Mapping[str, int]] = {"full": 40}
+
+    def __init__(self, setup: Setup) -> None:
+        self.task, self.limits = setup.task, setup.limits
+        self.prefixes = SampledPrefixes(setup.task, setup.policy, setup.grid, setup.limits.drawn)
+        self._searcher = Searcher(setup.task, setup.generator, enough=setup.enough)
+
+    def wanted(self, best: Candidates) -> Tensor:
+        """Agents whose plan does not satisfy phi, and is safe where that was searched for before."""
+        none = len(self.prefixes.heads) == 0
+        return (best.is_safe | (not self.limits.rescue)) & ~best.satisfies & (not none)
+
+    def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
+        """The best plan; what is not even safe is no better than nothing."""
+        found = Candidates.unjudged(rejected.plan[rows])
+        if deadline.over:
+            return found
+        x = rejected.x[rows]
+        tried = self.prefixes.finished(x)
+        picked = rank(tried).topk(min(self.limits.places, tried.rho.shape[1]), 1).indices
+        agents = torch.arange(len(rows), device=rows.device)
+        best = tried.pick(picked[:, 0])
+        climbed = climbed_from(self._searcher, x, tried.plans[agents[:, None], picked], self.limits.again)
+        place = rank(climbed).argmax(1)
+        length = tried.prefix_length[agents, picked[agents, place]]
+        climbed = climbed.pick(place)
+        source = torch.full_like(climbed.source, BACKUP)
+        best.improve(agents, replace(climbed, source=source, prefix_length=length))
+        safe = best.is_safe.nonzero()[:, 0]
+        found.put(safe, best.of(safe))
+        return found
+
+
+STAGE = SampledShooting
