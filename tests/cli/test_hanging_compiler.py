@@ -9,7 +9,7 @@ import pytest
 
 from stlc import native, toolchain
 from stlc.cli.framework.app import main
-from stlc.compile.backends.torch import kernel as ops_torch_kernel
+from stlc.compile.backends.array import kernel as window_kernel
 from stlc.controller.training.config import TrainConfig
 from stlc.trace.formats import cells as trace_cells
 from stlc.trace.formats import csv as trace_csv
@@ -45,7 +45,7 @@ def hanging(monkeypatch, tmp_path):
     )
     monkeypatch.setattr("stlc.controller.evaluation.deployment.LATENCY_SECONDS", 0.01)
     monkeypatch.setattr("stlc.controller.training.learner.MARGIN_STATES", 16)
-    caches = (trace_cells._library, ops_torch_kernel._library)
+    caches = (trace_cells._library, window_kernel._library)
     for each in caches:
         each.cache_clear()
     yield tmp_path / "cc.asked"

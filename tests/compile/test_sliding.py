@@ -1,8 +1,8 @@
-"""Sliding extrema and until: values by loops, gradients by plain torch, whatever the blocks and chunks."""
+"""Sliding extrema and until: values by loops, gradients by plain torch, with the C kernel and without."""
 
 from __future__ import annotations
 
-from itertools import pairwise
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -10,27 +10,29 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile.backends.array import extremum, scans
-from stlc.compile.backends.array.extremum import Pick, Sliding
+from stlc.compile.backends.array import kernel
+from stlc.compile.backends.array.namespace import Pick, Sliding
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.backends.array.sliding import Asked, extrema, until
 from stlc.compile.backends.array.windows import Windows
+from stlc.compile.backends.torch.extrema import small_extrema, small_until
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.backends.torch.small import block_extrema, small_extrema, small_until
-from stlc.compile.backends.torch.windows import SlidingExtremum, SlidingUntil
 from stlc.compile.semantics.semantics import Exact
 
 BOTH = pytest.mark.parametrize("pick", ["min", "max"])
 
 
-@pytest.fixture(params=["one piece", "pieces", "chunks"])
-def _layout(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Long rows are scanned one by one, short ones in pieces, and large batches in chunks."""
-    monkeypatch.setattr(scans, "_LONG_ROW", 1 if request.param == "one piece" else 1 << 30)
-    monkeypatch.setattr(scans, "_FEW_ROWS", 2)
-    if request.param == "chunks":
-        monkeypatch.setattr(extremum, "_SCRATCH", 8)
-        monkeypatch.setattr(extremum, "_NARROW", 1)
+@pytest.fixture(params=["kernel", "array operations"])
+def _method(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """By the C kernel, a few windows at a time, or without one."""
+    monkeypatch.setattr(kernel, "_CHUNK", 4)
+    monkeypatch.setattr("stlc.compile.backends.array.numpy_ops._LARGE_KERNEL", 1)
+    monkeypatch.setattr("stlc.compile.backends.array.numpy_ops._WIDE", 1)
+    monkeypatch.setattr("stlc.compile.backends.torch.extrema._SMALL", 0)
+    kernel._library.cache_clear()
+    if request.param != "kernel":
+        monkeypatch.setattr(kernel.native, "load", lambda _: None)
+    yield
+    kernel._library.cache_clear()
 
 
 @st.composite
@@ -58,11 +60,11 @@ def until_by_loops(left: torch.Tensor, right: torch.Tensor, pick: Pick, window: 
 
 
 def sliding_extrema(x: torch.Tensor, pick: Pick, window: Sliding) -> torch.Tensor:
-    return SlidingExtremum.apply(x, Asked(pick, window, TORCH))
+    return Windows(Exact(), TORCH).extrema(x, pick, count=window.count, width=window.width)
 
 
 def sliding_until(left: torch.Tensor, right: torch.Tensor, pick: Pick, window: Sliding) -> torch.Tensor:
-    return SlidingUntil.apply(left, right, Asked(pick, window, TORCH))
+    return Windows(Exact(), TORCH).until(left, right, pick, count=window.count, width=window.width)
 
 
 def gradients(value: torch.Tensor, operands: list[torch.Tensor], seed: int) -> list[torch.Tensor]:
@@ -76,7 +78,7 @@ def random(window: Sliding, seed: int, batch: int = 3) -> torch.Tensor:
     return torch.randn(window.rows, batch, generator=generator, dtype=torch.float64)
 
 
-@pytest.mark.usefixtures("_layout")
+@pytest.mark.usefixtures("_method")
 @BOTH
 @settings(max_examples=8)
 @given(window=windows(), seed=st.integers(0, 999))
@@ -84,14 +86,15 @@ def test_values_and_gradients_are_those_of_loops(pick: Pick, window: Sliding, se
     x, y = random(window, seed).requires_grad_(), random(window, seed + 1).requires_grad_()
     value, wanted = sliding_extrema(x, pick, window), extrema_by_loops(x, pick, window)
     assert torch.equal(value, wanted)
-    np.testing.assert_array_equal(extrema(x.detach().numpy(), Asked(pick, window, NUMPY)), wanted.detach())
+    numpy, sizes = Windows(Exact(), NUMPY), {"count": window.count, "width": window.width}
+    np.testing.assert_array_equal(numpy.extrema(x.detach().numpy(), pick, **sizes), wanted.detach())
     mine, theirs = gradients(value, [x], seed), gradients(wanted, [x], seed)
     torch.testing.assert_close(mine, theirs, atol=1e-12, rtol=1e-12)
 
     value, wanted = sliding_until(x, y, pick, window), until_by_loops(x, y, pick, window)
     assert torch.equal(value, wanted)
-    plain = until(x.detach().numpy(), y.detach().numpy(), Asked(pick, window, NUMPY))
-    np.testing.assert_array_equal(plain, wanted.detach())
+    met = numpy.until(x.detach().numpy(), y.detach().numpy(), pick, **sizes)
+    np.testing.assert_array_equal(met, wanted.detach())
     mine, theirs = gradients(value, [x, y], seed), gradients(wanted, [x, y], seed)
     torch.testing.assert_close(mine, theirs, atol=1e-12, rtol=1e-12)
 
@@ -103,11 +106,6 @@ def test_windows_side_by_side_are_those_of_loops(pick: Pick, window: Sliding, se
     x, y = random(window, seed).requires_grad_(), random(window, seed + 1).requires_grad_()
     wanted = extrema_by_loops(x, pick, window)
     assert torch.equal(small_extrema(x, pick, window), wanted)
-    if not window.to_end:
-        value = block_extrema(x, pick, window)
-        assert torch.equal(value, wanted)
-        mine, theirs = gradients(value, [x], seed), gradients(wanted, [x], seed)
-        torch.testing.assert_close(mine, theirs, atol=1e-12, rtol=1e-12)
     value, wanted = small_until(x, y, pick, window), until_by_loops(x, y, pick, window)
     assert torch.equal(value, wanted)
     mine, theirs = gradients(value, [x, y], seed), gradients(wanted, [x, y], seed)
@@ -140,7 +138,7 @@ def test_every_size_goes_the_same_way(pick: Pick, width: int, batch: int) -> Non
     torch.testing.assert_close(mine, theirs, atol=1e-10, rtol=1e-10)
 
 
-@pytest.mark.usefixtures("_layout")
+@pytest.mark.usefixtures("_method")
 @BOTH
 @settings(max_examples=5)
 @given(window=windows(), seed=st.integers(0, 999))
@@ -199,16 +197,3 @@ def test_infinite_operands_are_neutral() -> None:
     assert value.flatten().tolist() == [2.0, 2.0, inf, 1.0, 1.0, 1.0]
     value[torch.isfinite(value)].sum().backward()
     assert x.grad.flatten().tolist() == [0.0, 2.0, 0.0, 0.0, 0.0, 3.0]
-
-
-def test_memory_does_not_grow_with_the_width() -> None:
-    """Scratch arrays hold no more than a few traces, whatever the window."""
-    for width in (1, 2, 10, 101, 500, 999, 1000, 5000):
-        window = Sliding(1000, 1000, width)
-        assert window.covered <= 2 * 1000 + width
-        assert window.covered <= 3 * 1000
-        assert 4 * window.numbers(1000, 4) <= extremum._SCRATCH + 4 * window.covered * extremum._NARROW
-        chunks = window.chunks(1000, 4)
-        assert chunks[0].start == 0
-        assert chunks[-1].stop == 1000
-        assert all(a.stop == b.start for a, b in pairwise(chunks))

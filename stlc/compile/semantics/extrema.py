@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, final
 
-from stlc.compile.backends.array.extremum import Pick
-from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.backends.array.namespace import Array, Ops, Pick
 from stlc.compile.semantics.protocol import Associative
 
 

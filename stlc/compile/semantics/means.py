@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from functools import reduce
 from typing import ClassVar, final
 
-from stlc.compile.backends.array.extremum import Pick
-from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.backends.array.namespace import Array, Ops, Pick
 from stlc.compile.semantics.protocol import Parts
 
 

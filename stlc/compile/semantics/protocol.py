@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar, Protocol, TypeAlias
 
-from stlc.compile.backends.array.extremum import Pick
-from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.backends.array.namespace import Array, Ops, Pick
 
 Parts: TypeAlias = tuple[Array, ...]
 """What is known of some operands of an extremum: the extremum itself, or sums that it follows from."""

@@ -14,7 +14,7 @@ formula holds is decided by the truth of its predicates, and the exact robustnes
 
 from __future__ import annotations
 
-from stlc.compile.backends.array.extremum import Pick
+from stlc.compile.backends.array.namespace import Pick
 from stlc.compile.semantics.extrema import Exact, LogSumExp
 from stlc.compile.semantics.means import ArithmeticGeometricMean, GeneralizedMean
 from stlc.compile.semantics.protocol import Parts, Semantics

@@ -7,20 +7,50 @@ Operands named `x`, `a`, `b` are arrays; where a method says so a plain float ma
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, Protocol, TypeAlias
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol, TypeAlias, final
 
 import numpy as np
 from numpy.typing import NDArray
-
-from stlc.compile.backends.array.extremum import Pick, Sliding
 
 Array: TypeAlias = Any
 """A NumPy array or a torch tensor."""
 
 Mask: TypeAlias = Any
 """An array of booleans."""
+
+Pick: TypeAlias = Literal["min", "max"]
+
+
+def dual(pick: Pick) -> Pick:
+    """The other extremum."""
+    return "max" if pick == "min" else "min"
+
+
+def neutral(pick: Pick) -> float:
+    """The extremum of nothing."""
+    return math.inf if pick == "min" else -math.inf
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class Sliding:
+    """`count` windows of `width` rows over an array of `rows` rows; window `j` starts at row `j`.
+
+    There is at least one window, and at most one a row. Rows beyond the array are absent.
+    """
+
+    rows: int
+    count: int
+    width: int
+
+    @property
+    def to_end(self) -> bool:
+        """Whether every window reaches the last row."""
+        return self.width >= self.rows
 
 
 class Ops(Protocol):
@@ -164,9 +194,6 @@ class Ops(Protocol):
 
     def empty(self, shape: tuple[int, ...], like: Array) -> Array:
         """Memory with dtype and device of `like`, to be written to."""
-
-    def unbind(self, x: Array, axis: int) -> Sequence[Array]:
-        """Views of the slices along an axis."""
 
     def cat(self, parts: Sequence[Array]) -> Array:
         """Joined along axis 0."""

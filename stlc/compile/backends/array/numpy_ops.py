@@ -11,16 +11,18 @@ from typing import Any, cast, final
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.backends.array import sliding
-from stlc.compile.backends.array.extremum import Pick, Sliding
-from stlc.compile.backends.array.namespace import Array, Mask, Ops
+from stlc.compile.backends.array.kernel import Strided, window_kernel
+from stlc.compile.backends.array.namespace import Array, Mask, Ops, Pick, Sliding
 from stlc.compile.ir.functions import FUNCTIONS
 
 _WIDE = 8
-"""From so many columns on sliding windows beat putting pairs together,"""
+"""From so many columns on the kernel beats putting pairs together,"""
 
 _LONG = 20_000
-"""and for `until` also from so many rows of a window on."""
+"""and for `until` also from so many rows of a window on;"""
+
+_LARGE_KERNEL = 1 << 16
+"""from so many numbers on it is worth building."""
 
 
 @final
@@ -109,17 +111,14 @@ class NumpyOps:
         return reduce(np.minimum if pick == "min" else np.maximum, items)
 
     def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact extrema of sliding windows; None for narrow rows of which the last windows are cut."""
-        if x.ndim != 2 or x.shape[1] < _WIDE:
-            whole = window.rows >= window.count + window.width - 1
-            return _doubling(x, np.minimum if pick == "min" else np.maximum, window) if whole else None
-        return sliding.extrema(x, sliding.Asked(pick, window, NUMPY))
+        """Exact extrema of sliding windows of wide rows, by the kernel; None elsewhere."""
+        wide = x.ndim == 2 and x.shape[1] >= _WIDE and not window.to_end
+        return _by_kernel((x,), pick, window) if wide else None
 
     def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact `until` and `release`, for rows or windows that are long enough."""
-        if left.ndim != 2 or (left.shape[1] < _WIDE and window.width < _LONG):
-            return None
-        return sliding.until(left, right, sliding.Asked(pick, window, NUMPY))
+        """Exact `until` and `release`, for rows or windows that are long enough, by the kernel; else None."""
+        wide = left.ndim == 2 and (left.shape[1] >= _WIDE or window.width >= _LONG)
+        return _by_kernel((left, right), pick, window) if wide else None
 
     def softmax(self, x: Array, k: float) -> Array:
         """Smooth extremum over axis 0, kept."""
@@ -161,10 +160,6 @@ class NumpyOps:
         """Memory to be written to."""
         return np.empty(shape, dtype=like.dtype)
 
-    def unbind(self, x: Array, axis: int) -> Sequence[Array]:
-        """Views of the slices along an axis."""
-        return list(np.moveaxis(x, axis, 0))
-
     def flip(self, x: Array) -> Array:
         """Reversed along axis 0."""
         return x[::-1]
@@ -183,15 +178,20 @@ class NumpyOps:
         return context  # type: ignore[no-any-return]
 
 
-def _doubling(x: Array, pair: np.ufunc, window: Sliding) -> Array:
-    """Pieces of 1, 2, 4, … rows are put together."""
-    size, width = 1, window.width
-    while 2 * size <= width:
-        x = pair(x[:-size], x[size:])
-        size *= 2
-    rest = width - size
-    x = pair(x[:-rest], x[rest:]) if rest else x
-    return x[: window.count]
+def _by_kernel(operands: Sequence[Array], pick: Pick, window: Sliding) -> Array | None:
+    first = operands[0]
+    if first.size < _LARGE_KERNEL or any(each.dtype != first.dtype for each in operands):
+        return None
+    kernel = window_kernel(first.dtype.name, first.shape[1], len(operands), pick, window)
+    if kernel is None:
+        return None
+    out = np.empty((window.count, first.shape[1]), first.dtype)
+    kernel.run([_strided(each) for each in (*operands, out)], len(operands), back=False)
+    return out
+
+
+def _strided(x: Array) -> Strided:
+    return Strided(x.ctypes.data, *(stride // x.itemsize for stride in x.strides))
 
 
 for _function in FUNCTIONS.values():

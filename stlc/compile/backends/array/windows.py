@@ -1,4 +1,4 @@
-"""Extrema over windows of time, the algorithms: reductions, running extrema, sliding, doubling, scans.
+"""Extrema over windows of time: reductions, the C kernel, and in its place running extrema and doubling.
 
 All arrays are `(time, batch)`. Window `j` of `count` starts at row `j` and has `width` rows; rows beyond the
 array are absent, and a window without rows has the neutral value (+inf for a minimum, -inf for a maximum).
@@ -10,8 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import final
 
-from stlc.compile.backends.array.extremum import Pick, Sliding, dual, neutral
-from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.backends.array.namespace import Array, Ops, Pick, Sliding, dual, neutral
 from stlc.compile.semantics.protocol import Parts, Semantics
 
 __all__ = ["Windows", "dual", "neutral"]
@@ -84,11 +83,12 @@ class Windows:
             return x
         piece, size, done = self.semantics.lift(x, pick, self.ops), 1, 0
         total: Parts | None = None
+        overlapping = self.semantics.idempotent
         while True:
-            if self.semantics.idempotent and 2 * size > width:
+            if overlapping and 2 * size > width:
                 total = self._merged(piece, piece, width - size, pick) if width > size else piece
                 break
-            if width & size:
+            if width & size and not overlapping:
                 total = piece if total is None else self._merged(total, piece, done, pick)
                 done += size
                 if done == width:
@@ -129,6 +129,8 @@ class Windows:
             reached = self.until(left[lo:], right, pick, count=count, width=width)
             held = self.extrema(left, dual(pick), count=count, width=lo)
             return self.semantics.pair(held, reached, dual(pick), self.ops)
+        if width >= rows and (tiles := self._tiles(left, min(count, rows), 1)):
+            return self.padded(self._until_from_behind(left, right, pick, tiles), count, neutral(pick))
         if tiles := self._tiles(left, count, width):
             out = self.ops.empty((count, *left.shape[1:]), left)
             for asked, seen in tiles:
@@ -201,6 +203,22 @@ class Windows:
             out.append(row)
         rows = out[: -count - 1 : -1]
         return rows[0] if count == 1 else self.ops.cat(rows)
+
+    def _until_from_behind(
+        self, left: Array, right: Array, pick: Pick, tiles: list[tuple[slice, slice]]
+    ) -> Array:
+        """To the end of a long recorded trace: a stretch, and what the stretch behind it comes to."""
+        out = self.ops.empty((tiles[-1][0].stop, *left.shape[1:]), left)
+        behind = self.until(left[len(out) :], right[len(out) :], pick, count=1, width=len(left))
+        for rows, _ in reversed(tiles):
+            size = rows.stop - rows.start
+            held = self._to_end(left[rows], dual(pick))
+            met = self.until(left[rows], right[rows], pick, count=size, width=size)
+            out[rows] = self.semantics.pair(
+                met, self.semantics.pair(held, behind, dual(pick), self.ops), pick, self.ops
+            )
+            behind = out[rows.start : rows.start + 1]
+        return out
 
     def _until_doubling(self, held: Array, met: Array, pick: Pick, width: int) -> Array:
         """Full windows, in about log2(width) compositions of (`left` holds throughout, met within).

@@ -12,8 +12,7 @@ from collections.abc import Hashable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TypeAlias, cast, final
 
-from stlc.compile.backends.array.extremum import Pick, Sliding
-from stlc.compile.backends.array.namespace import Ops
+from stlc.compile.backends.array.namespace import Ops, Pick, Sliding
 from stlc.compile.backends.onnx.sheet import BATCH, Kind, Value, joined
 
 Number: TypeAlias = Value | float

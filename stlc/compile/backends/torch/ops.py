@@ -15,24 +15,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from stlc.compile.backends.array.extremum import Pick, Sliding
-from stlc.compile.backends.array.namespace import Mask, Ops
-from stlc.compile.backends.array.sliding import Asked
-from stlc.compile.backends.torch.choice import choice, reduction
-from stlc.compile.backends.torch.kernel import by_kernel
-from stlc.compile.backends.torch.small import block_extrema, is_small, small_extrema, small_until
-from stlc.compile.backends.torch.windows import SlidingExtremum, SlidingUntil
+from stlc.compile.backends.array.namespace import Mask, Ops, Pick, Sliding
+from stlc.compile.backends.torch.extrema import (
+    by_kernel,
+    choice,
+    is_small,
+    reduction,
+    small_extrema,
+    small_until,
+)
 from stlc.compile.ir.functions import FUNCTIONS
-
-_LARGE, _LARGE_FEW, _LARGE_BLOCK, _LARGE_UNTIL = 1 << 13, 1 << 17, 1 << 16, 1 << 12
-"""From so many numbers on, on a processor, scans in place beat what torch's own operations can do: for
-windows, for windows of a few traces, for windows that all reach the last row, and for `until`."""
-
-_LARGE_KERNEL = 1 << 11
-"""From so many numbers on a kernel is worth building."""
-
-_FEW = 16
-"""So many traces are a few."""
 
 
 class _SafeSqrt(torch.autograd.Function):
@@ -241,14 +233,7 @@ class TorchOps:
             return None
         if is_small(x, window):
             return small_extrema(x, pick, window)
-        if x.numel() >= _LARGE_KERNEL and (found := by_kernel((x,), pick, window)) is not None:
-            return found
-        if x.is_cuda or (window.to_end and x.numel() < _LARGE_BLOCK):
-            return None
-        if not window.to_end and x.numel() < (_LARGE_FEW if x.shape[1] <= _FEW else _LARGE):
-            return block_extrema(x, pick, window)
-        out: Tensor = SlidingExtremum.apply(x, Asked(pick, window, TORCH))  # type: ignore[no-untyped-call]
-        return out
+        return by_kernel((x,), pick, window)
 
     def until(self, left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Tensor | None:
         """Exact `until` and `release`; one of several equal operands may get all of the gradient."""
@@ -256,12 +241,7 @@ class TorchOps:
             return None
         if is_small(left, window):
             return small_until(left, right, pick, window)
-        if left.numel() >= _LARGE_KERNEL and (found := by_kernel((left, right), pick, window)) is not None:
-            return found
-        if left.numel() < _LARGE_UNTIL and not window.to_end:
-            return None
-        out: Tensor = SlidingUntil.apply(left, right, Asked(pick, window, TORCH))  # type: ignore[no-untyped-call]
-        return out
+        return by_kernel((left, right), pick, window)
 
     def softmax(self, x: Tensor, k: float) -> Tensor:
         """Smooth extremum over axis 0, kept."""
@@ -302,10 +282,6 @@ class TorchOps:
         """Memory to be written to, also outside of inference mode."""
         with torch.inference_mode(False):
             return like.new_empty(shape)
-
-    def unbind(self, x: Tensor, axis: int) -> Sequence[Tensor]:
-        """Views of the slices along an axis."""
-        return x.unbind(axis)
 
     def flip(self, x: Tensor) -> Tensor:
         """Reversed along axis 0."""

@@ -3,7 +3,8 @@
    REAL, INDEX (an integer as wide) and BYTES (of a vector) are defined before this text. Traces are taken
    LANES at a time, their samples beside each other, whatever the layout of the arrays. Windows are put
    together from the end of one block and the beginning of the next (van Herk; Gil and Werman). Every value
-   carries the row that it came from; the gradient goes there, whole where rows tie. NaN wins.
+   carries the row that it came from; the gradient goes there, whole where rows tie. NaN wins. Long arrays are
+   taken CHUNK windows at a time, so that memory follows the width of the windows and not their number.
 
    `shape` is {rows, count, width, traces, step and trace strides of each array in turn}. */
 
@@ -14,11 +15,14 @@
 
 #define LANES ((int64_t)(BYTES / sizeof(REAL)))
 #define AHEAD 16 /* rows that memory is asked for before they are needed */
+#ifndef CHUNK
+#define CHUNK 4096 /* windows that are taken at a time, at least */
+#endif
 
 typedef REAL Values __attribute__((vector_size(BYTES)));
 typedef INDEX Rows __attribute__((vector_size(BYTES)));
 typedef struct { Values value; Rows from; } Best;
-typedef struct { int64_t rows, count, width; } Sliding;
+typedef struct { int64_t rows, count, width, apart; } Sliding; /* apart: from the left operand to the right one */
 
 static int64_t least(int64_t a, int64_t b) { return a < b ? a : b; }
 
@@ -68,13 +72,13 @@ slide(Sliding s, const Values *x, Values *rows, Values *to, Best *tails, int max
 static inline __attribute__((always_inline)) void
 until(Sliding s, const Values *x, Values *rows, Values *to, Best *tails, int max, int back)
 {
-    const Values *left = x, *right = x + s.rows;
+    const Values *left = x, *right = x + s.apart;
     for (int64_t begin = 0; begin < s.count; begin += s.width) {
         int64_t stop = least(begin + s.width, s.rows), last = least(begin + s.width, s.count);
         Best held = none(!max), met = none(max), head = none(!max), reach = none(max);
         for (int64_t t = stop - 1; t >= begin; t--) {
             Best l = at(left, t, t);
-            met = better(l, better(at(right, t, s.rows + t), met, max), !max);
+            met = better(l, better(at(right, t, s.apart + t), met, max), !max);
             held = better(l, held, !max);
             tails[2 * (t - begin)] = met;
             tails[2 * (t - begin) + 1] = held;
@@ -83,7 +87,7 @@ until(Sliding s, const Values *x, Values *rows, Values *to, Best *tails, int max
             int64_t t = j + s.width - 1;
             if (j > begin && t < s.rows) {
                 head = better(head, at(left, t, t), !max);
-                reach = better(reach, better(at(right, t, s.rows + t), head, !max), max);
+                reach = better(reach, better(at(right, t, s.apart + t), head, !max), max);
             }
             Best later = better(tails[2 * (j - begin) + 1], reach, !max);
             emit(better(tails[2 * (j - begin)], later, max), rows + j, (REAL *)to, back);
@@ -142,31 +146,63 @@ static void store(const Values *y, const int64_t *stride, int64_t rows, int64_t 
 
 typedef void Walk(Sliding, const Values *, Values *, Values *, Best *, int, int);
 
+/* Rows that no window sees have no gradient. */
+static void clear(const int64_t *stride, int64_t rows, int64_t lanes, REAL *x)
+{
+    for (int64_t t = 0; t < rows; t++)
+        for (int64_t lane = 0; lane < lanes; lane++)
+            x[t * stride[0] + lane * stride[1]] = 0;
+}
+
+/* Some of the windows of an array: those from row `begin` on, and the rows that they see. */
+static Sliding chunk_at(Sliding all, int64_t begin, int64_t some, int64_t apart)
+{
+    int64_t count = least(some, all.count - begin);
+    return (Sliding){least(count + all.width - 1, all.rows - begin), count, all.width, apart};
+}
+
 /* `arrays` are operands, values or their gradient, and with `back` the gradients of the operands. */
 static inline __attribute__((always_inline)) int
 judge(REAL **arrays, const int64_t *shape, int operands, Walk walk, int max, int back)
 {
-    Sliding s = {shape[0], shape[1], least(shape[2], shape[0])};
+    Sliding all = {shape[0], shape[1], least(shape[2], shape[0]), 0};
     const int64_t *stride = shape + 4, *mine = stride + 2 * operands;
-    int64_t all = operands * s.rows, room = all * (1 + back) + s.count + 2 * operands * s.width;
+    int64_t some = least(all.count, 8 * all.width > CHUNK ? 8 * all.width : CHUNK);
+    int64_t apart = least(some + all.width - 1, all.rows), block = least(all.width, apart);
+    int64_t room = operands * apart * (1 + back) + some + 2 * operands * block;
     Values *memory = aligned_alloc(BYTES, (size_t)room * BYTES);
     if (!memory)
         return 1;
-    Values *x = memory, *to = x + all, *rows = to + back * all;
+    Values *x = memory, *to = x + operands * apart, *rows = to + back * operands * apart;
     for (int64_t first = 0; first < shape[3]; first += LANES) {
         int64_t lanes = least(shape[3] - first, LANES);
-        for (int i = 0; i < operands; i++)
-            load(arrays[i] + first * stride[2 * i + 1], stride + 2 * i, s.rows, lanes, x + i * s.rows);
-        if (back) {
-            memset(to, 0, (size_t)all * BYTES);
-            load(arrays[operands] + first * mine[1], mine, s.count, lanes, rows);
-        }
-        walk(s, x, rows, to, (Best *)(rows + s.count), max, back);
-        if (!back)
-            store(rows, mine, s.count, lanes, arrays[operands] + first * mine[1]);
-        for (int i = 0; back && i < operands; i++) {
-            const int64_t *its = mine + 2 + 2 * i;
-            store(to + i * s.rows, its, s.rows, lanes, arrays[operands + 1 + i] + first * its[1]);
+        if (back)
+            memset(to, 0, (size_t)(operands * apart) * BYTES);
+        for (int64_t begin = 0; begin < all.count; begin += some) {
+            Sliding s = chunk_at(all, begin, some, apart);
+            int last = begin + s.count == all.count;
+            for (int i = 0; i < operands; i++) {
+                const int64_t *its = stride + 2 * i;
+                load(arrays[i] + first * its[1] + begin * its[0], its, s.rows, lanes, x + i * apart);
+            }
+            REAL *values = arrays[operands] + first * mine[1] + begin * mine[0];
+            if (back)
+                load(values, mine, s.count, lanes, rows);
+            walk(s, x, rows, to, (Best *)(rows + some), max, back);
+            if (!back)
+                store(rows, mine, s.count, lanes, values);
+            for (int i = 0; back && i < operands; i++) {
+                const int64_t *its = mine + 2 + 2 * i;
+                REAL *gradient = arrays[operands + 1 + i] + first * its[1] + begin * its[0];
+                int64_t done = last ? s.rows : s.count, left = s.rows - done;
+                store(to + i * apart, its, done, lanes, gradient);
+                if (last) {
+                    clear(its, all.rows - begin - done, lanes, gradient + done * its[0]);
+                    continue;
+                }
+                memmove(to + i * apart, to + i * apart + done, (size_t)left * BYTES);
+                memset(to + i * apart + left, 0, (size_t)(apart - left) * BYTES);
+            }
         }
     }
     free(memory);

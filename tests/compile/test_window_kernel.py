@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from stlc import native
-from stlc.compile.backends.array.extremum import Pick, Sliding
+from stlc.compile.backends.array import kernel
+from stlc.compile.backends.array.namespace import Pick, Sliding
 from stlc.compile.backends.array.windows import Windows
-from stlc.compile.backends.torch import kernel as ops_torch_kernel
-from stlc.compile.backends.torch.kernel import by_kernel
+from stlc.compile.backends.torch.extrema import by_kernel
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.semantics import Exact
 
@@ -146,7 +146,7 @@ def test_other_dtypes_are_left_to_torch(dtype: torch.dtype) -> None:
 
 
 def test_memory_of_its_own_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ops_torch_kernel, "_ROOM", 1)
+    monkeypatch.setattr(kernel, "_ROOM", 1)
     assert by_kernel([torch.zeros(900, 1)], "min", Sliding(900, 900, 800)) is None
     assert by_kernel([torch.zeros(900, 900)], "min", Sliding(900, 900, 800)) is not None
 
@@ -162,11 +162,11 @@ def test_without_a_compiler_torch_does_the_same(batch: int, monkeypatch: pytest.
         return [*values, *torch.autograd.grad(sum(each.sum() for each in values), [x, y])]
 
     with_kernel = judged()
-    ops_torch_kernel._library.cache_clear()
+    kernel._library.cache_clear()
     monkeypatch.setattr(native, "load", lambda _: None)
     try:
         assert by_kernel([x], "min", Sliding(300, 300, 20)) is None
         without = judged()
     finally:
-        ops_torch_kernel._library.cache_clear()
+        kernel._library.cache_clear()
     torch.testing.assert_close(with_kernel, without)

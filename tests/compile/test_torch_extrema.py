@@ -7,8 +7,8 @@ from functools import reduce
 import pytest
 import torch
 
-from stlc.compile.backends.array.extremum import Pick
-from stlc.compile.backends.torch.choice import choice, reduction
+from stlc.compile.backends.array.namespace import Pick
+from stlc.compile.backends.torch.extrema import choice, reduction
 from stlc.compile.backends.torch.ops import TORCH
 
 SHAPES = [(2, 3), (40, 700)]

@@ -1,0 +1,186 @@
+"""Extrema in torch with cheap subgradients: of several arrays, along time, over sliding windows, and `until`.
+
+Torch's own backward passes spend most of their time on boolean masks. Here a mask is written as numbers, in
+the memory of the gradient that it becomes. Windows come from the C kernel
+(`stlc.compile.backends.array.kernel`), or for a handful of numbers are laid side by side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import pad
+
+from stlc.compile.backends.array.kernel import Strided, WindowKernel, window_kernel
+from stlc.compile.backends.array.namespace import Pick, Sliding, dual, neutral
+
+_LARGE = 1 << 12
+"""From so many numbers on a gradient of our own is faster."""
+
+_LARGE_COLUMN = 1 << 14
+
+_SEVERAL = 4
+"""From so many small operands on stacking them is faster than one operation a pair."""
+
+_SMALL = 1 << 12
+"""The most numbers of all windows together that are laid side by side."""
+
+
+class _Choice(torch.autograd.Function):
+    """Elementwise extremum of arrays of one shape; the first of equal operands gets the gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, pick: Pick, *items: Tensor) -> Tensor:
+        choose = torch.minimum if pick == "min" else torch.maximum
+        out = choose(items[0], items[1])
+        for item in items[2:]:
+            choose(out, item, out=out)
+        ctx.save_for_backward(out, *items)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        out, *items = ctx.saved_tensors
+        grads: list[Tensor] = []
+        left = grad
+        for item in items[:-1]:
+            mine = torch.empty_like(out)
+            torch.eq(item, out, out=mine).mul_(left)
+            left = left - mine if left is grad else left.sub_(mine)
+            grads.append(mine)
+        return None, *grads, left
+
+
+class _Reduction(torch.autograd.Function):
+    """Extremum over axis 0, kept; equal operands share the gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, pick: Pick) -> Tensor:
+        out = x.amin(dim=0, keepdim=True) if pick == "min" else x.amax(dim=0, keepdim=True)
+        ctx.save_for_backward(x, out)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        x, out = ctx.saved_tensors
+        share = torch.empty_like(x)
+        torch.eq(x, out, out=share)
+        return share.mul_(grad / share.sum(dim=0, keepdim=True)), None
+
+
+def choice(items: Sequence[Tensor], pick: Pick) -> Tensor:
+    """The elementwise extremum of one or more arrays."""
+    first = items[0]
+    if len(items) == 1:
+        return first
+    alike = all(item.shape == first.shape and item.dtype == first.dtype for item in items[1:])
+    if alike and first.numel() >= _LARGE and torch.is_grad_enabled():
+        out: Tensor = _Choice.apply(pick, *items)  # type: ignore[no-untyped-call]
+        return out
+    if alike and len(items) >= _SEVERAL and first.numel() < _LARGE:
+        stacked = torch.stack(list(items))
+        return stacked.amin(dim=0) if pick == "min" else stacked.amax(dim=0)
+    return reduce(torch.minimum if pick == "min" else torch.maximum, items)
+
+
+def reduction(x: Tensor, pick: Pick) -> Tensor:
+    """The extremum over axis 0, which stays with length 1."""
+    if x.requires_grad and x.numel() >= _LARGE_COLUMN:
+        out: Tensor = _Reduction.apply(x, pick)  # type: ignore[no-untyped-call]
+        return out
+    return x.amin(dim=0, keepdim=True) if pick == "min" else x.amax(dim=0, keepdim=True)
+
+
+# --------------------------------------------------------------------------- windows, by the kernel
+
+
+class _Windows(torch.autograd.Function):
+    """One operand: its extrema; two: `until` or `release`. One of several equal rows gets the gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, kernel: WindowKernel, *operands: Tensor) -> Tensor:
+        ctx.kernel = kernel
+        ctx.save_for_backward(*operands)
+        out = _like(operands[0], kernel.window.count)
+        kernel.run([_strided(each) for each in (*operands, out)], len(operands), back=False)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        operands, kernel = ctx.saved_tensors, ctx.kernel
+        out = [_like(operand, kernel.window.rows) for operand in operands]
+        kernel.run([_strided(each) for each in (*operands, grad, *out)], len(operands), back=True)
+        return None, *out
+
+
+def by_kernel(operands: Sequence[Tensor], pick: Pick, window: Sliding) -> Tensor | None:
+    """Sliding extrema of one array, `until` or `release` of two; None where there is no kernel for them.
+
+    Args:
+        operands: `(time, batch)`, of one dtype.
+        pick: "max" for `until`, "min" for `release`.
+        window: the windows.
+    """
+    first = operands[0]
+    alike = all(each.dtype == first.dtype and each.device.type == "cpu" for each in operands)
+    dtype = str(first.dtype).removeprefix("torch.")
+    kernel = window_kernel(dtype, first.shape[1], len(operands), pick, window) if alike else None
+    if kernel is None:
+        return None
+    out: Tensor = _Windows.apply(kernel, *operands)  # type: ignore[no-untyped-call]
+    return out
+
+
+def _strided(x: Tensor) -> Strided:
+    return Strided(x.data_ptr(), *x.stride())
+
+
+def _like(x: Tensor, rows: int) -> Tensor:
+    """Memory for so many rows, laid out as `x`: samples or traces beside each other."""
+    batch = x.shape[1]
+    return x.new_empty((batch, rows)).T if x.stride(0) == 1 and batch > 1 else x.new_empty((rows, batch))
+
+
+# ------------------------------------------------------------------ windows over few numbers
+
+
+def is_small(x: Tensor, window: Sliding) -> bool:
+    """Whether the windows may be laid side by side, which takes `rows * width` numbers."""
+    return x.numel() * window.width <= _SMALL
+
+
+def small_extrema(x: Tensor, pick: Pick, window: Sliding) -> Tensor:
+    """Exact extrema of sliding windows: `(time, batch)` -> `(count, batch)`."""
+    if window.to_end:
+        turned = x.flip(0)
+        running = torch.cummin(turned, 0) if pick == "min" else torch.cummax(turned, 0)
+        return _first(running.values.flip(0), window.count)
+    beside = _beside(x, neutral(pick), window)
+    return beside.amin(dim=-1) if pick == "min" else beside.amax(dim=-1)
+
+
+def small_until(left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Tensor:
+    """Exact `until` and `release`: two of `(time, batch)` -> `(count, batch)`."""
+    held, then = _beside(left, neutral(dual(pick)), window), _beside(right, neutral(pick), window)
+    if pick == "max":
+        return torch.minimum(torch.cummin(held, -1).values, then).amax(dim=-1)
+    return torch.maximum(torch.cummax(held, -1).values, then).amin(dim=-1)
+
+
+def _beside(x: Tensor, fill: float, window: Sliding) -> Tensor:
+    """The windows, `(count, batch, width)`."""
+    missing = window.count + window.width - 1 - window.rows
+    filled = pad(x, (0, 0, 0, missing), value=fill) if missing > 0 else x
+    return _first(filled.unfold(0, window.width, 1), window.count)
+
+
+def _first(x: Tensor, count: int) -> Tensor:
+    return x if x.shape[0] == count else x[:count]
