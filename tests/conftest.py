@@ -51,6 +51,6 @@ def _plain_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 def _kernels_are_asked_for_again(request):
     """A test that hides the compiler leaves no "there is no kernel" behind for the next one."""
     yield
-    module = sys.modules.get("stlc.compile.backends.torch.kernel")
+    module = sys.modules.get("stlc.compile.backends.array.kernel")
     if module is not None and "monkeypatch" in request.fixturenames:
         module._library.cache_clear()

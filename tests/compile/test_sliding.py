@@ -143,19 +143,19 @@ def test_every_size_goes_the_same_way(pick: Pick, width: int, batch: int) -> Non
 @settings(max_examples=5)
 @given(window=windows(), seed=st.integers(0, 999))
 def test_gradients_where_operands_tie_are_subgradients(pick: Pick, window: Sliding, seed: int) -> None:
-    """The gradient of every window goes, whole, to operands that have its value."""
+    """The gradient of every window goes to operands that have its value, and nothing of it is lost."""
     x, y = random(window, seed).round_().requires_grad_(), random(window, seed + 1).round_().requires_grad_()
     extreme, met = sliding_extrema(x, pick, window), sliding_until(x, y, pick, window)
     extreme_by_loops = extrema_by_loops(x, pick, window).detach()
     met_by_loops = until_by_loops(x, y, pick, window).detach()
     for j in range(window.count):
         (row,) = torch.autograd.grad(extreme[j].sum(), [x], retain_graph=True)
-        assert (row.sum(0) == 1).all()
+        assert ((row.sum(0) - 1).abs() < 1e-12).all()
         inside = torch.zeros(window.rows, 1, dtype=torch.bool)
         inside[j : j + window.width] = True
         assert ((row == 0) | inside & (x == extreme_by_loops[j])).all()
         left, right = torch.autograd.grad(met[j].sum(), [x, y], retain_graph=True)
-        assert (left.sum(0) + right.sum(0) == 1).all()
+        assert ((left.sum(0) + right.sum(0) - 1).abs() < 1e-12).all()
         assert ((left == 0) | inside & (x == met_by_loops[j])).all()
         assert ((right == 0) | inside & (y == met_by_loops[j])).all()
 
