@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.resolve import resolve
 from stlc.compile.ir.discretize import Grid
+from stlc.compile.pipeline import Purpose, compile_resolved
 from stlc.diagnostics import CODES, Diagnostic, SpecError, UsageError
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
@@ -48,10 +49,11 @@ class Selection:
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """The system that a specification is looked at with."""
+    """The system that a specification is looked at with, and for which purpose."""
 
     interface: Interface
     grid: Grid
+    purpose: Purpose = "train"
 
 
 EVERYTHING_USUAL = Selection()
@@ -83,9 +85,7 @@ def _compiled(spec: ast.Spec, within: Surroundings | None) -> Sequence[Diagnosti
         resolved = resolve(spec, interface=None if within is None else within.interface, sink=warnings)
         if within is None:
             return warnings
-        from stlc.compile.pipeline import compile_resolved
-
-        return compile_resolved(resolved, within.grid).warnings
+        return compile_resolved(resolved, within.grid, within.purpose).warnings
     except SpecError as error:
         return [*warnings, *error.diagnostics]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -170,3 +171,13 @@ def test_a_spec_without_a_system(tmp_path, capsys):
     path.write_text("state signal x [m]\nrequire a: always[0, 1 s] x > 0 m\n")
     assert main(["compile", str(path)]) == 2
     assert "--system FILE" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("system", ["car", "maze", "panda", "rover", "ship_safe", "ship_track"])
+def test_the_specification_that_judges_drives_is_compiled_for_recorded_traces(capsys, system):
+    text = (ROOT / f"examples/{system}.yaml").read_text()
+    (rules,) = re.findall(r"judge: \.\./(specs/\w+_rules\.stl)", text)
+    exit_code, found = document(capsys, str(ROOT / rules))
+    assert exit_code == 0
+    assert found["result"]["requirements"]
+    assert main(["lint", str(ROOT / rules), "--system", str(ROOT / f"examples/{system}.yaml")]) == 0

@@ -6,10 +6,11 @@ import pytest
 import reference
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from resolving import margin
+from resolving import margin, state
 
 from stlc.compile.frontend.polygons import area, simple
 from stlc.compile.ir import nodes as ir
+from stlc.diagnostics import SpecError
 
 L_SHAPE = ((0.0, 0.0), (4.0, 0.0), (4.0, 1.0), (1.0, 1.0), (1.0, 3.0), (0.0, 3.0))
 SQUARE = ((0.0, 0.0), (2.0, 0.0), (2.0, 2.0), (0.0, 2.0))
@@ -119,3 +120,10 @@ def test_orientation_and_crossing() -> None:
     assert simple(STAR)
     assert not simple(((0.0, 0.0), (1.0, 1.0), (1.0, 0.0), (0.0, 1.0)))
     assert not simple(((0.0, 0.0), (0.0, 0.0), (1.0, 0.0)))
+
+
+def test_a_bare_bound_of_a_box_is_read_in_the_unit_of_the_point() -> None:
+    region = "[z, z] in box([5, 5], [10 cm, 10 cm])"
+    assert state(region, "signal z [cm]")
+    with pytest.raises(SpecError, match="this box is empty"):
+        state(region, "signal z [m]")

@@ -126,9 +126,12 @@ def _show(
 
 
 def _compiled(path: Path, system: str | None, overrides: Mapping[str, str]) -> tuple[Compiled, SystemDecl]:
-    """Read both files and run the compiler; torch is not needed."""
+    """Read both files and run the compiler; torch is not needed.
+
+    The specification by which a system has its closed-loop runs judged is compiled for recorded traces.
+    """
     from stlc.compile.ir.discretize import Grid
-    from stlc.compile.pipeline import compile_spec
+    from stlc.compile.pipeline import Purpose, compile_spec
     from stlc.diagnostics import Diagnostic, UsageError
     from stlc.dynamics.declaration.load import load_system_decl
     from stlc.files import find_spec, find_system, read_source
@@ -147,7 +150,9 @@ def _compiled(path: Path, system: str | None, overrides: Mapping[str, str]) -> t
         )
     decl = load_system_decl(find_system(wanted, path), overrides)
     grid = Grid(decl.dt, decl.horizon)
-    return compile_spec(spec, grid=grid, interface=decl.interface(), overrides=overrides), decl
+    interface = decl.interface()
+    purpose: Purpose = "check" if decl.judges_by(path) else "train"
+    return compile_spec(spec, grid=grid, interface=interface, overrides=overrides, purpose=purpose), decl
 
 
 def _result(compiled: Compiled, decl: SystemDecl) -> dict[str, Any]:

@@ -149,12 +149,14 @@ def _surroundings(system: str | None, source: Source) -> Surroundings | None:
     if system is None:
         return None
     from stlc.compile.ir.discretize import Grid
+    from stlc.compile.pipeline import Purpose
     from stlc.dynamics.declaration.load import load_system_decl
     from stlc.files import find_system
     from stlc.lint.lint import Surroundings
 
     decl = load_system_decl(find_system(system, Path(source.name)))
-    return Surroundings(decl.interface(), Grid(decl.dt, decl.horizon))
+    purpose: Purpose = "check" if decl.judges_by(Path(source.name)) else "train"
+    return Surroundings(decl.interface(), Grid(decl.dt, decl.horizon), purpose)
 
 
 def _show(result: _Result, layout: Format, code: int) -> None:

@@ -113,7 +113,9 @@ def _box(call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scope) 
         message = f"corners of {len(lower.items)} and {len(upper.items)} components do not span a box"
         scope.fail(Diagnostic("E205", message, call.span))
     for low, high in zip(lower.items, upper.items, strict=True):
-        if not (low.bare or high.bare):
+        if low.bare is not high.bare:
+            continue  # the point that is asked for says the unit of the bare one
+        if not low.bare:
             low, high = absolute(low), absolute(high)
         if low.constant is not None and high.constant is not None and low.constant > high.constant:
             scope.fail(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from stlc.compile.frontend.algebra import apply, gap, negated
+from stlc.compile.frontend.algebra import agree, apply, gap, negated
 from stlc.compile.frontend.polygons import triangles
 from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.values import (
@@ -79,6 +79,12 @@ def signed_distance(point: Vector, region: Region, span: Span, scope: Scope) -> 
 
 def _box(point: Vector, lower: Vector, upper: Vector, span: Span, scope: Scope) -> Number:
     """Min of the room to each face inside; minus the Euclidean distance outside."""
+    for p, low, high in zip(point.items, lower.items, upper.items, strict=True):
+        if low.bare is not high.bare:
+            (_, low, high), _ = agree((p, low, high), "compare", span, scope)
+            if low.constant is not None and high.constant is not None and low.constant > high.constant:
+                message = "this box is empty: a lower bound is above the upper one"
+                scope.fail(Diagnostic("E205", message, span))
     room = [
         apply("min", (gap(p, low, span, scope), gap(high, p, span, scope)), span, scope)
         for p, low, high in zip(point.items, lower.items, upper.items, strict=True)

@@ -122,6 +122,10 @@ class SystemDecl:
         named = (self.test.judge, *(scenario.judge for scenario in self.scenarios))
         return tuple(judge for judge in named if judge is not None)
 
+    def judges_by(self, spec: Path) -> bool:
+        """Whether closed-loop runs are judged by this specification, so that it is for recorded traces."""
+        return any(judge.path.resolve() == spec.resolve() for judge in self.judges)
+
     @property
     def grid(self) -> Grid:
         """The steps that formulas are compiled for."""
