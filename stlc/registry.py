@@ -142,3 +142,8 @@ METHODS: PackageRegistry[Any] = PackageRegistry(
     "method", "stlc.controller.methods", "METHOD", default="guided"
 )
 """Ways to a policy, `stlc.controller.methods.Method` each: what `--method` and `train: {method: …}` name."""
+
+SEMANTICS: PackageRegistry[Any] = PackageRegistry(
+    "semantics", "stlc.compile.semantics.kinds", "SEMANTICS", default="exact"
+)
+"""Semantics of robustness, `stlc.compile.semantics.protocol.Semantics` each."""

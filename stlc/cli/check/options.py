@@ -9,6 +9,7 @@ import typer
 
 from stlc.cli.check.judge import End
 from stlc.cli.framework.completion import requirement_names
+from stlc.registry import SEMANTICS
 
 Files = Annotated[
     list[str],
@@ -33,7 +34,7 @@ Ending = Annotated[End, typer.Option(help="Too short a trace: bounds, an error, 
 Robustness = Annotated[
     str,
     typer.Option(
-        metavar="NAME", help="Robustness that is told: exact, smooth, agm, dgmsr. Verdicts are exact."
+        metavar="NAME", help=f"Robustness that is told: {', '.join(SEMANTICS.names)}. Verdicts are exact."
     ),
 ]
 Tolerance = Annotated[

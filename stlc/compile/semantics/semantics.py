@@ -1,8 +1,8 @@
-"""What "max" means: exactly, or smoothly enough for a gradient to see more than one operand.
+"""Semantics of robustness: how a maximum and a minimum are taken, exactly or smoothly.
 
-A semantics says how a maximum and a minimum of robustness values are taken; everything else about formulas
-is the same for all of them (`stlc.compile.backends.array.graph`). Verdicts do not depend on it: whether a
-formula holds is decided by the truth of its predicates, and the exact robustness has that sign.
+Everything else about formulas is the same for all semantics (`stlc.compile.backends.array.graph`). Verdicts
+do not depend on them: whether a formula holds is decided by the truth of its predicates, and the exact
+robustness has that sign.
 
 | name     | class                     | is a positive value satisfied, a negative one violated?       |
 |----------|---------------------------|---------------------------------------------------------------|
@@ -10,16 +10,20 @@ formula holds is decided by the truth of its predicates, and the exact robustnes
 | `smooth` | `LogSumExp`               | not near 0: every operator may be off by log(n) / k           |
 | `agm`    | `ArithmeticGeometricMean` | yes                                                           |
 | `dgmsr`  | `GeneralizedMean`         | yes                                                           |
+
+A semantics is one file of `stlc.compile.semantics.kinds`, called by its name.
 """
 
 from __future__ import annotations
 
 from stlc.compile.backends.array.namespace import Pick
-from stlc.compile.semantics.extrema import Exact, LogSumExp
-from stlc.compile.semantics.means import ArithmeticGeometricMean, GeneralizedMean
+from stlc.compile.semantics.kinds.agm import ArithmeticGeometricMean
+from stlc.compile.semantics.kinds.dgmsr import GeneralizedMean
+from stlc.compile.semantics.kinds.exact import Exact
+from stlc.compile.semantics.kinds.smooth import LogSumExp
 from stlc.compile.semantics.protocol import Parts, Semantics
 from stlc.diagnostics import Diagnostic, UsageError
-from stlc.registry import Registry
+from stlc.registry import SEMANTICS
 
 __all__ = [
     "SEMANTICS",
@@ -37,12 +41,6 @@ __all__ = [
 TOLERANCE = 1e-6
 """A robustness of at least minus this, in float64, is satisfied (time and start states lie on grids)."""
 
-SEMANTICS: Registry[type[Semantics]] = Registry("semantics")
-SEMANTICS.register("exact")(Exact)
-SEMANTICS.register("smooth")(LogSumExp)
-SEMANTICS.register("agm")(ArithmeticGeometricMean)
-SEMANTICS.register("dgmsr")(GeneralizedMean)
-
 
 def semantics_of(asked: str | Semantics = "exact", smoothing: float | None = None) -> Semantics:
     """The semantics that somebody asks for.
@@ -54,7 +52,7 @@ def semantics_of(asked: str | Semantics = "exact", smoothing: float | None = Non
     Raises:
         UsageError: U101, there is no semantics of this name, or it has no such scale.
     """
-    chosen = SEMANTICS.get(asked)() if isinstance(asked, str) else asked
+    chosen: Semantics = SEMANTICS.get(asked)() if isinstance(asked, str) else asked
     if smoothing is None:
         return chosen
     if not isinstance(chosen, Exact | LogSumExp):

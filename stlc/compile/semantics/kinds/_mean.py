@@ -10,9 +10,8 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import reduce
-from typing import ClassVar, final
+from typing import ClassVar
 
 from stlc.compile.backends.array.namespace import Array, Ops, Pick
 from stlc.compile.semantics.protocol import Parts
@@ -89,72 +88,3 @@ class Mean(ABC):
             return x
         least, *sums = self.lift(x, pick, ops)
         return self.finish((ops.amin(least), *map(ops.sum, sums)), pick, ops)
-
-
-@final
-@dataclass(frozen=True, slots=True)
-class ArithmeticGeometricMean(Mean):
-    """AGM robustness (Mehdipour, Vasile and Belta, ACC 2019).
-
-    `min(x)` is the geometric mean of `1 + x`, less 1, where all operands are positive; else the arithmetic
-    mean of the negative ones, the others counting as 0. It rewards satisfying more operands, and by more.
-    Predicates should be of the same size: the paper normalises them to [-1, 1].
-
-    Sound: the sign is that of the exact robustness. The value does not say how far predicates may change.
-    Its slope jumps where an operand changes its sign.
-    """
-
-    def gain(self, x: Array, ops: Ops) -> Array:
-        """log(1 + x)."""
-        return ops.log1p(x)
-
-    def loss(self, x: Array, ops: Ops) -> Array:  # noqa: ARG002
-        """Its size."""
-        return x
-
-    def satisfied(self, gains: Array, count: Array, ops: Ops) -> Array:
-        """The geometric mean."""
-        return ops.expm1(gains / count)
-
-    def violated(self, losses: Array, count: Array, ops: Ops) -> Array:  # noqa: ARG002
-        """The arithmetic mean."""
-        return -(losses / count)
-
-
-@final
-@dataclass(frozen=True, slots=True)
-class GeneralizedMean(Mean):
-    """D-GMSR, the generalized mean-based smooth robustness measure (Uzun, Elango, Garoche, Acikmese 2024).
-
-    `min(x) = sqrt(M0(x+^2)) - sqrt(Mp(x-^2))`, where x+ and x- are the positive and the negative parts of the
-    n operands, `M0(z) = (eps^n + prod z)^(1/n)` and `Mp(z) = (eps^p + mean(z^p))^(1/p)`. Continuously
-    differentiable.
-
-    Sound: the sign is that of the exact robustness (in floating point a value may round to 0). The value does
-    not say how far predicates may change.
-
-    Attributes:
-        eps: smoothing near 0; distances below its square root count little.
-        p: order of the mean over violated operands; the larger, the more the worst one counts.
-    """
-
-    eps: float = 1e-8
-    p: int = 1
-
-    def gain(self, x: Array, ops: Ops) -> Array:
-        """log(x^2 / eps)."""
-        return ops.log(x) * 2.0 - math.log(self.eps)
-
-    def loss(self, x: Array, ops: Ops) -> Array:
-        """(x^2 / eps)^p."""
-        square = ops.square(x) * (1.0 / self.eps)
-        return square if self.p == 1 else ops.pow(square, float(self.p))
-
-    def satisfied(self, gains: Array, count: Array, ops: Ops) -> Array:
-        """sqrt((eps^n + prod x^2)^(1/n)) - sqrt(eps), where gains are large and where they are small."""
-        soft = ops.maximum(gains, gains * 0.0) + ops.log1p(ops.exp(-ops.abs(gains)))
-        return ops.expm1(soft / (count * 2.0)) * math.sqrt(self.eps)
-
-    def violated(self, losses: Array, count: Array, ops: Ops) -> Array:
-        """sqrt(eps) - sqrt((eps^p + mean x^2p)^(1/p))."""
-        return ops.expm1(ops.log1p(losses / count) / (2.0 * self.p)) * -math.sqrt(self.eps)

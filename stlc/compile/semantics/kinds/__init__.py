@@ -1,0 +1,1 @@
+"""The semantics that `--robustness` and `semantics=` name: a file each, its class under `SEMANTICS`."""

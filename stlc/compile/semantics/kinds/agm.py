@@ -1,0 +1,42 @@
+"""`agm`: arithmetic and geometric means of the operands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.semantics.kinds._mean import Mean
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class ArithmeticGeometricMean(Mean):
+    """AGM robustness (Mehdipour, Vasile and Belta, ACC 2019).
+
+    `min(x)` is the geometric mean of `1 + x`, less 1, where all operands are positive; else the arithmetic
+    mean of the negative ones, the others counting as 0. It rewards satisfying more operands, and by more.
+    Predicates should be of the same size: the paper normalises them to [-1, 1].
+
+    Sound: the sign is that of the exact robustness. The value does not say how far predicates may change.
+    Its slope jumps where an operand changes its sign.
+    """
+
+    def gain(self, x: Array, ops: Ops) -> Array:
+        """log(1 + x)."""
+        return ops.log1p(x)
+
+    def loss(self, x: Array, ops: Ops) -> Array:  # noqa: ARG002
+        """Its size."""
+        return x
+
+    def satisfied(self, gains: Array, count: Array, ops: Ops) -> Array:
+        """The geometric mean."""
+        return ops.expm1(gains / count)
+
+    def violated(self, losses: Array, count: Array, ops: Ops) -> Array:  # noqa: ARG002
+        """The arithmetic mean."""
+        return -(losses / count)
+
+
+SEMANTICS = ArithmeticGeometricMean

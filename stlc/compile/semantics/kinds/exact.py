@@ -1,0 +1,41 @@
+"""`exact`: minima and maxima as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, final
+
+from stlc.compile.backends.array.namespace import Array, Ops, Pick
+from stlc.compile.semantics.protocol import Associative
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class Exact(Associative):
+    """Minimum and maximum as they are (Fainekos and Pappas 2009; Donzé and Maler 2010).
+
+    Sound: a positive value means satisfied, a negative one violated, and it stays so while no predicate
+    changes by as much as the value. The gradient is a subgradient: operands that attain the extremum get it.
+    """
+
+    exact: ClassVar[bool] = True
+    idempotent: ClassVar[bool] = True
+    associative: ClassVar[bool] = True
+    sound: ClassVar[bool] = True
+    bounded: ClassVar[bool] = True
+
+    def pair(self, a: Array, b: Array, pick: Pick, ops: Ops) -> Array:
+        """The extremum of two values."""
+        return ops.join([a, b], pick)
+
+    def join(self, items: Sequence[Array], pick: Pick, ops: Ops) -> Array:
+        """The extremum of one or more values."""
+        return ops.join(items, pick)
+
+    def reduce(self, x: Array, pick: Pick, ops: Ops) -> Array:
+        """The extremum over time."""
+        return ops.amin(x) if pick == "min" else ops.amax(x)
+
+
+SEMANTICS = Exact
