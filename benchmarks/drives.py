@@ -17,8 +17,9 @@ from benchmarks.training import Place, benchmark_order
 from stlc.cli.framework.output import say
 from stlc.cli.framework.ranges import parse_limit, parse_seeds
 from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
-from stlc.controller.evaluation.deployment import decided, feasible_states, measure
+from stlc.controller.evaluation.deployment import decided, feasible_states
 from stlc.controller.evaluation.executed import judge_executed
+from stlc.controller.evaluation.metrics import METRICS, is_progress, measure
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.feasibility import viable
 from stlc.controller.guard.guard import GUARD_VERSION, Guard, Mode
@@ -42,12 +43,6 @@ SCENARIOS = (NOMINAL, *DISTURBED)
 GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
 USUAL = (*GUARDS, "full+auto")
 """Guards, and behind a `+` the margin that they ask of safety requirements; see `guard.margin_request`."""
-KEPT = (
-    *("saved", "saved_starts", "savable", "executed_safe", "executed_starts", "executed_safe_starts"),
-    *("foreseen_safe_starts", "quiet", "quiet_safe_starts", "plan_accuracy", "plan_safety"),
-    *("policy_accuracy", "feasible", "feasible_followed"),
-)
-"""The metrics that are kept; see `stlc.controller.evaluation.metrics`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,8 +170,8 @@ class Deployments:
             "run": run.dir.name,
             "policy": _policy_of(run.dir),
             **({"margin": dict(margin)} if margin else {}),
-            "metrics": {name: metrics[name].summary() for name in KEPT if name in metrics},
-            "progress": {name: metrics[name].summary() for name in recording.progress[0] if name in metrics},
+            "metrics": {name: metrics[name].summary() for name in METRICS if name in metrics},
+            "progress": {name: metrics[name].summary() for name in filter(is_progress, metrics)},
             "acted": 1.0 - decided(recording)["policy"],
             "seconds": seconds,
         }

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from stlc.controller.evaluation.metrics import HOLDS, METRICS, is_progress
 from stlc.view.html import Child, Html, classed, el, join, table
 from stlc.view.material import Material
 from stlc.view.page import Section
@@ -13,56 +14,6 @@ from stlc.view.words import cause_words, count, drives_of, seconds, share, sprea
 Record = Mapping[str, Any]
 
 GUARDS = {"none": "no guard", "paper": "with the backup", "full": "with the full guard"}
-SHARES = {
-    "plan_accuracy": (
-        "plan accuracy",
-        "of the plans that were followed, the share that satisfies the specification",
-    ),
-    "feasible": (
-        "visited states that have a plan",
-        "the followed plan satisfies the specification, or a search finds one that does",
-    ),
-    "feasible_followed": ("share of these", "of such states, those whose followed plan satisfies it"),
-    "policy_accuracy": ("policy's plan accuracy", "the same of what the policy proposed"),
-    "plan_safety": (
-        "plan safety",
-        "of the plans that were followed, the share that satisfies what is tagged @safety",
-    ),
-    "executed": ("executed, agents", "agents whose drive satisfied everything from every start"),
-    "executed_safe": (
-        "executed safely, agents",
-        "agents whose drive satisfied what is tagged @safety from every start",
-    ),
-    "savable": (
-        "savable, agents",
-        "agents that were driven safely, or from whose start a search finds a plan that is safe",
-    ),
-    "saved": ("of these driven safely", "the share of them whose drive satisfied what is tagged @safety"),
-    "executed_starts": ("executed, starts", "starts from which what was driven satisfies the specification"),
-    "executed_safe_starts": ("executed safely, starts", "the same for what is tagged @safety"),
-    "foreseen": (
-        "as foreseen",
-        "starts from which the world did what the model said, through the whole window",
-    ),
-    "foreseen_starts": (
-        "executed, as foreseen",
-        "of those starts, the share that satisfies the specification",
-    ),
-    "foreseen_safe_starts": ("executed safely, as foreseen", "the same for what is tagged @safety"),
-    "saved_starts": (
-        "driven safely, savable starts",
-        "of the starts of savable agents, those from which the drive satisfies what is tagged @safety",
-    ),
-    "quiet": (
-        "quiet",
-        "starts from which the world did nothing but what the truth of the dynamics does",
-    ),
-    "quiet_safe_starts": (
-        "driven safely, quiet",
-        "of those of savable agents, the share that satisfies what is tagged @safety",
-    ),
-}
-HOLDS = "holds."
 MOST_BROKEN = 12
 """Drives that broke rules and are listed."""
 SOURCES = ("policy", "polished", "backup", "safest", "")
@@ -194,9 +145,9 @@ def _names(guards: Mapping[str, Record]) -> list[str]:
 
 def _share_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
     return [
-        (join(label, el("small", meaning)), *_cells(guards, name, _share_cell))
-        for name, (label, meaning) in SHARES.items()
-        if name in _names(guards) and (name != "foreseen" or _ever(guards, name))
+        (join(metric.label, el("small", metric.meaning)), *_cells(guards, metric.key, _share_cell))
+        for metric in METRICS.values()
+        if metric.key in _names(guards) and (metric.key != "foreseen" or _ever(guards, metric.key))
     ]
 
 
@@ -217,9 +168,7 @@ def _cells(guards: Mapping[str, Record], name: str, cell: Callable[[Record | Non
 
 def _progress_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
     rows: list[tuple[Child, ...]] = []
-    for name in _names(guards):
-        if name in SHARES or name.startswith(HOLDS):
-            continue
+    for name in filter(is_progress, _names(guards)):
         cells = []
         for guard in guards.values():
             unit = str((guard.get("units") or {}).get(name, ""))

@@ -14,15 +14,14 @@ from traffic_drivers import careful
 from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
 from stlc.controller.evaluation.archive import save_scene, save_trace_of
 from stlc.controller.evaluation.deployment import (
-    METRICS,
     InterruptedDeploymentError,
     as_json,
     decided,
     deploy,
     feasible_states,
-    measure,
 )
 from stlc.controller.evaluation.executed import judge_executed
+from stlc.controller.evaluation.metrics import METRICS, measure
 from stlc.controller.evaluation.stats import Interval, student
 from stlc.controller.guard.feasibility import solvable
 from stlc.controller.guard.guard import Decision, Guard

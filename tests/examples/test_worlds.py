@@ -14,7 +14,8 @@ from torch import Tensor
 from stlc.cli.framework.app import main
 from stlc.controller.deployment.simulator import Setting
 from stlc.controller.evaluation.archive import save_trace_of
-from stlc.controller.evaluation.deployment import METRICS, deploy
+from stlc.controller.evaluation.deployment import deploy
+from stlc.controller.evaluation.metrics import METRICS
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder

@@ -26,28 +26,6 @@ TITLES = {"none": "no guard", "paper": "paper's guard", "full": "full guard"}
 COMPARED = ("obeyed every rule", "plan accuracy")
 """Columns by which scenarios are compared; drives that are lost are not counted."""
 
-ROWS = {
-    "plan accuracy": "plan_accuracy",
-    "  visited states that have one": "feasible",
-    "  share of these": "feasible_followed",
-    "plan safety": "plan_safety",
-    "policy's own plans": "policy_accuracy",
-    "executed, agents": "executed",
-    "  safely": "executed_safe",
-    "  safely, of the savable": "saved",
-    "executed, starts": "executed_starts",
-    "  safely ": "executed_safe_starts",
-    "  where foreseen": "foreseen_starts",
-    "  safely, where foreseen": "foreseen_safe_starts",
-}
-
-
-SAFETY = (
-    *("plan_safety", "executed_safe", "saved", "executed_safe_starts", "foreseen_safe_starts"),
-    "savable",
-)
-"""Of these, what says nothing where no requirement is tagged `@safety`."""
-
 
 def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
     """The measured figures, as a person reads them: the drives first; with `windows` plans and starts, too.
@@ -134,7 +112,7 @@ def _foreseen(foreseen: Record | None) -> Iterator[str]:
     if foreseen and foreseen["mean"] > 0:
         share = _part(foreseen["mean"])
         beyond = "; others hold what no plan could know" if foreseen["mean"] < 1 else ""
-        yield f"  foreseen: the {share} of starts from which the world did as the model says{beyond}"
+        yield f"  model-consistent: the {share} of starts from which the world did as the model says{beyond}"
 
 
 def _wrong(errors: Mapping[str, Any]) -> Iterator[str]:
@@ -192,24 +170,25 @@ def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: s
 
 def _shares(guards: Record, *, safe: bool) -> Iterator[tuple[str, ...]]:
     """Shares of plans and starts; those of safety where any requirement is tagged `@safety`."""
-    for label, name in ROWS.items():
-        if not safe and name in SAFETY:
-            continue
-        found = [guard["metrics"].get(name) for guard in guards.values()]
-        if any(found):
-            yield (label, *("" if metric is None else _number(metric, "", 3) for metric in found))
+    from stlc.controller.evaluation.metrics import METRICS
+
+    for metric in METRICS.values():
+        found = [guard["metrics"].get(metric.key) for guard in guards.values()]
+        if any(found) and (safe or not metric.safety):
+            yield (metric.label, *("" if each is None else _number(each, "", 3) for each in found))
 
 
 def _progress(guards: Record) -> Iterator[tuple[str, ...]]:
-    """What the world tells of itself: every metric that is not one of ours."""
-    from stlc.controller.evaluation.deployment import METRICS
+    """Metrics that the world tells of itself."""
+    from stlc.controller.evaluation.metrics import is_progress
 
     first = next(iter(guards.values()))
-    for name in first["metrics"]:
-        if name not in METRICS and not name.startswith("holds."):
-            unit = first["units"].get(name, "")
-            cells = (_number(guard["metrics"][name], unit, 2) for guard in guards.values())
-            yield (name.replace("_", " "), *cells)
+    for name in filter(is_progress, first["metrics"]):
+        unit = first["units"].get(name, "")
+        yield (
+            name.replace("_", " "),
+            *(_number(guard["metrics"][name], unit, 2) for guard in guards.values()),
+        )
 
 
 def _times(guards: Record) -> Iterator[tuple[str, ...]]:
@@ -227,11 +206,15 @@ def _number(metric: Record, unit: str, digits: int) -> str:
 
 
 def _unsafe(unsafe: Sequence[Record], agents: int) -> str:
-    """`not driven safely: 9 of 60 agents, of which 1 can be saved (seed 2: 7)`."""
+    """`not driven safely: 9 of 60 agents, of which 1 is viable (seed 2: 7)`."""
     if not unsafe:
         return f"all {agents} agents were driven safely"
     lost = [each for each in unsafe if each["savable"]]
-    ending = f"{len(lost)} can be saved ({_listed(lost)})" if lost else "none can be saved"
+    ending = (
+        f"{len(lost)} {'is' if len(lost) == 1 else 'are'} viable ({_listed(lost)})"
+        if lost
+        else "none is viable"
+    )
     return f"not driven safely: {len(unsafe)} of {agents} agents, of which {ending}"
 
 

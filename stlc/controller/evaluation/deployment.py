@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.simulator import Recorder, Recording, Setting, Watch, drive
 from stlc.controller.evaluation.executed import Executed, judge_executed
+from stlc.controller.evaluation.metrics import measure
 from stlc.controller.evaluation.rules import Drives, Rules, drives_json, drives_of_plans, judge_drives
 from stlc.controller.evaluation.stats import Interval
 from stlc.controller.guard.candidates import SOURCES, Limits
@@ -29,27 +30,6 @@ if TYPE_CHECKING:
 LATENCY_SAMPLES = 200
 LATENCY_SECONDS = 5.0
 """After so long the samples that there are have to do."""
-
-METRICS = {
-    "plan_accuracy": "share of followed plans that satisfy the specification",
-    "policy_accuracy": "share of plans that the policy proposed and that satisfy it",
-    "plan_safety": "share of followed plans that satisfy the safety requirements",
-    "feasible": "share of visited states where the followed plan, or one that a search finds, does",
-    "feasible_followed": "share of those whose followed plan does",
-    "executed": "share of agents that satisfied it at every start",
-    "executed_safe": "share of agents that satisfied the safety requirements at every start",
-    "savable": "share of agents that were driven safely, or from whose start a search finds a safe plan",
-    "saved": "share of those that were driven safely",
-    "saved_starts": "share of the starts of those from which what was driven satisfies them",
-    "executed_starts": "share of starts from which what was driven satisfies it",
-    "executed_safe_starts": "share of starts from which it satisfies the safety requirements",
-    "foreseen": "share of starts from which the world did as the model says, through the window",
-    "foreseen_starts": "share of those from which what was driven satisfies the specification",
-    "foreseen_safe_starts": "share of those from which it satisfies the safety requirements",
-    "quiet": "share of starts from which the world did nothing but what the truth of the dynamics does",
-    "quiet_safe_starts": "share of those from which what was driven satisfies the safety requirements",
-}
-"""What the shares mean; one of nothing is left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +57,8 @@ class Deployment:
     Attributes:
         guard: which.
         recording: what happened.
-        metrics: name -> mean over seeds with its interval; see `METRICS`. Further there are `holds.NAME`, the
-            share of starts that satisfy one requirement, and the progress of the world.
+        metrics: name -> mean over seeds with its interval; see `metrics.METRICS`. Further there are
+            `holds.NAME`, the share of starts that satisfy one requirement, and the progress of the world.
         decisions: share of decisions by source, and those of the backup by T0 ("backup T0=1").
         latency: of one decision.
         unsafe: the agents that were not driven safely.
@@ -170,61 +150,6 @@ def feasible_states(task: Task, recording: Recording, count: int) -> NDArray[np.
     open_ = np.isfinite(known) & ~(recording.rho >= -TOLERANCE)
     known[open_] = solvable(task, torch.from_numpy(recording.states[:, :-1][open_])).numpy()
     return known
-
-
-def measure(
-    recording: Recording, executed: Executed, feasible: NDArray[np.float64] | None = None
-) -> dict[str, Interval]:
-    """All metrics over the seeds that have them: a share of nothing is none, and so is what is not finite.
-
-    Args:
-        recording: what happened.
-        executed: the verdicts on it.
-        feasible: what `feasible_states` knows.
-    """
-    each = [_of_seed(recording, executed, seed) for seed in range(len(recording.progress))]
-    if feasible is not None:
-        for seed, shares in enumerate(each):
-            rows = slice(seed * recording.agents, (seed + 1) * recording.agents)
-            shares |= _ceiling(feasible[rows], recording.rho[rows] >= -TOLERANCE)
-    found = {
-        name: [seed[name] for seed in each if math.isfinite(seed.get(name, math.nan))] for name in each[0]
-    }
-    return {name: Interval.of(values) for name, values in found.items() if values}
-
-
-def _of_seed(recording: Recording, executed: Executed, seed: int) -> dict[str, float]:
-    rows = slice(seed * recording.agents, (seed + 1) * recording.agents)
-    names, safety = tuple(executed.rules), executed.safety
-    starts, foreseen = executed.starts(names)[:, rows], executed.foreseen[:, rows]
-    safe_starts = executed.starts(safety)[:, rows]
-    shares = {
-        "plan_accuracy": recording.rho[rows] >= -TOLERANCE,
-        "policy_accuracy": recording.policy_rho[rows] >= -TOLERANCE,
-        "plan_safety": recording.safe[rows],
-        "executed": executed.agents(names)[rows],
-        "executed_safe": executed.agents(safety)[rows],
-        "savable": executed.savable[rows],
-        "saved": executed.agents(safety)[rows][executed.savable[rows]],
-        "saved_starts": safe_starts[:, executed.savable[rows]],
-        "executed_starts": starts,
-        "executed_safe_starts": safe_starts,
-        "foreseen": foreseen,
-        "foreseen_starts": starts[foreseen],
-        "foreseen_safe_starts": safe_starts[foreseen],
-    }
-    if executed.quiet is not None:
-        quiet = executed.quiet[:, rows]
-        shares |= {"quiet": quiet, "quiet_safe_starts": safe_starts[quiet & executed.savable[rows]]}
-    shares |= {f"holds.{name}": held[:, rows] for name, held in executed.rules.items()}
-    found = {name: float(mask.mean()) if mask.size else math.nan for name, mask in shares.items()}
-    return found | {name: float(value) for name, value in recording.progress[seed].items()}
-
-
-def _ceiling(feasible: NDArray[np.float64], good: NDArray[np.bool_]) -> dict[str, float]:
-    looked, can = np.isfinite(feasible), feasible == 1.0
-    shares = {"feasible": feasible[looked], "feasible_followed": good[can]}
-    return {name: float(found.mean()) if found.size else math.nan for name, found in shares.items()}
 
 
 def decided(recording: Recording) -> dict[str, float]:

@@ -1,0 +1,269 @@
+"""Metrics of a deployment: shares of plans, agents and starts, each with its words; a table of all of them.
+
+What is measured, and what a terminal, a report, JSON documents and the tables of the benchmarks show, derives
+from `METRICS`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.evaluation.stats import Interval
+
+if TYPE_CHECKING:
+    from stlc.controller.deployment.simulator import Recording
+    from stlc.controller.evaluation.executed import Executed
+
+Mask: TypeAlias = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Seed:
+    """One seed of a deployment, as masks: plans are (agents, steps), drives (starts, agents).
+
+    Attributes:
+        followed: whether the plan that was followed satisfies the specification.
+        proposed: whether the plan that the policy proposed does.
+        plan_safe: whether the plan that was followed satisfies the safety requirements.
+        satisfied: whether what was driven satisfies the specification, from each start.
+        safe: whether it satisfies the safety requirements.
+        satisfied_agents: (agents,), whether it satisfies every requirement wherever that is judged.
+        safe_agents: (agents,), the same for the safety requirements.
+        viable: (agents,), driven safely, or a search finds a safe plan from the first instant.
+        consistent: whether the world did as the model says, through the window of each start.
+        quiet: whether there was no exogenous event in it; None where nobody has looked.
+        searched: visited states that were searched for a plan; None where none was.
+        feasible: visited states with a known satisfying plan.
+    """
+
+    followed: Mask
+    proposed: Mask
+    plan_safe: Mask
+    satisfied: Mask
+    safe: Mask
+    satisfied_agents: Mask
+    safe_agents: Mask
+    viable: Mask
+    consistent: Mask
+    quiet: Mask | None = None
+    searched: Mask | None = None
+    feasible: Mask | None = None
+
+    @property
+    def of_viable(self) -> Mask:
+        """The starts of viable agents."""
+        return np.broadcast_to(self.viable, self.safe.shape)
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """A share: of how many of what counts something holds.
+
+    Attributes:
+        key: in JSON documents.
+        label: in tables.
+        meaning: a sentence without its end.
+        mask: of a seed, what holds; None where it was not looked at.
+        among: of a seed, what counts; None for everything. A share of nothing is left out.
+        unit: of the value; shares have none.
+        safety: whether it says nothing where no requirement is tagged `@safety`.
+    """
+
+    key: str
+    label: str
+    meaning: str
+    mask: Callable[[Seed], Mask | None]
+    among: Callable[[Seed], Mask | None] | None = None
+    unit: str = ""
+    safety: bool = False
+
+    def of(self, seed: Seed) -> float:
+        """The value of a seed; NaN where nothing counts."""
+        mask = self.mask(seed)
+        among = None if self.among is None else self.among(seed)
+        if mask is None or (self.among is not None and among is None):
+            return math.nan
+        counted = mask if among is None else mask[among]
+        return float(counted.mean()) if counted.size else math.nan
+
+
+def _quiet_and_viable(seed: Seed) -> Mask | None:
+    return None if seed.quiet is None else seed.quiet & seed.of_viable
+
+
+_ALL = (
+    Metric(
+        "plan_accuracy",
+        "plan accuracy",
+        "share of followed plans that satisfy the specification",
+        lambda seed: seed.followed,
+    ),
+    Metric(
+        "feasible",
+        "feasible states",
+        "share of visited states with a known satisfying plan: the followed one, or one that a search finds",
+        lambda seed: seed.feasible,
+        lambda seed: seed.searched,
+    ),
+    Metric(
+        "feasible_followed",
+        "plan accuracy, feasible states",
+        "share of the feasible states whose followed plan satisfies the specification",
+        lambda seed: seed.followed,
+        lambda seed: seed.feasible,
+    ),
+    Metric(
+        "policy_accuracy",
+        "policy's plan accuracy",
+        "share of the plans that the policy proposed which satisfy the specification",
+        lambda seed: seed.proposed,
+    ),
+    Metric(
+        "plan_safety",
+        "plan safety",
+        "share of followed plans that satisfy the requirements tagged @safety",
+        lambda seed: seed.plan_safe,
+        safety=True,
+    ),
+    Metric(
+        "executed",
+        "satisfied, agents",
+        "share of agents whose drive satisfied the specification from every start",
+        lambda seed: seed.satisfied_agents,
+    ),
+    Metric(
+        "executed_safe",
+        "safe, agents",
+        "share of agents whose drive satisfied the requirements tagged @safety from every start",
+        lambda seed: seed.safe_agents,
+        safety=True,
+    ),
+    Metric(
+        "savable",
+        "viable, agents",
+        "share of agents that were driven safely, or from whose start a search finds a safe plan",
+        lambda seed: seed.viable,
+        safety=True,
+    ),
+    Metric(
+        "saved",
+        "safe among viable, agents",
+        "share of the viable agents that were driven safely",
+        lambda seed: seed.safe_agents,
+        lambda seed: seed.viable,
+        safety=True,
+    ),
+    Metric(
+        "saved_starts",
+        "safe among viable, starts",
+        "share of the starts of viable agents from which the drive satisfies the requirements tagged @safety",
+        lambda seed: seed.safe,
+        lambda seed: seed.of_viable,
+        safety=True,
+    ),
+    Metric(
+        "executed_starts",
+        "satisfied, starts",
+        "share of starts from which the drive satisfies the specification",
+        lambda seed: seed.satisfied,
+    ),
+    Metric(
+        "executed_safe_starts",
+        "safe, starts",
+        "share of starts from which the drive satisfies the requirements tagged @safety",
+        lambda seed: seed.safe,
+        safety=True,
+    ),
+    Metric(
+        "foreseen",
+        "model-consistent, starts",
+        "share of starts from which the world did as the model says, through the window",
+        lambda seed: seed.consistent,
+    ),
+    Metric(
+        "foreseen_starts",
+        "satisfied, model-consistent starts",
+        "share of the model-consistent starts from which the drive satisfies the specification",
+        lambda seed: seed.satisfied,
+        lambda seed: seed.consistent,
+    ),
+    Metric(
+        "foreseen_safe_starts",
+        "safe, model-consistent starts",
+        "share of the model-consistent starts from which the drive satisfies the requirements tagged @safety",
+        lambda seed: seed.safe,
+        lambda seed: seed.consistent,
+        safety=True,
+    ),
+    Metric(
+        "quiet",
+        "no exogenous event, starts",
+        "share of starts through whose window there was no exogenous event",
+        lambda seed: seed.quiet,
+    ),
+    Metric(
+        "quiet_safe_starts",
+        "safe, starts without exogenous event",
+        "share of those of viable agents from which the drive satisfies the requirements tagged @safety",
+        lambda seed: seed.safe,
+        _quiet_and_viable,
+        safety=True,
+    ),
+)
+METRICS = {metric.key: metric for metric in _ALL}
+"""All metrics by key, in the order in which they are shown."""
+HOLDS = "holds."
+"""`holds.NAME`: the share of starts from which the drive satisfies one requirement."""
+
+
+def is_progress(key: str) -> bool:
+    """Whether a metric is one that the world tells of itself."""
+    return key not in METRICS and not key.startswith(HOLDS)
+
+
+def measure(
+    recording: Recording, executed: Executed, feasible: NDArray[np.float64] | None = None
+) -> dict[str, Interval]:
+    """All metrics over the seeds that have them, the requirements one by one, and the progress of the world.
+
+    Args:
+        recording: what happened.
+        executed: the verdicts on it.
+        feasible: (rows, steps), 1 with a known satisfying plan, 0 without, NaN where nobody has looked.
+    """
+    rows = [slice(at, at + recording.agents) for at in range(0, len(recording.states), recording.agents)]
+    each = [dict(_of_seed(recording, executed, feasible, own)) for own in rows]
+    for found, progress in zip(each, recording.progress, strict=True):
+        found |= {name: float(value) for name, value in progress.items()}
+    values = {key: [one[key] for one in each if math.isfinite(one.get(key, math.nan))] for key in each[0]}
+    return {key: Interval.of(some) for key, some in values.items() if some}
+
+
+def _of_seed(
+    recording: Recording, executed: Executed, feasible: NDArray[np.float64] | None, own: slice
+) -> Iterator[tuple[str, float]]:
+    names, safety = tuple(executed.rules), executed.safety
+    seed = Seed(
+        followed=recording.rho[own] >= -TOLERANCE,
+        proposed=recording.policy_rho[own] >= -TOLERANCE,
+        plan_safe=recording.safe[own],
+        satisfied=executed.starts(names)[:, own],
+        safe=executed.starts(safety)[:, own],
+        satisfied_agents=executed.agents(names)[own],
+        safe_agents=executed.agents(safety)[own],
+        viable=executed.savable[own],
+        consistent=executed.foreseen[:, own],
+        quiet=None if executed.quiet is None else executed.quiet[:, own],
+        searched=None if feasible is None else np.isfinite(feasible[own]),
+        feasible=None if feasible is None else feasible[own] == 1.0,
+    )
+    yield from ((key, metric.of(seed)) for key, metric in METRICS.items())
+    for name, held in executed.rules.items():
+        yield f"{HOLDS}{name}", float(held[:, own].mean()) if held[:, own].size else math.nan
