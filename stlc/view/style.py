@@ -155,6 +155,7 @@ class Picture:
         for text in self.figure.findobj(Text):
             text.set_text(lawful(text.get_text()))  # its comments may hold what XML may not
         with look():
+            self._lay_out()
             self.figure.savefig(
                 buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None}
             )
@@ -167,8 +168,15 @@ class Picture:
     def save_png(self, path: Path, *, dpi: int = 150) -> Path:
         """Write the figure on white paper to `path`."""
         with look(), atomic_path(path) as beside:
+            self._lay_out()
             self.figure.savefig(beside, format="png", dpi=dpi, facecolor=PAPER)
         return path
+
+    def _lay_out(self) -> None:
+        """Place the panels once: matplotlib would do so twice each time that it saves."""
+        if self.figure.get_layout_engine() is not None:
+            self.figure.draw_without_rendering()
+            self.figure.set_layout_engine("none")
 
 
 def _themed(svg: str) -> str:

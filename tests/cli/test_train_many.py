@@ -33,7 +33,21 @@ def returned(errand: Job, seed: int, code: int) -> JobResult:
     return JobResult(errand, 0, {"result": result}, "", 1)
 
 
-def test_every_seed_is_a_run_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("real", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_every_seed_is_a_run_of_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *, real: bool
+) -> None:
+    """In this process, as far as the processes of `test_sweep.py` are not asked for."""
+
+    def here(errands, *, jobs, begun):
+        assert jobs == 2
+        for errand in errands:
+            begun(errand)
+            code = main(["train", *errand.arguments, "--threads", "1", "--json"])
+            yield JobResult(errand, code, json.loads(capsys.readouterr().out), "", 1)
+
+    if not real:
+        monkeypatch.setattr("stlc.controller.parallel.jobs.side_by_side", here)
     words = ["train", SPEC, "--seeds", "3..4", "--jobs", "2", "--steps", "2", "--set", "T_red=3s", *QUICK]
     code = main([*words, "--name", "pair", "--runs", str(tmp_path), "--json"])
     document = json.loads(capsys.readouterr().out)
