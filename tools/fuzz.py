@@ -14,7 +14,6 @@ import argparse
 import collections
 import concurrent.futures
 import contextlib
-import functools
 import io
 import json
 import multiprocessing
@@ -34,7 +33,6 @@ import fuzz_foreign
 import fuzz_inputs
 import fuzz_runs
 import fuzz_valid
-import typer
 from fuzz_laws import laws, stage
 from fuzz_specs import SMALL, SYSTEM
 from fuzz_traces import small_trace
@@ -173,11 +171,6 @@ def worker(plan, indices, limits, results):
     os.chdir(folder)
     tempfile.tempdir = str(folder)  # crash reports
     limit_address_space(4 * limits.memory)
-    from stlc.cli.framework.program import Program
-
-    # to describe the commands takes a third of the time of most inputs
-    Program.made = functools.cache(Program.made)
-    typer.main.get_command = functools.cache(typer.main.get_command)
     base = peak()
     try:
         for index in indices:

@@ -160,8 +160,8 @@ class Program:
         return app
 
     def parser(self, name: str) -> Any:
-        """The parser of one command, made once in a process."""
-        key = (self.package, name)
+        """The parser of one command, or of the program, made once in a process."""
+        key = (self.package, name if name in self.names() else "")
         if key not in _PARSERS:
             _PARSERS[key] = typer.main.get_command(self.made(name))
             spare_adapters(_PARSERS[key])
