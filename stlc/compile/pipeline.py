@@ -20,8 +20,8 @@ from fractions import Fraction
 from typing import Literal, TypeAlias, final
 
 from stlc.compile.analysis.margins import as_written
-from stlc.compile.analysis.modulo import jumps
 from stlc.compile.analysis.ranges import Facts
+from stlc.compile.analysis.warnings import jumps
 from stlc.compile.augment.augment import Augmented, augment
 from stlc.compile.augment.guidance import pull
 from stlc.compile.augment.lift import recorded
@@ -29,7 +29,7 @@ from stlc.compile.augment.mission import Goal, endless, mission_steps
 from stlc.compile.augment.timers import Ledger, Timer
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.resolve import resolve
-from stlc.compile.frontend.scales import nominal
+from stlc.compile.frontend.tags import nominal
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, in_samples, in_words

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 
-from stlc.compile.frontend.expressions import evaluate
-from stlc.compile.frontend.formulas import resolve_formula
-from stlc.compile.frontend.imported import declared
+from stlc.compile.frontend.declare import ranged
+from stlc.compile.frontend.evaluate import evaluate
+from stlc.compile.frontend.expressions import resolve_formula
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.modules import Module
+from stlc.compile.frontend.resolve import declared
 from stlc.compile.frontend.scope import Definition, Failed, Known, Scope
-from stlc.compile.frontend.signals import ranged
 from stlc.compile.frontend.values import Value
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, to_window

@@ -1,17 +1,169 @@
-"""The rules that look at what is written; sorts, units and time are the compiler's."""
+"""The rules that look at a text as it is written; sorts, units and times are checked by the compiler."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from types import MappingProxyType
 from typing import TypeAlias
 
-from stlc.diagnostics import Diagnostic
+from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar import ast
-from stlc.lint.parentheses import missing_parentheses, unclear_implications
-from stlc.lint.spelling import foreign_spellings
-from stlc.lint.unused import nothing_required, unused_names
+from stlc.grammar.ambiguity import Ambiguity, Kind, ambiguities
+from stlc.grammar.children import descendants
+from stlc.grammar.scan import Lexeme, lexemes
+from stlc.grammar.words import BINARY_TEMPORAL, UNARY_TEMPORAL
+
+_WHY: dict[Kind, str] = {
+    "scope": "here a temporal word ends before `{outer}`; RTAMT, MoonLight and FalCAuN take in what follows",
+    "mixed": "`and` binds tighter here; `or` does in RTAMT and MoonLight, and STLRom has one rank for both",
+    "chain": "`->` goes from the right here; RTAMT and MoonLight read it from the left",
+    "until": "`until` and its kin bind tighter than `{outer}` here; RTAMT and MoonLight bind them looser",
+    "implication": "`->` binds loosest here; MoonLight binds it tightest, STLRom has one rank for all",
+}
+
+
+def missing_parentheses(spec: ast.Spec) -> Iterator[Diagnostic]:
+    """W301: a part whose extent depends on the tool."""
+    return (_finding("W301", part) for part in ambiguities(spec))
+
+
+def unclear_implications(spec: ast.Spec) -> Iterator[Diagnostic]:
+    """W302: `and` or `or` beside `->`, which most readers and tools read as it is meant here."""
+    parts = ambiguities(spec, implications=True)
+    return (_finding("W302", part) for part in parts if part.kind == "implication")
+
+
+def _finding(code: str, part: Ambiguity) -> Diagnostic:
+    start, end = part.span.start, part.span.end
+    source = part.span.source
+    edits = ((source.span(start, start), "("), (source.span(end, end), ")"))
+    text = " ".join(part.span.text.split())
+    shown = f"({text})" if "#" not in text and "//" not in text else "(…)"
+    return Diagnostic(
+        code,
+        "other tools read this differently without parentheses",
+        part.span,
+        note=(_WHY[part.kind].format(outer=part.outer),),
+        fix=Fix(edits, f"write `{shown}`; `stlc fmt` does"),
+    )
+
+
+_SIGNS = {
+    **{"&&": "and", "&": "and", "||": "or", "|": "or", "!": "not"},
+    **{"=>": "->", "<=>": "<->"},
+}
+_WORDS = {
+    **{word: name for word, name in {**UNARY_TEMPORAL, **BINARY_TEMPORAL}.items() if word != name},
+    **{"implies": "->", "iff": "<->"},
+}
+
+
+def foreign_spellings(spec: ast.Spec) -> Iterator[Diagnostic]:
+    """W106: `G`, `ev`, `&&`, `=>` and their kin."""
+    source = spec.source
+    end = Lexeme("sign", "", len(source.text), len(source.text))
+    for item, following in pairwise([*lexemes(source.text), end]):
+        name = _own(item, following)
+        if name is None:
+            continue
+        span = source.span(item.start, item.end)
+        text = f"{name} " if name[-1].isalpha() and _glues(item, following) else name
+        if item.start and name[0].isalpha() and source.text[item.start - 1].isalnum():
+            text = f" {text}"
+        yield Diagnostic(
+            "W106",
+            f"`{item.text}` is spelled `{name}` here",
+            span,
+            fix=Fix(((span, text),), f"write `{name}`; `stlc fmt` does"),
+        )
+
+
+def _own(item: Lexeme, following: Lexeme) -> str | None:
+    """How the language spells a word or sign of another tool."""
+    if item.kind == "sign":
+        return _SIGNS.get(item.text)
+    if item.kind != "word":
+        return None
+    bare = item.text.removesuffix("_") if following.text == "[" else item.text
+    name = _WORDS.get(bare)
+    return bare if name is None and bare != item.text and bare in UNARY_TEMPORAL | BINARY_TEMPORAL else name
+
+
+def _glues(item: Lexeme, following: Lexeme) -> bool:
+    """Whether the word behind a sign would become one with the word that replaces it."""
+    return following.start == item.end and following.kind in ("word", "number")
+
+
+_KINDS: dict[type[ast.Declaration], str] = {
+    ast.Const: "constant",
+    ast.Param: "parameter",
+    ast.Enum: "enum",
+    ast.Region: "region",
+    ast.Def: "definition",
+    ast.Extern: "function",
+}
+
+
+def unused_names(spec: ast.Spec) -> Iterator[Diagnostic]:
+    """W105: what is declared and never used. A signal may be there for the system's sake."""
+    used = Counter(_uses(spec))
+    for item in spec.items:
+        kind = _KINDS.get(type(item))
+        names = (
+            [item.name, *(name for name, _ in item.members)] if isinstance(item, ast.Enum) else [item.name]
+        )
+        if kind is not None and not any(used[name] for name in names):
+            yield Diagnostic(
+                "W105",
+                f"the {kind} `{item.name}` is never used",
+                item.name_span,
+                help=("remove it",),
+            )
+        if isinstance(item, ast.Def):
+            yield from _unused_arguments(item)
+    for entry in spec.imports:
+        name = entry.alias or (entry.target if not entry.is_file else "")
+        if name and not used[name]:
+            yield Diagnostic("W105", f"the import `{name}` is never used", entry.span, help=("remove it",))
+
+
+def _unused_arguments(item: ast.Def) -> Iterator[Diagnostic]:
+    used = set(_uses(item.value))
+    for formal in item.formals:
+        if formal.name not in used:
+            yield Diagnostic(
+                "W105",
+                f"`{item.name}` never uses its argument `{formal.name}`",
+                formal.span,
+                help=("remove it, here and where the definition is used",),
+            )
+
+
+def _uses(root: ast.Node) -> Iterator[str]:
+    """Every name that is read below a node."""
+    for node in descendants(root):
+        match node:
+            case ast.Name(name=name) | ast.TypeRef(name=name):
+                yield name
+            case _:
+                continue
+
+
+def nothing_required(spec: ast.Spec) -> Iterator[Diagnostic]:
+    """W504: signals and definitions, but no requirement. A file to be imported has no signals."""
+    kinds = {type(item) for item in spec.items}
+    if ast.Require not in kinds and (ast.Signal in kinds or not kinds):
+        name = spec.name or spec.source.name
+        yield Diagnostic(
+            "W504",
+            f"`{name}` requires nothing",
+            spec.source.span(0, 0),
+            help=("say what must hold:  require name: always[0, T] x > 0",),
+        )
+
 
 Check: TypeAlias = Callable[[ast.Spec], Iterator[Diagnostic]]
 

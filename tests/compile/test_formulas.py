@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from resolving import HEAD, formula, state
 
-from stlc.compile.frontend.formulas import resolve_state_formula
+from stlc.compile.frontend.expressions import resolve_state_formula
 from stlc.compile.frontend.scope import Scope, column_entries
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed

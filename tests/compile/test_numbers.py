@@ -9,7 +9,7 @@ import reference
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from stlc.compile.frontend.numbers import Number, resolve_number, resolve_numbers, stored
+from stlc.compile.frontend.expressions import Number, resolve_number, resolve_numbers, stored
 from stlc.compile.frontend.scope import (
     Definition,
     Scope,

@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from resolving import margin, state
 
-from stlc.compile.frontend.polygons import area, simple
+from stlc.compile.frontend.regions import area, simple
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import SpecError
 

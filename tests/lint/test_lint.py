@@ -13,8 +13,7 @@ from stlc.dynamics.declaration.load import load_system_decl
 from stlc.files import read_source
 from stlc.grammar.format.format import format_text
 from stlc.grammar.parse.parser import parse
-from stlc.lint.fixes import fix
-from stlc.lint.lint import Selection, Surroundings, lint
+from stlc.lint.lint import Selection, Surroundings, fix, lint
 from stlc.lint.rules import RULES
 from stlc.source import Source
 

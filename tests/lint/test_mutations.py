@@ -12,8 +12,7 @@ from stlc.grammar.format.format import format_text
 from stlc.grammar.parse.parser import parse
 from stlc.grammar.scan import lexemes
 from stlc.grammar.show.english import sentence
-from stlc.lint.fixes import fix
-from stlc.lint.lint import Selection, lint
+from stlc.lint.lint import Selection, fix, lint
 from stlc.source import Source
 
 ROOT = Path(__file__).resolve().parents[2]

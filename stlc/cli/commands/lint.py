@@ -128,7 +128,7 @@ def _look(names: Sequence[str], job: _Job) -> _Result:
 def _one(source: Source, job: _Job) -> tuple[int, Sequence[Diagnostic]]:
     """How much of a file was repaired, and what is left to say."""
     from stlc.files import write_atomic
-    from stlc.lint.fixes import fix
+    from stlc.lint.lint import fix
     from stlc.lint.lint import lint as lint_text
 
     within = _surroundings(job.system, source)

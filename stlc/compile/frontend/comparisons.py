@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from stlc.compile.frontend.algebra import agree, apply, gap, half, in_unit
+from stlc.compile.frontend.arithmetic import agree, apply, gap, half, in_unit
+from stlc.compile.frontend.coerce import Need, as_formula, as_number, loose_number
 from stlc.compile.frontend.regions import signed_distance
 from stlc.compile.frontend.scope import Scope
-from stlc.compile.frontend.sorts import Need, as_formula, as_number, loose_number
 from stlc.compile.frontend.sweep import swept_distance
 from stlc.compile.frontend.values import (
     REGION_TYPES,

@@ -1,385 +1,185 @@
-"""From syntax to values: the one recursion over expressions.
-
-Everything else in the front half of the compiler works on values; here names are looked up, macros expand
-(an argument is a value, so nothing is captured), quantifiers unroll, and independent findings are gathered.
-"""
+"""Expressions of system files and declarations, as numbers, state formulas and regions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
-from fractions import Fraction
-from types import MappingProxyType
-from typing import Any
 
-from stlc.compile.frontend import comparisons
-from stlc.compile.frontend import intervals as moments
-from stlc.compile.frontend.calls import builtin, unsupported
-from stlc.compile.frontend.macros import arguments, cycle, finished, too_large
-from stlc.compile.frontend.members import member
-from stlc.compile.frontend.meter import Cost
-from stlc.compile.frontend.operations import OPERATIONS
-from stlc.compile.frontend.outside import outside
-from stlc.compile.frontend.scope import TIME_WORDS, Definition, External, Failed, Scope, reserved
-from stlc.compile.frontend.sorts import Need, as_formula, as_number, loose_number
-from stlc.compile.frontend.values import Number, Origin, Value, Vector, at, is_formula, literal
+from stlc.compile.frontend.arithmetic import difference_for_point, in_unit, rebased
+from stlc.compile.frontend.coerce import Need, as_formula, loose_number
+from stlc.compile.frontend.evaluate import evaluate
+from stlc.compile.frontend.scope import Failed, Scope
+from stlc.compile.frontend.values import REGION_TYPES, Label, Number, Region, Value, Vector, describe, noun
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.diagnostics import Diagnostic, Label
+from stlc.compile.ir.normal_form import condition
+from stlc.compile.ir.traverse import is_state
+from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
-from stlc.source import Span
+from stlc.signature import Column
+from stlc.units import Unit, nearest, same_dims
 
 
-def evaluate(expr: ast.Expr, scope: Scope) -> Value:
-    """The value of an expression. Raises Failed, with all independent findings in the sink."""
-    meter = scope.meter
-    meter.enter()
-    before = meter.nodes
-    try:
-        _refuse_excess(expr.span, scope)
-        value = _value(expr, scope)
-        if _is_written_twice(expr, value):
-            _charge(Cost(meter.nodes - before), expr.span, scope)
-        return at(value, expr.span)
-    finally:
-        meter.leave()
+def resolve_state_formula(expr: ast.Expr, scope: Scope, *, what: str = "a condition") -> ir.Formula:
+    """The expression as a formula over one instant, in negation normal form.
 
+    Args:
+        expr: as parsed.
+        scope: what names mean; findings are appended to its sink.
+        what: what the formula is, for messages: "a guard".
 
-def _is_written_twice(expr: ast.Expr, value: Value) -> bool:
-    """Whether parts of a formula appear twice in what it means: `a <-> b` is `a -> b` and `b -> a`."""
-    match expr:
-        case ast.Logic(op="<->" | "xor") | ast.Until(op="unless"):
-            return True
-        case ast.IfThenElse():
-            return is_formula(value)
-        case ast.Compare():
-            return isinstance(value, typed.Logic)
-        case ast.Call():
-            return isinstance(value, typed.Edge)
-        case _:
-            return False
-
-
-def _value(expr: ast.Expr, scope: Scope) -> Value:
-    operation = OPERATIONS.get(type(expr))
-    if operation is None:
-        return _HANDLERS[type(expr)](expr, scope)
-    return operation.value(expr, evaluate_all(operation.parts(expr), scope), scope)
-
-
-def evaluate_all(exprs: Sequence[ast.Expr], scope: Scope) -> list[Value]:
-    """The values of independent expressions; each is looked at even where another one failed."""
-    values: list[Value] = []
-    for expr in exprs:
-        try:
-            values.append(evaluate(expr, scope))
-        except Failed:
-            continue
-    if len(values) < len(exprs):
-        raise Failed
-    return values
-
-
-def formula(expr: ast.Expr, need: Need, scope: Scope) -> typed.Formula:
-    """The expression as a formula. Raises Failed."""
-    return as_formula(evaluate(expr, scope), expr, need, scope)
-
-
-def formulas(exprs: Sequence[tuple[ast.Expr, Need]], scope: Scope) -> list[typed.Formula]:
-    """Independent expressions as formulas. Raises Failed."""
-    found: list[typed.Formula] = []
-    for expr, need in exprs:
-        try:
-            found.append(formula(expr, need, scope))
-        except Failed:
-            continue
-    if len(found) < len(exprs):
-        raise Failed
-    return found
-
-
-# ------------------------------------------------------------------------ names
-
-
-def _name(expr: ast.Name, scope: Scope) -> Value:
-    if expr.name in scope.locals:
-        value, cost = scope.locals[expr.name]
-        _charge(cost, expr.span, scope)
-        return value
-    if scope.in_spec and expr.name in TIME_WORDS and not expr.quoted:
-        return moments.time_word(expr.name, expr.span)
-    return _named(expr, scope, scope)
-
-
-def _attr(expr: ast.Attr, scope: Scope) -> Value:
-    """A name of an imported file."""
-    name, home = member(expr, scope)
-    return _named(name, home, scope)
-
-
-def _named(expr: ast.Name, home: Scope, scope: Scope) -> Value:
-    """What a name of `home` is worth in `scope`."""
-    entry = home.entries.get(expr.name)
-    if entry is None:
-        return home.unknown(expr)
-    if isinstance(entry, External):
-        scope.fail(Diagnostic("E105", f"`{entry.name}` takes arguments", expr.span))
-    if isinstance(entry, Definition):
-        if entry.formals:
-            help_ = (f"{entry.name}({', '.join(entry.formals)})",)
-            scope.fail(Diagnostic("E105", f"`{entry.name}` takes arguments", expr.span, help=help_))
-        value = _defined(entry, expr.span, home)
-    else:
-        value = entry.value
-    if isinstance(value, Number) and entry.span is not None:
-        return replace(value, origin=Origin(entry.span, f"line {entry.span.line}"))
-    return value
-
-
-# --------------------------------------------------------------------- macros
-
-
-def _defined(entry: Definition, place: Span, scope: Scope) -> Value:
-    """The value of a definition without arguments: found once, charged at every use."""
-    if entry.name not in scope.cache:
-        if entry.name in scope.open:
-            scope.fail(cycle(entry, scope))
-        inner = replace(scope, locals={}, open=(*scope.open, entry.name))
-        scope.cache[entry.name] = None
-        with scope.meter.measured() as cost:
-            value = finished(entry, evaluate(entry.body, inner), inner)
-        scope.cache[entry.name] = (value, cost)
-    found = scope.cache[entry.name]
-    if found is None:
-        if entry.name in scope.open:
-            scope.fail(cycle(entry, scope))
-        raise Failed
-    _charge(found[1], place, scope)
-    return found[0]
-
-
-def _expanded(entry: Definition, call: ast.Call, scope: Scope, home: Scope) -> Value:
-    """A macro of `home` with its arguments put in."""
-    if home.cache.get(entry.name, entry) is None:
-        raise Failed
-    if entry.name in home.open:
-        scope.fail(cycle(entry, home))
-    bound: dict[str, tuple[Value, Cost]] = {}
-    failed = False
-    for formal, expr in arguments(entry, call, scope).items():
-        try:
-            with scope.meter.measured() as cost:
-                value = evaluate(expr, scope)
-            bound[formal] = (value, cost)
-        except Failed:
-            failed = True
-    if failed:
-        raise Failed
-    inner = replace(home, locals=bound, open=(*home.open, entry.name))
-    with _traced(entry, call, scope):
-        return finished(entry, evaluate(entry.body, inner), inner)
-
-
-@contextmanager
-def _traced(entry: Definition, call: ast.Call, scope: Scope) -> Iterator[None]:
-    """Findings inside a macro also show the use that brought them up."""
+    Raises:
+        StlcError: `scope.error`, with what was found.
+    """
     before = len(scope.sink)
     try:
-        yield
+        with scope.meter.fresh():
+            value = evaluate(expr, scope)
+            formula = _formula(value, expr, what, scope)
+            if not is_state(formula):
+                scope.fail(Diagnostic("E202", f"{what} speaks about one instant", expr.span, "temporal"))
+            return condition(formula)
     except Failed:
-        label = Label(call.span, f"in this use of `{entry.name}`")
-        scope.sink[before:] = [
-            finding
-            if finding.labels and finding.labels[-1] == label
-            else replace(finding, labels=(*finding.labels, label))
-            for finding in scope.sink[before:]
-        ]
-        raise
+        raise scope.error(*(f for f in scope.sink[before:] if f.severity == "error")) from None
 
 
-def _charge(cost: Cost, place: Span, scope: Scope) -> None:
-    scope.meter.charge(cost)
-    _refuse_excess(place, scope)
+def resolve_region(expr: ast.Expr, scope: Scope) -> Region:
+    """The expression as a region.
 
-
-def _refuse_excess(place: Span, scope: Scope) -> None:
-    """E005, once for a declaration."""
-    meter = scope.meter
-    if not meter.over:
-        return
-    if not meter.reported:
-        meter.reported = True
-        scope.report(too_large(meter, place))
-    raise Failed
-
-
-def _call(expr: ast.Call, scope: Scope) -> Value:
-    if scope.in_spec and isinstance(expr.func, ast.Attr):
-        return _called(expr, *member(expr.func, scope), scope)
-    if not isinstance(expr.func, ast.Name):
-        note = ("expressions are parsed, never evaluated as Python; for Python dynamics use `plugin:`",)
-        message = "calls to attributes are not part of the expression language"
-        place = expr.func.span
-        if isinstance(expr.func, ast.Attr):
-            place = place.source.span(expr.func.base.span.end, place.end)
-        scope.fail(Diagnostic("S201", message, place, note=note))
-    return _called(expr, expr.func, scope, scope)
-
-
-def _called(expr: ast.Call, name: ast.Name, home: Scope, scope: Scope) -> Value:
-    """A call of something that `home` declares, or of a built-in function."""
-    entry = home.entries.get(name.name)
-    if isinstance(entry, Definition) and entry.formals:
-        return _expanded(entry, expr, scope, home)
-    if isinstance(entry, External):
-        return outside(entry, expr, evaluate_all([arg.value for arg in expr.args], scope), scope)
-    if entry is not None and (home is not scope or not reserved(name.name)):
-        if home.cache.get(name.name, entry) is not None:
-            scope.report(Diagnostic("E105", f"`{name.name}` is not a function", name.span))
-        raise Failed
-    if home is not scope:
-        return home.unknown(name, called=True)
-    values = evaluate_all([arg.value for arg in expr.args], scope)
-    return builtin(name.name, expr, values, scope)
-
-
-# ------------------------------------------------------------------- formulas
-
-
-def _not(expr: ast.Not, scope: Scope) -> Value:
-    return typed.Not(
-        expr.span, formula(expr.operand, Need("`not`", span=_head(expr.span, expr.operand)), scope)
-    )
-
-
-def _logic(expr: ast.Logic, scope: Scope) -> Value:
-    """Chains of `and` and of `or` become one node, without recursion along the chain."""
-    operands: list[ast.Expr] = [expr.right]
-    left = expr.left
-    while expr.op in ("and", "or") and isinstance(left, ast.Logic) and left.op == expr.op:
-        operands.append(left.right)
-        left = left.left
-    operands.append(left)
-    need = Need(f"`{expr.op}`")
-    return typed.Logic(
-        expr.span, expr.op, tuple(formulas([(item, need) for item in reversed(operands)], scope))
-    )
-
-
-def _temporal(expr: ast.Temporal, scope: Scope) -> Value:
-    place = _head(expr.span, expr.interval or expr.body, len(expr.alias or expr.op))
-    return _timed(expr, [(expr.body, Need(f"`{expr.op}`", span=place))], place, scope)
-
-
-def _until(expr: ast.Until, scope: Scope) -> Value:
-    after = expr.interval.span if expr.interval is not None else expr.right.span
-    place = comparisons.sign_span(expr.alias or expr.op, expr.left.span, after)
-    sides = [(expr.left, Need(f"`{expr.op}`", span=place)), (expr.right, Need(f"`{expr.op}`", span=place))]
-    return _timed(expr, sides, place, scope)
-
-
-def _timed(
-    expr: ast.Temporal | ast.Until, operands: Sequence[tuple[ast.Expr, Need]], place: Span, scope: Scope
-) -> typed.Formula:
-    """Operands and interval of a temporal operator, each looked at even where the other failed."""
-    if not scope.temporal:
-        scope.fail(unsupported(f"`{expr.op}`", expr.span, scope))
-    window: typed.Interval | None = None
-    body = operands[-1][0]
+    Raises:
+        StlcError: `scope.error`, with what was found.
+    """
+    before = len(scope.sink)
     try:
-        bounds = (
-            evaluate_all((expr.interval.lo, expr.interval.hi), scope) if expr.interval is not None else ()
+        with scope.meter.fresh():
+            value = evaluate(expr, scope)
+            if not isinstance(value, REGION_TYPES):
+                scope.fail(Diagnostic("E205", f"a region is needed, this is {noun(value)}", expr.span))
+            return value
+    except Failed:
+        raise scope.error(*(f for f in scope.sink[before:] if f.severity == "error")) from None
+
+
+def resolve_formula(expr: ast.Expr, scope: Scope, *, what: str = "a requirement") -> typed.Formula:
+    """The expression as a formula, temporal operators included where `scope.temporal`.
+
+    Raises:
+        Failed: the findings are in the sink.
+    """
+    with scope.meter.fresh():
+        return as_formula(evaluate(expr, scope), expr, Need(what), scope)
+
+
+def _formula(value: Value, expr: ast.Expr, what: str, scope: Scope) -> typed.Formula:
+    fits = isinstance(value, typed.Node) or (isinstance(value, Number) and value.kind == "bool")
+    if not fits and not scope.in_spec:
+        help_ = (f"`{expr.span.text} > 0`",) if isinstance(value, Number) and not value.labels else ()
+        message = f"{what} must be a formula, this is {noun(value)}"
+        scope.fail(Diagnostic("S203", message, expr.span, describe(value), help=help_))
+    return as_formula(value, expr, Need(what), scope)
+
+
+__all__ = ["Number", "resolve_number", "resolve_numbers", "stored"]
+
+
+def resolve_number(
+    expr: ast.Expr, scope: Scope, *, expected: Column | None = None, what: str = "a value"
+) -> Number:
+    """The expression as one number, in SI units from the zero of its unit.
+
+    Args:
+        expr: as parsed.
+        scope: what names mean; findings are appended to its sink.
+        expected: the column that the number is for: its enum members are names, `true` is 1, a formula is
+            1 where it holds, a bare number takes its unit, another unit is E203.
+        what: what the number is, for messages: "the flow of `x`".
+
+    Raises:
+        StlcError: `scope.error`, with what was found.
+    """
+    numbers = resolve_numbers(expr, scope, expected=expected, what=what)
+    if len(numbers) == 1:
+        return numbers[0]
+    finding = Diagnostic(_code(scope), f"{what} is one number, this is a vector of {len(numbers)}", expr.span)
+    scope.report(finding)
+    raise scope.error(finding)
+
+
+def resolve_numbers(
+    expr: ast.Expr, scope: Scope, *, expected: Column | None = None, what: str = "a value"
+) -> tuple[Number, ...]:
+    """The expression as the components of a vector; a number is a vector of one. See `resolve_number`."""
+    before = len(scope.sink)
+    try:
+        with scope.meter.fresh():
+            value = evaluate(expr, scope)
+            items: tuple[Value, ...] = value.items if isinstance(value, Vector) else (value,)
+            return tuple(_stored_value(item, expr, expected, what, scope) for item in items)
+    except Failed:
+        raise scope.error(*(f for f in scope.sink[before:] if f.severity == "error")) from None
+
+
+def stored(number: Number, unit: Unit) -> ir.Num:
+    """The number as a column of `unit` stores it: SI from the zero of the unit, divided by its scale."""
+    number = rebased(number, unit)
+    if unit.ratio == 1:
+        return number.num
+    value = number.constant
+    if value is None:
+        return ir.Op("div", (number.num, ir.Const(unit.scale)))
+    return ir.Const(nearest(number.exact / unit.ratio) if number.exact is not None else value / unit.scale)
+
+
+def _code(scope: Scope) -> str:
+    return "E205" if scope.in_spec else "S203"
+
+
+def _stored_value(value: Value, expr: ast.Expr, column: Column | None, what: str, scope: Scope) -> Number:
+    """A value as the number that a column stores."""
+    if column is not None and column.kind == "bool" and isinstance(value, typed.Node) and is_state(value):
+        cond = condition(value)
+        truth = ir.Const(float(cond.value)) if isinstance(cond, ir.Truth) else ir.Indicator(cond)
+        return Number(truth, kind="bool", span=expr.span)
+    if column is not None and column.labels and isinstance(value, Label):
+        return _member_of_column(value, expr, column, scope)
+    if isinstance(value, typed.Node) and not isinstance(value, typed.Truth) and not scope.in_spec:
+        help_ = (f"`ind({expr.span.text})` is 1 where it holds and 0 elsewhere",) if is_state(value) else ()
+        scope.fail(
+            Diagnostic(
+                "S203", f"{what} must be a number, this is a formula", expr.span, "formula", help=help_
+            )
         )
-        window = moments.interval(expr.interval, bounds, (expr.op, place), body, scope)
-    finally:
-        inner = formulas(operands, scope)
-    if isinstance(expr, ast.Temporal):
-        return typed.Temporal(expr.span, expr.op, window, inner[0])
-    return typed.Until(expr.span, expr.op, window, inner[0], inner[1])
+    number = loose_number(value, expr, Need(f"{what} is a number"), scope)
+    return number if column is None else _fitted(number, expr, column, scope)
 
 
-def _head(span: Span, inner: ast.Node, length: int | None = None) -> Span:
-    """The operator that stands before its operand."""
-    end = min(inner.span.start, span.start + length) if length is not None else inner.span.start
-    text = span.source.text[span.start : end].rstrip(" \t\n(")
-    return span.source.span(span.start, span.start + max(1, len(text)))
+def _member_of_column(value: Label, expr: ast.Expr, column: Column, scope: Scope) -> Number:
+    known = dict(column.labels)
+    if value.name not in known:
+        names = ", ".join(f"`{name}`" for name in known)
+        message = f"`{value.name}` is not a member of the enum of `{column.name}`"
+        scope.fail(Diagnostic("E205", message, expr.span, help=(f"its members are {names}",)))
+    return Number(ir.Const(known[value.name]), kind="enum", labels=column.labels, span=expr.span)
 
 
-def _quantifier(expr: ast.Quantifier, scope: Scope) -> Value:
-    """The conjunction or disjunction over a finite domain."""
-    items: list[typed.Formula] = []
-    need = Need(f"`{expr.kind}`")
-    for value in _domain(expr, scope):
-        inner = replace(scope, locals={**scope.locals, expr.var: (value, Cost(1, 1))})
-        items.append(formula(expr.body, need, inner))
-    if not items:
-        return typed.Truth(expr.span, expr.kind == "forall")
-    if len(items) == 1:
-        return items[0]
-    return typed.Logic(expr.span, "and" if expr.kind == "forall" else "or", tuple(items))
-
-
-def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
-    """The body, where the names stand for the values of the instant at which it is judged."""
-    if not scope.temporal:
-        scope.fail(unsupported("`freeze`", expr.span, scope))
-    names = [name for name, _ in expr.bindings]
-    if len(set(names)) < len(names):
-        scope.fail(Diagnostic("E102", "`freeze` binds one name twice", expr.span))
-    bindings: list[tuple[str, ir.Num]] = []
-    bound: dict[str, tuple[Value, Cost]] = {}
-    values = evaluate_all([value for _, value in expr.bindings], scope)
-    for (name, written), value in zip(expr.bindings, values, strict=True):
-        if isinstance(value, Vector):
-            items = [_held(item, f"{name}[{i}]", expr, bindings) for i, item in enumerate(value.items)]
-            bound[name] = (Vector(tuple(items), written.span), Cost(1, 1))
-        else:
-            number = loose_number(value, written, Need("`freeze` binds numbers and vectors"), scope)
-            bound[name] = (_held(number, name, expr, bindings), Cost(1, 1))
-    inner = replace(scope, locals={**scope.locals, **bound})
-    body = formula(expr.body, Need("`freeze`"), inner)
-    return typed.Freeze(expr.span, tuple(bindings), body) if bindings else body
-
-
-def _held(number: Number, name: str, expr: ast.Freeze, bindings: list[tuple[str, ir.Num]]) -> Number:
-    """The number as the body reads it; its key tells it apart from those of other `freeze`s."""
-    if number.constant is not None:
-        return number
-    key = f"{name}#{expr.span.start}@{expr.span.source.name}"
-    bindings.append((key, number.num))
-    return replace(number, num=ir.FrozenVar(key), formula=None, origin=None)
-
-
-def _domain(expr: ast.Quantifier, scope: Scope) -> Iterator[Number]:
-    if isinstance(expr.domain, ast.SetLiteral):
-        values = evaluate_all(expr.domain.items, scope)
-        for item, value in zip(expr.domain.items, values, strict=True):
-            yield as_number(value, item, Need(f"`{expr.kind}` runs over numbers"), scope)
-        return
-    ends = []
-    for end, value in zip(expr.domain, evaluate_all(expr.domain, scope), strict=True):
-        number = as_number(value, end, Need(f"`{expr.kind}` runs over whole numbers"), scope)
-        if number.exact is None or number.exact.denominator != 1:
-            message = f"`{expr.kind}` runs over whole numbers that are known at compile time"
-            scope.fail(Diagnostic("E205", message, end.span))
-        ends.append(int(number.exact))
-    scope.meter.charge(Cost(nodes=max(0, ends[1] - ends[0])))
-    _refuse_excess(expr.span, scope)
-    for index in range(ends[0], ends[1] + 1):
-        yield literal(Fraction(index), expr.span)
-
-
-_HANDLERS: Mapping[type[ast.Node], Callable[[Any, Scope], Value]] = MappingProxyType(
-    {
-        ast.Name: _name,
-        ast.Attr: _attr,
-        ast.Call: _call,
-        ast.Not: _not,
-        ast.Logic: _logic,
-        ast.Temporal: _temporal,
-        ast.Until: _until,
-        ast.Quantifier: _quantifier,
-        ast.Freeze: _freeze,
-    }
-)
+def _fitted(number: Number, expr: ast.Expr, column: Column, scope: Scope) -> Number:
+    """Kind and unit agree with the column; a bare number takes its unit."""
+    values = [value for _, value in column.labels] if column.labels else [0.0, 1.0]
+    if column.kind in ("bool", "enum"):
+        fits = (number.kind == column.kind and number.labels == column.labels) or number.constant in values
+        if not fits and number.kind != "int":
+            names = ", ".join(f"`{name}`" for name, _ in column.labels) or "`true` and `false`"
+            message = f"`{column.name}` is one of {names}, this is {noun(number)}"
+            scope.fail(Diagnostic(_code(scope), message, expr.span))
+        return replace(number, kind=column.kind, labels=column.labels)
+    if number.kind == "enum":
+        scope.fail(
+            Diagnostic(_code(scope), f"`{column.name}` is a number, this is an enum member", expr.span)
+        )
+    if number.bare:
+        return in_unit(number, column.unit, scope)
+    if not number.flexible and column.unit.text and not same_dims(number.unit, column.unit):
+        message = f"`{column.name}` is in [{column.unit}], this is in [{number.unit}]"
+        scope.fail(Diagnostic("E203", message, expr.span, f"[{number.unit}]"))
+    if column.unit.offset and number.sense == "difference":
+        scope.fail(difference_for_point(number, column.unit, expr.span))
+    return number

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from stlc.compile.frontend.algebra import in_unit, on_scale
-from stlc.compile.frontend.meter import MAX_LEVELS, MAX_NODES, Meter
-from stlc.compile.frontend.scope import Definition, Scope
-from stlc.compile.frontend.sorts import Need, as_formula, as_number
+from stlc.compile.frontend.arithmetic import in_unit, on_scale
+from stlc.compile.frontend.coerce import Need, as_formula, as_number
+from stlc.compile.frontend.scope import MAX_LEVELS, MAX_NODES, Definition, Meter, Scope
 from stlc.compile.frontend.values import REGION_TYPES, Moment, Number, Value, Vector, noun, unit_text
 from stlc.compile.ir import typed
 from stlc.compile.ir.functions import REGIONS
@@ -92,7 +91,7 @@ def cycle(entry: Definition, scope: Scope) -> Diagnostic:
     return Diagnostic("E105", f"`{entry.name}` is defined in terms of itself", entry.span, note=note)
 
 
-def too_large(meter: Meter, span: Span) -> Diagnostic:
+def outgrown(meter: Meter, span: Span) -> Diagnostic:
     """E005: an expression that outgrows the limits once it is written out."""
     if meter.nodes > MAX_NODES:
         message = f"this expands to more than {MAX_NODES:,} operations"

@@ -14,9 +14,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations, product
 
-from stlc.compile.frontend.algebra import apply, gap, negated
-from stlc.compile.frontend.polygons import convex
-from stlc.compile.frontend.regions import dimension, signed_distance, to_segment
+from stlc.compile.frontend.arithmetic import apply, cross, dot, gap, minus, negated, norm
+from stlc.compile.frontend.regions import convex, dimension, signed_distance, to_segment
 from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.values import (
     Ball,
@@ -31,7 +30,6 @@ from stlc.compile.frontend.values import (
     Vector,
     literal,
 )
-from stlc.compile.frontend.vectors import cross, dot, minus, norm
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import shifted
 from stlc.diagnostics import Diagnostic

@@ -1,19 +1,70 @@
-"""Tags of requirements: `@safety`, `@weight(2)`, `@id("R1")`."""
+"""Tags of requirements: `@safety`, `@weight(2)`, `@id("R1")`, and what `@scale(auto)` divides by."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from stlc.compile.frontend.algebra import refuse_point
-from stlc.compile.frontend.expressions import evaluate
+from stlc.compile.analysis.ranges import Facts, bounds
+from stlc.compile.frontend.arithmetic import refuse_point
+from stlc.compile.frontend.coerce import Need, as_number
+from stlc.compile.frontend.evaluate import evaluate
 from stlc.compile.frontend.scope import Failed, Scope
-from stlc.compile.frontend.sorts import Need, as_number
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.functions import Bounds
+from stlc.compile.ir.support import columns_of
+from stlc.compile.ir.traverse import nodes
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.registry import closest
+from stlc.signature import Column
 from stlc.source import Span
+
+
+def nominal(columns: Iterable[Column]) -> dict[str, Bounds]:
+    """Every declared range, enforced or not, in stored units."""
+    return {
+        column.name: (column.low, column.high)
+        for column in columns
+        if column.low is not None and column.high is not None
+    }
+
+
+def reach_of_formula(formula: typed.Formula, ranges: Facts, place: Span, scope: Scope) -> float:
+    """The greatest magnitude of a predicate in `formula`. Raises Failed (E205) where a range is missing."""
+    known = dict(ranges)
+    found = [reach_of_number(pred.num, known, place, scope) for pred in _predicates(formula, known)]
+    if not found:
+        scope.fail(Diagnostic("E205", "this has no predicate that varies", place))
+    return max(found)
+
+
+def reach_of_number(num: ir.Num, ranges: Facts, place: Span, scope: Scope) -> float:
+    """The greatest magnitude of a number. Raises Failed (E205) where a range is missing."""
+    ends = bounds(num, ranges)
+    if ends is not None and all(map(math.isfinite, ends)) and ends != (0.0, 0.0):
+        return max(map(abs, ends))
+    missing = sorted(columns_of(num) - ranges.keys())
+    help_: tuple[str, ...] = ("say it: `@scale(10)`",)
+    message = "how far this reaches is not known"
+    if missing:
+        listed = ", ".join(f"`{name}`" for name in missing)
+        message += f": {listed} declares no range"
+        help_ = (f"signal {missing[0]} in [low, high]", *help_)
+    return scope.fail(Diagnostic("E205", message, place, help=help_))
+
+
+def _predicates(formula: typed.Formula, ranges: dict[str, Bounds]) -> Iterator[typed.Predicate]:
+    """All predicates; the ranges of what `freeze` binds are added on the way."""
+    for node in nodes(formula):
+        if isinstance(node, typed.Predicate):
+            yield node
+        elif isinstance(node, typed.Freeze):
+            found = {name: bounds(num, ranges) for name, num in node.bindings}
+            ranges.update({name: ends for name, ends in found.items() if ends is not None})
+
 
 MARKS = ("safety", "liveness")
 _SHOWN = '@safety @liveness @weight(x) @id("…") @group(name) @scale(x) @scale(auto) @product'

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias, get_args
 
-from stlc.compile.analysis.spread import spread
+from stlc.compile.analysis.ranges import spread
+from stlc.compile.frontend.declare import MAX_COMPONENTS
 from stlc.compile.frontend.scope import column_entries, member_entries
-from stlc.compile.frontend.signals import MAX_COMPONENTS
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.motion import Assign, shared_draws, state_assigns
 from stlc.dynamics.schema.names import UNIT, Context, Names, base_name, component_names

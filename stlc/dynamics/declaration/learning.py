@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from stlc.compile.frontend.algebra import absolute
+from stlc.compile.frontend.arithmetic import absolute
 from stlc.compile.frontend.scope import Entry, Known
 from stlc.compile.frontend.values import Number, Vector
 from stlc.compile.ir import nodes as ir

@@ -8,9 +8,14 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import TypeVar
 
-from stlc.compile.frontend.algebra import difference_for_point, point_for_amount
-from stlc.compile.frontend.formulas import resolve_region, resolve_state_formula
-from stlc.compile.frontend.numbers import resolve_number, resolve_numbers, stored
+from stlc.compile.frontend.arithmetic import difference_for_point, point_for_amount
+from stlc.compile.frontend.expressions import (
+    resolve_number,
+    resolve_numbers,
+    resolve_region,
+    resolve_state_formula,
+    stored,
+)
 from stlc.compile.frontend.scope import Entry, Scope
 from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir

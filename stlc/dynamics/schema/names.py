@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
-from stlc.compile.frontend.algebra import absolute
+from stlc.compile.frontend.arithmetic import absolute
 from stlc.compile.frontend.scope import Definition, Entry, Known, Scope, constant_value, enforced
 from stlc.compile.frontend.values import Number, Vector
 from stlc.compile.ir import nodes as ir

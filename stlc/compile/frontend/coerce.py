@@ -1,10 +1,10 @@
-"""From values to what a place needs: a number, a formula, a vector, a region."""
+"""Values as numbers, formulas or vectors: the sort that a place in an expression needs."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from stlc.compile.frontend.algebra import apply, half
+from stlc.compile.frontend.arithmetic import apply, half
 from stlc.compile.frontend.intervals import out_of_place
 from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.values import Label as Member

@@ -1,0 +1,437 @@
+"""Calls of functions: built-in ones, regions, neighbouring samples, functions of the system."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from types import MappingProxyType
+
+from stlc.compile.frontend.arithmetic import absolute, agree, apply, broadcast, cross, dot, minus, norm
+from stlc.compile.frontend.coerce import (
+    Need,
+    as_formula,
+    as_number,
+    as_state_formula,
+    as_vector,
+    loose_number,
+)
+from stlc.compile.frontend.intervals import moment
+from stlc.compile.frontend.regions import area, dimension, points, signed_distance, simple
+from stlc.compile.frontend.scope import External, Scope
+from stlc.compile.frontend.values import (
+    REGION_TYPES,
+    Ball,
+    Box,
+    Combined,
+    Complement,
+    Dilated,
+    HalfSpace,
+    Moment,
+    Number,
+    Polygon,
+    Region,
+    Swept,
+    Value,
+    Vector,
+    literal,
+    noun,
+)
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.discretize import Grid, delay_fault, no_delay
+from stlc.compile.ir.functions import FUNCTIONS, REGIONS, REWRITTEN, STEPPING
+from stlc.compile.ir.traverse import shifted
+from stlc.diagnostics import Diagnostic
+from stlc.grammar import ast
+from stlc.source import Span
+from stlc.units import SYMBOLS, same_dims
+
+FORMALS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "circle": ("center", "radius"),
+        "ball": ("center", "radius"),
+        "box": ("lower", "upper"),
+        "halfspace": ("normal", "offset"),
+        "complement": ("region",),
+        "dilate": ("region", "margin"),
+    }
+)
+"""Names of the arguments; `polygon`, `union` and `intersect` take any number of them without names."""
+
+
+def region(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Region:
+    """The region that a call makes. Raises Failed (E105 arguments, E205 sorts)."""
+    if name not in FORMALS:
+        for arg in call.args:
+            if arg.name is not None:
+                scope.fail(Diagnostic("E105", f"`{name}` has no argument called `{arg.name}`", arg.span))
+        pairs = [(arg.value, value) for arg, value in zip(call.args, values, strict=True)]
+        return _polygon_of(call, pairs, scope) if name == "polygon" else _combined(name, call, pairs, scope)
+    given = _bound(name, call, values, scope)
+    match name:
+        case "circle" | "ball":
+            return _ball_of(name, call, given, scope)
+        case "box":
+            return _box_of(call, given, scope)
+        case "halfspace":
+            normal = as_vector(
+                given[0][1], given[0][0], Need("the normal of a half-space is a vector"), scope
+            )
+            offset = as_number(
+                given[1][1], given[1][0], Need("the offset of a half-space is a number"), scope
+            )
+            return HalfSpace(normal, offset, call.span)
+        case "complement":
+            return Complement(_as_region(name, *given[0], scope), call.span)
+        case _:
+            margin = as_number(given[1][1], given[1][0], Need("`dilate` grows by a length"), scope)
+            return Dilated(_as_region(name, *given[0], scope), margin, call.span)
+
+
+def _bound(
+    name: str, call: ast.Call, values: Sequence[Value], scope: Scope
+) -> tuple[tuple[ast.Expr, Value], ...]:
+    """Arguments in the order of the formals, whether they were named or not."""
+    formals = FORMALS[name]
+    found: dict[str, tuple[ast.Expr, Value]] = {}
+    shape = f"{name}({', '.join(formals)})"
+    for index, (arg, value) in enumerate(zip(call.args, values, strict=True)):
+        formal = arg.name if arg.name is not None else (formals[index] if index < len(formals) else "")
+        if formal not in formals or formal in found:
+            scope.fail(Diagnostic("E105", f"`{name}` does not take this argument", arg.span, help=(shape,)))
+        found[formal] = (arg.value, value)
+    missing = [formal for formal in formals if formal not in found]
+    if missing:
+        scope.fail(Diagnostic("E105", f"`{name}` needs `{missing[0]}`", call.span, help=(shape,)))
+    return tuple(found[formal] for formal in formals)
+
+
+def _as_region(name: str, expr: ast.Expr, value: Value, scope: Scope) -> Region:
+    if isinstance(value, REGION_TYPES):
+        return value
+    return scope.fail(Diagnostic("E205", f"`{name}` takes regions, this is {noun(value)}", expr.span))
+
+
+def _ball_of(name: str, call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> Ball:
+    center = as_vector(given[0][1], given[0][0], Need(f"the center of a {name} is a vector"), scope)
+    radius = as_number(given[1][1], given[1][0], Need(f"the radius of a {name} is a number"), scope)
+    if name == "circle" and len(center.items) != 2:
+        message = f"a circle lies in the plane, this center has {len(center.items)} components"
+        scope.fail(
+            Diagnostic("E205", message, given[0][0].span, help=("`ball` takes any number of components",))
+        )
+    if radius.constant is not None and radius.constant < 0:
+        scope.fail(Diagnostic("E205", "a radius is not negative", given[1][0].span))
+    return Ball(center, radius, call.span)
+
+
+def _box_of(call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> Box:
+    lower, upper = (
+        as_vector(value, expr, Need("a corner of a box is a vector"), scope) for expr, value in given
+    )
+    if len(lower.items) != len(upper.items):
+        message = f"corners of {len(lower.items)} and {len(upper.items)} components do not span a box"
+        scope.fail(Diagnostic("E205", message, call.span))
+    for low, high in zip(lower.items, upper.items, strict=True):
+        if low.bare is not high.bare:
+            continue  # the point that is asked for says the unit of the bare one
+        if not low.bare:
+            low, high = absolute(low), absolute(high)
+        if low.constant is not None and high.constant is not None and low.constant > high.constant:
+            scope.fail(
+                Diagnostic("E205", "this box is empty: a lower bound is above the upper one", call.span)
+            )
+    return Box(lower, upper, call.span)
+
+
+def _polygon_of(call: ast.Call, pairs: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> Polygon:
+    need = Need("a corner of a polygon is a vector")
+    corners = tuple(as_vector(value, expr, need, scope) for expr, value in pairs)
+    known = points(corners)
+    if len(corners) < 3:
+        scope.fail(Diagnostic("E105", "a polygon has at least 3 corners", call.span))
+    if known is None:
+        message = "the corners of a polygon are constant points of the plane"
+        scope.fail(
+            Diagnostic("E205", message, call.span, help=("a moving obstacle can be a `circle` or a `box`",))
+        )
+    if not simple(known) or area(known) == 0:
+        scope.fail(Diagnostic("E205", "this polygon has no inside, or crosses itself", call.span))
+    return Polygon(corners if area(known) > 0 else corners[::-1], call.span)
+
+
+def _combined(name: str, call: ast.Call, pairs: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> Combined:
+    if not pairs:
+        scope.fail(Diagnostic("E105", f"`{name}` needs at least one region", call.span))
+    parts = tuple(_as_region(name, expr, value, scope) for expr, value in pairs)
+    sizes = {size for part in parts if (size := dimension(part)) is not None}
+    if len(sizes) > 1:
+        message = f"regions of {' and '.join(map(str, sorted(sizes)))} dimensions do not go together"
+        scope.fail(Diagnostic("E205", message, call.span))
+    return Combined("union" if name == "union" else "intersect", parts, call.span)
+
+
+_SECOND = SYMBOLS["s"]
+
+
+def stepping(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
+    """`name(values)`, with as many values as it takes. Raises Failed (E201, E205)."""
+    value, expr = values[0], call.args[0].value
+    match name:
+        case "rise":
+            return typed.Edge(call.span, "rise", as_formula(value, expr, Need("`rise`"), scope))
+        case "fall":
+            return typed.Edge(call.span, "fall", as_formula(value, expr, Need("`fall`"), scope))
+        case "sweep":
+            return Swept(_swept_point(value, expr, Need("`sweep` follows a point"), scope), call.span)
+        case "delta":
+            return _delta(value, expr, call.span, scope)
+    delay = typed.Time(steps=Fraction({"next": 1, "prev": -1}.get(name, 0)))
+    if name == "shift":
+        delay = _delay(values[1], call.args[1].value, scope)
+    return _shifted(value, delay, (expr, call.span), f"`{name}`", scope)
+
+
+def _shifted(
+    value: Value, delay: typed.Time, places: tuple[ast.Expr, Span], name: str, scope: Scope
+) -> Value:
+    """A number, a vector or a formula some time later."""
+    expr, span = places
+    match value:
+        case Number() if value.kind != "bool":
+            return replace(value, num=_delayed_number(value.num, delay), origin=None)
+        case Vector(items):
+            return Vector(tuple(_later(item, delay, span) for item in items), span)
+        case _:
+            return _delayed_formula(as_formula(value, expr, Need(name), scope), delay, span)
+
+
+def _delayed_number(num: ir.Num, delay: typed.Time) -> ir.Num:
+    if delay.seconds or delay.horizons:
+        return shifted(num, 0, delay=delay)
+    return shifted(num, int(delay.steps))
+
+
+def _delayed_formula(formula: typed.Formula, delay: typed.Time, span: Span) -> typed.Formula:
+    if delay.seconds or delay.horizons:
+        return typed.Shift(span, 1, formula, delay=delay)
+    return typed.Shift(span, int(delay.steps), formula)
+
+
+def _later(number: Number, delay: typed.Time, span: Span) -> Number:
+    """A component some time later; of a choice between bools the formula as well."""
+    formula = None if number.formula is None else _delayed_formula(number.formula, delay, span)
+    return replace(number, num=_delayed_number(number.num, delay), formula=formula)
+
+
+def _delta(value: Value, expr: ast.Expr, span: Span, scope: Scope) -> Value:
+    """What changed since the sample before."""
+    now = value if isinstance(value, Vector) else as_number(value, expr, Need("`delta` takes numbers"), scope)
+    before = _shifted(now, typed.Time(steps=Fraction(-1)), (expr, span), "`delta`", scope)
+    assert isinstance(before, Number | Vector)
+    return broadcast("sub", (now, before), span, scope)
+
+
+def _swept_point(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> Vector:
+    if isinstance(value, Vector):
+        return value
+    return Vector((as_number(value, expr, need, scope),), expr.span)
+
+
+def _delay(value: Value, expr: ast.Expr, scope: Scope) -> typed.Time:
+    """A number of samples, `3`, `-1`, `3 steps`, or a time, which the grid will count in samples: `0.1 s`.
+
+    Raises Failed: E205 where it is none.
+    """
+    match value:
+        case Moment(end=False):
+            time = typed.Time(value.seconds, value.steps, value.horizons, expr.span)
+        case Number(bare=True, exact=known) if known is not None:
+            time = typed.Time(steps=known, span=expr.span)
+        case Number(bare=False, flexible=False) if value.constant is not None and same_dims(
+            value.unit, _SECOND
+        ):
+            found = moment(expr, value, scope)
+            time = typed.Time(found.seconds, found.steps, found.horizons, expr.span)
+        case _:
+            message = "`shift` goes a whole number of samples, known at compile time"
+            return scope.fail(no_delay(message, expr.span))
+    if not (time.seconds or time.horizons):
+        finding = delay_fault(time.steps, expr.span, Grid())
+        if finding is not None:
+            scope.fail(finding)
+    return time
+
+
+def outside(entry: External, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
+    """A call. Raises Failed (E105, E202, E205)."""
+    _check_arguments(entry, call, scope)
+    flat: list[ir.Num] = []
+    for arg, value, size in zip(call.args, values, entry.arguments, strict=True):
+        need = Need(f"`{entry.name}` takes {'a number' if size is None else f'a vector of {size}'}", "this")
+        if size is None:
+            flat.append(absolute(loose_number(value, arg.value, need, scope)).num)
+            continue
+        vector = as_vector(value, arg.value, need, scope)
+        if len(vector.items) != size:
+            scope.fail(Diagnostic("E205", f"{need.who}, this has {len(vector.items)} components", arg.span))
+        flat += [absolute(item).num for item in vector.items]
+    numbers = [_output(entry, index, tuple(flat)) for index in range(entry.result or 1)]
+    if entry.result is None:
+        return replace(numbers[0], span=call.span)
+    return Vector(tuple(numbers), call.span)
+
+
+def _output(entry: External, index: int, args: tuple[ir.Num, ...]) -> Number:
+    num: ir.Num = ir.Extern(entry.name, args, index, entry.function)
+    if entry.unit.ratio != 1:
+        num = ir.Op("mul", (num, ir.Const(entry.unit.scale)))
+    return Number(num, entry.unit, flexible=not entry.unit.text, kind=entry.kind)
+
+
+def _check_arguments(entry: External, call: ast.Call, scope: Scope) -> None:
+    given, count = len(call.args), len(entry.arguments)
+    named = next((arg for arg in call.args if arg.name is not None), None)
+    if named is not None:
+        message = f"`{entry.name}` has no argument called `{named.name}`"
+        scope.fail(Diagnostic("E105", message, named.span, help=("give its arguments in order",)))
+    if given != count:
+        were = "was" if given == 1 else "were"
+        message = f"`{entry.name}` takes {count} argument{'s' if count != 1 else ''}, {given} {were} given"
+        scope.fail(Diagnostic("E105", message, call.span))
+
+
+def builtin(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
+    """`name(values)` for a built-in function. Raises Failed; E101 where there is no such function."""
+    if name in REGIONS:
+        return region(name, call, values, scope)
+    if name == "ind":
+        return _indicator(call, values, scope)
+    _positional(name, call, scope)
+    if name in STEPPING:
+        count_arguments(name, call, STEPPING[name], scope)
+        if not scope.temporal:
+            scope.fail(unsupported(f"`{name}`", call.span, scope))
+        return stepping(name, call, values, scope)
+    if name in REWRITTEN:
+        count_arguments(name, call, REWRITTEN[name], scope)
+        return _rewritten(name, call, values, scope)
+    function = FUNCTIONS.get(name)
+    if function is None or function.kind == "operator":
+        assert isinstance(call.func, ast.Name)
+        return scope.unknown(call.func, called=True)
+    if function.kind == "sampler" and not scope.samplers:
+        scope.fail(_no_samplers(name, call, scope))
+    return _function(name, call, values, scope)
+
+
+def unsupported(what: str, span: Span, scope: Scope) -> Diagnostic:
+    """A part of the language that is not compiled here."""
+    if not scope.in_spec:
+        return Diagnostic("S201", f"{what} is not part of the expression language of system files", span)
+    return Diagnostic("E015", f"{what} is not compiled by this version", span)
+
+
+def count_arguments(name: str, call: ast.Call, arity: tuple[int, int | None], scope: Scope) -> None:
+    """Refuse a wrong number of arguments (E105)."""
+    least, most = arity
+    given = len(call.args)
+    if least <= given and (most is None or given <= most):
+        return
+    if most is None:
+        wants = f"at least {least} argument{'s' if least != 1 else ''}"
+    elif least == most:
+        wants = f"{least} argument{'s' if least != 1 else ''}"
+    else:
+        wants = f"{least} to {most} arguments"
+    were = "was" if given == 1 else "were"
+    scope.fail(Diagnostic("E105", f"`{name}` takes {wants}, {given} {were} given", call.span))
+
+
+def _positional(name: str, call: ast.Call, scope: Scope) -> None:
+    for arg in call.args:
+        if arg.name is not None:
+            scope.fail(Diagnostic("E105", f"`{name}` has no argument called `{arg.name}`", arg.span))
+
+
+def _no_samplers(name: str, call: ast.Call, scope: Scope) -> Diagnostic:
+    message = f"`{name}` draws at random, which only initial states and events can"
+    return Diagnostic("E205" if scope.in_spec else "S201", message, call.span)
+
+
+def _function(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
+    """A function of the table: component by component, or over all components at once."""
+    items: list[Number | Vector] = []
+    for index, (arg, value) in enumerate(zip(call.args, values, strict=True), start=1):
+        need = Need(f"`{name}` takes numbers", f"argument {index}")
+        if isinstance(value, Vector):
+            items.append(value)
+        elif name == "choice":
+            items.append(loose_number(value, arg.value, need, scope))
+        else:
+            items.append(as_number(value, arg.value, need, scope))
+    function = FUNCTIONS[name]
+    if function.most is None and function.kind == "function" and items:
+        flat = [n for item in items for n in (item.items if isinstance(item, Vector) else (item,))]
+        return apply(name, flat, call.span, scope) if flat else Number(ir.Const(0.0), span=call.span)
+    count_arguments(name, call, (function.least, function.most), scope)
+    return broadcast(name, items, call.span, scope)
+
+
+def _rewritten(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
+    span, exprs = call.span, [arg.value for arg in call.args]
+    if name in ("deg", "rad"):
+        angle = as_number(values[0], exprs[0], Need(f"`{name}` converts an angle"), scope)
+        return _convert(name, angle, span, scope)
+    if name == "sdist":
+        point = as_vector(values[0], exprs[0], Need("`sdist` takes a point"), scope)
+        place = values[1]
+        if not isinstance(place, REGION_TYPES):
+            scope.fail(Diagnostic("E205", f"`sdist` takes a region, this is {noun(place)}", exprs[1].span))
+        return signed_distance(point, place, span, scope)
+    left, right = (
+        as_vector(value, expr, Need(f"`{name}` takes two vectors", f"argument {index}"), scope)
+        for index, (value, expr) in enumerate(zip(values, exprs, strict=True), start=1)
+    )
+    if name == "cross":
+        return cross(left, right, span, scope)
+    return (
+        dot(left, right, span, scope) if name == "dot" else norm(minus(left, right, span, scope), span, scope)
+    )
+
+
+def _convert(name: str, angle: Number, span: Span, scope: Scope) -> Number:
+    """`deg(x)`: how many degrees an angle is; `rad(x)`: the angle of so many degrees."""
+    ratio = Fraction(math.pi) / 180
+    factor = literal(1 / ratio if name == "deg" else ratio, span)
+    (angle, _), _ = agree((angle, Number(ir.Const(1.0))), f"`{name}`", span, scope)
+    return replace(apply("mul", (angle, factor), span, scope), flexible=False, bare=False)
+
+
+def _indicator(call: ast.Call, values: Sequence[Value], scope: Scope) -> Number:
+    """`ind(phi, sharpness = w)`: 1 where phi holds, else 0 (the paper's Eq. 6 in training)."""
+    if not call.args or call.args[0].name is not None or len(call.args) > 2:
+        message = "`ind` takes a formula, and perhaps `sharpness = w`"
+        scope.fail(Diagnostic("E105", message, call.span, help=("ind(x > 0, sharpness = 500)",)))
+    sharpness = None
+    if len(call.args) == 2:
+        arg = call.args[1]
+        if arg.name not in (None, "sharpness"):
+            scope.fail(
+                Diagnostic(
+                    "E105",
+                    f"`ind` has no argument called `{arg.name}`",
+                    arg.span,
+                    help=("its second argument is `sharpness`",),
+                )
+            )
+        width = as_number(values[1], arg.value, Need("the sharpness of `ind` is a number"), scope)
+        sharpness = width.constant
+        if sharpness is None or sharpness <= 0:
+            scope.fail(Diagnostic("E205", "the sharpness of `ind` is a positive constant", arg.value.span))
+    cond = as_state_formula(values[0], call.args[0].value, Need("`ind`", "argument 1"), scope)
+    if isinstance(cond, ir.Truth):
+        return replace(literal(int(cond.value), call.span), flexible=False, bare=False)
+    return Number(ir.Indicator(cond, sharpness), kind="int", span=call.span)

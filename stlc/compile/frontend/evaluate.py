@@ -1,0 +1,640 @@
+"""Evaluation: from syntax to values, the one recursion over expressions.
+
+Everything else in the front end works on values; here names are looked up, macros expand (an argument is a
+value, so nothing is captured), quantifiers unroll, and independent findings are gathered.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import lru_cache
+from types import MappingProxyType
+from typing import Any
+
+from stlc.compile.frontend import comparisons
+from stlc.compile.frontend import intervals as moments
+from stlc.compile.frontend.arithmetic import agree, broadcast, negate, refuse_point, too_large
+from stlc.compile.frontend.builtins import builtin, outside, unsupported
+from stlc.compile.frontend.coerce import Need, as_formula, as_number, as_state_formula, loose_number
+from stlc.compile.frontend.macros import arguments, cycle, finished, outgrown
+from stlc.compile.frontend.scope import TIME_WORDS, Cost, Definition, External, Failed, Scope, reserved
+from stlc.compile.frontend.values import Moment, Number, Origin, Swept, Value, Vector, at, is_formula, literal
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.functions import OPERATORS
+from stlc.compile.ir.traverse import is_state
+from stlc.diagnostics import Diagnostic, Label
+from stlc.grammar import ast
+from stlc.registry import closest
+from stlc.signature import Kind
+from stlc.source import Span
+from stlc.units import nearest, parse_unit
+
+
+def member_of(expr: ast.Attr, scope: Scope) -> tuple[ast.Name, Scope]:
+    """`m.name`: the name, and the scope in which it means something. Raises Failed (E101)."""
+    if not scope.in_spec:
+        scope.fail(unsupported(f"`{expr.span.text}`", expr.span, scope))
+    place = expr.span.source.span(expr.span.end - len(expr.name), expr.span.end)
+    return ast.Name(place, expr.name, quoted=True), _module(expr.base, scope)
+
+
+def _module(expr: ast.Expr, scope: Scope) -> Scope:
+    match expr:
+        case ast.Name(_, name) if name in scope.modules:
+            return scope.modules[name]
+        case ast.Attr(_, base, name):
+            outer = _module(base, scope)
+            if name in outer.modules:
+                return outer.modules[name]
+    near = closest(expr.span.text, scope.modules)
+    asks = f"did you mean `{near}`?" if near is not None else 'import "file.stl" as m, or import std'
+    return scope.fail(
+        Diagnostic("E101", f"`{expr.span.text}` is not an imported file", expr.span, help=(asks,))
+    )
+
+
+Branches = tuple[Value, Value, Value]
+
+
+def choose(expr: ast.IfThenElse, values: Branches, scope: Scope) -> Value:
+    """A choice between formulas, or between numbers or vectors. One between bools is both.
+
+    Args:
+        expr: as written.
+        values: of the condition and of both branches.
+        scope: where findings go.
+
+    Raises:
+        Failed: the condition is not a formula (E201), for numbers not one about a single instant (E202), or
+            the branches do not go together (E203, E205).
+    """
+    cond = as_formula(values[0], expr.cond, Need("`if`"), scope)
+    yes, no = values[1:]
+    if isinstance(yes, typed.Node) or isinstance(no, typed.Node):
+        return _choice_of_formulas(expr, cond, (yes, no), scope)
+    if _is_bool(yes) and _is_bool(no) and not is_state(cond):
+        return _choice_of_formulas(expr, cond, (yes, no), scope)
+    if not (isinstance(yes, Vector) and isinstance(no, Vector)):
+        return _choose(expr, cond, (yes, no), scope)
+    if len(yes.items) != len(no.items):
+        message = f"vectors of {len(yes.items)} and {len(no.items)} components do not go together"
+        scope.fail(Diagnostic("E205", message, expr.span))
+    pairs = zip(yes.items, no.items, strict=True)
+    return Vector(tuple(_choose(expr, cond, pair, scope) for pair in pairs), expr.span)
+
+
+def _is_bool(value: Value) -> bool:
+    return isinstance(value, Number) and value.kind == "bool"
+
+
+def _choice_of_formulas(
+    expr: ast.IfThenElse, cond: typed.Formula, branches: tuple[Value, Value], scope: Scope
+) -> typed.Formula:
+    """`(cond and yes) or (not cond and no)`."""
+    yes = as_formula(branches[0], expr.yes, Need("`then`"), scope)
+    no = as_formula(branches[1], expr.no, Need("`else`"), scope)
+    first = typed.Logic(expr.yes.span, "and", (cond, yes))
+    second = typed.Logic(expr.no.span, "and", (typed.Not(expr.cond.span, cond), no))
+    return typed.Logic(expr.span, "or", (first, second))
+
+
+def _choose(expr: ast.IfThenElse, cond: typed.Formula, branches: tuple[Value, Value], scope: Scope) -> Number:
+    """One of two numbers, by a state formula; of two bools the choice between formulas as well."""
+    decides = as_state_formula(cond, expr.cond, Need("`if`"), scope)
+    need = Need("the branches of `if` are of one sort", "this")
+    yes = loose_number(branches[0], expr.yes, need, scope)
+    no = loose_number(branches[1], expr.no, need, scope)
+    (yes, no), blank = agree((yes, no), "choose between", expr.span, scope)
+    if isinstance(decides, ir.Truth):
+        return yes if decides.value else no
+    formula = _choice_of_formulas(expr, cond, branches, scope) if _is_bool(yes) and _is_bool(no) else None
+    same = yes.kind == no.kind and yes.labels == no.labels
+    kind: Kind = yes.kind if same else "real"
+    labels = yes.labels if same else ()
+    num = ir.Where(decides, yes.num, no.num)
+    return replace(blank, num=num, kind=kind, labels=labels, formula=formula)
+
+
+_VERBS = {"+": "adds", "-": "subtracts", "*": "multiplies", "/": "divides", "%": "divides", "^": "raises"}
+
+
+@dataclass(frozen=True, slots=True)
+class Operation:
+    """How a kind of node is valued: its parts, in order, and what their values make."""
+
+    parts: Callable[[Any], Sequence[ast.Expr]]
+    value: Callable[[Any, Sequence[Value], Scope], Value]
+
+
+def _quantity(expr: ast.Quantity, _values: Sequence[Value], scope: Scope) -> Value:
+    if not expr.unit:
+        return literal(expr.value, expr.span)
+    if expr.unit in ("step", "steps"):
+        if not scope.in_spec:
+            scope.fail(unsupported("a number of steps", expr.span, scope))
+        return Moment(steps=expr.value, span=expr.span)
+    try:
+        number = _measured(expr.value, expr.unit)
+    except ValueError as error:
+        scope.fail(Diagnostic("E203", str(error), expr.span))
+    if number is None:
+        scope.fail(too_large(expr.span))
+    return replace(number, span=expr.span)
+
+
+@lru_cache(maxsize=256)
+def _measured(value: Fraction, unit_text: str) -> Number | None:
+    """A number with a unit, from its zero; None: too large for a float. Raises ValueError: no such unit."""
+    unit = parse_unit(unit_text)
+    exact = value * unit.ratio
+    if not math.isfinite(nearest(exact)):
+        return None
+    return replace(literal(exact), unit=unit, flexible=False, bare=False, kind="real")
+
+
+def _bool(expr: ast.Bool, _values: Sequence[Value], _scope: Scope) -> Value:
+    return typed.Truth(expr.span, expr.value)
+
+
+def _string(expr: ast.String, _values: Sequence[Value], scope: Scope) -> Value:
+    return scope.fail(Diagnostic("E205", "a text has no value here", expr.span))
+
+
+def _inf(expr: ast.Inf, _values: Sequence[Value], _scope: Scope) -> Value:
+    return Moment(end=True, span=expr.span)
+
+
+def _vector(expr: ast.Vector, values: Sequence[Value], scope: Scope) -> Value:
+    need = Need("a vector holds numbers", "this component")
+    pairs = zip(values, expr.items, strict=True)
+    return Vector(tuple(as_number(value, item, need, scope) for value, item in pairs), expr.span)
+
+
+def _index(expr: ast.Index, values: Sequence[Value], scope: Scope) -> Value:
+    base, index = values
+    if not isinstance(base, Vector):
+        scope.fail(Diagnostic("E205", "only a vector has components", expr.base.span))
+    number = as_number(index, expr.index, Need("an index is a whole number"), scope)
+    value = number.constant
+    if value is None or value != int(value):
+        message = "an index is a whole number that is known at compile time"
+        scope.fail(Diagnostic("E205", message, expr.index.span))
+    if not 0 <= value < len(base.items):
+        last = len(base.items) - 1
+        message = f"index {int(value)} is outside the vector: it has components 0 to {last}"
+        scope.fail(Diagnostic("E205", message, expr.index.span))
+    return base.items[int(value)]
+
+
+def _neg(expr: ast.Neg, values: Sequence[Value], scope: Scope) -> Value:
+    (value,) = values
+    if isinstance(value, Moment):
+        return moments.negative(value, expr.span, scope)
+    if not isinstance(value, Vector):
+        value = as_number(value, expr.operand, Need("`-` takes a number"), scope)
+    if not isinstance(expr.operand, ast.Quantity):  # -5 degC is below zero; a temperature has no negation
+        for item in value.items if isinstance(value, Vector) else (value,):
+            refuse_point("`-`", item, expr.operand.span, scope)
+    return negate(value, expr.span)
+
+
+def _binary(expr: ast.Binary, values: Sequence[Value], scope: Scope) -> Value:
+    left, right = values
+    if isinstance(left, Moment) or isinstance(right, Moment):
+        return moments.combine(expr.op, (expr.left, left), (expr.right, right), expr.span, scope)
+    who = f"`{expr.op}` {_VERBS[expr.op]} numbers"
+    sides: list[Number | Vector] = []
+    for value, side, which in ((left, expr.left, "left"), (right, expr.right, "right")):
+        if isinstance(value, Vector):
+            sides.append(value)
+        else:
+            sides.append(as_number(value, side, Need(who, f"the {which} side"), scope))
+    place = comparisons.sign_span(expr.op, expr.left.span, expr.right.span)
+    _refuse_products(expr, sides, place, scope)
+    return broadcast(OPERATORS[expr.op], sides, place if expr.op in "+-%" else expr.span, scope)
+
+
+def _refuse_products(expr: ast.Binary, sides: Sequence[Number | Vector], place: Span, scope: Scope) -> None:
+    """Sums are made of two vectors or of two numbers; a product takes at most one vector."""
+    vectors = [isinstance(side, Vector) for side in sides]
+    if expr.op in "+-" and any(vectors) and not all(vectors):
+        scope.fail(Diagnostic("E205", f"`{expr.op}` does not mix a vector and a number", place))
+    if expr.op == "*" and all(vectors):
+        left, right = expr.left.span.text, expr.right.span.text
+        help_ = (f"`dot({left}, {right})` or `cross({left}, {right})`",)
+        scope.fail(Diagnostic("E205", "`*` of two vectors is ambiguous", place, help=help_))
+    if expr.op in "/%^" and vectors[1]:
+        scope.fail(Diagnostic("E205", f"`{expr.op}` does not take a vector on its right", place))
+
+
+def _compare(expr: ast.Compare, values: Sequence[Value], scope: Scope) -> Value:
+    return comparisons.comparison(expr, values, scope)
+
+
+def _membership(expr: ast.Member, values: Sequence[Value], scope: Scope) -> Value:
+    region = expr.region
+    item, rest = (expr.item, values[0]), values[1:]
+    if isinstance(values[0], Swept):
+        return comparisons.sweeps(
+            expr, values[0], list(zip(_member_parts(expr)[1:], rest, strict=True)), scope
+        )
+    if isinstance(region, ast.SetLiteral):
+        inside = comparisons.in_set(item, list(zip(region.items, rest, strict=True)), expr.span, scope)
+    elif isinstance(region, ast.Vector) and len(region.items) == 2:
+        inside = comparisons.in_range(item, list(zip(region.items, rest, strict=True)), expr.span, scope)
+    else:
+        inside = comparisons.in_region(item, (region, rest[0]), expr.span, scope)
+    return typed.Not(expr.span, inside) if expr.negated else inside
+
+
+def _member_parts(expr: ast.Member) -> Sequence[ast.Expr]:
+    region = expr.region
+    if isinstance(region, ast.SetLiteral) or (isinstance(region, ast.Vector) and len(region.items) == 2):
+        return (expr.item, *region.items)
+    return (expr.item, region)
+
+
+def _if(expr: ast.IfThenElse, values: Sequence[Value], scope: Scope) -> Value:
+    cond, yes, no = values
+    return choose(expr, (cond, yes, no), scope)
+
+
+def _nothing(_expr: ast.Expr) -> Sequence[ast.Expr]:
+    return ()
+
+
+OPERATIONS: Mapping[type[ast.Node], Operation] = MappingProxyType(
+    {
+        ast.Quantity: Operation(_nothing, _quantity),
+        ast.String: Operation(_nothing, _string),
+        ast.Bool: Operation(_nothing, _bool),
+        ast.Inf: Operation(_nothing, _inf),
+        ast.Vector: Operation(lambda expr: expr.items, _vector),
+        ast.Index: Operation(lambda expr: (expr.base, expr.index), _index),
+        ast.Neg: Operation(lambda expr: (expr.operand,), _neg),
+        ast.Binary: Operation(lambda expr: (expr.left, expr.right), _binary),
+        ast.Compare: Operation(lambda expr: expr.operands, _compare),
+        ast.Member: Operation(_member_parts, _membership),
+        ast.IfThenElse: Operation(lambda expr: (expr.cond, expr.yes, expr.no), _if),
+    }
+)
+"""Kind of node -> how it is valued."""
+
+
+def evaluate(expr: ast.Expr, scope: Scope) -> Value:
+    """The value of an expression. Raises Failed, with all independent findings in the sink."""
+    meter = scope.meter
+    meter.enter()
+    before = meter.nodes
+    try:
+        _refuse_excess(expr.span, scope)
+        value = _value(expr, scope)
+        if _is_written_twice(expr, value):
+            _charge(Cost(meter.nodes - before), expr.span, scope)
+        return at(value, expr.span)
+    finally:
+        meter.leave()
+
+
+def _is_written_twice(expr: ast.Expr, value: Value) -> bool:
+    """Whether parts of a formula appear twice in what it means: `a <-> b` is `a -> b` and `b -> a`."""
+    match expr:
+        case ast.Logic(op="<->" | "xor") | ast.Until(op="unless"):
+            return True
+        case ast.IfThenElse():
+            return is_formula(value)
+        case ast.Compare():
+            return isinstance(value, typed.Logic)
+        case ast.Call():
+            return isinstance(value, typed.Edge)
+        case _:
+            return False
+
+
+def _value(expr: ast.Expr, scope: Scope) -> Value:
+    operation = OPERATIONS.get(type(expr))
+    if operation is None:
+        return _HANDLERS[type(expr)](expr, scope)
+    return operation.value(expr, evaluate_all(operation.parts(expr), scope), scope)
+
+
+def evaluate_all(exprs: Sequence[ast.Expr], scope: Scope) -> list[Value]:
+    """The values of independent expressions; each is looked at even where another one failed."""
+    values: list[Value] = []
+    for expr in exprs:
+        try:
+            values.append(evaluate(expr, scope))
+        except Failed:
+            continue
+    if len(values) < len(exprs):
+        raise Failed
+    return values
+
+
+def formula(expr: ast.Expr, need: Need, scope: Scope) -> typed.Formula:
+    """The expression as a formula. Raises Failed."""
+    return as_formula(evaluate(expr, scope), expr, need, scope)
+
+
+def formulas(exprs: Sequence[tuple[ast.Expr, Need]], scope: Scope) -> list[typed.Formula]:
+    """Independent expressions as formulas. Raises Failed."""
+    found: list[typed.Formula] = []
+    for expr, need in exprs:
+        try:
+            found.append(formula(expr, need, scope))
+        except Failed:
+            continue
+    if len(found) < len(exprs):
+        raise Failed
+    return found
+
+
+# ------------------------------------------------------------------------ names
+
+
+def _name(expr: ast.Name, scope: Scope) -> Value:
+    if expr.name in scope.locals:
+        value, cost = scope.locals[expr.name]
+        _charge(cost, expr.span, scope)
+        return value
+    if scope.in_spec and expr.name in TIME_WORDS and not expr.quoted:
+        return moments.time_word(expr.name, expr.span)
+    return _named(expr, scope, scope)
+
+
+def _attr(expr: ast.Attr, scope: Scope) -> Value:
+    """A name of an imported file."""
+    name, home = member_of(expr, scope)
+    return _named(name, home, scope)
+
+
+def _named(expr: ast.Name, home: Scope, scope: Scope) -> Value:
+    """What a name of `home` is worth in `scope`."""
+    entry = home.entries.get(expr.name)
+    if entry is None:
+        return home.unknown(expr)
+    if isinstance(entry, External):
+        scope.fail(Diagnostic("E105", f"`{entry.name}` takes arguments", expr.span))
+    if isinstance(entry, Definition):
+        if entry.formals:
+            help_ = (f"{entry.name}({', '.join(entry.formals)})",)
+            scope.fail(Diagnostic("E105", f"`{entry.name}` takes arguments", expr.span, help=help_))
+        value = _defined(entry, expr.span, home)
+    else:
+        value = entry.value
+    if isinstance(value, Number) and entry.span is not None:
+        return replace(value, origin=Origin(entry.span, f"line {entry.span.line}"))
+    return value
+
+
+# --------------------------------------------------------------------- macros
+
+
+def _defined(entry: Definition, place: Span, scope: Scope) -> Value:
+    """The value of a definition without arguments: found once, charged at every use."""
+    if entry.name not in scope.cache:
+        if entry.name in scope.open:
+            scope.fail(cycle(entry, scope))
+        inner = replace(scope, locals={}, open=(*scope.open, entry.name))
+        scope.cache[entry.name] = None
+        with scope.meter.measured() as cost:
+            value = finished(entry, evaluate(entry.body, inner), inner)
+        scope.cache[entry.name] = (value, cost)
+    found = scope.cache[entry.name]
+    if found is None:
+        if entry.name in scope.open:
+            scope.fail(cycle(entry, scope))
+        raise Failed
+    _charge(found[1], place, scope)
+    return found[0]
+
+
+def _expanded(entry: Definition, call: ast.Call, scope: Scope, home: Scope) -> Value:
+    """A macro of `home` with its arguments put in."""
+    if home.cache.get(entry.name, entry) is None:
+        raise Failed
+    if entry.name in home.open:
+        scope.fail(cycle(entry, home))
+    bound: dict[str, tuple[Value, Cost]] = {}
+    failed = False
+    for formal, expr in arguments(entry, call, scope).items():
+        try:
+            with scope.meter.measured() as cost:
+                value = evaluate(expr, scope)
+            bound[formal] = (value, cost)
+        except Failed:
+            failed = True
+    if failed:
+        raise Failed
+    inner = replace(home, locals=bound, open=(*home.open, entry.name))
+    with _traced(entry, call, scope):
+        return finished(entry, evaluate(entry.body, inner), inner)
+
+
+@contextmanager
+def _traced(entry: Definition, call: ast.Call, scope: Scope) -> Iterator[None]:
+    """Findings inside a macro also show the use that brought them up."""
+    before = len(scope.sink)
+    try:
+        yield
+    except Failed:
+        label = Label(call.span, f"in this use of `{entry.name}`")
+        scope.sink[before:] = [
+            finding
+            if finding.labels and finding.labels[-1] == label
+            else replace(finding, labels=(*finding.labels, label))
+            for finding in scope.sink[before:]
+        ]
+        raise
+
+
+def _charge(cost: Cost, place: Span, scope: Scope) -> None:
+    scope.meter.charge(cost)
+    _refuse_excess(place, scope)
+
+
+def _refuse_excess(place: Span, scope: Scope) -> None:
+    """E005, once for a declaration."""
+    meter = scope.meter
+    if not meter.over:
+        return
+    if not meter.reported:
+        meter.reported = True
+        scope.report(outgrown(meter, place))
+    raise Failed
+
+
+def _call(expr: ast.Call, scope: Scope) -> Value:
+    if scope.in_spec and isinstance(expr.func, ast.Attr):
+        return _called(expr, *member_of(expr.func, scope), scope)
+    if not isinstance(expr.func, ast.Name):
+        note = ("expressions are parsed, never evaluated as Python; for Python dynamics use `plugin:`",)
+        message = "calls to attributes are not part of the expression language"
+        place = expr.func.span
+        if isinstance(expr.func, ast.Attr):
+            place = place.source.span(expr.func.base.span.end, place.end)
+        scope.fail(Diagnostic("S201", message, place, note=note))
+    return _called(expr, expr.func, scope, scope)
+
+
+def _called(expr: ast.Call, name: ast.Name, home: Scope, scope: Scope) -> Value:
+    """A call of something that `home` declares, or of a built-in function."""
+    entry = home.entries.get(name.name)
+    if isinstance(entry, Definition) and entry.formals:
+        return _expanded(entry, expr, scope, home)
+    if isinstance(entry, External):
+        return outside(entry, expr, evaluate_all([arg.value for arg in expr.args], scope), scope)
+    if entry is not None and (home is not scope or not reserved(name.name)):
+        if home.cache.get(name.name, entry) is not None:
+            scope.report(Diagnostic("E105", f"`{name.name}` is not a function", name.span))
+        raise Failed
+    if home is not scope:
+        return home.unknown(name, called=True)
+    values = evaluate_all([arg.value for arg in expr.args], scope)
+    return builtin(name.name, expr, values, scope)
+
+
+# ------------------------------------------------------------------- formulas
+
+
+def _not(expr: ast.Not, scope: Scope) -> Value:
+    return typed.Not(
+        expr.span, formula(expr.operand, Need("`not`", span=_head(expr.span, expr.operand)), scope)
+    )
+
+
+def _logic(expr: ast.Logic, scope: Scope) -> Value:
+    """Chains of `and` and of `or` become one node, without recursion along the chain."""
+    operands: list[ast.Expr] = [expr.right]
+    left = expr.left
+    while expr.op in ("and", "or") and isinstance(left, ast.Logic) and left.op == expr.op:
+        operands.append(left.right)
+        left = left.left
+    operands.append(left)
+    need = Need(f"`{expr.op}`")
+    return typed.Logic(
+        expr.span, expr.op, tuple(formulas([(item, need) for item in reversed(operands)], scope))
+    )
+
+
+def _temporal(expr: ast.Temporal, scope: Scope) -> Value:
+    place = _head(expr.span, expr.interval or expr.body, len(expr.alias or expr.op))
+    return _timed(expr, [(expr.body, Need(f"`{expr.op}`", span=place))], place, scope)
+
+
+def _until(expr: ast.Until, scope: Scope) -> Value:
+    after = expr.interval.span if expr.interval is not None else expr.right.span
+    place = comparisons.sign_span(expr.alias or expr.op, expr.left.span, after)
+    sides = [(expr.left, Need(f"`{expr.op}`", span=place)), (expr.right, Need(f"`{expr.op}`", span=place))]
+    return _timed(expr, sides, place, scope)
+
+
+def _timed(
+    expr: ast.Temporal | ast.Until, operands: Sequence[tuple[ast.Expr, Need]], place: Span, scope: Scope
+) -> typed.Formula:
+    """Operands and interval of a temporal operator, each looked at even where the other failed."""
+    if not scope.temporal:
+        scope.fail(unsupported(f"`{expr.op}`", expr.span, scope))
+    window: typed.Interval | None = None
+    body = operands[-1][0]
+    try:
+        bounds = (
+            evaluate_all((expr.interval.lo, expr.interval.hi), scope) if expr.interval is not None else ()
+        )
+        window = moments.interval(expr.interval, bounds, (expr.op, place), body, scope)
+    finally:
+        inner = formulas(operands, scope)
+    if isinstance(expr, ast.Temporal):
+        return typed.Temporal(expr.span, expr.op, window, inner[0])
+    return typed.Until(expr.span, expr.op, window, inner[0], inner[1])
+
+
+def _head(span: Span, inner: ast.Node, length: int | None = None) -> Span:
+    """The operator that stands before its operand."""
+    end = min(inner.span.start, span.start + length) if length is not None else inner.span.start
+    text = span.source.text[span.start : end].rstrip(" \t\n(")
+    return span.source.span(span.start, span.start + max(1, len(text)))
+
+
+def _quantifier(expr: ast.Quantifier, scope: Scope) -> Value:
+    """The conjunction or disjunction over a finite domain."""
+    items: list[typed.Formula] = []
+    need = Need(f"`{expr.kind}`")
+    for value in _domain(expr, scope):
+        inner = replace(scope, locals={**scope.locals, expr.var: (value, Cost(1, 1))})
+        items.append(formula(expr.body, need, inner))
+    if not items:
+        return typed.Truth(expr.span, expr.kind == "forall")
+    if len(items) == 1:
+        return items[0]
+    return typed.Logic(expr.span, "and" if expr.kind == "forall" else "or", tuple(items))
+
+
+def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
+    """The body, where the names stand for the values of the instant at which it is judged."""
+    if not scope.temporal:
+        scope.fail(unsupported("`freeze`", expr.span, scope))
+    names = [name for name, _ in expr.bindings]
+    if len(set(names)) < len(names):
+        scope.fail(Diagnostic("E102", "`freeze` binds one name twice", expr.span))
+    bindings: list[tuple[str, ir.Num]] = []
+    bound: dict[str, tuple[Value, Cost]] = {}
+    values = evaluate_all([value for _, value in expr.bindings], scope)
+    for (name, written), value in zip(expr.bindings, values, strict=True):
+        if isinstance(value, Vector):
+            items = [_held(item, f"{name}[{i}]", expr, bindings) for i, item in enumerate(value.items)]
+            bound[name] = (Vector(tuple(items), written.span), Cost(1, 1))
+        else:
+            number = loose_number(value, written, Need("`freeze` binds numbers and vectors"), scope)
+            bound[name] = (_held(number, name, expr, bindings), Cost(1, 1))
+    inner = replace(scope, locals={**scope.locals, **bound})
+    body = formula(expr.body, Need("`freeze`"), inner)
+    return typed.Freeze(expr.span, tuple(bindings), body) if bindings else body
+
+
+def _held(number: Number, name: str, expr: ast.Freeze, bindings: list[tuple[str, ir.Num]]) -> Number:
+    """The number as the body reads it; its key tells it apart from those of other `freeze`s."""
+    if number.constant is not None:
+        return number
+    key = f"{name}#{expr.span.start}@{expr.span.source.name}"
+    bindings.append((key, number.num))
+    return replace(number, num=ir.FrozenVar(key), formula=None, origin=None)
+
+
+def _domain(expr: ast.Quantifier, scope: Scope) -> Iterator[Number]:
+    if isinstance(expr.domain, ast.SetLiteral):
+        values = evaluate_all(expr.domain.items, scope)
+        for item, value in zip(expr.domain.items, values, strict=True):
+            yield as_number(value, item, Need(f"`{expr.kind}` runs over numbers"), scope)
+        return
+    ends = []
+    for end, value in zip(expr.domain, evaluate_all(expr.domain, scope), strict=True):
+        number = as_number(value, end, Need(f"`{expr.kind}` runs over whole numbers"), scope)
+        if number.exact is None or number.exact.denominator != 1:
+            message = f"`{expr.kind}` runs over whole numbers that are known at compile time"
+            scope.fail(Diagnostic("E205", message, end.span))
+        ends.append(int(number.exact))
+    scope.meter.charge(Cost(nodes=max(0, ends[1] - ends[0])))
+    _refuse_excess(expr.span, scope)
+    for index in range(ends[0], ends[1] + 1):
+        yield literal(Fraction(index), expr.span)
+
+
+_HANDLERS: Mapping[type[ast.Node], Callable[[Any, Scope], Value]] = MappingProxyType(
+    {
+        ast.Name: _name,
+        ast.Attr: _attr,
+        ast.Call: _call,
+        ast.Not: _not,
+        ast.Logic: _logic,
+        ast.Temporal: _temporal,
+        ast.Until: _until,
+        ast.Quantifier: _quantifier,
+        ast.Freeze: _freeze,
+    }
+)
