@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
-from stlc.compile.ir.support import columns as columns_of_formula
-from stlc.compile.ir.support import columns_of
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
 from stlc.dynamics.declaration.columns import (
     ControlKeys,
@@ -42,6 +40,7 @@ from stlc.dynamics.declaration.motion import (
     shared_draws,
     state_assigns,
 )
+from stlc.dynamics.model.algebra import names_in
 from stlc.dynamics.schema.names import (
     Clockwork,
     Context,
@@ -223,8 +222,8 @@ def _report_idle(
 ) -> None:
     """W603 for controls that move nothing."""
     moved = [assign.value for assign in (*flow, *(reset for jump in jumps for reset in jump.resets))]
-    read = {name for num in moved for name in columns_of(num)}
-    read |= {name for jump in jumps for name in columns_of_formula(jump.guard)}
+    read = {name for num in moved for name in names_in(num)}
+    read |= {name for jump in jumps for name in names_in(jump.guard)}
     known = {entry.key.text: entry.key.span for entry in reader.entries(node, "`control`")}
     for control in names.controls:
         span = known.get(control.name) or known.get(base_name(control.name))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.motion import JumpDecl
-from stlc.dynamics.model.algebra import add, blend, map_formula, multiply, substitute
+from stlc.dynamics.model.algebra import add, multiply, substitute
 from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.model.integrators._tableau import State
 
@@ -92,7 +92,7 @@ def _given(jump: JumpDecl, given: State) -> JumpDecl:
     if not given:
         return jump
     resets = tuple(replace(each, value=substitute(each.value, given)) for each in jump.resets)
-    return replace(jump, guard=map_formula(jump.guard, lambda num: substitute(num, given)), resets=resets)
+    return replace(jump, guard=substitute(jump.guard, given), resets=resets)
 
 
 def _flow(decl: SystemDecl, writer: _Writer, state: State, given: State) -> State:
@@ -118,10 +118,17 @@ def _jump(jump: JumpDecl, state: State, *, soft: bool) -> State:
     for assign in jump.resets:
         flowed = changed[assign.name]
         if soft:
-            changed[assign.name] = blend(jump.guard, assign.value, flowed, jump.sharpness)
+            changed[assign.name] = _blend(jump.guard, assign.value, flowed, jump.sharpness)
         else:
             changed[assign.name] = ir.Where(jump.guard, assign.value, flowed)
     return changed
+
+
+def _blend(cond: ir.Formula, yes: ir.Num, no: ir.Num, sharpness: float | None) -> ir.Num:
+    """`I yes + (1 - I) no` with the paper's I_w (Eq. 6); equal to a choice wherever I is exactly 0 or 1."""
+    weight = ir.Indicator(cond, sharpness)
+    kept = multiply(ir.Op("sub", (ir.Const(1.0), weight)), no)
+    return kept if yes == ir.Const(0.0) else add(multiply(weight, yes), kept)
 
 
 def _clamped(decl: SystemDecl, name: str, num: ir.Num) -> ir.Num:
