@@ -1,1 +1,1 @@
-"""How state moves: hybrid systems declared in YAML."""
+"""Hybrid systems declared in YAML."""

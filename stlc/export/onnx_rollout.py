@@ -10,7 +10,7 @@ from stlc.compile.backends.onnx.ops import ONNX
 from stlc.compile.backends.onnx.sheet import BATCH, Sheet, Value
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.model.algebra import names_in
-from stlc.dynamics.model.schedule import Stage, schedule
+from stlc.dynamics.model.schedule import RolloutStage, schedule
 from stlc.dynamics.model.step import Step
 
 
@@ -49,7 +49,7 @@ class _Film:
         self.now: Columns = {name: value for name, value in start.items() if name not in moving}
         self.now |= controls
 
-    def run(self, stage: Stage) -> None:
+    def run(self, stage: RolloutStage) -> None:
         """A stage whose inputs are known."""
         if stage.early:
             self.now.update(Program(stage.early)(self.now, ONNX))
@@ -71,7 +71,7 @@ class _Film:
         value = self.now[name]
         return value.spread(self.steps, value.shape[1])
 
-    def _loop(self, stage: Stage) -> None:
+    def _loop(self, stage: RolloutStage) -> None:
         """Step what feeds back into itself."""
         inside = stage.stepped.keys() | {name for block in stage.blocks for name in block}
         read = {name for block in stage.blocks for num in block.values() for name in names_in(num)}

@@ -1,4 +1,4 @@
-"""Recorded signals: what a trace is, its clock, and the files that it comes from."""
+"""Recorded signals: traces, their clocks, and their file formats."""
 
 from stlc.trace.trace import (
     AS_IT_IS,

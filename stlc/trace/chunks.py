@@ -1,4 +1,4 @@
-"""Traces that are larger than memory: the same files, a stretch of samples at a time, with one clock."""
+"""Traces that are larger than memory, read a number of samples at a time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.trace.enums import instants_of
 from stlc.trace.formats.registry import SUFFIXES, format_of, unreadable
-from stlc.trace.recording import CLOCK, Recording, Strand
+from stlc.trace.recording import CLOCK, ClockGroup, Recording
 from stlc.trace.time_grid import TOLERANCE, resample_advice
 from stlc.trace.trace import Reading, Trace, trace_of
 
@@ -22,7 +22,7 @@ LARGE = 1_500_000_000
 
 
 def size_of(path: Path) -> int:
-    """Bytes that the numbers of a file take in memory, roughly; 0 where the format cannot be read in pieces.
+    """Approximate bytes of a file's numbers in memory; 0 for a format that is not read in chunks.
 
     Raises:
         StlcError: the file cannot be opened, or is damaged.
@@ -33,7 +33,7 @@ def size_of(path: Path) -> int:
 
 
 def pieces(path: Path, samples: int, reading: Reading) -> Iterator[Trace]:
-    """The trace of a file, so many samples at a time; times go on from piece to piece.
+    """The trace of a file, so many samples at a time, with continuing times.
 
     Raises:
         TraceError: as `stlc.trace.trace.load_trace`; E605, the file holds several traces, or its format
@@ -66,48 +66,48 @@ def _single(trace: Trace) -> Trace:
 
 
 def _begin(recording: Recording, reading: Reading) -> np.datetime64 | None:
-    """The first date of a clock that is written in dates."""
+    """The first date of a clock that is written as dates."""
     clock = reading.names.get(CLOCK)
-    (strand,) = (recording if clock is None else recording.clocked_by(clock)).strands
-    if strand.clock is None or strand.clock.dtype.kind != "U":
+    (group,) = (recording if clock is None else recording.clocked_by(clock)).groups
+    if group.clock is None or group.clock.dtype.kind != "U":
         return None
-    first: np.datetime64 = instants_of(recording.name, strand).flat[0]
+    first: np.datetime64 = instants_of(recording.name, group).flat[0]
     return first
 
 
 class _Clock:
-    """Time that goes on from one piece to the next."""
+    """The clock of consecutive chunks."""
 
     def __init__(self, first: Trace, begin: np.datetime64 | None) -> None:
         self.name, self.dt, self.t0, self.samples = first.name, first.dt, first.t0, first.samples
         self.begin = begin
 
     def next(self, recording: Recording, reading: Reading) -> Trace:
-        """The piece on the grid of those before it."""
+        """The next chunk, on the grid of those before it."""
         names = dict(reading.names)
         renamed = names.pop(CLOCK, None)
         recording = recording if renamed is None else recording.clocked_by(renamed)
-        (strand,) = recording.strands
-        if strand.clock is not None:
-            self._check(self._seconds(strand))
+        (group,) = recording.groups
+        if group.clock is not None:
+            self._check(self._seconds(group))
         meta = replace(recording.meta, dt=self.dt)
-        unclocked = replace(recording, strands=(Strand(strand.arrays, None),), meta=meta)
+        unclocked = replace(recording, groups=(ClockGroup(group.arrays, None),), meta=meta)
         trace = trace_of(unclocked, replace(reading, names=names))
         start = self.t0 + self.samples * self.dt
         self.samples += trace.samples
         return replace(trace, t0=start)
 
-    def _seconds(self, strand: Strand) -> NDArray[np.float64]:
-        """The times of a piece, of dates since the first of the file."""
-        assert strand.clock is not None
-        if strand.clock.dtype.kind not in "Uc":
-            return strand.clock.astype(np.float64)
-        instants = instants_of(self.name, strand)
+    def _seconds(self, group: ClockGroup) -> NDArray[np.float64]:
+        """The times of a chunk; of dates, seconds since the first of the file."""
+        assert group.clock is not None
+        if group.clock.dtype.kind not in "Uc":
+            return group.clock.astype(np.float64)
+        instants = instants_of(self.name, group)
         begin = instants.flat[0] if self.begin is None else self.begin
         return np.asarray((instants - begin) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)
 
     def _check(self, times: NDArray[np.float64]) -> None:
-        """Every sample is where the grid says; small errors of rounding may add up slowly."""
+        """Check that every sample is on the grid; small rounding errors may accumulate."""
         wanted = self.t0 + self.dt * (self.samples + np.arange(len(times)))
         off = np.abs(times - wanted)
         bad = ~(off <= TOLERANCE * self.dt + 1e-9 * np.abs(wanted))

@@ -1,4 +1,4 @@
-"""Words in a trace -> numbers: members of an enum and truth values, as the specification declares them.
+"""Conversion of words in a trace to numbers: members of enums, and truth values.
 
 What is no number of any kind, words and complex numbers, is set aside, and refused where a signal needs it.
 """
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.registry import closest
-from stlc.trace.recording import Recording, Strand
+from stlc.trace.recording import ClockGroup, Recording
 
 Words = Mapping[str, float]
 
@@ -23,11 +23,11 @@ TRUTH: Words = {
     **dict.fromkeys(("true", "yes", "on"), 1.0),
     **dict.fromkeys(("false", "no", "off"), 0.0),
 }
-"""What a column of a truth value may say, in any case of letters."""
+"""Words for truth values, in any case."""
 
 
 def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
-    """The recording without words.
+    """The recording with words converted to numbers.
 
     Args:
         recording: whose arrays may be text.
@@ -38,30 +38,30 @@ def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
         TraceError: E603, words or complex numbers where numbers are needed, or a word that the signal does
             not have.
     """
-    strands = tuple(
+    groups = tuple(
         replace(
-            strand,
+            group,
             arrays={
                 name: _numbers(recording.name, name, values, words[name]) if _is_odd(values) else values
-                for name, values in strand.arrays.items()
+                for name, values in group.arrays.items()
                 if name in words or not _is_odd(values)
             },
-            clock=_seconds(recording.name, strand) if _is_odd(strand.clock) else strand.clock,
+            clock=_seconds(recording.name, group) if _is_odd(group.clock) else group.clock,
         )
-        for strand in recording.strands
+        for group in recording.groups
     )
     aside = {
         name: values
-        for strand in recording.strands
-        for name, values in strand.arrays.items()
+        for group in recording.groups
+        for name, values in group.arrays.items()
         if name not in words and _is_odd(values)
     }
-    return replace(recording, strands=strands, extras={**recording.extras, **aside})
+    return replace(recording, groups=groups, extras={**recording.extras, **aside})
 
 
 def wordless(recording: Recording) -> Recording:
-    """The recording, its words set aside. Raises TraceError (E603) where all signals are words."""
-    signals = [values for strand in recording.strands for values in strand.arrays.values()]
+    """The recording with signals of words set aside. Raises TraceError (E603) where all signals are."""
+    signals = [values for group in recording.groups for values in group.arrays.values()]
     none_left = all(map(_is_odd, signals))
     return in_numbers(recording, {name: {} for name in recording.signals} if none_left else {})
 
@@ -77,16 +77,16 @@ def _refuse_complex(trace: str, name: str, values: NDArray[Any]) -> None:
         raise TraceError(Diagnostic("E603", f"`{name}` in `{trace}` holds complex numbers", help=advice))
 
 
-def instants_of(trace: str, strand: Strand) -> NDArray[np.datetime64]:
+def instants_of(trace: str, group: ClockGroup) -> NDArray[np.datetime64]:
     """The dates and times (ISO 8601) of a clock. Raises TraceError (E603) for other words."""
-    assert strand.clock is not None
-    _refuse_complex(trace, strand.named, strand.clock)
-    written = np.char.rstrip(strand.clock, "Zz")
+    assert group.clock is not None
+    _refuse_complex(trace, group.named, group.clock)
+    written = np.char.rstrip(group.clock, "Zz")
     try:
         return np.asarray(written.astype("datetime64[ns]"))
     except ValueError:
-        shown = str(strand.clock.flat[0])[:40]
-        message = f"the clock `{strand.named}` in `{trace}` holds words (`{shown}`)"
+        shown = str(group.clock.flat[0])[:40]
+        message = f"the clock `{group.named}` in `{trace}` holds words (`{shown}`)"
         advice = ("seconds, or dates and times such as 2026-01-31T12:00:00.5",)
         raise TraceError(Diagnostic("E603", message, help=advice)) from None
 
@@ -100,16 +100,16 @@ def instant_of_word(word: str) -> np.datetime64 | None:
 
 
 def number_of_word(trace: str, name: str, word: str, words: Words) -> float:
-    """What a word of a signal is worth. Raises TraceError (E603) for one that it does not have."""
+    """The number of a word. Raises TraceError (E603) for an unknown word."""
     worth = _worth(word, words)
     if worth is None:
         raise TraceError(_unknown(trace, name, word, words))
     return worth
 
 
-def _seconds(trace: str, strand: Strand) -> NDArray[np.float64]:
+def _seconds(trace: str, group: ClockGroup) -> NDArray[np.float64]:
     """Dates and times as seconds since the first."""
-    instants = instants_of(trace, strand)
+    instants = instants_of(trace, group)
     first = instants.flat[0] if instants.size else np.datetime64(0, "ns")
     return np.asarray((instants - first) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)
 
@@ -125,7 +125,7 @@ def _numbers(trace: str, name: str, values: NDArray[Any], words: Words) -> NDArr
 
 
 def _worth(word: str, words: Words) -> float | None:
-    """A member as it is written, or the only one that differs in the case of letters; NaN for no word."""
+    """The number of a member, also where its case differs and no other member matches; NaN for no word."""
     if word in words:
         return words[word]
     if not word and words:

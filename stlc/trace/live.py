@@ -1,4 +1,4 @@
-"""Samples that come line by line, as a table with a header or as JSON -> the same on one grid of time.
+"""Samples that arrive line by line, as a table with a header or as JSON, on one time grid.
 
 What a line says is what a file with these lines would say (`stlc.trace.formats.csv`): names, units, words,
 clocks.
@@ -44,16 +44,16 @@ _SLACK = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
-    """A sample, and when it was taken, in seconds; None where nothing says so."""
+class TimedSample:
+    """A sample with its time in seconds; None where the stream gives no times."""
 
     time: float | None
     sample: Sample
 
 
 @dataclass(slots=True)
-class Lines:
-    """Lines of a stream as samples.
+class SampleStream:
+    """A stream of lines, parsed into samples.
 
     Attributes:
         name: of the stream, for messages.
@@ -71,8 +71,8 @@ class Lines:
     _begin: np.datetime64 | None = None
     _signals: dict[str, str] = field(default_factory=dict)
 
-    def moments(self, lines: Iterable[bytes]) -> Iterator[Moment]:
-        """The samples that lines hold; empty lines are passed over.
+    def moments(self, lines: Iterable[bytes]) -> Iterator[TimedSample]:
+        """The samples of the lines; empty lines are skipped.
 
         Raises:
             TraceError: E601, a signal or clock that was named is missing; E603, a line that is no sample, or
@@ -106,7 +106,7 @@ class Lines:
     # ------------------------------------------------------------------------ names
 
     def _named(self, there: Iterable[str]) -> None:
-        """Which name there is the clock, and what signals the others are."""
+        """Find the clock and the signals among the names of the stream."""
         known = list(there)
         names = dict(self.reading.names)
         self._clock = names.pop(CLOCK, None) or clock_among(known)
@@ -137,7 +137,7 @@ class Lines:
 
     # ------------------------------------------------------------------------ values
 
-    def _row(self, text: str, number: int) -> Moment:
+    def _row(self, text: str, number: int) -> TimedSample:
         cells = [bare(cell) for cell in text.split(self._delimiter)]
         if len(cells) != len(self._heads):
             what = f"has {len(cells)} cells, the header names {len(self._heads)} columns"
@@ -146,7 +146,7 @@ class Lines:
             cells = [_with_point(cell) for cell in cells]
         return self._moment(dict(zip(self._heads, cells, strict=True)), number)
 
-    def _object(self, text: str, number: int) -> Moment:
+    def _object(self, text: str, number: int) -> TimedSample:
         try:
             found = loads(text)
         except (ValueError, RecursionError):
@@ -165,7 +165,7 @@ class Lines:
             self._signals |= {name: name for name in new if name not in self.reading.names}
         return self._moment(flat, number)
 
-    def _moment(self, values: Mapping[str, object], number: int) -> Moment:
+    def _moment(self, values: Mapping[str, object], number: int) -> TimedSample:
         time = None if self._clock is None else self._seconds(values.get(self._clock), number)
         sample: dict[str, float] = {}
         for name, signal in self._signals.items():
@@ -173,7 +173,7 @@ class Lines:
                 value = self._number(signal, values[name], number)
                 if value is not None:
                     sample[signal] = value
-        return Moment(time, sample)
+        return TimedSample(time, sample)
 
     def _seconds(self, value: object, number: int) -> float:
         found = _plain(value)
@@ -188,7 +188,7 @@ class Lines:
         raise self._bad(number, f"has {shown}")
 
     def _number(self, signal: str, value: object, number: int) -> float | None:
-        """What a cell is worth; None where it holds a word and nobody is interested."""
+        """The number of a cell; None for words of a signal that nothing reads."""
         if value is None:
             return math.nan
         found = _plain(value)
@@ -203,7 +203,7 @@ class Lines:
 
 
 def _with_point(cell: str) -> str:
-    """A number with a decimal comma as one with a point."""
+    """A number with a decimal comma, rewritten with a point."""
     changed = cell.replace(",", ".")
     return changed if value_of(cell) is None and value_of(changed) is not None else cell
 
@@ -235,8 +235,8 @@ class Uniform:
     samples: Iterator[Sample]
 
 
-def on_grid(moments: Iterator[Moment], reading: Reading, name: str) -> Uniform:
-    """Samples as `stlc.trace.trace.trace_of` would lay them on a grid, as soon as they are known.
+def on_grid(moments: Iterator[TimedSample], reading: Reading, name: str) -> Uniform:
+    """Samples on the grid that `stlc.trace.trace.trace_of` would use, as soon as they are known.
 
     Without a new grid they have to be on one. With one (`resample`, or a longest gap) a sample is known when
     the next one of every signal has come, or none within the longest gap.
@@ -262,7 +262,7 @@ def _again(first: Sample, rest: Iterator[Sample]) -> Iterator[Sample]:
     yield from rest
 
 
-def _steady(first: Moment, rest: Iterator[Moment], dt: float | None, name: str) -> Uniform:
+def _steady(first: TimedSample, rest: Iterator[TimedSample], dt: float | None, name: str) -> Uniform:
     if dt is not None:
         require_step(name, dt)
     second = next(rest, None)
@@ -277,7 +277,7 @@ def _steady(first: Moment, rest: Iterator[Moment], dt: float | None, name: str) 
 
 
 def _checked(
-    first: Moment, second: Moment, rest: Iterator[Moment], how: tuple[float, bool, str]
+    first: TimedSample, second: TimedSample, rest: Iterator[TimedSample], how: tuple[float, bool, str]
 ) -> Iterator[Sample]:
     step, measured, name = how
     assert first.time is not None
@@ -293,7 +293,7 @@ def _checked(
         yield moment.sample
 
 
-def _moments(second: Moment, rest: Iterator[Moment]) -> Iterator[Moment]:
+def _moments(second: TimedSample, rest: Iterator[TimedSample]) -> Iterator[TimedSample]:
     yield second
     yield from rest
 
@@ -310,7 +310,7 @@ def _ways_out(now: float | None, wanted: float, step: float, *, measured: bool) 
 
 @dataclass(slots=True)
 class _Track:
-    """The samples of a signal that may still be needed."""
+    """The samples of a signal that later interpolation may need."""
 
     held: bool
     times: list[float] = field(default_factory=list)
@@ -328,19 +328,19 @@ class _Track:
             del self.times[:there], self.values[:there]
 
     def on(self, grid: Floats, spacing: Spacing, end: float) -> Floats:
-        """Its values on a grid; nothing came after the last sample until `end`."""
+        """The values on a grid; nothing came after the last sample until `end`."""
         times, values = np.array(self.times, dtype=np.float64), np.array(self.values, dtype=np.float64)
         return values_on(grid, times, values, spacing, held=self.held, end=end)
 
     def known_until(self, now: float, limit: float) -> float:
-        """The instant before which nothing that comes makes a difference."""
+        """The instant up to which later samples change nothing."""
         last = self.times[-1] if self.times else -math.inf
         return now if now - last > limit else last
 
 
 @dataclass(slots=True)
 class Gridded:
-    """Samples of any times, laid on a grid as they come.
+    """Samples of any times, resampled to a grid as they arrive.
 
     Attributes:
         name: of the stream, for messages.
@@ -359,7 +359,7 @@ class Gridded:
     _came: int = 0
     _last: float = -math.inf
 
-    def samples(self, first: Moment, rest: Iterator[Moment]) -> Iterator[Sample]:
+    def samples(self, first: TimedSample, rest: Iterator[TimedSample]) -> Iterator[Sample]:
         """The samples on the grid, one by one; the first one comes when the step is known."""
         waiting: list[float] = []
         for moment in _moments(first, rest):
@@ -376,10 +376,10 @@ class Gridded:
 
     @property
     def _has_to_wait(self) -> bool:
-        """Whether the usual step matters."""
+        """Whether the first samples are needed to estimate the usual step."""
         return self.reading.max_gap is None or (self.reading.resample or self.reading.dt) is None
 
-    def _take(self, moment: Moment) -> float:
+    def _take(self, moment: TimedSample) -> float:
         time = moment.time
         if time is None:
             if self.reading.dt is None:
@@ -408,7 +408,7 @@ class Gridded:
         self._spacing = Spacing.of(self.dt, first, self.reading.max_gap)
 
     def _ready(self, now: float) -> Iterator[Sample]:
-        """What is known now that was not before."""
+        """The samples of the grid that a new sample completes."""
         assert self._spacing is not None
         until = [track.known_until(now, self._spacing.limit) for track in self._tracks.values()]
         stop = min(until, default=now)
@@ -417,7 +417,7 @@ class Gridded:
         yield from self._upto(lambda grid: grid + self._slack < stop, (stop - self.t0) / self.dt + 1, now)
 
     def _rest(self) -> Iterator[Sample]:
-        """Where nothing more comes."""
+        """The samples of the grid that are left at the end of the stream."""
         count = math.floor((self._last - self.t0) / self.dt + self._slack / self.dt) + 1
         yield from self._upto(lambda grid: np.ones(len(grid), dtype=np.bool_), count, self._last)
 
@@ -428,7 +428,7 @@ class Gridded:
     def _upto(
         self, known: Callable[[Floats], NDArray[np.bool_]], most: float, end: float
     ) -> Iterator[Sample]:
-        """The instants before number `most` of the grid, as long as they are known."""
+        """The instants of the grid before number `most`, as long as they are known."""
         assert self._spacing is not None
         if most > MAX_SAMPLES:
             message = f"the {self.name} spans more than {MAX_SAMPLES:,} steps of {self.dt:g} s"

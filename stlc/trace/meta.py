@@ -1,4 +1,4 @@
-"""What a trace says about itself: where it comes from, and what its signals mean, as a JSON text."""
+"""Metadata of a trace, as JSON: its origin, and the meaning of its signals."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _TEXTS = ("spec_library", "spec_set", "judge_library", "judge_set")
 
 @dataclass(frozen=True, slots=True)
 class Carried:
-    """A specification in a trace.
+    """A specification that is stored in a trace.
 
     Attributes:
         name: of it, where that is known.
@@ -50,7 +50,7 @@ class Carried:
 
 @dataclass(frozen=True, slots=True)
 class TraceMeta:
-    """What was recorded, and by whom; every field may be unknown ("" or None).
+    """Metadata of a recording; every field may be unknown ("" or None).
 
     Attributes:
         spec_name: name of the specification.
@@ -98,19 +98,19 @@ class TraceMeta:
 
     @property
     def planned(self) -> Carried:
-        """What plans were made for."""
+        """The specification that plans were made for."""
         return Carried(self.spec_name, self.spec_path, self.spec_text, self.spec_library, self.spec_set)
 
     @property
     def carried(self) -> Carried:
-        """What the trace is judged by: the rules of drives that were recorded with it, else `planned`."""
+        """The specification that the trace is judged by: that of closed-loop runs, else `planned`."""
         if not self.judge_text:
             return self.planned
         return Carried("", self.judge_path, self.judge_text, self.judge_library, self.judge_set)
 
 
 def read_meta(path: Path, array: NDArray[Any] | None) -> tuple[TraceMeta, dict[str, Column]]:
-    """What the array `meta` of a trace says, and the columns that it describes.
+    """The metadata in the array `meta` of a trace, and the columns that it describes.
 
     Raises:
         TraceError: E603, it is no JSON text of the expected form.

@@ -1,4 +1,4 @@
-"""What a trace file holds before it is laid on one grid of time: arrays by name, and their clocks."""
+"""The content of a trace file before resampling: arrays by name, and their clocks."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ Floats = NDArray[np.float64]
 
 CLOCK = "t"
 ROSTOPIC = "%time"
-"""How `rostopic echo -p` calls the clock, which it gives in nanoseconds."""
+"""The clock in output of `rostopic echo -p`, in nanoseconds."""
 CLOCKS = (CLOCK, "time", "times", "timestamp", "__time", "tout", ROSTOPIC)
 """Names of a clock, in any case of letters."""
 EXTRA = "extra."
 
 
 @dataclass(frozen=True, slots=True)
-class Strand:
-    """Signals that were sampled at the same instants.
+class ClockGroup:
+    """Signals that share a clock.
 
     Attributes:
         arrays: signal -> (samples,), (traces, samples) or (…, samples, components).
@@ -48,14 +48,14 @@ class Recording:
 
     Attributes:
         name: the path as the user gave it, for messages.
-        strands: the signals; files with one clock have one.
+        groups: the signals; files with one clock have one.
         columns: signal -> unit, kind and range, where the file says so.
         meta: where it comes from.
         extras: whatever else was recorded.
     """
 
     name: str
-    strands: tuple[Strand, ...]
+    groups: tuple[ClockGroup, ...]
     columns: Mapping[str, Column] = field(default_factory=dict)
     meta: TraceMeta = field(default_factory=TraceMeta)
     extras: Mapping[str, Array] = field(default_factory=dict)
@@ -63,24 +63,24 @@ class Recording:
     @property
     def signals(self) -> tuple[str, ...]:
         """Names of all signals."""
-        return tuple(name for strand in self.strands for name in strand.arrays)
+        return tuple(name for group in self.groups for name in group.arrays)
 
     def clocked_by(self, signal: str) -> Recording:
-        """The same with `signal` as the clock of its strand.
+        """The same with `signal` as the clock of its group.
 
         Raises:
             TraceError: E601, there is no such signal.
         """
-        for index, strand in enumerate(self.strands):
-            if strand.clock is not None and strand.named == signal:
+        for index, group in enumerate(self.groups):
+            if group.clock is not None and group.named == signal:
                 return self
-            if signal in strand.arrays:
-                rest = {name: values for name, values in strand.arrays.items() if name != signal}
-                if strand.clock is not None:
-                    rest[strand.named] = strand.clock
-                changed = Strand(rest, strand.arrays[signal].reshape(-1), signal)
-                strands = (*self.strands[:index], changed, *self.strands[index + 1 :])
-                return replace(self, strands=strands)
+            if signal in group.arrays:
+                rest = {name: values for name, values in group.arrays.items() if name != signal}
+                if group.clock is not None:
+                    rest[group.named] = group.clock
+                changed = ClockGroup(rest, group.arrays[signal].reshape(-1), signal)
+                groups = (*self.groups[:index], changed, *self.groups[index + 1 :])
+                return replace(self, groups=groups)
         raise TraceError(absent(self.name, signal, self.signals))
 
 
@@ -97,19 +97,19 @@ def absent(trace: str, signal: str, known: Iterable[str]) -> Diagnostic:
 
 
 def clock_among(names: Iterable[str]) -> str | None:
-    """Which of the names is that of the clock: `t`, or the only other one that is a usual one."""
+    """The clock among names: `t`, or the only usual name of a clock."""
     known = list(names)
     found = [name for name in known if name.strip().lower() in CLOCKS]
     return CLOCK if CLOCK in known else found[0] if len(found) == 1 else None
 
 
 def of_arrays(path: Path, arrays: Mapping[str, Array], meta: TraceMeta | None = None) -> Recording:
-    """A file with one clock among its arrays; those called `extra.…` are set aside."""
+    """A recording with one clock from arrays; those called `extra.…` are set aside."""
     named = clock_among(arrays)
     extras = {n.removeprefix(EXTRA): values for n, values in arrays.items() if n.startswith(EXTRA)}
     signals = {n: values for n, values in arrays.items() if n != named and not n.startswith(EXTRA)}
-    strand = Strand(signals, None) if named is None else Strand(signals, arrays[named], named)
-    return Recording(str(path), (strand,), meta=meta or TraceMeta(), extras=extras)
+    group = ClockGroup(signals, None) if named is None else ClockGroup(signals, arrays[named], named)
+    return Recording(str(path), (group,), meta=meta or TraceMeta(), extras=extras)
 
 
 def unit_of(path: Path, name: str, text: str) -> Unit:

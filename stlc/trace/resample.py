@@ -1,4 +1,4 @@
-"""Signals of any clocks -> one uniform grid: what is discrete is held, real numbers are interpolated.
+"""Resampling of signals with any clocks to one grid: discrete ones are held, real ones interpolated.
 
 In gaps that are too long for that a signal is not known: NaN.
 """
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.signature import Kind
-from stlc.trace.recording import Recording, Strand, fit
+from stlc.trace.recording import ClockGroup, Recording, fit
 from stlc.trace.time_grid import NO_CLOCK, NO_STEP, require_step, snapped
 
 Array = NDArray[Any]
@@ -42,12 +42,12 @@ def usual_step(times: Floats) -> float:
 
 
 FIRST = _GAPS + 1
-"""How many samples `usual_step` looks at."""
+"""Number of samples that `usual_step` uses."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spacing:
-    """A new grid, and which gaps between samples are bridged.
+    """A grid, and the longest gap between samples that is bridged.
 
     Attributes:
         dt: seconds between the instants of the grid.
@@ -69,7 +69,7 @@ class Spacing:
 
     @property
     def slack(self) -> float:
-        """Rounding of a clock, in seconds, must not cost a sample."""
+        """Tolerance for rounding of a clock, in seconds."""
         return _ROUNDING * self.dt
 
 
@@ -122,7 +122,7 @@ class _Timed:
 
     @property
     def events(self) -> bool:
-        """Whether all signals are held."""
+        """Whether all signals are held between samples."""
         return len(self.held) == len(self.signals)
 
     @property
@@ -132,13 +132,13 @@ class _Timed:
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
-    """What the samples of a file are laid on.
+class ResampleGrid:
+    """A requested grid.
 
     Attributes:
         dt: seconds between instants; None takes the usual step of the samples.
         max_gap: the longest gap in seconds in which values are known; None bridges three steps, and between
-            events (a strand beside others, all of whose signals are discrete) any gap.
+            events (a group beside others, all of whose signals are discrete) any gap.
     """
 
     dt: float | None = None
@@ -160,43 +160,43 @@ class Resampled:
     data: dict[str, Floats]
 
 
-def resampled(recording: Recording, grid: Grid, kinds: Mapping[str, Kind]) -> Resampled:
+def resampled(recording: Recording, grid: ResampleGrid, kinds: Mapping[str, Kind]) -> Resampled:
     """The signals of a recording on one grid.
 
     The grid spans the time in which every signal is known. bool, int and enum signals keep their last value
     (zero-order hold), real ones are interpolated; in gaps that are too long neither is known.
 
     Args:
-        recording: of one or more strands.
+        recording: of one or more groups.
         grid: what they are laid on.
         kinds: signal -> what its numbers mean, where the caller knows better than the file.
 
     Raises:
-        TraceError: E601, a strand has no clock; E602, times decrease, or have no stretch in common, or `dt`
+        TraceError: E601, a group has no clock; E602, times decrease, or have no stretch in common, or `dt`
             is no time step; E604, a time that is not finite; E605, arrays that do not fit, or too many
             samples.
     """
-    strands = [_timed(recording, strand, kinds) for strand in recording.strands if strand.arrays]
-    if not strands:
+    groups = [_timed(recording, group, kinds) for group in recording.groups if group.arrays]
+    if not groups:
         raise TraceError(Diagnostic("E601", f"trace `{recording.name}` has no signals"))
     dt = grid.dt
     if dt is None:
-        dt = snapped(min((step for s in strands if (step := usual_step(s.times))), default=0.0))
+        dt = snapped(min((step for s in groups if (step := usual_step(s.times))), default=0.0))
     require_step(recording.name, dt)
-    start = max(strand.first for strand in strands)
-    stop = min(strand.last for strand in strands)
+    start = max(group.first for group in groups)
+    stop = min(group.last for group in groups)
     if math.isinf(stop):
-        stop = max(float(strand.times[-1]) for strand in strands)
+        stop = max(float(group.times[-1]) for group in groups)
     count = _count(recording.name, start, stop, dt)
     instants = start + dt * np.arange(count, dtype=np.float64)
     data: dict[str, Floats] = {}
-    for strand in strands:
-        spacing = Spacing.of(dt, strand.times, grid.max_gap, events=strand.events and len(strands) > 1)
-        end = max(float(strand.times[-1]), float(instants[-1]))
-        for name, rows in strand.signals.items():
-            held = name in strand.held
+    for group in groups:
+        spacing = Spacing.of(dt, group.times, grid.max_gap, events=group.events and len(groups) > 1)
+        end = max(float(group.times[-1]), float(instants[-1]))
+        for name, rows in group.signals.items():
+            held = name in group.held
             data[name] = np.stack(
-                [values_on(instants, strand.times, row, spacing, held=held, end=end) for row in rows]
+                [values_on(instants, group.times, row, spacing, held=held, end=end) for row in rows]
             )
     return Resampled(start, dt, _same_traces(recording.name, data))
 
@@ -215,14 +215,14 @@ def _count(name: str, start: float, stop: float, dt: float) -> int:
     return math.floor(steps) + 1
 
 
-def _timed(recording: Recording, strand: Strand, kinds: Mapping[str, Kind]) -> _Timed:
+def _timed(recording: Recording, group: ClockGroup, kinds: Mapping[str, Kind]) -> _Timed:
     name = recording.name
-    if strand.clock is None:
+    if group.clock is None:
         help_ = (NO_CLOCK, NO_STEP)
         raise TraceError(Diagnostic("E601", f"trace `{name}` has no `t`", help=help_))
-    times: Floats = strand.clock.astype(np.float64).reshape(-1)
+    times: Floats = group.clock.astype(np.float64).reshape(-1)
     _check_times(name, times)
-    signals = fit(name, strand.arrays, len(times))
+    signals = fit(name, group.arrays, len(times))
     held = frozenset(n for n, values in signals.items() if _discrete(n, values, recording, kinds))
     return _Timed(times, signals, held)
 

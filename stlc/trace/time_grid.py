@@ -1,4 +1,4 @@
-"""The clock of a trace: one uniform grid, or a diagnostic that says where it is not."""
+"""The uniform time grid of a trace, or a diagnostic of where it is not uniform."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SNAP = 1e-6
 
 
 def resample_advice(step: float) -> str:
-    """A way out for samples that are not on one grid, by the usual time between them in seconds.
+    """Advice for samples that are not on one grid, from their usual time step in seconds.
 
     The grid is at least twice as fine: on one of their own step samples would be passed over.
     """
@@ -38,7 +38,7 @@ def resample_advice(step: float) -> str:
 
 
 def gap_advice(step: float) -> str:
-    """A way out for samples on a grid of which some are missing."""
+    """Advice for samples on a grid of which some are missing."""
     return (
         f"--max-gap {3 * step:.6g}s  keeps the grid and bridges gaps up to that; "
         "in longer ones signals are unknown, and what needs them is inconclusive"
@@ -126,7 +126,7 @@ def _step(name: str, times: Floats, dt: float | None) -> float:
 
 
 def _require_even(name: str, times: Floats) -> None:
-    """Every sample comes after the one before it, about as much as usual."""
+    """Check that times increase by about the usual step."""
     gaps = np.diff(times)
     usual = float(np.median(gaps))
     backwards = np.flatnonzero(gaps <= 0)
@@ -162,12 +162,12 @@ def _uneven(name: str, times: Floats, gaps: Floats, usual: float) -> Diagnostic:
 
 
 def snapped(step: float) -> float:
-    """A measured time step as the plain fraction that was probably meant."""
+    """A measured time step, as a simple fraction where one is near."""
     return _snap(step, None) if np.isfinite(step) and step > 0 else step
 
 
 def _snap(mean: float, dt: float | None) -> float:
-    """The recorded step if the times agree with it, else the mean, as a plain fraction if one is near."""
+    """The recorded step if the times agree with it, else the mean, as a simple fraction where one is near."""
     if dt is not None and abs(dt - mean) <= 1e-3 * mean:
         return dt
     near = float(Fraction(mean).limit_denominator(100_000))

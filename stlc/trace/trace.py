@@ -1,4 +1,4 @@
-"""Recorded signals: a signature, a time step, arrays; `.npz`, `.csv` and `.mcap` in and out, never a pickle.
+"""Traces: a signature, a time step and arrays, read and written without pickles.
 
 An `.npz` trace holds `t` (samples,) in seconds, one array (samples,) or (traces, samples) per signal, arrays
 `extra.NAME` of any shape, and `meta`, a JSON text that says what was recorded, with which specification.
@@ -20,8 +20,8 @@ from stlc.signature import Column, Kind, Signature
 from stlc.trace.enums import Words, in_numbers, wordless
 from stlc.trace.formats.registry import WRITTEN, format_of, needed, read_recording
 from stlc.trace.meta import TraceMeta
-from stlc.trace.recording import CLOCK, EXTRA, Recording, Strand, absent, fit
-from stlc.trace.resample import Grid, resampled, usual_step
+from stlc.trace.recording import CLOCK, EXTRA, ClockGroup, Recording, absent, fit
+from stlc.trace.resample import ResampleGrid, resampled, usual_step
 from stlc.trace.time_grid import read_clock, require_same_step, resample_advice
 
 __all__ = [
@@ -64,12 +64,12 @@ class Trace:
 
     @property
     def traces(self) -> int:
-        """How many agents or repetitions."""
+        """Number of agents or repetitions."""
         return next((len(values) for values in self.data.values()), 0)
 
     @property
     def samples(self) -> int:
-        """How many samples each has."""
+        """Number of samples of each."""
         return next((values.shape[1] for values in self.data.values()), 0)
 
     @property
@@ -97,7 +97,7 @@ class Trace:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """How a file is read.
+    """Options for reading a file.
 
     Attributes:
         names: signal -> its name in the file; `t` names the clock.
@@ -158,43 +158,43 @@ def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
         trace = _uniform(recording, reading.dt)
     else:
         kinds = {names.get(name, name): kind for name, kind in reading.kinds.items()}
-        grid = Grid(reading.resample or reading.dt, reading.max_gap)
+        grid = ResampleGrid(reading.resample or reading.dt, reading.max_gap)
         laid = resampled(_clocked(recording, reading.dt), grid, kinds)
         trace = _trace(recording, laid.t0, laid.dt, laid.data)
     return trace.renamed(names)
 
 
 def _clocked(recording: Recording, dt: float | None) -> Recording:
-    """The recording where strands without a clock have one with this step."""
+    """The recording with clocks of this step for signals that have none."""
     step = dt or recording.meta.dt
     if step is None:
         return recording
-    strands = tuple(
-        strand if strand.clock is not None else replace(strand, clock=step * np.arange(_longest(strand)))
-        for strand in recording.strands
+    groups = tuple(
+        group if group.clock is not None else replace(group, clock=step * np.arange(_longest(group)))
+        for group in recording.groups
     )
-    return replace(recording, strands=strands)
+    return replace(recording, groups=groups)
 
 
-def _longest(strand: Strand) -> int:
-    return max((values.shape[-1] for values in strand.arrays.values() if values.ndim), default=0)
+def _longest(group: ClockGroup) -> int:
+    return max((values.shape[-1] for values in group.arrays.values() if values.ndim), default=0)
 
 
 def _uniform(recording: Recording, step: float | None) -> Trace:
     """The trace of a file with one uniform clock."""
     name = recording.name
-    strands = [strand for strand in recording.strands if strand.arrays] or list(recording.strands)
-    if len(strands) > 1:
-        message = f"the signals of `{name}` follow {len(strands)} clocks"
-        usual = [usual_step(s.clock.astype(np.float64).reshape(-1)) for s in strands if s.clock is not None]
+    groups = [group for group in recording.groups if group.arrays] or list(recording.groups)
+    if len(groups) > 1:
+        message = f"the signals of `{name}` follow {len(groups)} clocks"
+        usual = [usual_step(s.clock.astype(np.float64).reshape(-1)) for s in groups if s.clock is not None]
         help_ = (resample_advice(min((each for each in usual if each > 0), default=0.0)),)
         raise TraceError(Diagnostic("E602", message, help=help_))
-    (strand,) = strands
+    (group,) = groups
     said = recording.meta.dt if step is None else step
-    t0, dt, samples = read_clock(name, strand.clock, said, _longest(strand), others=strand.arrays)
+    t0, dt, samples = read_clock(name, group.clock, said, _longest(group), others=group.arrays)
     if step is not None:
         require_same_step(name, dt, step)
-    data = fit(name, strand.arrays, samples)
+    data = fit(name, group.arrays, samples)
     whole = {n: np.ascontiguousarray(values, dtype=np.float64) for n, values in data.items()}
     return _trace(recording, t0, dt, whole)
 
@@ -224,7 +224,7 @@ def save_trace(path: Path | str, trace: Trace) -> None:
 
 
 def check_writable(path: Path | str) -> None:
-    """Whether a trace can be written there is known before there is one.
+    """Check that a trace can be written to a path.
 
     Raises:
         UsageError: U101, the suffix is none that traces are written with.

@@ -105,7 +105,7 @@ def test_what_is_none_of_them(make: Make, before: str, after: str, words: str) -
 
 
 def test_a_share_of_a_temperature_is_not_wrong(make: Make) -> None:
-    from stlc.dynamics.scenarios.uncertain import loosened
+    from stlc.dynamics.scenarios.perturbed import perturbable
 
-    found = loosened(make(ROOM.format(unit="degC", **RATES)).decl)
+    found = perturbable(make(ROOM.format(unit="degC", **RATES)).decl)
     assert {each.text for each in found.numbers} == {"loss", "0.01 K/s", "5 K"}

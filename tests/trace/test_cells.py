@@ -18,7 +18,7 @@ from stlc import native
 from stlc.diagnostics import StlcError
 from stlc.trace.formats import cells as trace_cells
 from stlc.trace.formats import csv as trace_csv
-from stlc.trace.formats.cells import Lines, read_lines
+from stlc.trace.formats.cells import TableText, read_lines
 from stlc.trace.formats.csv import table_of_text
 
 NAME = Path("table.csv")
@@ -83,7 +83,7 @@ def outcome(data: bytes) -> object:
 @settings(deadline=None, max_examples=25)
 def test_every_number_is_the_nearest_double(cells: list[str]) -> None:
     room = [*cells, *["0"] * (40 * len(cells))]  # a few may be doubts
-    columns = read_lines(Lines("\n".join(room).encode(), 0, 1, ","))
+    columns = read_lines(TableText("\n".join(room).encode(), 0, 1, ","))
     assert columns is not None
     for cell, value in zip(cells, columns[0].tolist(), strict=False):
         assert value == float(cell), cell
@@ -138,11 +138,11 @@ def test_usual_files_need_no_careful_reader(
 @pytest.mark.parametrize("line", [b"1,2,", b"1", b"1,2,3", b"1,x", b"1,1_0", b"1,2 3", b"1,--2", b"1,\0"])
 @pytest.mark.usefixtures("reader")
 def test_what_does_not_fit_is_left_to_the_careful_reader(line: bytes) -> None:
-    assert read_lines(Lines(b"0,1\n" * 50 + line + b"\n0,1\n", 0, 2, ",")) is None
+    assert read_lines(TableText(b"0,1\n" * 50 + line + b"\n0,1\n", 0, 2, ",")) is None
 
 
 def test_empty_cells_and_lines(reader: None) -> None:  # noqa: ARG001 - both ways
-    columns = read_lines(Lines(b"head\n1,2\n\n , \t\n" + b"3,4\n" * 3, 5, 2, ","))
+    columns = read_lines(TableText(b"head\n1,2\n\n , \t\n" + b"3,4\n" * 3, 5, 2, ","))
     assert columns is not None
     assert [column.tolist() for column in columns] == [[1, 3, 3, 3], [2, 4, 4, 4]]
 

@@ -37,7 +37,7 @@ def outcome_of_stream(question: Question, *, talk: bool) -> Outcome:
         UsageError: U101, no specification, or an option that needs the whole trace.
         TraceError: a line that is no sample, or signals that are missing or not finite.
     """
-    from stlc.trace.live import MAX_LINE, Lines, on_grid
+    from stlc.trace.live import MAX_LINE, SampleStream, on_grid
 
     if question.spec is None:
         raise usage("which specification?", "stlc check SPEC -")
@@ -47,7 +47,7 @@ def outcome_of_stream(question: Question, *, talk: bool) -> Outcome:
     source = read_source(find_spec(question.spec))
     monitor = monitor_of(source, question)
     reading = laid_reading(monitor, question)
-    lines = Lines(NAME, reading)
+    lines = SampleStream(NAME, reading)
     raw = iter(lambda: sys.stdin.buffer.readline(MAX_LINE + 1), b"")
     uniform = on_grid(lines.moments(raw), reading, NAME)
     online = _online(monitor, question, uniform)

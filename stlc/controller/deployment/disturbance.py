@@ -10,8 +10,7 @@ import torch
 from stlc.controller.streams import seeded
 from stlc.dynamics.declaration.deployment import ErrorsDecl
 from stlc.dynamics.init.draws import Drawing, Rows
-from stlc.dynamics.scenarios.mistaken import Mistaken
-from stlc.dynamics.scenarios.uncertain import loosened
+from stlc.dynamics.scenarios.perturbed import PerturbedSystem, perturbable
 from stlc.units import parse_unit
 
 if TYPE_CHECKING:
@@ -63,11 +62,11 @@ class Disturbance:
     def truths(self, truth: System) -> list[System]:
         """The truth of each seed, from what it is where no number is wrong."""
         off = self._errors.parameters
-        loose = loosened(truth.decl) if off else None
+        loose = perturbable(truth.decl) if off else None
         if loose is None or not loose.numbers:
             return [truth] * len(self._generators)
         factors = 1.0 + off * self._signs(_NUMBERS, len(loose.numbers))
-        return [Mistaken(loose, each) for each in torch.split(factors, self._agents)]
+        return [PerturbedSystem(loose, each) for each in torch.split(factors, self._agents)]
 
     def _wrong_gains(self) -> tuple[Tensor, Tensor]:
         """Factors and offsets of controls, (rows, m) each: as much too large as too small, evenly."""
@@ -133,7 +132,7 @@ def errors_of(truth: System) -> dict[str, Any]:
     shares = {} if scenario is None else asdict(scenario.errors)
     found: dict[str, Any] = {name: share for name, share in shares.items() if share}
     if "parameters" in found:
-        found["numbers"] = [str(each) for each in loosened(truth.decl).numbers]
+        found["numbers"] = [str(each) for each in perturbable(truth.decl).numbers]
     return found
 
 

@@ -1,1 +1,1 @@
-"""A system file as data."""
+"""The sections of a system file: their records, and how they are read."""

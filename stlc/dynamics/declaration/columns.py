@@ -1,4 +1,4 @@
-"""The sections `state`, `param` and `control`: columns with units and bounds, components of vectors each."""
+"""The sections `state`, `param` and `control`: columns with units and ranges."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def read_states(node: Node | None, reader: Reader, names: Names) -> dict[str, St
 
 
 def _add(columns: tuple[Column, ...], names: Names) -> None:
-    """Columns of one state, whose components are declared where it is."""
+    """Add the columns of one state; the components of a vector share its place."""
     names.columns.extend(columns)
     names.place_components(base_name(columns[0].name), [column.name for column in columns])
 
@@ -161,7 +161,7 @@ def _columns(name: str, keys: StateKeys | ParamKeys, where: str, cx: Context) ->
 
 
 def _members(node: Node, where: str, reader: Reader) -> tuple[tuple[str, float], ...]:
-    """`{stop: 0, light: 1}` or `[stop, light]`."""
+    """The members of an enum, from `{stop: 0, light: 1}` or `[stop, light]`."""
     members: list[tuple[str, float]] = []
     if isinstance(node, Sequence):
         words = [reader.name(item, f"a member of {where}") for item in reader.items(node, where)]
@@ -178,7 +178,7 @@ def _members(node: Node, where: str, reader: Reader) -> tuple[tuple[str, float],
 
 
 def _ranges(keys: StateKeys | ParamKeys | ControlKeys, where: str, cx: Context) -> Ranges | None:
-    """`[low, high]` of every component, in its unit; an end is a number for all or a vector."""
+    """The range `[low, high]` of every component, in its unit; an end is a number for all or a vector."""
     node, reader, here = keys.ends, cx.reader, cx.here
     if node is None:
         return None

@@ -1,4 +1,4 @@
-"""What a system file says, as data: names bound, units checked, expressions in the IR. No torch."""
+"""The declaration of a system: names bound, units checked, expressions in the IR. No torch."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class SystemDecl:
 
     @property
     def learnt(self) -> str:
-        """SHA-256 of what a policy learns from, in hexadecimal: all but names, comments, and deployment."""
+        """SHA-256 of the parts that a policy learns from, in hexadecimal."""
         text = repr([getattr(self, name) for name in LEARNT])
         text = re.sub(r"\b[A-Z]\w+(?=\()", lambda found: _HASHED_AS.get(found[0], found[0]), text)
         return hashlib.sha256(text.encode()).hexdigest()
@@ -118,7 +118,7 @@ class SystemDecl:
 
     @property
     def judges(self) -> tuple[JudgeRef, ...]:
-        """Every specification of drives that the file names, for `test` and for scenarios."""
+        """Every specification for closed-loop runs that the file names, for `test` and for scenarios."""
         named = (self.test.judge, *(scenario.judge for scenario in self.scenarios))
         return tuple(judge for judge in named if judge is not None)
 
@@ -132,7 +132,7 @@ class SystemDecl:
         return Grid(self.dt, self.horizon)
 
     def interface(self) -> Interface:
-        """What the compiler of specifications may know of this system, nothing loaded."""
+        """The interface that specifications are compiled against; no function is loaded."""
         names = frozenset(function.name for function in self.functions)
         known = {function.name: function for function in self.functions if function.body is not None}
         path = self.source.name

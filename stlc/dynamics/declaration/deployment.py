@@ -242,7 +242,7 @@ class ErrorsDecl:
     """Errors of actuators, parameters and sensors, as shares.
 
     A direction (squash `angle`) is off by a share of a radian instead. Parameters are the numbers in the
-    dynamics (`stlc.dynamics.scenarios.uncertain`). Clocks, which are states in seconds, are known exactly.
+    dynamics (`stlc.dynamics.scenarios.perturbed`). Clocks, which are states in seconds, are known exactly.
     """
 
     actuator_gain: float = key(SHARE, "constant relative error of every control of an agent", 0.0)

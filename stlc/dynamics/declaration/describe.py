@@ -1,4 +1,4 @@
-"""A system file in a table: what moves, how, and between which bounds. No torch."""
+"""A system file as tables of text: states, controls, flow, jumps and scenarios. No torch."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _control(decl: SystemDecl, index: int) -> Row:
 
 
 def _feedback(decl: SystemDecl) -> list[Row]:
-    """`u  [N]  u0 + plan + 3.1 (x0 - x) within 4, then within [-8, 8]`, a row a control."""
+    """The feedback law, a row a control: `u  [N]  u0 + plan + 3.1 (x0 - x) within 4, then within [-8, 8]`."""
     feedback = decl.feedback
     rows: list[Row] = []
     for i, control in enumerate(decl.controls if feedback is not None else ()):
@@ -90,7 +90,7 @@ def _situations(mixture: Sequence[Situation]) -> list[Row]:
 
 
 def _table(title: str, rows: Sequence[Row]) -> list[str]:
-    """A title and aligned rows; nothing where there are none."""
+    """A title and aligned rows; no lines without rows."""
     if not rows:
         return []
     rows = [tuple(map(visible, row)) for row in rows]

@@ -45,7 +45,7 @@ class FunctionDecl:
     base: str = ""
 
     def bound(self, arguments: tuple[int | None, ...], result: int | None) -> ir.Body:
-        """What it computes; see `stlc.compile.frontend.interface.Function`. Raises SystemFileError (S208)."""
+        """The function with declared sizes. Raises SystemFileError (S208) where they differ."""
         assert self.body is not None
         takes, gives = len(self.body.formals), len(self.body.outputs)
         if (arguments, result) == ((takes,), gives):

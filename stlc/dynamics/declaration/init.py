@@ -243,7 +243,7 @@ class _Draws:
         self.failed = len(reader.findings) > before
 
     def _draw(self, entry: Entry, where: str) -> None:
-        """One state."""
+        """Read the value of one state."""
         columns = states_of(entry, where, self.cx)
         if not columns:
             return
@@ -259,7 +259,7 @@ class _Draws:
                 self._let(name)
 
     def _let(self, name: str) -> None:
-        """One local name, and those that it needs."""
+        """Resolve a local name, and the local names that it reads."""
         if name not in self.lets:
             return
         node = self.lets.pop(name)
@@ -285,7 +285,7 @@ class _Draws:
 
 
 def _known(keys: InitKeys, node: Node, drawn: _Drawn, cx: Context) -> Situation:
-    """One situation whose states, but for those that it draws, are those of a grid or a file."""
+    """One situation whose states come from a grid or a file, except for those that it draws."""
     rest = {entry.key.text for entry in cx.reader.entries(keys.draw, "`draw`")}
     missing = [
         column.name

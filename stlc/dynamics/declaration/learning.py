@@ -216,7 +216,7 @@ class FeedbackDecl:
 
 
 def _feedback(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
-    """`lqr`, or a mapping."""
+    """The feedback asked for: `lqr`, or a mapping."""
     if isinstance(node, Scalar) and node.is_null:
         return {"feedback_span": node.span}
     if not isinstance(node, Scalar):
@@ -246,7 +246,7 @@ def _seen(node: Node, cx: Context) -> tuple[tuple[ir.Num, str], ...]:
 
 
 def _mirror(cx: Context, node: Node, label: str) -> dict[str, Any]:
-    """The mirror image of every state and control that has another one than itself.
+    """The images of states and controls under a symmetry; those that are not listed stay as they are.
 
     Dynamics and specification are compared with their images later: see `controller.problem.symmetry`.
     """

@@ -116,7 +116,7 @@ def system_schema() -> Json:
 
 
 def load_system_decl(path: Path | str, overrides: MappingType[str, str] | None = None) -> SystemDecl:
-    """The declaration that a system file holds.
+    """The declaration of a system file.
 
     Args:
         path: of the file.
@@ -132,7 +132,7 @@ def load_system_decl(path: Path | str, overrides: MappingType[str, str] | None =
 
 
 def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | None = None) -> SystemDecl:
-    """The declaration that a text holds; `path` says what its relative paths start from."""
+    """The declaration of a system file's text; relative paths start from the folder of `path`."""
     reader = Reader(source)
     root = load_yaml(source, sink=reader.findings)
     root, bases = extended(root, reader)
@@ -152,7 +152,7 @@ def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | 
 
 
 def _with_feedback(decl: SystemDecl) -> SystemDecl:
-    """The declaration with the feedback beneath its plans that it asks for. Raises SystemFileError (S205)."""
+    """The declaration with the requested feedback beneath its plans. Raises SystemFileError (S205)."""
     asked = decl.policy.feedback
     if asked is None:
         return decl
@@ -220,7 +220,7 @@ def _declaration(
 def _report_idle(
     node: Node | None, reader: Reader, names: Names, flow: SequenceType[Assign], jumps: SequenceType[JumpDecl]
 ) -> None:
-    """W603 for controls that move nothing."""
+    """Report W603 for controls that have no effect."""
     moved = [assign.value for assign in (*flow, *(reset for jump in jumps for reset in jump.resets))]
     read = {name for num in moved for name in names_in(num)}
     read |= {name for jump in jumps for name in names_in(jump.guard)}
@@ -303,7 +303,7 @@ def _empty(node: Node | None) -> bool:
 
 
 def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]]:
-    """The document with everything that the files it extends say, and the texts of these.
+    """The document merged with the files that it extends, and the texts of these.
 
     A section that is a mapping in both keeps the entries of both, and where both have an entry that of the
     extending file; an entry that is nothing (`~`) takes that of the extended file away, and anything else is
@@ -338,7 +338,7 @@ def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]
 
 
 def _merged(base: Mapping, own: Mapping) -> Mapping:
-    """Two documents: the sections of both, mappings entry by entry."""
+    """One document merged over another, section by section and entry by entry."""
     result = Mapping(own.span, base.entries, base.size)
     for entry in own.entries:
         if _removes(entry, base):
@@ -349,7 +349,7 @@ def _merged(base: Mapping, own: Mapping) -> Mapping:
 
 
 def _removes(entry: Entry, base: Mapping) -> bool:
-    """Whether an entry takes one of the extended file away: `brake: ~`."""
+    """Whether an entry removes one of the extended file: `brake: ~`."""
     return isinstance(entry.value, Scalar) and entry.value.is_null and base.get(entry.key.text) is not None
 
 
@@ -391,12 +391,12 @@ def overridden(root: Mapping, overrides: MappingType[str, str], reader: Reader) 
 
 
 def _keys(node: Node | None) -> dict[str, Node]:
-    """What a section declares."""
+    """The entries of a section by name."""
     return {entry.key.text: entry.value for entry in node.entries} if isinstance(node, Mapping) else {}
 
 
 def _value(key: str, text: str, reader: Reader) -> Node | None:
-    """The value of an override, as a node of its own little text."""
+    """The value of an override, parsed as a YAML text of its own."""
     source = Source(f"--set {key}", text)
     try:
         return load_node(source, sink=reader.findings)
@@ -431,7 +431,7 @@ def _missing(node: Node, head: str, value: Node, key: str, reader: Reader) -> No
 
 
 def _given_states(init: InitDecl, overrides: MappingType[str, str], cx: Context) -> InitDecl:
-    """Initial states where `--set` names a state: `--set x=3m`, or how it is drawn instead."""
+    """The initial states with those that `--set` names replaced: a value (`x=3m`) or a distribution."""
     params = {base_name(assign.name) for assign in init.params}
     found: list[Assign] = []
     for name, text in overrides.items():

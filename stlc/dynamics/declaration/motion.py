@@ -96,7 +96,7 @@ def components(
 
 
 def component_texts(node: Node, size: int) -> tuple[str, ...]:
-    """What each component of a vector is written as."""
+    """The text of each component of a vector."""
     if isinstance(node, ListNode):
         return tuple(written(item) for item in node.items)
     text = written(node)
@@ -196,7 +196,7 @@ def read_jumps(node: Node | None, cx: Context) -> tuple[JumpDecl, ...]:
 
 
 def read_latches(node: Node | None, reader: Reader, names: Names) -> tuple[Assign, ...]:
-    """For every jump that happens `once`, a state that remembers whether it has; false at first."""
+    """A state for every jump with `once` that records whether it has happened; false at first."""
     found: list[Assign] = []
     for index, item in enumerate(node.items if isinstance(node, ListNode) else ()):
         once = item.get("once") if isinstance(item, Mapping) else None
@@ -215,7 +215,7 @@ def read_latches(node: Node | None, reader: Reader, names: Names) -> tuple[Assig
 
 
 def latch_name(jump: str) -> str:
-    """The state that remembers whether a jump has happened."""
+    """The name of the state that records whether a jump has happened."""
     return f"{re.sub(r'[^0-9A-Za-z_]', '_', jump)}_happened"
 
 
@@ -266,7 +266,7 @@ def _timer(column: Column, keys: StateKeys, where: str, cx: Context) -> tuple[li
 
 
 def shared_draws(assigns: Sequence[Assign]) -> tuple[Assign, ...]:
-    """The assignments, with what a sampler gives to more than one of them drawn before, as a local name.
+    """The assignments with samplers that several of them read drawn before, as local names.
 
     `p: "uniform(0, 1) * [1, 2]"` names one random number; `p: "uniform(low, high)"` with vectors names one
     for each component.

@@ -1,1 +1,1 @@
-"""Where a system begins."""
+"""Initial states."""

@@ -22,7 +22,7 @@ _SAMPLERS = frozenset(sampler_names())
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """How many rows to draw, and from which generator; float64 on the generator's device."""
+    """A number of rows to draw, and a random generator; float64 on the generator's device."""
 
     count: int
     generator: torch.Generator
@@ -40,11 +40,11 @@ class Rows:
         )
 
     def blank(self) -> Tensor:
-        """(count,) zeros: what gives constants their shape."""
+        """(count,) zeros, which give constants their shape."""
         return torch.zeros(self.count, dtype=torch.float64, device=self.generator.device)
 
     def pick(self, weights: Sequence[float]) -> Tensor:
-        """(count,) indices, each with the share of its weight."""
+        """(count,) indices, drawn with probabilities proportional to `weights`."""
         edges = torch.tensor(weights, dtype=torch.float64).cumsum(0)
         edges = (edges / edges[-1])[:-1].to(self.generator.device)
         return torch.bucketize(self.uniforms(), edges, right=True)
@@ -52,7 +52,7 @@ class Rows:
 
 @dataclass(frozen=True, slots=True)
 class _Call:
-    """One occurrence of a sampler: its own draw, whatever else is written the same way."""
+    """One occurrence of a sampler; equal expressions are drawn independently."""
 
     name: str
     sampler: str
@@ -61,7 +61,7 @@ class _Call:
 
 
 class Drawing:
-    """An assignment, ready to be drawn."""
+    """An assignment with its samplers compiled."""
 
     def __init__(self, assign: Assign) -> None:
         self.name = assign.name
@@ -96,7 +96,7 @@ class Drawing:
 
 
 def _draw(sampler: str, args: list[Tensor], rows: Rows) -> Tensor:
-    """One number a row."""
+    """Draw from a sampler, one number a row."""
     match sampler, args:
         case "uniform", [low, high]:
             return torch.lerp(low, high, rows.uniforms())

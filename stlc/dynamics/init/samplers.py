@@ -1,7 +1,12 @@
-"""Initial states: a mixture of situations, drawn in order, filtered by what must hold."""
+"""Initial states: a mixture of situations, drawn in order, with rejection by the conditions of `where`."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -9,10 +14,11 @@ from stlc.compile.backends.array.arith import Program
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.switch import Hard
-from stlc.diagnostics import Diagnostic, SystemFileError
-from stlc.dynamics.declaration.init import InitDecl, Situation
+from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
+from stlc.dynamics.declaration.init import FileDecl, GridDecl, InitDecl, Situation
 from stlc.dynamics.init.draws import Drawing, Rows
-from stlc.dynamics.init.points import points_of
+from stlc.trace import load_trace
+from stlc.trace.formats.npz import read_npz
 
 MAX_ROUNDS = 500
 MAX_BATCH = 1 << 20
@@ -20,12 +26,15 @@ FEW = 0.01
 """Acceptance rate below which W601 speaks up, and nothing is trained."""
 RATED = 10_000
 
+SHUFFLED = 1 << 20
+"""Up to so many points every one comes equally often; beyond, every axis is picked for itself."""
+
 _HARD = Hard()
 Table = dict[str, Tensor]
 
 
 class _Draws:
-    """A situation, ready to be drawn."""
+    """A situation with its draws compiled."""
 
     def __init__(self, situation: Situation) -> None:
         self.weight = situation.weight
@@ -34,7 +43,7 @@ class _Draws:
         self.points = points_of(situation.points) if situation.points is not None else None
 
     def __call__(self, table: Table, rows: Rows) -> Table:
-        """`table` with this situation's names added, all (count,)."""
+        """`table` with the names of this situation added, (count,) each."""
         if self.points is not None:
             table = {**table, **self.points(rows)}
         for drawing in self.draws:
@@ -125,11 +134,11 @@ class InitialStates:
         return torch.stack([table[name] for name in self.names], 1)
 
     def holds(self, states: Tensor) -> Tensor:
-        """Where (n, dim) states meet every condition of `where`, (n,) booleans."""
+        """Whether (n, dim) states meet every condition of `where`, (n,) booleans."""
         return self._each_holds(states).all(0)
 
     def _each_holds(self, states: Tensor) -> Tensor:
-        """Where each condition of `where` holds, (conditions, n) booleans."""
+        """Whether each condition of `where` holds, (conditions, n) booleans."""
         if self._where is None:
             return torch.ones(0, len(states), dtype=torch.bool, device=states.device)
         env = dict(zip(self.names, states.unbind(1), strict=True))
@@ -157,14 +166,14 @@ class InitialStates:
         )
 
     def _rates(self) -> tuple[str, ...]:
-        """How often each condition holds, the rarest first."""
+        """The share of proposed states that meet each condition, the smallest first."""
         proposed = self._propose(RATED, torch.Generator().manual_seed(0))
         rates = self._each_holds(proposed).double().mean(1).tolist()
         told = sorted(zip(rates, self.decl.where_text, strict=True))
         return tuple(f"`{text}` holds for {rate:.2%} of what is drawn" for rate, text in told)
 
     def warnings(self) -> tuple[Diagnostic, ...]:
-        """W601 where few of the states drawn so far were kept."""
+        """W601 where few of the proposed states were kept."""
         if self.acceptance >= FEW:
             return ()
         return (
@@ -176,3 +185,101 @@ class InitialStates:
                 help=("draw the states closer to what `where` asks for",),
             ),
         )
+
+
+# ------------------------------------------------------------------------- known points
+
+
+class Points(Protocol):
+    """A set of known states."""
+
+    def __call__(self, rows: Rows) -> dict[str, Tensor]:
+        """One known state for every row, (count,) float64 by name."""
+
+
+def points_of(decl: GridDecl | FileDecl) -> Points:
+    """The known states of a declaration; a file is read when the first state is asked for."""
+    return _Grid(decl) if isinstance(decl, GridDecl) else _File(decl)
+
+
+class _Grid:
+    """A grid: combinations are computed from their index (the last axis is fastest), never stored."""
+
+    def __init__(self, decl: GridDecl) -> None:
+        self._axes = [(name, torch.tensor(values, dtype=torch.float64)) for name, values in decl.axes]
+        self._count = math.prod(len(values) for _, values in self._axes)
+
+    def __call__(self, rows: Rows) -> dict[str, Tensor]:
+        if self._count > SHUFFLED:
+            return {
+                name: values.to(rows.generator.device)[_picked(len(values), rows)]
+                for name, values in self._axes
+            }
+        number = _picked(self._count, rows)
+        found: dict[str, Tensor] = {}
+        for name, values in reversed(self._axes):
+            found[name] = values.to(number.device)[number % len(values)]
+            number = number // len(values)
+        return found
+
+
+class _File:
+    """The rows of a file of states."""
+
+    def __init__(self, decl: FileDecl) -> None:
+        self._decl = decl
+        self._columns: dict[str, Tensor] = {}
+
+    def __call__(self, rows: Rows) -> dict[str, Tensor]:
+        """Raises SystemFileError (S303) where the file does not hold the states."""
+        if not self._columns:
+            self._columns = self._read()
+        first = next(iter(self._columns.values()))
+        number = _picked(len(first), rows)
+        return {name: column.to(number.device)[number] for name, column in self._columns.items()}
+
+    def _read(self) -> dict[str, Tensor]:
+        path = self._decl.path
+        try:
+            arrays = read_npz(path) if path.suffix == ".npz" else load_trace(path).data
+        except StlcError as error:
+            raise self._refused(error.diagnostics[0].message) from None
+        found = {name: _column(name, arrays) for name in self._decl.names}
+        missing = [name for name, column in found.items() if column is None]
+        if missing:
+            listed = ", ".join(f"`{name}`" for name in missing)
+            raise self._refused(f"`{path}` has no {listed}", f"it holds {', '.join(arrays)}")
+        columns = {name: torch.from_numpy(column) for name, column in found.items() if column is not None}
+        sizes = {len(column) for column in columns.values()}
+        if len(sizes) > 1 or 0 in sizes:
+            counts = ", ".join(f"`{name}` {len(column)}" for name, column in columns.items())
+            raise self._refused(f"`{path}` does not hold as many values for every state", counts)
+        bad = [name for name, column in columns.items() if not bool(torch.isfinite(column).all())]
+        if bad:
+            raise self._refused(f"`{path}` holds NaN or infinity in `{bad[0]}`")
+        return columns
+
+    def _refused(self, message: str, note: str = "") -> SystemFileError:
+        notes = (note,) if note else ()
+        return SystemFileError(Diagnostic("S303", message, self._decl.span, "named here", note=notes))
+
+
+def _column(name: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """All samples of a column, (count,); a component of a vector may be a slice of its last axis."""
+    base, bracket, index = name.partition("[")
+    values = arrays.get(name)
+    if values is None and bracket and base in arrays and arrays[base].ndim:
+        component = int(index.rstrip("]"))
+        whole = arrays[base]
+        values = whole[..., component] if component < whole.shape[-1] else None
+    if values is None or values.dtype.kind not in "biuf":
+        return None
+    return values.astype(np.float64).ravel()
+
+
+def _picked(count: int, rows: Rows) -> Tensor:
+    """Indices below `count`, (rows,): all equally often, in random order."""
+    generator, device = rows.generator, rows.generator.device
+    rounds = -(-rows.count // count)
+    orders = [torch.randperm(count, generator=generator, device=device) for _ in range(rounds)]
+    return torch.cat(orders)[: rows.count] if orders else torch.zeros(0, dtype=torch.int64, device=device)

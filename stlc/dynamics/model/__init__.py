@@ -1,1 +1,1 @@
-"""One step and many: how a declared system moves."""
+"""The dynamics of a declared system: steps, rollouts, integrators."""

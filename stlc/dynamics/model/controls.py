@@ -1,4 +1,4 @@
-"""Network outputs become controls within their ranges."""
+"""Maps from network outputs to controls within their ranges."""
 
 from __future__ import annotations
 

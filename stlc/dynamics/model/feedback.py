@@ -44,7 +44,7 @@ GROWING = 10.0
 
 
 class NoFeedbackError(ValueError):
-    """A gain that cannot be computed, and why."""
+    """A gain that cannot be computed, with the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +129,7 @@ def _rest(decl: SystemDecl, around: Mapping[str, float]) -> tuple[NDArray[np.flo
 
 
 def _held(linear: Linear) -> NDArray[np.bool_]:
-    """The moving states that a point of operation holds: not those that nothing depends on (a place)."""
+    """Mask of the moving states that a point of operation holds: those that the dynamics depend on."""
     others = np.abs(linear.a - np.eye(len(linear.a)))
     return np.asarray(others.max(0, initial=0.0) > STILL)
 
@@ -223,7 +223,7 @@ def _lqr(
 def riccati(
     a: NDArray[np.float64], b: NDArray[np.float64], q: NDArray[np.float64], r: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The gain (m, n) that the recursion of dynamic programming settles at.
+    """The gain (m, n) at which the Riccati recursion settles.
 
     It needs no stabilising solution of the algebraic equation, which there is none of where an integrator is
     out of reach of the controls.
@@ -245,7 +245,7 @@ def riccati(
 
 
 def unstable(decl: SystemDecl) -> tuple[Diagnostic, ...]:
-    """W602 where plans are open-loop controls of a plant whose fastest mode grows too much over a horizon."""
+    """W602 where plans are open-loop controls of an unstable plant that grows too much over a horizon."""
     growth = growth_of(decl)
     if not growth > GROWING:
         return ()
@@ -263,7 +263,7 @@ def unstable(decl: SystemDecl) -> tuple[Diagnostic, ...]:
 
 
 def growth_of(decl: SystemDecl) -> float:
-    """The growth of the fastest mode over a horizon, linearised at rest; 1 where that cannot be said.
+    """Growth of the fastest mode over a horizon, linearised at rest; 1 where it cannot be computed.
 
     With a feedback the loop is closed by it.
     """
@@ -282,7 +282,7 @@ def growth_of(decl: SystemDecl) -> float:
 
 
 def _opened(decl: SystemDecl, feedback: Feedback) -> SystemDecl:
-    """The same plant with the actuators' own ranges."""
+    """The plant with the actuators' own ranges and no feedback."""
     ends = zip(decl.controls, feedback.low, feedback.high, strict=True)
     own = tuple(replace(each, low=low, high=high) for each, low, high in ends)
     return replace(decl, controls=own, feedback=None)

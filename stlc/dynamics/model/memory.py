@@ -1,4 +1,4 @@
-"""Freed memory kept for the next step, because giving it back costs more than the arithmetic."""
+"""Allocator settings that keep freed memory in the process between rollouts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _LARGEST = 32 * 2**20  # the most that glibc accepts
 
 @cache
 def keep_freed_memory() -> bool:
-    """Tell the C library not to hand freed memory back to the system; whether it understood.
+    """Tell the C library not to return freed memory to the system; True if it accepted.
 
     A rollout allocates and frees the same few arrays of some 100 kB in every step. By default glibc returns
     them, and each time their pages have to be mapped and cleared again, which takes as long as the rollout

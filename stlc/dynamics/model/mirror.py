@@ -1,4 +1,4 @@
-"""A symmetry of a system: states and controls that behave as their mirror images do.
+"""Symmetries of a system under which states and controls behave as their images do.
 
 A ship on the left of a river is a ship on the right of it seen in a mirror. A policy that knows this learns
 one half of the states and has learnt the other.
@@ -25,7 +25,7 @@ HARD = Hard()
 
 
 class Mirror:
-    """What the entry `mirror` of a system's policy says; applied twice it changes nothing.
+    """The symmetry that `policy: {mirror: …}` declares; it is its own inverse.
 
     Attributes:
         side: index of the state that tells a state from its image; the larger of the two is kept.
@@ -34,7 +34,7 @@ class Mirror:
     def __init__(
         self, images: Sequence[Assign], names: Sequence[str], controls: Sequence[ControlDecl]
     ) -> None:
-        """`images` of states among `names` and of `controls`, the first one of a state."""
+        """A symmetry from the images of states and controls, the first one of a state."""
         self._names = tuple(names)
         self._controls = tuple(controls)
         known = {control.name for control in controls}
@@ -55,7 +55,7 @@ class Mirror:
         return moved
 
     def fold(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """States or their images, whichever lie on the side that is kept, (B, n), and where images, (B,)."""
+        """States or their images, whichever are on the kept side, (B, n), and a mask of the images, (B,)."""
         image = self.states(x)
         swapped = x[..., self.side] < image[..., self.side]
         return torch.where(swapped[..., None], image, x), swapped

@@ -1,4 +1,4 @@
-"""Many steps: columns of shape (time, batch), as few array operations as the dynamics allow."""
+"""Rollouts: columns of shape (time, batch), with as few array operations as the dynamics allow."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from stlc.compile.backends.array.arith import Program
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.switch import Switch
 from stlc.dynamics.model.algebra import names_in
-from stlc.dynamics.model.schedule import Stage, blocks, schedule
+from stlc.dynamics.model.schedule import RolloutStage, blocks, schedule
 from stlc.dynamics.model.step import Step
 
 Columns = dict[str, Tensor]
 
 
 @dataclass
-class _Film:
-    """What is known so far: states at all T+1 samples, and numbers at the T steps.
+class _Columns:
+    """The columns of a rollout computed so far: states at all T+1 samples, and numbers at the T steps.
 
     `now` maps every name to its values at the T steps, shape (T, B), or (B,) where it never changes.
     """
@@ -42,7 +42,7 @@ class _Film:
         }
 
     def enter(self, name: str, column: Tensor) -> None:
-        """A state whose T+1 samples are known."""
+        """Add a state of which all T+1 samples are computed."""
         self.states[name] = column
         self.now[name] = column[:-1]
 
@@ -51,7 +51,7 @@ class _Film:
         return values.expand(self.steps, self.batch)
 
     def sliced(self, names: Iterable[str]) -> tuple[dict[str, Tensor], list[tuple[str, Sequence[Tensor]]]]:
-        """What stays through the loop, and what changes from step to step."""
+        """The values that are constant over the loop, and those that change from step to step."""
         fixed: dict[str, Tensor] = {}
         timed: list[tuple[str, Sequence[Tensor]]] = []
         for name in names:
@@ -64,7 +64,7 @@ class _Film:
 
 
 class _Accumulated(torch.autograd.Function):
-    """(B,) and (T, B) -> (T+1, B): every row is the one above plus an increment. Faster than `cumsum`."""
+    """Running sum: start (B,) and increments (T, B) -> (T+1, B). Faster than `cumsum`."""
 
     @staticmethod
     def forward(ctx: Any, start: Tensor, increments: Tensor) -> Tensor:  # noqa: ARG004
@@ -86,7 +86,7 @@ class _Accumulated(torch.autograd.Function):
 
 
 def _accumulated(start: Tensor, increments: Tensor) -> Tensor:
-    """`_Accumulated`, as one operation while a program is recorded for export."""
+    """The running sum of `_Accumulated`, as one operation while a program is exported."""
     if torch.compiler.is_exporting():
         return torch.cat((start[None], increments)).cumsum(0)
     column: Tensor = _Accumulated.apply(start, increments)  # type: ignore[no-untyped-call]
@@ -94,9 +94,9 @@ def _accumulated(start: Tensor, increments: Tensor) -> Tensor:
 
 
 class _StageRunner:
-    """A stage, its programs compiled."""
+    """A stage with its programs compiled."""
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: RolloutStage) -> None:
         self.stage = stage
         self.early = Program(stage.early) if stage.early else None
         self.blocks = tuple(Program(block) for block in stage.blocks)
@@ -104,40 +104,42 @@ class _StageRunner:
         read = {name for block in stage.blocks for num in block.values() for name in names_in(num)}
         self.outside = tuple(sorted(read - inside))
 
-    def __call__(self, film: _Film) -> None:
+    def __call__(self, columns: _Columns) -> None:
         if self.early is not None:
-            film.now.update(film.run(self.early))
+            columns.now.update(columns.run(self.early))
         for state, source in self.stage.follows.items():
-            start = film.states[state]
-            film.enter(state, torch.cat((start[None], film.full(film.now[source]))))
+            start = columns.states[state]
+            columns.enter(state, torch.cat((start[None], columns.full(columns.now[source]))))
         for state, source in self.stage.sums.items():
-            increments = film.full(film.now[source])
-            film.enter(state, _accumulated(film.states[state], increments))
+            increments = columns.full(columns.now[source])
+            columns.enter(state, _accumulated(columns.states[state], increments))
         if self.blocks:
-            self._loop(film)
+            self._loop(columns)
 
-    def _loop(self, film: _Film) -> None:
-        """Step what feeds back into itself."""
+    def _loop(self, columns: _Columns) -> None:
+        """Run the components that depend on their own past step by step."""
         stage = self.stage
-        env, timed = film.sliced(self.outside)
+        env, timed = columns.sliced(self.outside)
         kept = (*stage.stepped.values(), *stage.lets)
         history: dict[str, list[Tensor]] = {name: [] for name in kept}
-        env.update((state, film.states[state]) for state in stage.stepped)
-        for step in range(film.steps):
+        env.update((state, columns.states[state]) for state in stage.stepped)
+        for step in range(columns.steps):
             env.update((name, values[step]) for name, values in timed)
             for block in self.blocks:
-                env.update(block(env, TORCH, film.switch))
+                env.update(block(env, TORCH, columns.switch))
             for name in kept:
                 history[name].append(env[name])
             env.update((state, env[source]) for state, source in stage.stepped.items())
         for state, source in stage.stepped.items():
-            start = film.states[state]
-            film.enter(state, torch.stack([start, *(value.expand(film.batch) for value in history[source])]))
-        film.now.update((name, torch.stack(history[name])) for name in stage.lets)
+            start = columns.states[state]
+            columns.enter(
+                state, torch.stack([start, *(value.expand(columns.batch) for value in history[source])])
+            )
+        columns.now.update((name, torch.stack(history[name])) for name in stage.lets)
 
 
 class Stepper:
-    """A step, ready to run: once on (B,) columns, or over time on (T, B) controls."""
+    """A compiled step: run once on (B,) columns, or over time on (T, B) controls."""
 
     def __init__(self, step: Step) -> None:
         self.next = dict(step.next)
@@ -160,8 +162,8 @@ class Stepper:
         """From (B,) columns and (T, B) controls to (T+1, B) columns; constant ones are expanded views."""
         batch = next(iter(start.values())).shape[0]
         steady = {name: column for name, column in start.items() if name not in self.next}
-        film = _Film(dict(start), {**steady, **controls}, steps, batch, switch)
+        columns = _Columns(dict(start), {**steady, **controls}, steps, batch, switch)
         for stage in self.stages:
-            stage(film)
-        film.states.update((name, column.expand(steps + 1, batch)) for name, column in steady.items())
-        return film.states
+            stage(columns)
+        columns.states.update((name, column.expand(steps + 1, batch)) for name, column in steady.items())
+        return columns.states

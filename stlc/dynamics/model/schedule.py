@@ -1,4 +1,4 @@
-"""In which order the components of a step are run over time.
+"""Order of evaluation of a step's components over a rollout.
 
 A rollout need not take all components through one loop. Components are ordered by what they read: one that
 depends only on earlier ones is computed for all steps at once, one that adds a known increment is a
@@ -20,8 +20,8 @@ Lets: TypeAlias = Mapping[str, ir.Num]
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
-    """What can be run together, once everything that it reads is known.
+class RolloutStage:
+    """Components that can be run together once all that they read is computed.
 
     Attributes:
         early: numbers of all steps, computed together, before anything else here.
@@ -40,7 +40,7 @@ class Stage:
     lets: tuple[str, ...]
 
 
-def schedule(step: Step) -> tuple[Stage, ...]:
+def schedule(step: Step) -> tuple[RolloutStage, ...]:
     """The stages of a step, in an order in which each reads only states and numbers of earlier ones."""
     numbers = dict(step.lets) | {_next(name): num for name, num in step.next.items()}
     reads = {name: names_in(num) & (numbers.keys() | step.next.keys()) for name, num in numbers.items()}
@@ -77,7 +77,7 @@ class _StageWriter:
         self.lets: list[str] = []
 
     def add(self, group: Sequence[str]) -> None:
-        """One strongly connected group of names."""
+        """Add one strongly connected group of names."""
         name = group[0]
         if len(group) == 1 and name not in self.reads[name]:
             if name in self.numbers:
@@ -102,9 +102,11 @@ class _StageWriter:
         }
         self.lets += [name for name in body if name in read_outside]
 
-    def stage(self) -> Stage:
-        """The level as a stage."""
-        return Stage(self.early, self.follows, self.sums, blocks(self.body), self.stepped, tuple(self.lets))
+    def stage(self) -> RolloutStage:
+        """The gathered groups as a stage."""
+        return RolloutStage(
+            self.early, self.follows, self.sums, blocks(self.body), self.stepped, tuple(self.lets)
+        )
 
 
 def blocks(numbers: Lets) -> tuple[Lets, ...]:
@@ -117,12 +119,12 @@ def blocks(numbers: Lets) -> tuple[Lets, ...]:
 
 
 def _next(name: str) -> str:
-    """How the next value of a state is called."""
+    """The name of the next value of a state."""
     return f"{name}'"
 
 
 def _increment(states: Mapping[str, str], body: Lets) -> ir.Num | None:
-    """What is added every step, if that is all that happens to a single state."""
+    """The increment of a state that is a running sum; None for other states."""
     if len(states) != 1 or len(body) != 1:
         return None
     (state,) = states
@@ -180,7 +182,7 @@ def _enter(
 
 @dataclass
 class Hoist:
-    """Splits numbers into what changes within a loop and what can be computed before it.
+    """Hoisting of loop invariants: parts of numbers that can be computed before the loop.
 
     Attributes:
         moving: names that change within the loop.
@@ -193,7 +195,7 @@ class Hoist:
     early: dict[str, ir.Num] = field(default_factory=dict)
 
     def split(self, num: ir.Num) -> ir.Num:
-        """`num` with its largest steady parts replaced by columns of `early`."""
+        """`num` with its largest loop-invariant parts replaced by columns of `early`."""
         if not names_in(num) & self.moving:
             return self._steady(num)
         match num:
@@ -207,7 +209,7 @@ class Hoist:
                 return map_parts(num, self.split)
 
     def _steady(self, num: ir.Num) -> ir.Num:
-        """A steady number, named; what is a number or a name already stays."""
+        """A loop invariant, named; constants and columns stay."""
         if isinstance(num, ir.Const | ir.Signal):
             return num
         for name, known in self.early.items():
@@ -218,7 +220,7 @@ class Hoist:
         return ir.Signal(name)
 
     def _choice(self, cond: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
-        """A choice whose condition is steady: the condition becomes a mask."""
+        """A choice whose condition is invariant: the condition becomes a mask."""
         if yes == ir.Const(0.0):
             keep = self._steady(ir.Op("sub", (ir.Const(1.0), ir.Indicator(cond))))
             return multiply(keep, self.split(no))
@@ -226,7 +228,7 @@ class Hoist:
         return ir.Where(ir.Predicate(mask), self.split(yes), self.split(no))
 
     def _sum(self, num: ir.Num) -> ir.Num:
-        """Terms of a sum, the steady ones gathered into one."""
+        """The terms of a sum, invariant ones gathered into one."""
         terms = _terms(num)
         moving = [(sign, self.split(term)) for sign, term in terms if names_in(term) & self.moving]
         steady = [(sign, term) for sign, term in terms if not names_in(term) & self.moving]
@@ -238,7 +240,7 @@ class Hoist:
         return total if rest == ir.Const(0.0) else add(total, self._steady(rest))
 
     def _product(self, num: ir.Num) -> ir.Num:
-        """Factors of a product, the steady ones gathered into one."""
+        """The factors of a product, invariant ones gathered into one."""
         factors = _factors(num)
         moving = [self.split(factor) for factor in factors if names_in(factor) & self.moving]
         steady = [factor for factor in factors if not names_in(factor) & self.moving]
@@ -280,7 +282,7 @@ def _signed(sign: int, num: ir.Num) -> ir.Num:
 
 
 def _total(terms: list[tuple[int, ir.Num]]) -> ir.Num:
-    """Steady terms as one number, constants folded."""
+    """Invariant terms as one number, constants folded."""
     constant = sum(sign * term.value for sign, term in terms if isinstance(term, ir.Const))
     total: ir.Num | None = None
     for sign, term in sorted(

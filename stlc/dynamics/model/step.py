@@ -67,7 +67,7 @@ def build_step(decl: SystemDecl, *, soft: bool) -> Step:
 
 
 def commands(decl: SystemDecl) -> dict[str, ir.Num]:
-    """Name of a control -> what its actuator gets, from the state and from what is planned.
+    """The commands of actuators, from the state and the plan: name of a control -> number.
 
     {} where actuators get what is planned. It is computed once a step, as a sampled controller does.
     """
@@ -88,7 +88,7 @@ def commands(decl: SystemDecl) -> dict[str, ir.Num]:
 
 
 def _given(jump: JumpDecl, given: State) -> JumpDecl:
-    """The jump, where it reads controls of what actuators get."""
+    """The jump with controls replaced by the commands of actuators."""
     if not given:
         return jump
     resets = tuple(replace(each, value=substitute(each.value, given)) for each in jump.resets)
@@ -96,7 +96,7 @@ def _given(jump: JumpDecl, given: State) -> JumpDecl:
 
 
 def _flow(decl: SystemDecl, writer: _Writer, state: State, given: State) -> State:
-    """All substeps of the continuous part; `given` is what actuators get."""
+    """All substeps of the continuous part; `given` are the commands of actuators."""
 
     def rate(at: State) -> State:
         table = {**writer.named(at), **given}
@@ -132,7 +132,7 @@ def _blend(cond: ir.Formula, yes: ir.Num, no: ir.Num, sharpness: float | None) -
 
 
 def _clamped(decl: SystemDecl, name: str, num: ir.Num) -> ir.Num:
-    """A component kept in its range, where that is declared."""
+    """A component clamped to its range, where one is declared."""
     if name not in decl.clamps:
         return num
     low, high = decl.clamps[name]

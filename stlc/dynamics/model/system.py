@@ -1,4 +1,4 @@
-"""A declaration becomes something that steps: tensors in, hybrid dynamics, initial states, objective."""
+"""A system made from its declaration: steps, rollouts, initial states and objective as tensors."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class System:
     def load(
         cls, path: Path | str, overrides: Mapping[str, str] | None = None, *, scenario: str | None = None
     ) -> System:
-        """The system of a file, or of the name of one that `stlc.files.find_system` finds, under a scenario.
+        """Load a system file, by path or by name (`stlc.files.find_system`), under a scenario.
 
         Raises UsageError where there is none, SystemFileError where it is invalid.
         """
@@ -79,7 +79,7 @@ class System:
 
     @cached_property
     def truth(self) -> System:
-        """The system as it is, where its scenario says that the model is mistaken; parameters apart."""
+        """The true system where the scenario has a model mismatch; without parameters."""
         real = truth(self.decl)
         return self if real is self.decl else System(real)
 
@@ -92,7 +92,7 @@ class System:
         return System(self.decl, (*self.timers, *timers), (*self.parameters, *parameters))
 
     def interface(self) -> Interface:
-        """What the compiler may know of this system, its functions loaded. Raises SystemFileError (S208)."""
+        """The interface that specifications are compiled against. Raises SystemFileError (S208)."""
         return replace(self.decl.interface(), functions=load_functions(self.decl))
 
     # ---------------------------------------------------------------- description
@@ -144,14 +144,14 @@ class System:
 
     @property
     def actuators(self) -> tuple[tuple[float, float], ...]:
-        """Ranges of what actuators get; those of plans are wider where a feedback lies beneath."""
+        """Ranges of the actuators; those of plans are wider where a feedback lies beneath."""
         if self.decl.feedback is None:
             return tuple((control.low, control.high) for control in self.controls)
         return tuple(zip(self.decl.feedback.low, self.decl.feedback.high, strict=True))
 
     @property
     def observed_count(self) -> int:
-        """Numbers that the policy sees."""
+        """Number of inputs of the policy."""
         observe = self.decl.policy.observe
         return len(observe) + len(self.added) if observe else len(self.names)
 
@@ -168,7 +168,7 @@ class System:
         return torch.stack([moved[name] for name in self.names], 1)
 
     def begun(self, states: Tensor, generator: torch.Generator) -> Tensor:
-        """States of the declaration with parameters drawn, and timers as at the start of a mission.
+        """Initial states with parameters drawn and timers at the start of a mission.
 
         (B, n - added) -> (B, n).
         """
@@ -187,20 +187,20 @@ class System:
         return tuple(Drawing(Assign(each.column.name, each.draw)) for each in self.parameters)
 
     def added_later(self, x: Tensor) -> Tensor:
-        """Parameters and timers one step after a state, whatever moved it: (B, n) -> (B, added)."""
+        """Parameters and timers one step later, by any cause of motion: (B, n) -> (B, added)."""
         before = self._named(x)
         later = before | self._later(before)
         return torch.stack([later[column.name] for column in self.added], 1) if self.added else x[:, :0]
 
     def commanded(self, x: Tensor, u: Tensor) -> Tensor:
-        """What actuators get in states (B, n) where `u` (B, m) is planned; `u` itself without a feedback."""
+        """Commands of actuators in states (B, n) for plans `u` (B, m); `u` itself without a feedback."""
         if self._commands is None:
             return u
         found = self._commands({**self._named(x), **self._inputs(u)}, TORCH, HARD)
         return torch.stack([found[name] for name in self.control_names], 1)
 
     def planned(self, x: Tensor, command: Tensor) -> Tensor:
-        """What has to be planned in states (B, n) for actuators to get `command` (B, m), where they can."""
+        """Plans in states (B, n) for which actuators get `command` (B, m), where they can."""
         if self._commands is None:
             return command
         feedback = self.decl.feedback
@@ -254,12 +254,12 @@ class System:
 
     @cached_property
     def _keeper(self) -> Stepper:
-        """What moves the timers."""
+        """The dynamics of the timers."""
         return Stepper(Step((), {timer.name: timer.update for timer in self.timers}))
 
     @cached_property
     def exact_step(self) -> Step:
-        """One exact step in the IR, timers included, for those who compile it."""
+        """One exact step in the IR, timers included, for code generators."""
         step = build_step(self.decl, soft=False)
         return Step(step.lets, {**step.next, **{timer.name: timer.update for timer in self.timers}})
 
@@ -304,7 +304,7 @@ class System:
     # -------------------------------------------------------------- policy, objective
 
     def observe(self, x: Tensor) -> Tensor:
-        """What the policy sees, parameters and timers last: (…, n) -> (…, k)."""
+        """Inputs of the policy, parameters and timers last: (…, n) -> (…, k)."""
         if self._observation is None:
             return x
         seen = self._observation(self._named(x), TORCH, HARD)
@@ -318,7 +318,7 @@ class System:
 
     @cached_property
     def mirror(self) -> Mirror | None:
-        """The symmetry that the file declares; None where it declares none."""
+        """The declared symmetry; None without one."""
         images = self.decl.policy.mirror
         return Mirror(images, self.names, self.controls) if images else None
 
@@ -373,7 +373,7 @@ class System:
 
     @cached_property
     def _terms(self) -> tuple[Program | None, Program | None]:
-        """`objective` as programs."""
+        """The objective's terms as programs."""
         states, controlled = (None if total is None else Program({"cost": total}) for total in self.objective)
         return states, controlled
 
@@ -411,7 +411,7 @@ class System:
         )
 
     def probe(self, n: int = 256, *, seed: int = 0) -> tuple[Diagnostic, ...]:
-        """Try the system: initial states, random plans of at most `PROBED` steps; warnings come back.
+        """Test the system: initial states and random plans of at most `PROBED` steps; returns warnings.
 
         Raises SystemFileError where states cannot be drawn (S301) or are not finite (S302).
         """

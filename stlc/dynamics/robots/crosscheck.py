@@ -1,4 +1,4 @@
-"""Forward kinematics as it is computed here against another library's, on a user's robot description.
+"""Comparison of the compiled forward kinematics with another library's, on a robot description.
 
 `stlc.dynamics.robots.kinematics` unrolls a chain of joints into a few operations; pytorch-kinematics
 multiplies batches of transforms. Where that package is installed, `stlc system check` compares the two.
@@ -26,12 +26,12 @@ from stlc.dynamics.robots.urdf import Doubles, read_urdf
 LIBRARY = "pytorch-kinematics"
 POSITIONS = 256
 _NEAR = 1e-5
-"""How far apart the two may be, in parts of the reach: the library keeps offsets in single precision."""
+"""Tolerance of the comparison, relative to the reach: the library keeps offsets in single precision."""
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What came of comparing one function.
+    """The result of comparing one function.
 
     Attributes:
         name: of the function.
@@ -98,7 +98,7 @@ def _by_body(body: ir.Body, q: Doubles) -> Doubles:
 
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
-    """The library tells of every tag that it passes over."""
+    """Suppress the library's messages about tags that it ignores."""
     nowhere = io.StringIO()
     with (
         contextlib.redirect_stdout(nowhere),

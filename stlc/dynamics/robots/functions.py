@@ -1,4 +1,4 @@
-"""Functions from outside: loaded when somebody asks for them, on arrays of either library."""
+"""Functions from outside, loaded on demand, on arrays of NumPy or torch."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def _shape(parts: Sequence[Array]) -> tuple[int, ...]:
 
 
 def _joined(parts: Sequence[Array], sizes: tuple[int | None, ...]) -> list[Array]:
-    """Components as the arguments that they make up, all of one shape but for the last axis."""
+    """Arguments made from their components, broadcast to one shape but for the last axis."""
     if all(isinstance(part, (float, np.ndarray, np.generic)) for part in parts):
         library: Any = np
         spread = np.broadcast_arrays(*parts)

@@ -18,7 +18,7 @@ Point: TypeAlias = tuple[ir.Num, ir.Num, ir.Num]
 
 
 def position(joints: Sequence[Joint]) -> ir.Body:
-    """Where the tip is in the frame of the base, (3,) m, from the positions of the moving joints."""
+    """The position of the tip in the frame of the base, (3,) m, from the positions of the moving joints."""
     moving = [joint for joint in joints if joint.kind != "fixed"]
     formals = {joint.name: f"q{index}" for index, joint in enumerate(moving)}
     writer = _Lines()
@@ -33,7 +33,7 @@ def position(joints: Sequence[Joint]) -> ir.Body:
 
 
 class _Lines:
-    """Gathers named numbers, so that none is written out twice."""
+    """Named intermediate results, so that none is written out twice."""
 
     def __init__(self) -> None:
         self.lets: list[tuple[str, ir.Num]] = []
@@ -48,7 +48,7 @@ class _Lines:
 
 
 def _turned(axis: Doubles, point: Point, angle: ir.Num, writer: _Lines) -> Point:
-    """A point turned about an axis (Rodrigues): what is along it stays, the rest turns."""
+    """A point rotated about an axis (Rodrigues)."""
     along = _linear(np.outer(axis, axis), point)
     across = tuple(writer.name(num) for num in _linear(np.eye(3) - np.outer(axis, axis), point))
     if all(num == ir.Const(0.0) for num in across):
@@ -64,7 +64,7 @@ def _turned(axis: Doubles, point: Point, angle: ir.Num, writer: _Lines) -> Point
 
 
 def _pushed(axis: Doubles, point: Point, length: ir.Num, writer: _Lines) -> Point:
-    """A point pushed along an axis."""
+    """A point translated along an axis."""
     a, b, c = (
         writer.name(_sum(part, _product(ir.Const(float(share)), length)))
         for part, share in zip(point, axis, strict=True)

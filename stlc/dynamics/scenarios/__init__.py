@@ -1,1 +1,1 @@
-"""A system that is not as its model says."""
+"""Scenarios, and systems that differ from their model."""

@@ -1,4 +1,4 @@
-"""A scenario laid over a system: what is different in it, and for whom.
+"""Scenarios: overlays of a system for deployment.
 
 Some are there for every system: `mismatch`, `disturb` and `noise`, with a number of per cent behind a hyphen
 or without.
@@ -24,7 +24,7 @@ _USUAL = {"mismatch": 10.0, "disturb": 10.0, "noise": 0.5}
 
 
 def standard(name: str) -> ScenarioDecl | None:
-    """A scenario that every system has, such as `mismatch-20`; None where the name is not one of theirs."""
+    """A scenario that every system has, such as `mismatch-20`; None for other names."""
     found = _STANDARD.fullmatch(name)
     percent = float(found[2] or _USUAL[found[1]]) if found else 0.0
     if found is None or not 0.0 < percent <= 100.0:
@@ -58,12 +58,12 @@ def find_scenario(decl: SystemDecl, name: str) -> ScenarioDecl:
 
 
 def scenario_constants(path: Path, name: str, overrides: Mapping[str, str]) -> Mapping[str, str]:
-    """What a scenario of a system file says about constants: specification and model change together."""
+    """The constants that a scenario changes, for specification and model alike."""
     return find_scenario(load_system_decl(path, overrides), name).constants
 
 
 def under(decl: SystemDecl, name: str) -> SystemDecl:
-    """The system under a scenario: what agents start from and meet; its model stays, but for constants.
+    """The system under a scenario; its model keeps all but the constants that the scenario changes.
 
     Raises UsageError (U101) where there is no such scenario.
     """
@@ -72,7 +72,7 @@ def under(decl: SystemDecl, name: str) -> SystemDecl:
 
 
 def truth(decl: SystemDecl) -> SystemDecl:
-    """The system as it is where its scenario says that the model is mistaken."""
+    """The true system where the scenario has a model mismatch."""
     scenario = decl.scenario
     if scenario is None or not scenario.mismatch:
         return decl

@@ -1,1 +1,1 @@
-"""A system file read, checked, and turned into a declaration."""
+"""YAML with places, records of keys, names and expressions: what sections are read with."""

@@ -1,4 +1,4 @@
-"""Expressions inside a system file: parsed where they stand, typed by the compiler."""
+"""Expressions in a system file: parsed in place, typed by the compiler."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _SORTS_DIFFER = frozenset({"E201", "E202", "E205"})
 
 @dataclass(frozen=True, slots=True)
 class Expressions:
-    """Compiles the values of fields.
+    """Compiler of the expressions of a section.
 
     Attributes:
         reader: where findings go.
@@ -59,7 +59,7 @@ class Expressions:
     def extended(
         self, entries: Mapping[str, Entry], *, samplers: bool = False, ready: frozenset[str] | None = None
     ) -> Expressions:
-        """The same with more names."""
+        """The same compiler with more names."""
         scope = self.scope.extended(entries, samplers=samplers)
         return Expressions(self.reader, scope, ready, self.amounts)
 
@@ -89,7 +89,7 @@ class Expressions:
             return None
 
     def _attribute(self, span: Span, found: re.Match[str]) -> None:
-        """Report something that Python would take for an attribute."""
+        """Report an attribute access, which the language does not have."""
         place = Span(span.source, span.start + found.start(1), span.start + found.end(1))
         finding = Diagnostic(
             "S201",
@@ -158,7 +158,7 @@ class Expressions:
                 return
 
     def _typed(self, resolve: Callable[[ast.Expr, Scope], _T], expr: ast.Expr) -> _T | None:
-        """What a resolver of the compiler makes of an expression, or None with its findings reported."""
+        """The result of a resolver of the compiler, or None with its findings reported."""
         sink: list[Diagnostic] = []
         try:
             return resolve(expr, replace(self.scope, sink=sink))
@@ -239,7 +239,7 @@ class Expressions:
                 return self.stored(node, where, Unit())
 
     def constant(self, node: Node | None, where: str, unit: Unit) -> float | None:
-        """A number that is known now, as it is stored in a column of `unit`."""
+        """A compile-time constant, as it is stored in a column of `unit`."""
         value = self.stored(node, where, unit)
         if value is None or node is None:
             return None
@@ -249,7 +249,7 @@ class Expressions:
         return value.value
 
     def constants(self, node: Node, where: str, unit: Unit, size: int) -> tuple[float, ...] | None:
-        """Components that are known now, as they are stored in columns of `unit`."""
+        """Compile-time constants, as they are stored in columns of `unit`."""
         values = self.stored_each(node, where, unit, size)
         if values is None:
             return None
@@ -304,7 +304,7 @@ class Expressions:
 
 
 def in_stored_unit(number: Number, unit: Unit) -> ir.Num:
-    """SI to the unit of a column; a bare number is in that unit already."""
+    """A number converted from SI to the unit of a column; a bare number is in that unit already."""
     return number.num if number.bare else stored(number, unit)
 
 

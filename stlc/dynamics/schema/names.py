@@ -1,4 +1,4 @@
-"""What the names of a system file are: time, constants, states, controls, definitions."""
+"""The names of a system file: time, constants, states, controls and definitions."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def component_names(name: str, size: int | None) -> tuple[str, ...]:
 
 @dataclass
 class Names:
-    """What has been declared so far.
+    """The names declared so far.
 
     Attributes:
         constants: name -> (value in SI units, unit).
@@ -72,7 +72,7 @@ class Names:
         return Signature(tuple(self.columns))
 
     def expressions(self, reader: Reader) -> Expressions:
-        """A compiler of expressions that knows all of it."""
+        """A compiler of expressions that knows all declared names."""
         return Expressions(
             reader, Scope(dict(self.entries), error=SystemFileError, facts=enforced(self.columns))
         )
@@ -92,12 +92,12 @@ class Names:
         return all(column.name != name for column in self.columns)
 
     def place_components(self, name: str, columns: Iterable[str]) -> None:
-        """The components of a vector are declared where it is."""
+        """Record the place of a vector for its components."""
         if name in self.places:
             self.places |= dict.fromkeys(columns, self.places[name])
 
     def declare(self, key: Scalar, what: str, reader: Reader) -> bool:
-        """Whether `key` may become a name; says why not."""
+        """Declare a name; False, with a finding, where it is taken or is no identifier."""
         first = self.places.get(key.text)
         if first is not None:
             reader.report(
@@ -120,7 +120,7 @@ class Names:
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What the values of a section are read with.
+    """The context in which the values of a section are read.
 
     Attributes:
         reader: takes the findings.

@@ -1,4 +1,4 @@
-"""Reading nodes as fields: keys that are known, values of the right kind, every finding with its place."""
+"""Checked access to YAML nodes: known keys, kinds of values, and findings with their places."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _OPENING, _CLOSING = "([{", ")]}"
 
 @dataclass
 class Reader:
-    """Reads fields of a system file and remembers what is wrong with them.
+    """Checked access to the values of a system file, and the findings about them.
 
     Every method returns None (or leaves a key out) where it has reported something.
     """
@@ -35,11 +35,11 @@ class Reader:
         label: str = "",
         labels: tuple[Label, ...] = (),
     ) -> None:
-        """Remember a finding."""
+        """Record a finding."""
         self.add(Diagnostic(code, message, span, label, labels, tuple(line for line in help_ if line)))
 
     def add(self, *findings: Diagnostic) -> None:
-        """Remember findings, each place once: an anchor that is used twice is wrong once."""
+        """Record findings, one for each place: an anchor that is used twice is wrong once."""
         for finding in findings:
             tell(self.findings, finding)
 
@@ -78,7 +78,7 @@ class Reader:
         return found
 
     def unknown(self, key: Scalar, where: str, known: Collection[str], code: str = "S101") -> None:
-        """Report a key that nobody reads."""
+        """Report an unknown key."""
         near = closest(key.text, known)
         guess = f"did you mean `{near}`?  " if near else ""
         self.report(
@@ -90,7 +90,7 @@ class Reader:
 
     @staticmethod
     def near(name: str, candidates: Iterable[str]) -> str | None:
-        """What `name` is probably a slip of."""
+        """The candidate that `name` is probably a misspelling of."""
         return closest(name, candidates)
 
     def items(self, node: Node | None, where: str) -> tuple[Node, ...]:
@@ -107,7 +107,7 @@ class Reader:
         return node.items
 
     def _whole(self, entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
-        """Without the pieces of expressions that a comma inside `{…}` has cut."""
+        """The entries without the fragments of expressions that a comma inside `{…}` has cut."""
         kept: list[Entry] = []
         open_value = False
         for entry in entries:
@@ -146,12 +146,12 @@ class Reader:
         return node.text
 
     def name(self, node: Node | None, where: str) -> str | None:
-        """A text of one line that can be seen whole, as names are."""
+        """A text that can be a name: printable, and not too long."""
         text = self.text(node, where)
         return text if text is None or self.nameable(node, where) else None
 
     def nameable(self, node: Node | None, where: str) -> bool:
-        """Whether a text can be a name: nothing in it is invisible, and it is not too long; says why not."""
+        """Whether a text can be a name: printable, and not too long; reports why not."""
         assert isinstance(node, Scalar)
         hidden = unseen(node.text)
         if not hidden and len(node.text) <= MAX_NAME:
@@ -207,7 +207,7 @@ class Reader:
 
 
 def _kind(node: Node) -> str:
-    """How a message calls a value."""
+    """The description of a value in messages."""
     match node:
         case Sequence():
             return "a list"
@@ -220,7 +220,7 @@ def _kind(node: Node) -> str:
 
 
 def first_line(span: Span) -> Span:
-    """The part of a span on its first line: what carets can underline."""
+    """The part of a span on its first line, which carets underline."""
     length = span.text.find("\n")
     return span if length < 0 else Span(span.source, span.start, span.start + max(length, 1))
 

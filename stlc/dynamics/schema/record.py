@@ -1,4 +1,4 @@
-"""Records of a system file: one description of a key gives its reader, its JSON Schema and its documentation.
+"""Records of a system file: a key's description gives its reader, its JSON Schema and its documentation.
 
 A record is a frozen dataclass some of whose fields are made by `key`:
 
@@ -253,7 +253,7 @@ def _shown(default: Any) -> str:
 
 
 def _values(kind: Kind) -> str:
-    """What a kind takes, in a few words."""
+    """The accepted values of a kind, in a few words."""
     schema = kind.schema
     if "enum" in schema:
         return ", ".join(f"`{option}`" for option in schema["enum"])

@@ -1,4 +1,4 @@
-"""YAML with marks, strict and safe: every key and value knows where it stands in the file.
+"""YAML nodes with their places in the file, read strictly and safely.
 
 Built on the event stream of PyYAML, so no object is ever constructed from a tag, aliases share one
 node instead of being copied, and depth and size are bounded while reading. Scalars stay text: what a
@@ -25,7 +25,7 @@ MAX_NODES = 20_000
 MERGE_KEY = "<<"
 _FAST = getattr(yaml, "CSafeLoader", None)
 _LAX = re.compile("[\t?\ufeff]")
-"""What the parser in C reads otherwise: tabs and `?` within words, a mark of the order of bytes."""
+"""Text that the parser in C reads differently: tabs and `?` within words, a mark of the order of bytes."""
 _PLAIN_WORDS = (("character '\\t'", "a tab"), ("'<stream end>'", "the end of the file"), ("'", "`"))
 
 Style: TypeAlias = Literal["plain", "single", "double", "block"]
@@ -41,7 +41,7 @@ _STYLES: dict[str | None, Style] = {
 
 @dataclass(frozen=True, slots=True)
 class Scalar:
-    """A text.
+    """A scalar, as text.
 
     Attributes:
         span: of the text as it stands in the file, quotes included.
@@ -56,7 +56,7 @@ class Scalar:
 
     @property
     def inside(self) -> Span:
-        """Where the characters of the value stand: the span without quotes or block header."""
+        """The span of the value's characters, without quotes or block header."""
         match self.style:
             case "plain":
                 return self.span
@@ -68,13 +68,13 @@ class Scalar:
 
     @property
     def escaped(self) -> bool:
-        """Whether the value is spelled differently from what stands between the quotes."""
+        """Whether the value differs from the characters between the quotes."""
         inside = self.inside.text
         return "\\" in inside if self.style == "double" else self.style == "single" and "''" in inside
 
     @property
     def is_null(self) -> bool:
-        """Whether this is nothing at all: an empty value, `~` or `null`."""
+        """Whether the value is null: empty, `~` or `null`."""
         return self.style == "plain" and self.text in {"", "~", "null", "Null", "NULL"}
 
 
@@ -218,7 +218,7 @@ def load_node(source: Source, *, sink: list[Diagnostic]) -> Node | None:
 
 
 def _syntax(source: Source, error: yaml.MarkedYAMLError) -> Diagnostic:
-    """PyYAML's complaint as a diagnostic."""
+    """An error of PyYAML as a diagnostic."""
     mark = error.problem_mark or error.context_mark
     offset = min(mark.index if mark else 0, max(len(source.text) - 1, 0))
     labels: tuple[Label, ...] = ()
@@ -235,7 +235,7 @@ def _syntax(source: Source, error: yaml.MarkedYAMLError) -> Diagnostic:
 
 
 class _Builder:
-    """Events to nodes, one document, bounded."""
+    """Builder of the nodes of one document from parser events, within bounds."""
 
     def __init__(self, source: Source, sink: list[Diagnostic], loader: Any) -> None:
         self.source = source
@@ -257,11 +257,11 @@ class _Builder:
         return root
 
     def refuse(self, event: Any, message: str, *help_: str) -> SystemFileError:
-        """An S100 at the place of an event."""
+        """An S100 error at the place of an event."""
         return SystemFileError(Diagnostic("S100", message, self.span(event), help=help_))
 
     def span(self, event: Any) -> Span:
-        """Where an event stands, trailing blanks cut off."""
+        """The span of an event without trailing blanks."""
         start, end = event.start_mark.index, event.end_mark.index
         end = start + len(self.source.text[start:end].rstrip())
         return self.source.span(start, max(end, min(start + 1, len(self.source.text))))
@@ -296,7 +296,7 @@ class _Builder:
         return self.mapping(event, depth)
 
     def joined(self, event: Any) -> str:
-        """The value of a scalar; a character that escapes give in two halves, as JSON does, is one."""
+        """The value of a scalar; surrogate pairs from escapes are joined."""
         value: str = event.value
         if not _HALF.search(value):
             return value
@@ -307,7 +307,7 @@ class _Builder:
             raise self.refuse(event, message) from None
 
     def here(self, event: Any) -> Span:
-        """The empty place of a value that is not there."""
+        """The empty span of a missing value."""
         index = event.start_mark.index
         return self.source.span(index, index)
 
@@ -329,7 +329,7 @@ class _Builder:
         return Sequence(span, tuple(items), 1 + sum(item.size for item in items))
 
     def mapping(self, start: Any, depth: int) -> Mapping:
-        """Entries up to the end of the mapping; merged ones behind the ones written here."""
+        """A mapping up to its end event; merged entries come after its own."""
         written: dict[str, Entry] = {}
         merged: dict[str, Entry] = {}
         while not isinstance(event := next(self.events), yaml.MappingEndEvent):
@@ -360,7 +360,7 @@ class _Builder:
         )
 
     def duplicate(self, key: Scalar, first: Scalar) -> None:
-        """Remember a key that stands twice in one mapping."""
+        """Report a key that occurs twice in one mapping."""
         self.sink.append(
             Diagnostic(
                 "S102",
@@ -373,7 +373,7 @@ class _Builder:
         )
 
     def whole(self, start: Any, end: Any) -> Span:
-        """From the start event to the end event of a collection, trailing blanks cut off."""
+        """The span from the start event to the end event, without trailing blanks."""
         first, last = start.start_mark.index, end.end_mark.index
         last = first + len(self.source.text[first:last].rstrip())
         return self.source.span(first, max(last, first + 1))

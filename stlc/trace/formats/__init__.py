@@ -1,1 +1,1 @@
-"""Formats of trace files: a reader each, chosen by the suffix of the file."""
+"""Formats of trace files, a module each."""

@@ -30,7 +30,7 @@ _MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _HEADER, _CHUNK, _CONNECTION = 2, 3, 5, 7
 _PACKED = ".zstd"
 _ALLOWED = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ)
-"""What a query may do: no function, no pragma, no recursion that a database brings with it."""
+"""Operations that a query may use: no function, pragma or recursion that a database contains."""
 _LONGEST = 256_000_000
 """Bytes of a message."""
 
@@ -51,7 +51,7 @@ def read(path: Path) -> Recording:
 
 @dataclass(frozen=True, slots=True)
 class _Connection:
-    """A topic, and what reads its messages; None where nothing does."""
+    """A topic, and the decoder of its messages; None where no decoder exists."""
 
     topic: str
     decode: Decode | None
@@ -80,7 +80,7 @@ Bytes: TypeAlias = bytes | mmap
 
 
 def _records(data: Bytes, at: int) -> Iterator[tuple[int, dict[bytes, bytes], bytes]]:
-    """Every record: what it is, the fields of its head, and its data."""
+    """The records of a file: kind, header fields and data."""
     while at < len(data):
         head, at = _sized(data, at)
         content, at = _sized(data, at)
@@ -115,7 +115,7 @@ def _take(
     fields: dict[bytes, bytes],
     content: bytes,
 ) -> None:
-    """A record that stands in a chunk or outside of one."""
+    """Process a record inside or outside of a chunk."""
     if kind == _CONNECTION:
         number = _word(fields[b"conn"])
         if number not in connections:
@@ -166,7 +166,7 @@ def _order(path: Path) -> tuple[object, ...]:
 
 
 def _add_stored(log: Log, path: Path) -> None:
-    """The messages of one file, unpacked beside where it is packed as a whole."""
+    """Add the messages of one file; a packed file is unpacked to a temporary one."""
     if path.name.lower().endswith(_PACKED):
         with mapped(path) as data:
             content = Room(path, len(data)).of_unknown_size(data[:])
@@ -204,7 +204,7 @@ def _add_database(log: Log, path: Path) -> None:
 
 
 def _opened(path: Path) -> sqlite3.Connection:
-    """A database that nothing can be written to, and that brings nothing along that runs."""
+    """A database, opened read-only and without functions or pragmas of its own."""
     where = path.resolve().as_uri()
     database = sqlite3.connect(f"{where}?mode=ro&immutable=1", uri=True)
     database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(_LONGEST, MAX_BYTES))
@@ -223,14 +223,14 @@ def _opened(path: Path) -> sqlite3.Connection:
 
 @dataclass(frozen=True, slots=True)
 class _Read:
-    """A topic of a database, and what reads its messages."""
+    """A topic of a database, and the decoder of its messages."""
 
     topic: str
     read: Decode
 
 
 def _topics(log: Log, database: sqlite3.Connection) -> dict[int, _Read]:
-    """What reads the messages of each topic, by its number."""
+    """The decoders of topics, by number."""
     texts = _definitions(database)
     topics: dict[int, _Read] = {}
     for number, topic, kind, form in database.execute(

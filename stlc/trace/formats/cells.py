@@ -1,4 +1,4 @@
-"""Cells of a table -> numbers: one at a time, or all of a large file in little more than their memory.
+"""Numbers from the cells of tables: one at a time, or all of a large file in little extra memory.
 
 `cells.c` reads large texts where there is a C compiler (`stlc.native`), else Arrow does where it is
 installed, else NumPy's reader, a stretch at a time. All leave what is unusual to others, and give the same
@@ -31,15 +31,15 @@ _SOURCE = Path(__file__).with_name("cells.c")
 STRETCH = 1 << 18
 """Bytes, or characters, that NumPy's reader is given at a time."""
 _PLAIN = bytes({*range(32, 127), *b"\t\n\r"} - {*b'"('})
-"""What Arrow reads as it is meant: no quotes, no `nan(1)`, no other letters."""
+"""Characters that Arrow reads correctly: no quotes, no `nan(1)`, no others."""
 _DOUBTS = 32
 """One cell in so many may be unusual."""
 _TOO_MANY = -2
 
 
 @dataclass(frozen=True, slots=True)
-class Lines:
-    """Lines of a table: the bytes from `start` on, so many cells a line, and what stands between them."""
+class TableText:
+    """The text of a table: the bytes from `start` on, its width and delimiter."""
 
     data: bytes
     start: int
@@ -48,14 +48,14 @@ class Lines:
 
 
 def bare(raw: str) -> str:
-    """The text of a cell, blanks and quotes taken off."""
+    """The text of a cell without blanks and quotes."""
     text = raw.strip()
     quoted = len(text) >= 2 and text[0] == text[-1] == '"'
     return text[1:-1].strip() if quoted else text
 
 
 def value_of(text: str) -> float | None:
-    """What the bare text of a cell is worth: NaN where it is empty, None where it is no number."""
+    """The number of a cell's text: NaN where it is empty, None where it is no number."""
     if NUMBER.fullmatch(text):
         return float(text)
     return _WORDS.get(text.lower()) if text else math.nan
@@ -88,7 +88,7 @@ def _loaded(body: str, delimiter: str, columns: Sequence[int] | None) -> Array |
 
 @dataclass(frozen=True, slots=True)
 class _Repair:
-    """What stands for a number in a cell that is not written as one."""
+    """Patterns that repair cells which NumPy's reader refuses."""
 
     empty: re.Pattern[str]
     quoted: re.Pattern[str]
@@ -109,7 +109,7 @@ def _repair(delimiter: str) -> _Repair:
 
 
 def _mended(body: str, delimiter: str) -> str:
-    """The lines that are not empty, with numbers for empty cells, truth values and what is within quotes."""
+    """The lines that are not empty, with numbers for empty cells, truth values and quoted cells."""
     repair = _repair(delimiter)
     body = repair.empty.sub("", body)
     if '"' in body:
@@ -124,7 +124,7 @@ def _mended(body: str, delimiter: str) -> str:
     return f"{'nan' * body.startswith(delimiter)}{body}{'nan' * body.endswith(delimiter)}"
 
 
-def read_lines(lines: Lines) -> list[Array] | None:
+def read_lines(lines: TableText) -> list[Array] | None:
     """The columns of a table of numbers; None where a line or a cell is not what it should be.
 
     Lines may end in any way. Lines of empty cells are left out; an empty cell beside others is NaN.
@@ -152,7 +152,7 @@ def _library() -> ctypes.CDLL | None:
     return library
 
 
-def _by_kernel(library: ctypes.CDLL, lines: Lines) -> list[Array] | None:
+def _by_kernel(library: ctypes.CDLL, lines: TableText) -> list[Array] | None:
     text, width = np.frombuffer(lines.data, dtype=np.uint8)[lines.start :], lines.width
     size = len(text)
     rows = min(lines.data.count(b"\n") + lines.data.count(b"\r") + 1, size // width + 1)
@@ -194,7 +194,7 @@ def _arrow() -> Any:
         return None
 
 
-def _by_arrow(lines: Lines) -> list[Array] | None:
+def _by_arrow(lines: TableText) -> list[Array] | None:
     """All lines with Arrow's reader, whose numbers are correctly rounded, too; None where one is unusual."""
     csv = _arrow()
     if csv is None or lines.data[lines.start :].translate(None, _PLAIN):
@@ -219,8 +219,8 @@ def _by_arrow(lines: Lines) -> list[Array] | None:
     return columns if len(columns[0]) else None
 
 
-def _by_numpy(lines: Lines) -> list[Array] | None:
-    """A stretch after the other; every column is put together, and its stretches are let go."""
+def _by_numpy(lines: TableText) -> list[Array] | None:
+    """The columns read in blocks with NumPy, to bound memory."""
     parts: list[list[Array]] = [[] for _ in range(lines.width)]
     for stretch in _stretches(lines):
         try:
@@ -238,7 +238,7 @@ def _by_numpy(lines: Lines) -> list[Array] | None:
     return columns or None
 
 
-def _stretches(lines: Lines) -> Iterator[bytes]:
+def _stretches(lines: TableText) -> Iterator[bytes]:
     data, begin = lines.data, lines.start
     while begin < len(data):
         end = data.find(b"\n", begin + STRETCH) + 1 or len(data)

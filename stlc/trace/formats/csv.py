@@ -1,4 +1,4 @@
-"""Named columns in a `.csv` file, in and out; every cell is a number, a word, empty or a diagnostic.
+"""Traces as `.csv` files; every cell is a number, a word, empty or a diagnostic.
 
 The first line names the columns, units in brackets if one likes: `t, x [m], v (km/h)`. A column `trace` or
 `agent` says to which of several traces a line belongs. A column whose first
@@ -23,7 +23,7 @@ from stlc.diagnostics import Diagnostic, TraceError
 from stlc.escape import from_spreadsheet, spreadsheet
 from stlc.files import write_atomic
 from stlc.source import Source, Span
-from stlc.trace.formats.cells import NUMBER, STRETCH, Lines, bare, load, read_lines, value_of
+from stlc.trace.formats.cells import NUMBER, STRETCH, TableText, bare, load, read_lines, value_of
 from stlc.trace.formats.registry import opened, unreadable
 from stlc.trace.formats.table import GROUPS, Table, is_unit, of_table
 from stlc.trace.recording import Recording
@@ -109,7 +109,7 @@ def _read(path: Path) -> bytes:
 
 
 def _read_large(path: Path, data: bytes) -> Table | None:
-    """The same where the first lines are those of a table of numbers; None if anything is unusual."""
+    """The columns of a large file of numbers; None if anything is unusual."""
     try:
         sheet = _sheet(path, data[: data.rfind(b"\n", 0, _HEAD_BYTES) + 1])
         names, units = _read_header(sheet)
@@ -121,7 +121,7 @@ def _read_large(path: Path, data: bytes) -> Table | None:
     for _ in range(sheet.source.text.count("\n", 0, sheet.body_at)):
         end = _END.search(data, start)
         start = len(data) if end is None else end.end()
-    columns = read_lines(Lines(data, start, len(names), sheet.delimiter))
+    columns = read_lines(TableText(data, start, len(names), sheet.delimiter))
     return None if columns is None else Table(dict(zip(names, columns, strict=True)), units)
 
 
@@ -169,17 +169,17 @@ def _read_header(sheet: _Sheet) -> tuple[list[str], dict[str, str]]:
 
 
 def delimiter_of(header: str) -> str:
-    """What stands between the names of a first line: comma, semicolon or tab."""
+    """The delimiter of a header: comma, semicolon or tab."""
     return max(",;\t", key=_QUOTED.sub("", header).count)
 
 
 def head_cells(header: str, delimiter: str) -> list[str]:
-    """The cells of a first line as they were meant, without quotes and what kept a spreadsheet from them."""
+    """The cells of a header, without quotes and protection against spreadsheets."""
     return [_head(raw) for raw in _raw_heads(header, delimiter)]
 
 
 def _raw_heads(header: str, delimiter: str) -> list[str]:
-    """The cells of a first line as they stand there; a delimiter within quotes is none."""
+    """The cells of a header as written; delimiters within quotes do not count."""
     hidden = _QUOTED.sub(lambda match: "\0" * len(match[0]), header)
     edges = [-1, *(at for at, char in enumerate(hidden) if char == delimiter), len(header)]
     return [header[left + 1 : right] for left, right in pairwise(edges)]
@@ -199,7 +199,7 @@ def _head_cells(sheet: _Sheet) -> Iterator[tuple[str, Span]]:
 
 
 def split_head(text: str) -> tuple[str, str]:
-    """`v [km/h]` or `v (km/h)` as name and unit; what is of another form is a name as a whole."""
+    """Name and unit of a header cell, `v [km/h]` or `v (km/h)`; other forms are a name as a whole."""
     match = _HEAD.fullmatch(text.strip())
     if match is None:
         return text.strip(), ""
@@ -210,7 +210,7 @@ def split_head(text: str) -> tuple[str, str]:
 
 
 def _cells(source: Source, start: int, line: str, delimiter: str) -> Iterator[tuple[str, Span]]:
-    """Cells of a line with blanks and quotes taken off, and where each stands."""
+    """The cells of a line without blanks and quotes, with their places."""
     for raw in line.split(delimiter):
         at = start + (len(raw) - len(raw.lstrip()))
         yield bare(raw), source.span(at, max(at + len(raw.strip()), at + 1))
@@ -233,7 +233,7 @@ def _text_columns(sheet: _Sheet, width: int) -> frozenset[int]:
 
 
 def _read_body(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array]:
-    """The columns, a stretch of lines after the other: what is unusual is read cell by cell."""
+    """The columns, read in blocks; unusual blocks are read cell by cell."""
     findings: list[Diagnostic] = []
     parts: list[list[Array]] = [[] for _ in range(width)]
     text, begin = sheet.source.text, sheet.body_at
@@ -274,7 +274,7 @@ def _told(line: str, sheet: _Sheet) -> bool:
 def _read_strict(
     sheet: _Sheet, ends: tuple[int, int], shape: tuple[int, frozenset[int]], findings: list[Diagnostic]
 ) -> list[Array]:
-    """The lines of a stretch cell by cell, with the place of everything that is wrong."""
+    """The lines of a block cell by cell, with the place of every error."""
     width, texts = shape
     rows: list[list[float | str]] = []
     start, end = ends
@@ -358,7 +358,7 @@ def write_csv(path: Path | str, columns: Mapping[str, NDArray[Any]], units: Mapp
 
 
 def _require_names(path: Path, header: str, names: Sequence[str]) -> None:
-    """Raise TraceError (E605) where a first line is not read back as these names."""
+    """Check that a header is read back as these names. Raises TraceError (E605)."""
     if _names_in(path, header) == list(names):
         return
     odd = next((name for name in names if _names_in(path, _row((name,))) != [name]), names[0])
@@ -367,7 +367,7 @@ def _require_names(path: Path, header: str, names: Sequence[str]) -> None:
 
 
 def _names_in(path: Path, header: str) -> list[str]:
-    """What a first line is read as; [] where it is refused."""
+    """The names of a header; [] where it is refused."""
     try:
         return _read_header(_sheet(path, header.encode("utf-8", "replace")))[0]
     except TraceError:
@@ -375,7 +375,7 @@ def _names_in(path: Path, header: str) -> list[str]:
 
 
 def _row(heads: Iterable[str]) -> str:
-    """A first line."""
+    """A header."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerow(map(spreadsheet, heads))
     return text.getvalue()

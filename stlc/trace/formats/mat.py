@@ -84,7 +84,7 @@ def _real(values: Array) -> Array:
 
 
 def _datasets(path: Path, group: Any, prefix: str, depth: int) -> Iterator[tuple[str, Any]]:
-    """Numeric data below a group; nothing that leads out of the file, or round in a circle."""
+    """Numeric datasets below a group; links out of the file and cycles are not followed."""
     h5py = needed("h5py")
     if depth > 8 or len(group) > MAX_ARRAYS:
         raise unreadable(path, "it is nested too deeply, or holds too many arrays")

@@ -33,7 +33,7 @@ _DEEPEST = 16
 
 
 class _DamageError(Exception):
-    """The bytes are not what the format says."""
+    """Bytes that do not follow the format."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ def read_mat5(path: Path) -> dict[str, Array]:
 
 
 def _inflated(data: memoryview, room: int) -> bytes:
-    """The element without its compression, never more than there is room for."""
+    """The decompressed element, limited to the available room."""
     engine = zlib.decompressobj()
     out = engine.decompress(data, room)
     if engine.unconsumed_tail:
@@ -101,7 +101,7 @@ def _elements(data: memoryview, order: str) -> Iterator[_Element]:
 
 @dataclass(frozen=True, slots=True)
 class _Matrix:
-    """What follows the name of an array."""
+    """The content of an array."""
 
     kind: int
     logical: bool

@@ -34,7 +34,7 @@ from stlc.trace.formats.messages import (
 from stlc.trace.formats.registry import damage, needed, unreadable
 from stlc.trace.formats.ros import decoder
 from stlc.trace.meta import meta_array, read_meta
-from stlc.trace.recording import Recording, Strand
+from stlc.trace.recording import ClockGroup, Recording
 
 if TYPE_CHECKING:
     from stlc.trace.trace import Trace
@@ -61,7 +61,7 @@ def read(path: Path) -> Recording:
 
 @dataclass(slots=True)
 class _File:
-    """What has been met of a file so far."""
+    """The state of reading a file."""
 
     log: Log
     room: Room
@@ -70,7 +70,7 @@ class _File:
     decoders: dict[int, Decode | None] = field(default_factory=dict)
 
     def take(self, record: Any) -> None:
-        """A record that stands in a chunk or outside of one."""
+        """Process a record inside or outside of a chunk."""
         match type(record).__name__:
             case "Schema":
                 self.schemas.setdefault(record.id, record)
@@ -90,7 +90,7 @@ class _File:
             self.log.add(channel.topic, message.log_time, decode(self.room.whole(message.data)))
 
     def decoder(self, channel: Any) -> Decode | None:
-        """The reader of a channel's messages; None, and a reason, where nothing reads them."""
+        """The decoder of a channel's messages; None, with a reason, where none exists."""
         schema, encoding = self.schemas.get(channel.schema_id), channel.message_encoding
         described = "" if schema is None else schema.encoding
         try:
@@ -109,7 +109,7 @@ class _File:
 
 
 def add_mcap(log: Log, path: Path) -> Mapping[str, str] | None:
-    """Add the messages of a file to a log; what stlc has noted in it about its own."""
+    """Add the messages of a file to a log; returns the metadata of files that stlc wrote."""
     reader = needed("mcap.stream_reader").StreamReader
     ours: Mapping[str, str] | None = None
     with mapped(path) as data:
@@ -148,7 +148,7 @@ def _of_json(data: bytes) -> Iterable[Number]:
 
 
 def _protobuf(schema: Any) -> Decode:
-    """The reader of a message by the descriptors that the file holds."""
+    """The decoder of messages by the descriptors in the file."""
     pool = needed("google.protobuf.descriptor_pool").DescriptorPool()
     files = needed("google.protobuf.descriptor_pb2").FileDescriptorSet.FromString(schema.data)
     left = {each.name: each for each in files.file}
@@ -270,4 +270,4 @@ def _as_written(log: Log, ours: Mapping[str, str]) -> Recording | None:
     clock = np.array([(t - origin) * 1e-9 for t in times.tolist()], dtype=np.float64)
     data = {name: np.stack([arrays[name] for _, arrays in found]) for name in first}
     meta, columns = read_meta(log.path, np.array(ours.get("meta", "{}")))
-    return Recording(str(log.path), (Strand(data, clock),), columns, meta)
+    return Recording(str(log.path), (ClockGroup(data, clock),), columns, meta)

@@ -1,4 +1,4 @@
-"""Messages of topics, as robots log them -> a recording: every number is a signal, every topic has a clock.
+"""Logged messages as a recording: every number is a signal, every topic has a clock.
 
 `/odom` with `twist.twist.linear.x` gives `odom.twist.twist.linear.x`; a message that holds nothing but `data`
 is called by its topic. Times are those at which a message was logged, in seconds since the first one. Most
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from stlc.signature import Column
 from stlc.trace.formats.registry import needed, opened, unreadable
 from stlc.trace.meta import TraceMeta
-from stlc.trace.recording import Recording, Strand
+from stlc.trace.recording import ClockGroup, Recording
 
 MAX_BYTES = 2_000_000_000
 MAX_VALUES = 100_000_000
@@ -37,14 +37,14 @@ HEADER = "header"
 
 _ROOM = 64_000_000
 _RATIO = 50
-"""What is packed may unpack to `_ROOM`, or to so many times the size of its file."""
+"""Packed data may unpack to `_ROOM` bytes, or to this multiple of the file's size."""
 _LATEST = 2**63 - 1
 _ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """One number of a message: where it stands, and whether it is whole (a truth value, too)."""
+    """One number of a message: its path, value, and whether it is an integer or a truth value."""
 
     name: str
     value: float
@@ -56,7 +56,7 @@ Decode = Callable[[bytes], Iterable[Number]]
 
 
 class DamageError(Exception):
-    """Bytes that are not what the format says."""
+    """Bytes that do not follow the format."""
 
 
 @dataclass(slots=True)
@@ -77,7 +77,7 @@ class _Topic:
 
 @contextmanager
 def mapped(path: Path) -> Iterator[mmap]:
-    """The bytes of a file, as far as they are looked at.
+    """The bytes of a file, memory-mapped.
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
@@ -95,7 +95,7 @@ def mapped(path: Path) -> Iterator[mmap]:
 
 
 class Log:
-    """The messages of a file, or of several that belong together.
+    """The collected messages of one or several files.
 
     Attributes:
         path: for messages.
@@ -109,7 +109,7 @@ class Log:
         self._values = 0
 
     def add(self, topic: str, time: int, numbers: Iterable[Number]) -> None:
-        """A message, logged at `time` in ns. Raises TraceError (E603) for a time that is none."""
+        """Add a message, logged at `time` in ns. Raises TraceError (E603) for an invalid time."""
         if not -_LATEST <= time <= _LATEST:
             raise unreadable(
                 self.path, f"a message of `{topic[:80]}` was logged at {time} ns, which is no time"
@@ -131,25 +131,25 @@ class Log:
             raise unreadable(self.path, f"it holds more than {MAX_VALUES:,} numbers", advice="split it")
 
     def recording(self) -> Recording:
-        """A strand a topic; signals that are not in every message of their topic are left out.
+        """A recording with a clock for each topic; signals must be in every message of their topic.
 
         Raises:
             TraceError: E603, no message has a number.
         """
         found = {name: topic.arrays() for name, topic in self._topics.items()}
         origin = min((int(times[0]) for times, _ in found.values() if len(times)), default=0)
-        strands: list[Strand] = []
+        groups: list[ClockGroup] = []
         columns: dict[str, Column] = {}
         for topic, (times, arrays) in found.items():
             base = topic.strip("/").replace("/", ".")
             named = {_called(base, name): values for name, values in arrays.items()}
             clock = np.array([(t - origin) * 1e-9 for t in times.tolist()], dtype=np.float64)
-            strands.append(Strand(named, clock))
+            groups.append(ClockGroup(named, clock))
             whole = self._topics[topic].whole
             columns |= {n: Column(n, kind="int") for n in (_called(base, m) for m in whole if m in arrays)}
-        if not any(strand.arrays for strand in strands):
+        if not any(group.arrays for group in groups):
             raise unreadable(self.path, self._nothing())
-        return Recording(str(self.path), tuple(strands), columns, TraceMeta(origin=origin))
+        return Recording(str(self.path), tuple(groups), columns, TraceMeta(origin=origin))
 
     def topic(self, name: str) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
         """Times in ns and signals of one topic, none where it has no message."""
@@ -168,7 +168,7 @@ def _called(topic: str, name: str) -> str:
 
 
 def numbers_of(content: object) -> Iterator[Number]:
-    """All numbers of a message of names and values (JSON), by path.
+    """All numbers of a JSON message, by path.
 
     Raises:
         OverflowError: a number is larger than a float.
@@ -207,7 +207,7 @@ def _entries(name: str, value: Mapping[str, object], depth: int) -> Iterator[Num
 
 
 class Room:
-    """How much of a file may be unpacked, all its parts together."""
+    """The limit on unpacked bytes, shared by all parts of a file."""
 
     def __init__(self, path: Path, size: int) -> None:
         self.path = path
@@ -240,11 +240,11 @@ class Room:
         return out
 
     def whole(self, message: bytes) -> bytes:
-        """A message, unpacked where it is a frame of `zstd` on its own, as ROS 2 packs them."""
+        """A message, unpacked where it is a `zstd` frame of its own, as in ROS 2."""
         return self.of_unknown_size(message) if message.startswith(_ZSTD) else message
 
     def of_unknown_size(self, data: bytes) -> bytes:
-        """The bytes of a frame of `zstd` that need not say how many it holds."""
+        """The bytes of a `zstd` frame that may not declare its size."""
         with needed("zstandard").ZstdDecompressor().stream_reader(data) as reader:
             out: bytes = reader.read(self.left + 1)
         if len(out) > self.left:

@@ -1,4 +1,4 @@
-"""Named arrays in an `.npz` file, in and out, without ever unpickling anything.
+"""Traces as `.npz` archives, read without unpickling.
 
 The archive is read member by member: the header of each array is checked against the size that the archive
 declares before memory is asked for, so that neither a pickle nor a bomb gets past the door.
@@ -43,7 +43,7 @@ MAX_NAME = 60_000
 MAX_ARRAYS = 10_000
 
 _LAST_LETTER, _PAIRS = 0x10FFFF, (0xD800, 0xDFFF)
-"""What Unicode knows, and the halves of pairs that are no letters on their own."""
+"""The last code point, and the range of surrogates."""
 _NUMERIC = "biuf"
 _TEXT = "U"
 _ZIP_MAGIC = (b"PK\x03\x04", b"PK\x05\x06")
@@ -168,7 +168,7 @@ def _read_members(path: Path, archive: zipfile.ZipFile) -> dict[str, Array]:
 
 
 def _check_letters(path: Path, name: str, values: Array) -> None:
-    """Raise TraceError (E603) for a text with numbers that are no letters."""
+    """Check that texts hold valid code points. Raises TraceError (E603)."""
     if values.dtype.kind == "U" and values.dtype.itemsize and values.size:
         letters = values.view(np.dtype(np.uint32).newbyteorder(values.dtype.byteorder))
         if ((letters > _LAST_LETTER) | ((letters >= _PAIRS[0]) & (letters <= _PAIRS[1]))).any():
@@ -178,7 +178,7 @@ def _check_letters(path: Path, name: str, values: Array) -> None:
 def _checked_header(
     path: Path, stream: IO[bytes], member: zipfile.ZipInfo, name: str
 ) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """The header of an array of numbers or texts, of which as much follows as it declares."""
+    """The header of an array of numbers or texts, checked against the size of the archive's member."""
     shape, fortran, dtype = _read_header(stream)
     if dtype.hasobject:
         raise unreadable(

@@ -1,4 +1,4 @@
-"""Named columns in a `.parquet` file (extra `parquet`): numbers, truth values, times, words, and lists.
+"""Traces as `.parquet` files (extra `parquet`): numbers, truth values, times, words and lists.
 
 Units stand in brackets behind a name, `v [km/h]`, or in the field's metadata under `unit`. Columns that hold
 anything else, such as structures, are left out.
@@ -41,7 +41,7 @@ def read(path: Path) -> Recording:
 
 
 def open_parquet(path: Path, *, whole: bool = True) -> Any:
-    """The file, opened, and small enough to be read where it is wanted as a whole."""
+    """The opened file; `whole` checks that its numbers fit into memory."""
     parquet = needed("pyarrow.parquet")
     if not path.is_file():
         raise UsageError(Diagnostic("U102", f"cannot read `{path}`: no such file or directory"))
@@ -143,7 +143,7 @@ def _even(lists: Any, size: int) -> bool:
 
 
 def _words(values: Any) -> NDArray[np.str_]:
-    """Texts, each stored once until they are laid out."""
+    """Texts, stored once each until they are laid out."""
     encoded = values if needed("pyarrow").types.is_dictionary(values.type) else values.dictionary_encode()
     array = encoded.unify_dictionaries().combine_chunks()
     texts = np.array(["", *(str(word)[:MAX_LETTERS].strip() for word in array.dictionary.to_pylist())])
@@ -151,7 +151,7 @@ def _words(values: Any) -> NDArray[np.str_]:
 
 
 def _floats(values: Any) -> Floats:
-    """Numbers as they are, times in seconds: a point in time since the first one."""
+    """Numbers; durations in seconds, points in time in seconds since the first."""
     arrow = needed("pyarrow")
     kind = values.type
     if arrow.types.is_timestamp(kind) or arrow.types.is_duration(kind):

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 MAX_BYTES = 4_000_000_000
 _ROOM = 500_000_000
 _RATIO = 200
-"""A packed file may unpack to `_ROOM`, or to so many times its size; records of sensors take a tenth."""
+"""A packed file may unpack to `_ROOM` bytes, or to this multiple of its size; sensor records need a tenth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ def unreadable(path: Path | str, why: str, *, advice: str = "") -> TraceError:
 
 @contextmanager
 def opened(path: Path) -> Iterator[None]:
-    """What the system says about a file that cannot be opened, as UsageError (U102)."""
+    """Errors of the system in opening a file, as UsageError (U102)."""
     try:
         yield
     except OSError as error:
@@ -131,7 +131,7 @@ def opened(path: Path) -> Iterator[None]:
 
 @contextmanager
 def damage(path: Path) -> Iterator[None]:
-    """What a library says about a file that it cannot read, as TraceError (E603)."""
+    """Errors of a library in reading a file, as TraceError (E603)."""
     try:
         yield
     except StlcError:

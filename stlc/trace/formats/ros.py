@@ -1,4 +1,4 @@
-"""Messages of ROS 1 and 2 -> their numbers, by the definitions that lie in a bag beside them.
+"""Decoders of ROS 1 and ROS 2 messages, from the definitions in the bag.
 
 A definition is the text of a `.msg` file, followed by those of the messages within, each behind a line of `=`
 and `MSG: package/Type` (https://wiki.ros.org/msg,
@@ -43,7 +43,7 @@ _MAX_NESTED = 32
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """One field: its name, its type (of another message where `inner`), and how many.
+    """A field: name, type (a message where `inner`), and count.
 
     Attributes:
         count: of an array of fixed length, -1 of one of any length, None of a single value.
@@ -57,19 +57,19 @@ class _Field:
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """The fields of a message in order, and the fewest bytes that they take."""
+    """The fields of a message in order, and its least number of bytes."""
 
     fields: tuple[_Field, ...]
     least: int
 
     @property
     def stamp(self) -> bool:
-        """Whether it is a point in time."""
+        """Whether the message is a time stamp."""
         return {each.name for each in self.fields} in STAMPS
 
 
 def decoder(definition: str, form: Form) -> Decoder:
-    """The reader of the messages of a definition.
+    """The decoder of the messages of a definition.
 
     Raises:
         DamageError: it is no definition, has no end, or names a message that it does not define.
@@ -85,12 +85,12 @@ def decoder(definition: str, form: Form) -> Decoder:
 
 
 def _short(name: str) -> str:
-    """`package/Type`, without the folder between them that ROS 2 writes."""
+    """`package/Type`, without the folder that ROS 2 adds."""
     return name.replace("/msg/", "/").replace("/action/", "/").replace("/srv/", "/")
 
 
 class _Builder:
-    """Texts of definitions -> layouts, each made once."""
+    """Builder of layouts from the texts of definitions."""
 
     def __init__(self, texts: dict[str, str], form: Form) -> None:
         self.texts, self.form = texts, form
@@ -114,7 +114,7 @@ class _Builder:
         return _Field(match["name"], kind, count, self.inner(kind, package, depth))
 
     def inner(self, kind: str, package: str, depth: int) -> _Layout | None:
-        """The layout of a message within; None for what is none."""
+        """The layout of a nested message; None for a plain type."""
         if kind in _CODES or kind in _TEXTS or (kind in _STAMPS and self.form == "ros1"):
             return None
         name = "std_msgs/Header" if kind == "Header" else _short(kind)
@@ -139,7 +139,7 @@ class _Builder:
 
 
 def _tells(line: str) -> bool:
-    """Whether a line declares a field, not a constant, a remark or nothing."""
+    """Whether a line declares a field, not a constant or a comment."""
     told = line.split("#")[0]
     match = _FIELD.fullmatch(told.rstrip())
     return bool(told.strip()) and (match is None or not match["rest"].startswith("="))
@@ -147,7 +147,7 @@ def _tells(line: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Decoder:
-    """A reader of the messages of one definition."""
+    """A decoder of the messages of one definition."""
 
     layout: _Layout
     form: Form
@@ -171,7 +171,7 @@ class Decoder:
 
 
 class _Cursor:
-    """A place in a message."""
+    """A position in a message."""
 
     def __init__(self, data: bytes, start: int, order: str, form: Form) -> None:
         self.data, self.at, self.start, self.order, self.form = data, start, start, order, form
@@ -214,7 +214,7 @@ class _Cursor:
                     pass
 
     def numbers(self, name: str, kind: str, count: int, *, told: bool) -> Iterator[Number]:
-        """An array of numbers, whose bytes are passed over where it is data."""
+        """The numbers of an array; long arrays are data and are skipped."""
         size = struct.calcsize(_CODES[kind])
         if count and self.form == "cdr":
             self.align(size)

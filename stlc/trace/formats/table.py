@@ -1,4 +1,4 @@
-"""Tables with one line a sample, from whatever file -> a recording; lines may belong to several traces."""
+"""Recordings from tables with one line a sample; lines may belong to several traces."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.signature import Column
 from stlc.trace.meta import TraceMeta
-from stlc.trace.recording import CLOCK, ROSTOPIC, Recording, Strand, clock_among, unit_of
+from stlc.trace.recording import CLOCK, ROSTOPIC, ClockGroup, Recording, clock_among, unit_of
 from stlc.units import parse_unit
 
 Array = NDArray[Any]
@@ -42,12 +42,12 @@ class Table:
 
     @property
     def rows(self) -> int:
-        """How many lines of numbers."""
+        """Number of lines."""
         return len(next(iter(self.columns.values())))
 
 
 def of_table(path: Path, table: Table, meta: TraceMeta | None = None) -> Recording:
-    """A recording with one strand.
+    """A recording with one clock.
 
     Raises:
         TraceError: E605, traces that differ in length or in their times, or a unit that is none.
@@ -62,11 +62,11 @@ def of_table(path: Path, table: Table, meta: TraceMeta | None = None) -> Recordi
     if clock is not None and named is not None:
         clock = _in_seconds(path, named, clock, table.units.get(named, ""))
     units = {name: Column(name, unit_of(path, name, table.units.get(name, ""))) for name in arrays}
-    return Recording(str(path), (Strand(arrays, clock, named or CLOCK),), units, meta or TraceMeta())
+    return Recording(str(path), (ClockGroup(arrays, clock, named or CLOCK),), units, meta or TraceMeta())
 
 
 def is_unit(text: str) -> bool:
-    """Whether a text in brackets behind a name says what it is measured in."""
+    """Whether a text in brackets after a name is a unit."""
     if text.lower() in _SPELLINGS:
         return True
     try:

@@ -1,4 +1,4 @@
-"""The numbers in the dynamics of a system, each with a factor by which it may be wrong. No torch.
+"""Parametric uncertainty: a factor for every uncertain number of the dynamics, and the perturbed system.
 
 These are, unless `test: {uncertain: […]}` names them, the constants that `flow` and the resets of jumps
 compute with, and the numbers that `flow` and resets have written in them. What a condition reads (where a
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stlc.compile.frontend.scope import Definition, Entry, Known
 from stlc.compile.frontend.values import Number, Vector
@@ -19,6 +19,7 @@ from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.load import moving_parts
 from stlc.dynamics.declaration.motion import Assign, JumpDecl, read_flow, read_jumps
 from stlc.dynamics.model.algebra import multiply, names_in
+from stlc.dynamics.model.system import System
 from stlc.dynamics.schema.expressions import Expressions
 from stlc.dynamics.schema.names import Context, Names, base_name
 from stlc.dynamics.schema.reader import Reader
@@ -27,10 +28,15 @@ from stlc.grammar import ast
 from stlc.grammar.children import children, descendants
 from stlc.units import SYMBOLS
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from stlc.dynamics.model.rollout import Columns
+
 
 @dataclass(frozen=True, slots=True)
 class Uncertain:
-    """A number that may be wrong.
+    """An uncertain number.
 
     Attributes:
         factor: the column that multiplies it; 1 is what the model says.
@@ -47,14 +53,14 @@ class Uncertain:
 
 
 @dataclass(frozen=True, slots=True)
-class Loose:
+class Perturbable:
     """A declaration whose `flow` and `jumps` read a factor for each of its uncertain numbers."""
 
     decl: SystemDecl
     numbers: tuple[Uncertain, ...]
 
 
-def loosened(decl: SystemDecl) -> Loose:
+def perturbable(decl: SystemDecl) -> Perturbable:
     """The dynamics of a declaration with a factor at every uncertain number."""
     parts = moving_parts(decl)
     names = parts.names
@@ -76,11 +82,11 @@ def loosened(decl: SystemDecl) -> Loose:
         marked.entries[factor] = Known(Number(ir.Signal(factor), flexible=True, bare=True))
     loose = _laid_over(decl, *read(marked))
     found = (Uncertain(factor, text, _readers(loose, factor)) for factor, text in texts.items())
-    return Loose(loose, tuple(each for each in found if each.states))
+    return Perturbable(loose, tuple(each for each in found if each.states))
 
 
 def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl, ...]) -> SystemDecl:
-    """The declaration, but for the numbers of its real states, and for guards."""
+    """The declaration with other numbers for its real states and its guards."""
     real = {column.name for column in decl.signature.columns if column.kind == "real"}
     rates = {assign.name: assign for assign in flow if assign.name in real}
     again = {jump.name: jump for jump in jumps}
@@ -98,7 +104,7 @@ def _jump(jump: JumpDecl, again: JumpDecl, real: set[str]) -> JumpDecl:
 
 
 def _readers(decl: SystemDecl, factor: str) -> tuple[str, ...]:
-    """The states whose equations, or whose jumps, read a factor."""
+    """The states whose equations or jumps read a factor."""
     found = [assign.name for assign in decl.flow if factor in names_in(assign.value)]
     for jump in decl.jumps:
         guarded = factor in names_in(jump.guard)
@@ -173,7 +179,7 @@ class _Rewriting(Expressions):
 
 
 class _Seen:
-    """Constants and numbers that expressions compute with, and constants that they compare with."""
+    """Constants and numbers that expressions compute with, and constants that conditions read."""
 
     def __init__(self, names: Names) -> None:
         self.names = names
@@ -183,7 +189,7 @@ class _Seen:
         self.literals: dict[str, ast.Quantity] = {}
 
     def look(self, expr: ast.Expr) -> ast.Expr:
-        """Take an expression in, and give it back."""
+        """Record an expression, unchanged."""
         self.rewritten(expr)
         return expr
 
@@ -238,7 +244,7 @@ def _parts(expr: ast.Expr) -> Iterator[tuple[Any, bool]]:
 
 
 def _with_parts(expr: ast.Expr, changed: Mapping[int, ast.Expr]) -> ast.Expr:
-    """An expression with other parts in the place of some of its own."""
+    """An expression with some of its parts replaced."""
 
     def put(value: Any) -> Any:
         match value:
@@ -250,3 +256,23 @@ def _with_parts(expr: ast.Expr, changed: Mapping[int, ast.Expr]) -> ast.Expr:
                 return changed.get(id(value), value)
 
     return replace(expr, **{each.name: put(getattr(expr, each.name)) for each in fields(expr)})
+
+
+# -------------------------------------------------------------------------- the perturbed truth
+
+
+class PerturbedSystem(System):
+    """The true dynamics of some agents, each with its own factors; all are stepped at once.
+
+    Args:
+        loose: the dynamics, with a factor at every uncertain number.
+        factors: (agents, numbers), 1 where a number is right.
+    """
+
+    def __init__(self, loose: Perturbable, factors: Tensor) -> None:
+        super().__init__(loose.decl)
+        self._factors = {each.factor: factors[:, index] for index, each in enumerate(loose.numbers)}
+
+    def _inputs(self, u: Tensor) -> Columns:
+        """Controls, and the factors of uncertain numbers."""
+        return {**super()._inputs(u), **{name: factor.to(u) for name, factor in self._factors.items()}}

@@ -11,8 +11,7 @@ from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.load import load_system_decl, parse_system
 from stlc.dynamics.model.system import System
-from stlc.dynamics.scenarios.mistaken import Mistaken
-from stlc.dynamics.scenarios.uncertain import loosened
+from stlc.dynamics.scenarios.perturbed import PerturbedSystem, perturbable
 from stlc.source import Source
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -56,15 +55,15 @@ def spring(text: str = SYSTEM) -> SystemDecl:
     ],
 )
 def test_what_the_page_says_of_the_benchmarks(name: str, numbers: list[str]) -> None:
-    found = [str(each) for each in loosened(load_system_decl(EXAMPLES / f"{name}.yaml")).numbers]
+    found = [str(each) for each in perturbable(load_system_decl(EXAMPLES / f"{name}.yaml")).numbers]
     assert found == numbers
     page = (EXAMPLES.parent / "docs" / "worlds.md").read_text(encoding="utf-8")
-    for number in loosened(load_system_decl(EXAMPLES / f"{name}.yaml")).numbers:
+    for number in perturbable(load_system_decl(EXAMPLES / f"{name}.yaml")).numbers:
         assert f"`{number.text}`" in page
 
 
 def test_conditions_exponents_calls_and_zeros_are_no_numbers_of_the_dynamics() -> None:
-    found = {each.text: each.states for each in loosened(spring()).numbers}
+    found = {each.text: each.states for each in perturbable(spring()).numbers}
     assert found == {
         "k": ("w",),
         "lost": ("w",),
@@ -81,12 +80,12 @@ def test_conditions_exponents_calls_and_zeros_are_no_numbers_of_the_dynamics() -
 def test_a_factor_of_one_changes_nothing() -> None:
     for name in ("maze", "ship_safe", "ship_track", "rover"):
         decl = load_system_decl(EXAMPLES / f"{name}.yaml")
-        loose, model = loosened(decl), System(decl)
+        loose, model = perturbable(decl), System(decl)
         x = model.sample(200, seed=0, dtype=torch.float64)
         low, high = model.control_low.double(), model.control_high.double()
         unit = torch.rand((200, len(low)), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         u = low + (high - low) * unit
-        right = Mistaken(loose, torch.ones(200, len(loose.numbers), dtype=torch.float64))
+        right = PerturbedSystem(loose, torch.ones(200, len(loose.numbers), dtype=torch.float64))
         torch.testing.assert_close(right.step(x, u), model.step(x, u), rtol=1e-13, atol=1e-13)
 
 
@@ -109,12 +108,12 @@ def states(system: System, count: int) -> tuple[torch.Tensor, torch.Tensor]:
     ],
 )
 def test_a_factor_is_another_number_in_the_file(name: str, before: str, after: str) -> None:
-    loose = loosened(spring())
+    loose = perturbable(spring())
     factors = torch.ones(50, len(loose.numbers), dtype=torch.float64)
     factors[:, [each.text for each in loose.numbers].index(name)] = 1.2
     factors[25:] = 1.0
     wrong, other, model = (
-        Mistaken(loose, factors),
+        PerturbedSystem(loose, factors),
         System(spring(SYSTEM.replace(before, after))),
         System(spring()),
     )
@@ -127,15 +126,17 @@ def test_a_factor_is_another_number_in_the_file(name: str, before: str, after: s
 
 def test_a_file_may_say_which_constants_are_uncertain() -> None:
     text = SYSTEM + "test: {uncertain: [wall, k]}\n"
-    loose = loosened(spring(text))
+    loose = perturbable(spring(text))
     assert {each.text: each.states for each in loose.numbers} == {"wall": ("w", "p", "mode"), "k": ("w",)}
     other = System(spring(SYSTEM.replace("wall: 1 m", "wall: 1.5 m")))
     x, u = states(other, 50)
     wall = [each.text for each in loose.numbers].index("wall")
     factors = torch.ones(50, 2, dtype=torch.float64)
     factors[:, wall] = 1.5
-    torch.testing.assert_close(Mistaken(loose, factors).step(x, u), other.step(x, u), rtol=1e-12, atol=1e-12)
-    assert loosened(spring(SYSTEM + "test: {uncertain: []}\n")).numbers == ()
+    torch.testing.assert_close(
+        PerturbedSystem(loose, factors).step(x, u), other.step(x, u), rtol=1e-12, atol=1e-12
+    )
+    assert perturbable(spring(SYSTEM + "test: {uncertain: []}\n")).numbers == ()
 
 
 def test_who_is_no_constant_is_not_uncertain() -> None:
