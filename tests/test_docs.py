@@ -342,19 +342,19 @@ def test_links_lead_somewhere():
 
 
 ROOMS = {
-    "": "The ground floor",
-    "trace": "trace: recorded signals, and the files that they come from",
-    "grammar": "grammar: what was written",
-    "compile": "compile: what satisfied means",
-    "lint": "lint: what is worth saying about a valid specification",
-    "dynamics": "dynamics: how state moves",
-    "runtime": "runtime: an exported controller at work",
-    "monitor": "monitor: how a recorded trace is judged and explained",
-    "controller": "controller: who acts",
-    "export": "export: a controller taken away",
-    "view": "view: what is drawn",
-    "editor": "editor: what an editor asks",
-    "cli": "cli: the terminal",
+    "": "stlc: modules that all packages may import",
+    "trace": "trace: recordings and their file formats",
+    "grammar": "grammar: parser, syntax tree, printer, formatter",
+    "compile": "compile: from syntax to evaluated formulas",
+    "lint": "lint: warnings and repairs",
+    "dynamics": "dynamics: system files and models",
+    "runtime": "runtime: exported controllers in Python",
+    "monitor": "monitor: verdicts, streams, explanations",
+    "controller": "controller: policies, training, guard, deployment, evaluation",
+    "export": "export: torch programs, ONNX graphs, C headers",
+    "view": "view: plots, animations, reports",
+    "editor": "editor: the language server",
+    "cli": "cli: the command line",
     "../benchmarks": "benchmarks: the tables of the documentation, beside the package",
 }
 
