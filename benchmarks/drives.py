@@ -23,7 +23,7 @@ from stlc.controller.evaluation.metrics import METRICS, is_progress, measure
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.feasibility import viable
 from stlc.controller.guard.guard import GUARD_VERSION, Guard, Mode
-from stlc.controller.guard.margin_request import Asked, parse_margins
+from stlc.controller.guard.margins import MarginRequest, parse_margins
 from stlc.controller.training.run import SPEC, SYSTEM, Run
 from stlc.controller.world import world_type
 from stlc.diagnostics import Diagnostic, UsageError
@@ -94,7 +94,7 @@ def recorded(guard: Guard, setting: Setting) -> Recording:
     return recording
 
 
-def guard_of(name: str) -> tuple[Mode, Asked]:
+def guard_of(name: str) -> tuple[Mode, MarginRequest]:
     """The guard of a name such as `full`, `full+0.2` or `full+auto`, and the margin that it asks for.
 
     Raises:

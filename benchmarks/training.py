@@ -10,7 +10,8 @@ from typing import Any
 from benchmarks.store import BENCHMARKS, Key, Result, ResultStore, inputs_of, load, spec_path
 from stlc.cli.framework.output import say
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.parallel.jobs import Job, JobResult, side_by_side
+from stlc.controller.parallel.bundle import input_files
+from stlc.controller.parallel.jobs import Job, JobResult, executor
 from stlc.controller.problem.task import satisfied
 from stlc.controller.training.checkpoint import load_checkpoint
 from stlc.controller.training.config import (
@@ -20,7 +21,6 @@ from stlc.controller.training.config import (
     Clock,
     TrainConfig,
 )
-from stlc.controller.training.inputs import input_files
 from stlc.controller.training.run import Run, spec_hash, system_hash
 from stlc.diagnostics import StlcError
 from stlc.rundir import RunDir, every_run
@@ -234,7 +234,7 @@ def _fill(cells: Sequence[Cell], place: Place) -> Iterator[tuple[Cell, Result | 
         else:
             jobs.append(_job(cell, place, run))
     for back in _sent(jobs, place, lambda job: say(f"training {job.name}")):
-        cell = wanted[back.errand.name]
+        cell = wanted[back.job.name]
         run = place.newest_run(cell.key)
         if back.code not in (0, 1) or run is None or run.status != "finished":
             yield cell, None, f"exit code {back.code}\n{back.why}".strip()
@@ -244,11 +244,8 @@ def _fill(cells: Sequence[Cell], place: Place) -> Iterator[tuple[Cell, Result | 
 
 def _sent(jobs: Sequence[Job], place: Place, begun: Callable[[Job], None]) -> Iterator[JobResult]:
     """Jobs run on this machine or on the cluster."""
-    if place.cluster is None or not jobs:
-        return side_by_side(jobs, jobs=place.jobs, begun=begun)
-    from stlc.controller.parallel.ray_cluster import Cluster, on_cluster
-
-    return on_cluster(jobs, Cluster(place.cluster, place.threads), begun=begun)
+    cluster = place.cluster if jobs else None
+    return executor(place.jobs, cluster, cores=place.threads).run(jobs, begun)
 
 
 def _job(cell: Cell, place: Place, run: RunDir | None) -> Job:

@@ -24,7 +24,7 @@ from benchmarks.store import Result, ResultStore
 from benchmarks.table import Table, provenance
 from benchmarks.tables.worlds import conclude
 from stlc.cli.framework.program import command
-from stlc.controller.guard.margin_request import AUTO
+from stlc.controller.guard.margins import AUTO
 
 if TYPE_CHECKING:
     from benchmarks.drives import Row

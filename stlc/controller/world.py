@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stlc.controller.deployment.events import Events
+from stlc.controller.deployment.disturbance import Events
 from stlc.controller.sketch import DECIDED, Scene, deciders
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.registry import closest

@@ -49,11 +49,11 @@ def trained(cell: Cell, place: Place, watch: Watch | None = None) -> Run:
 
 
 def no_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(sent: list[Any], **_: object) -> list[Any]:
+    def refuse(_executor: object, sent: list[Any], _begun: object) -> list[Any]:
         assert sent == []
         return []
 
-    monkeypatch.setattr("benchmarks.training.side_by_side", refuse)
+    monkeypatch.setattr("stlc.controller.parallel.jobs.LocalExecutor.run", refuse)
 
 
 # ---------------------------------------------------------------------- cells

@@ -18,9 +18,9 @@ SPEC = str(ROOT / "specs/traffic.stl")
 QUICK = ["--batch", "8", "--held-out", "20", "--no-pictures"]
 
 
-def returned(errand: Job, seed: int, code: int) -> JobResult:
+def returned(job: Job, seed: int, code: int) -> JobResult:
     if seed == 1:
-        return JobResult(errand, code, {"result": None}, "error[R401]: training diverged", 1)
+        return JobResult(job, code, {"result": None}, "error[R401]: training diverged", 1)
     result = {
         "run": f"runs/traffic/000{seed}-a",
         "seconds": 61.2,
@@ -30,7 +30,7 @@ def returned(errand: Job, seed: int, code: int) -> JobResult:
         "requirements": {"stop": 0.96, "go": 0.99},
         "feasible": 0.97,
     }
-    return JobResult(errand, 0, {"result": result}, "", 1)
+    return JobResult(job, 0, {"result": result}, "", 1)
 
 
 @pytest.mark.parametrize("real", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -64,13 +64,13 @@ def test_every_seed_is_a_run_of_its_own(
 def test_the_table_has_a_line_for_each_and_the_mean_of_those_that_ended_well(
     ended: int, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def pretended(errands, *, jobs, begun):
-        assert jobs == 3
-        for errand in reversed(errands):
-            begun(errand)
-            yield returned(errand, int(errand.arguments[errand.arguments.index("--seed") + 1]), ended)
+    def pretended(executor, jobs, begun):
+        assert executor.workers == 3
+        for job in reversed(jobs):
+            begun(job)
+            yield returned(job, int(job.arguments[job.arguments.index("--seed") + 1]), ended)
 
-    monkeypatch.setattr("stlc.controller.parallel.jobs.side_by_side", pretended)
+    monkeypatch.setattr("stlc.controller.parallel.jobs.LocalExecutor.run", pretended)
     assert main(["train", SPEC, "--seeds", "0..2", "--jobs", "3", "--steps", "2"]) == code
     told = capsys.readouterr()
     header, *lines = told.out.splitlines()
@@ -102,13 +102,13 @@ def test_every_specification_is_trained_for_and_one_that_fails_stops_no_other(
 def test_the_table_of_several_specifications_has_a_mean_for_each(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def pretended(errands, *, jobs, begun):
-        assert (len({errand.name for errand in errands}), jobs) == (6, 1)
-        for errand in errands:
-            begun(errand)
-            yield returned(errand, int(errand.arguments[errand.arguments.index("--seed") + 1]), 3)
+    def pretended(executor, jobs, begun):
+        assert (len({job.name for job in jobs}), executor.workers) == (6, 1)
+        for job in jobs:
+            begun(job)
+            yield returned(job, int(job.arguments[job.arguments.index("--seed") + 1]), 3)
 
-    monkeypatch.setattr("stlc.controller.parallel.jobs.side_by_side", pretended)
+    monkeypatch.setattr("stlc.controller.parallel.jobs.LocalExecutor.run", pretended)
     assert main(["train", "a.stl", "b.stl", "a.stl", "--seeds", "0..2", "--steps", "2"]) == 3
     header, *lines = capsys.readouterr().out.splitlines()
     assert header.split()[:2] == ["specification", "seed"]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from stlc.controller.problem.task import Task
-from stlc.controller.training.conflict import conflict, refuted
+from stlc.controller.training.diagnose import conflict, refuted
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source

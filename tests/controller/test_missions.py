@@ -18,8 +18,7 @@ from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Judged, Task
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import Trainer
-from stlc.controller.training.missions import GLIMPSES, POOL, ROUNDS, Missions, mission_steps, visited
-from stlc.controller.training.samplers import Draws
+from stlc.controller.training.samplers import GLIMPSES, POOL, ROUNDS, Draws, Missions, mission_steps, visited
 from stlc.controller.world import ModelWorld
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse

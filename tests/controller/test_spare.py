@@ -12,8 +12,8 @@ from stlc.compile.ir.nodes import Predicate, Signal
 from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard, Mode
+from stlc.controller.guard.margins import tightened, with_margins
 from stlc.controller.guard.safe_prefix import prefix_robustness, robustness_until
-from stlc.controller.guard.tightened import sparing, tighter
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
@@ -75,22 +75,22 @@ def test_robustness_is_less_by_the_margin(car_task: Task) -> None:
     generator = torch.Generator().manual_seed(1)
     u = low + (high - low) * torch.rand((300, car_task.horizon, 1), generator=generator, dtype=torch.float64)
     margin = {rule.name: 0.25 / (1 + at) for at, rule in enumerate(car_task.compiled.safety[:-1])}
-    strict = sparing(car_task, margin)
+    strict = with_margins(car_task, margin)
     before, after = car_task.judge(x0, u).requirements, strict.judge(x0, u).requirements
     assert len(margin) >= 2
     for index, rule in enumerate(car_task.rules):
         less = margin.get(rule.name, 0.0)
         torch.testing.assert_close(after[:, index], before[:, index] - less, rtol=0, atol=1e-9)
-    assert sparing(car_task, dict.fromkeys(margin, 0.0)) is sparing(car_task, {}) is car_task
+    assert with_margins(car_task, dict.fromkeys(margin, 0.0)) is with_margins(car_task, {}) is car_task
 
 
 def test_time_tests_stay_and_negated_predicates_are_tightened_too() -> None:
     guard = Predicate(Signal("t"), guard=True)
-    assert tighter(guard, 1.0) is guard
+    assert tightened(guard, 1.0) is guard
     task = Task.of(parse(Source("a.stl", SPEC.replace("p <= 2", "not (p > 2)"))), task_of().plain)
     x0 = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
     still = torch.zeros((1, 6, 1), dtype=torch.float64)
-    assert float(sparing(task, {"clear": 0.5}).judge(x0, still).requirements[0, 0]) == pytest.approx(0.5)
+    assert float(with_margins(task, {"clear": 0.5}).judge(x0, still).requirements[0, 0]) == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("mode", ["paper", "full"])

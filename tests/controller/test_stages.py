@@ -17,7 +17,7 @@ from stlc.controller.guard.stages import STAGES, stages_of
 from stlc.controller.guard.stages.longest_safe_prefix import LongestSafePrefix
 from stlc.controller.guard.stages.prefix_shooting import PrefixShooting
 from stlc.controller.problem.task import Task
-from tests.controller.test_backup import Constant, failing, grid
+from tests.controller.test_prefix_shooting import Constant, failing, grid
 
 BRAKING = '''"""Full braking, before anything else is tried."""
 

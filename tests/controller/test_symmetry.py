@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from stlc.controller.policies.policy import PlanNetwork
-from stlc.controller.problem.symmetry import check_mirror
 from stlc.controller.problem.task import Task
+from stlc.controller.training.diagnose import check_mirror
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.load import parse_system
 from stlc.dynamics.model.system import System

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from stlc.controller.evaluation.deployment import Deployment
     from stlc.controller.evaluation.rules import Rules
     from stlc.controller.guard.guard import Mode
-    from stlc.controller.guard.margin_request import Asked
+    from stlc.controller.guard.margins import MarginRequest
     from stlc.controller.training.run import Run
     from stlc.dynamics.declaration.deployment import ScenarioDecl
 
@@ -188,7 +188,7 @@ class _Order:
     live: bool
     margins: str | None
     overrides: Mapping[str, str]
-    asked: Asked
+    asked: MarginRequest
 
 
 def _driven(order: _Order, name: str | None, *, kept: bool = True) -> Record:
@@ -284,8 +284,8 @@ def _hurried(setting: Setting, given: str | None) -> Setting:
     return replace(setting, limit=limit, paper_limit=limit)
 
 
-def _asked(margins: list[str] | None) -> Asked:
-    from stlc.controller.guard.margin_request import parse_margins
+def _asked(margins: list[str] | None) -> MarginRequest:
+    from stlc.controller.guard.margins import parse_margins
 
     return parse_margins(margins or ())
 

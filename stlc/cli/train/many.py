@@ -72,7 +72,7 @@ class Many:
         words = [] if len(self.specs) == 1 and part.seed is not None else [str(part.spec)]
         return " ".join(words + ([] if part.seed is None else [f"seed {part.seed}"]))
 
-    def errand(self, part: Part) -> Job:
+    def job(self, part: Part) -> Job:
         """The command line of one run."""
         from stlc.controller.parallel.jobs import Job
 
@@ -104,7 +104,7 @@ class Many:
         arguments = (operand(str(part.spec)), *given, *changed, *drawn)
         if self.cluster is None:
             return Job(self.name(part), arguments)
-        from stlc.controller.training.inputs import input_files
+        from stlc.controller.parallel.bundle import input_files
 
         read = input_files(part.spec, self.system, launch.overrides)
         return Job(self.name(part), arguments, read, launch.root)
@@ -115,8 +115,8 @@ def train_many(many: Many, *, json: bool) -> NoReturn:
     found: dict[str, JobResult] = {}
     sent = "begins" if many.cluster is None else "is sent"
     try:
-        for back in _backs(many, lambda errand: say(f"{errand.name} {sent}")):
-            found[back.errand.name] = back
+        for back in _backs(many, lambda job: say(f"{job.name} {sent}")):
+            found[back.job.name] = back
             for line in _line(back).splitlines():
                 say(line)
     except (KeyboardInterrupt, SystemExit):
@@ -134,16 +134,11 @@ def train_many(many: Many, *, json: bool) -> NoReturn:
 
 def _backs(many: Many, begun: Callable[[Job], None]) -> Iterator[JobResult]:
     """The runs as they end: of processes here, or of a cluster."""
-    errands = [many.errand(part) for part in many.parts]
-    if many.cluster is None:
-        from stlc.controller.parallel.jobs import side_by_side
+    from stlc.controller.parallel.jobs import executor
 
-        return side_by_side(errands, jobs=many.jobs, begun=begun)
-    from stlc.controller.parallel.ray_cluster import Cluster, on_cluster
-
-    config = many.config
-    cluster = Cluster(many.cluster, config.threads or 1, gpus=int(config.device != "cpu"))
-    return on_cluster(errands, cluster, begun=begun)
+    cores, gpus = many.config.threads or 1, int(many.config.device != "cpu")
+    jobs = [many.job(part) for part in many.parts]
+    return executor(many.jobs, many.cluster, cores=cores, gpus=gpus).run(jobs, begun)
 
 
 def _table(many: Many, ordered: Mapping[Part, JobResult]) -> str:
@@ -161,8 +156,8 @@ def _line(back: JobResult) -> str:
     """What is said as a run ends."""
     accuracy = back.result.get("accuracy")
     if accuracy is None:
-        return f"{back.errand.name} broke off with exit code {back.code}\n{back.why}".rstrip()
-    return f"{back.errand.name} done: accuracy {accuracy:.4f}  {back.result['run']}"
+        return f"{back.job.name} broke off with exit code {back.code}\n{back.why}".rstrip()
+    return f"{back.job.name} done: accuracy {accuracy:.4f}  {back.result['run']}"
 
 
 def _cells(part: Part, back: JobResult) -> tuple[str, ...]:

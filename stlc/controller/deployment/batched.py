@@ -14,7 +14,7 @@ from torch import Tensor
 from stlc.controller.deployment.disturbance import Disturbance
 from stlc.controller.deployment.world_errors import blamed, require_numbers, scene_of, states_of, wrong
 from stlc.controller.guard.feasibility import solvable, viable
-from stlc.controller.guard.tightened import Spare
+from stlc.controller.guard.margins import RobustnessMargins
 from stlc.controller.world import Charting, Choosing, Redrawing
 from stlc.diagnostics import Diagnostic, RunError, SystemFileError
 
@@ -49,7 +49,7 @@ class Setting:
     replan: int = 1
     limit: float | None = 0.1
     ceiling: int = 0
-    margin: Spare = field(default_factory=dict)
+    margin: RobustnessMargins = field(default_factory=dict)
     paper_limit: float | None = None
 
 

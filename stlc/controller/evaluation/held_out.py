@@ -17,7 +17,7 @@ from stlc.controller.policies.policy import plan_judged
 from stlc.controller.problem.task import satisfied
 from stlc.controller.training.config import HELD_OUT, HELD_OUT_SEED
 from stlc.controller.training.exploration import EFFORTS, Exploration
-from stlc.controller.training.missions import mission_steps, visited
+from stlc.controller.training.samplers import mission_steps, visited
 from stlc.files import write_atomic
 from stlc.native import never
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.guard.tightened import Spare
+from stlc.controller.guard.margins import RobustnessMargins
 from stlc.runtime.prefixes import Grid
 
 if TYPE_CHECKING:
@@ -190,7 +190,7 @@ class Limits:
     places: int = 8
     again: int = 2000
     rescue: bool = True
-    margin: Spare = field(default_factory=dict)
+    margin: RobustnessMargins = field(default_factory=dict)
     paper: float | None = None
 
 

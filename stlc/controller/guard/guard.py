@@ -10,9 +10,9 @@ from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.candidates import Candidates, Limits, finite
+from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.safe_prefix import robustness_until
 from stlc.controller.guard.search import RelaxedSearch, StagedSearch
-from stlc.controller.guard.tightened import sparing
 from stlc.controller.policies.policy import BestOfKPolicy, plan_judged
 from stlc.controller.problem.task import rank
 from stlc.runtime.prefixes import Grid
@@ -97,7 +97,7 @@ class Guard:
         limits: Limits | None = None,
     ) -> None:
         self.task, self.mode = task, mode
-        self.strict = sparing(task, {} if mode == "none" or limits is None else limits.margin)
+        self.strict = with_margins(task, {} if mode == "none" or limits is None else limits.margin)
         self.policy: Policy = policy
         if isinstance(policy, BestOfKPolicy):
             self.policy = policy.for_task(self.strict)  # the choice among its plans keeps the margin

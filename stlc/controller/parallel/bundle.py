@@ -1,4 +1,4 @@
-"""An errand for another machine: what it reads travels there, its run travels back, as archives.
+"""Jobs for other machines: what they read travels there, their runs travel back, as archives.
 
 A worker that sees the caller's folders works in them. Any other makes a mirror of them in a temporary folder,
 in which every file lies under its whole path, so that what files say of one another stays true.
@@ -13,14 +13,19 @@ import socket
 import subprocess
 import tarfile
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from stlc.cache import Unusable, private
+from stlc.compile.frontend.modules import Module, load_modules
 from stlc.controller.parallel.jobs import TAIL, Job, JobResult, document_of, start
-from stlc.files import atomic_path, write_atomic
+from stlc.diagnostics import StlcError
+from stlc.dynamics.declaration.load import load_system_decl
+from stlc.dynamics.robots.functions import function_files
+from stlc.files import atomic_path, find_spec, find_system, read_source, write_atomic
+from stlc.grammar.parse.parser import parse
 from stlc.rundir import RECORD, RUNS, RunDir, every_run
 from stlc.version import __version__
 
@@ -29,7 +34,7 @@ _OTHER_VERSION = 5
 
 @dataclass(frozen=True, slots=True)
 class JobBundle:
-    """An errand on its way to a worker.
+    """A job on its way to a worker.
 
     Attributes:
         arguments: of `stlc train`.
@@ -38,7 +43,7 @@ class JobBundle:
         inputs: files and folders that are read; all absolute.
         files: an archive of them.
         probe: a file that only who shares the caller's folders can see.
-        cores: that the errand may use.
+        cores: that the job may use.
         version: of the caller's stlc.
     """
 
@@ -50,6 +55,18 @@ class JobBundle:
     probe: str
     cores: int
     version: str
+
+    @classmethod
+    def of(cls, job: Job, cores: int) -> JobBundle:
+        """A job made ready to travel. Raises MissingError (R201) where its runs cannot be written."""
+        folder, runs = Path.cwd(), _absolute(job.runs or RUNS)
+        inputs = tuple(dict.fromkeys(map(_absolute, job.inputs)))
+        probe = runs / f".probe-{secrets.token_hex(8)}"
+        with atomic_path(probe) as written:
+            written.touch()
+        files = pack({str(path.relative_to(path.anchor)): path for path in inputs if path.exists()})
+        known = tuple(map(str, inputs))
+        return cls(job.arguments, str(folder), str(runs), known, files, str(probe), cores, __version__)
 
     @property
     def shared(self) -> bool:
@@ -65,7 +82,7 @@ class JobBundle:
 
 @dataclass(frozen=True, slots=True)
 class BundleResult:
-    """What a worker sends back.
+    """Result of a job as a worker sends it back.
 
     Attributes:
         code: exit code of the training.
@@ -87,72 +104,53 @@ class BundleResult:
 # ---------------------------------------------------------------------- the caller
 
 
-def wrap(errand: Job, cores: int) -> JobBundle:
-    """Make an errand ready to travel. Raises MissingError (R201) where its runs cannot be written."""
-    folder, runs = Path.cwd(), _absolute(errand.runs or RUNS)
-    inputs = tuple(dict.fromkeys(map(_absolute, errand.inputs)))
-    probe = runs / f".probe-{secrets.token_hex(8)}"
-    with atomic_path(probe) as written:
-        written.touch()
-    return JobBundle(
-        errand.arguments,
-        str(folder),
-        str(runs),
-        tuple(map(str, inputs)),
-        pack({str(path.relative_to(path.anchor)): path for path in inputs if path.exists()}),
-        str(probe),
-        cores,
-        __version__,
-    )
-
-
 def _absolute(path: Path) -> Path:
     """The whole path, without `..`; links stay as they are."""
     return Path(os.path.normpath(Path.cwd() / path))
 
 
-def bring_home(errand: Job, parcel: JobBundle, delivery: BundleResult) -> JobResult:
+def import_run(job: Job, bundle: JobBundle, found: BundleResult) -> JobResult:
     """Enter the run that a worker sent into the caller's runs, under the next free number.
 
     A run that was sent to be gone on with is written over.
     """
-    document = document_of(delivery.out)
-    if delivery.run is not None:
-        sent = Path(delivery.run)
-        if str(sent) in parcel.inputs:
+    document = document_of(found.out)
+    if found.run is not None:
+        sent = Path(found.run)
+        if str(sent) in bundle.inputs:
             home = RunDir(sent)
         else:
             _, _, words = sent.name.partition("-")
-            home = RunDir.create(Path(parcel.runs), sent.parent.name, words)
-        unpack(delivery.files, home.path)
+            home = RunDir.create(Path(bundle.runs), sent.parent.name, words)
+        unpack(found.files, home.path)
         if document is not None and isinstance(document.get("result"), dict):
             document["result"]["run"] = home.shown
-    return JobResult(errand, delivery.code, document, delivery.said, delivery.cores)
+    return JobResult(job, found.code, document, found.said, found.cores)
 
 
 # ---------------------------------------------------------------------- the worker
 
 
-def carry(parcel: JobBundle) -> BundleResult:
-    """Run an errand on this machine, in the caller's folders or in a mirror of them."""
-    if parcel.version != __version__:
-        said = f"{socket.gethostname()} has stlc {__version__}; {parcel.version} is needed"
+def run_bundle(bundle: JobBundle) -> BundleResult:
+    """Run a job on this machine, in the caller's folders or in a mirror of them."""
+    if bundle.version != __version__:
+        said = f"{socket.gethostname()} has stlc {__version__}; {bundle.version} is needed"
         return BundleResult(_OTHER_VERSION, "", said, 0)
-    with claimed(parcel.cores) as share:
-        if parcel.shared:
-            return _ran(parcel.arguments, Path(parcel.folder), share, Path(parcel.probe))
+    with claimed(bundle.cores) as share:
+        if bundle.shared:
+            return _ran(bundle.arguments, Path(bundle.folder), share, Path(bundle.probe))
         with tempfile.TemporaryDirectory(prefix="stlc-") as temporary:
-            return _ran_in_mirror(parcel, Path(temporary).resolve(), share)
+            return _ran_in_mirror(bundle, Path(temporary).resolve(), share)
 
 
-def _ran_in_mirror(parcel: JobBundle, root: Path, share: frozenset[int]) -> BundleResult:
-    unpack(parcel.files, root)
-    folder, runs = mirrored(root, parcel.folder), mirrored(root, parcel.runs)
+def _ran_in_mirror(bundle: JobBundle, root: Path, share: frozenset[int]) -> BundleResult:
+    unpack(bundle.files, root)
+    folder, runs = mirrored(root, bundle.folder), mirrored(root, bundle.runs)
     folder.mkdir(parents=True, exist_ok=True)
-    known = {*parcel.inputs, parcel.runs}
-    arguments = [str(mirrored(root, word)) if word in known else word for word in parcel.arguments]
+    known = {*bundle.inputs, bundle.runs}
+    arguments = [str(mirrored(root, word)) if word in known else word for word in bundle.arguments]
     back = _ran(arguments, folder, share)
-    sent = [RunDir(mirrored(root, path)) for path in parcel.inputs]
+    sent = [RunDir(mirrored(root, path)) for path in bundle.inputs]
     made = [*every_run(runs), *(run for run in sent if (run.path / RECORD).is_file())]
     if not made:
         return back
@@ -189,7 +187,7 @@ def _awaited(process: subprocess.Popen[str], probe: Path | None) -> tuple[str, s
 
 @contextmanager
 def claimed(count: int) -> Iterator[frozenset[int]]:
-    """Cores that no other errand on this machine has claimed; all, where so many are not free."""
+    """Cores that no other job on this machine has claimed; all, where so many are not free."""
     everything = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     try:
         import fcntl
@@ -240,3 +238,39 @@ def unpack(data: bytes, folder: Path) -> None:
     """Write what an archive holds below a folder. Raises `tarfile.FilterError` for what leads out of it."""
     with tarfile.open(fileobj=io.BytesIO(data), mode="r:gz") as archive:
         archive.extractall(folder, filter="data")
+
+
+# ---------------------------------------------------------------------- the files of a job
+
+
+def input_files(
+    path: Path, system: str | None = None, overrides: Mapping[str, str] | None = None
+) -> tuple[Path, ...]:
+    """The files behind a training, as far as they can be read: who trains says what is wrong with the rest.
+
+    Args:
+        path: of the specification.
+        system: instead of the one that the specification names.
+        overrides: of `--set`.
+    """
+    path = find_spec(path)
+    found: dict[Path, None] = {path: None}
+    with suppress(StlcError):
+        spec = parse(read_source(path))
+        found.update(dict.fromkeys(_imported(load_modules(spec))))
+        if (wanted := system or spec.system) is not None:
+            there = find_system(wanted, path)
+            found[there] = None
+            decl = load_system_decl(there, overrides or {})
+            found.update(dict.fromkeys(function_files(decl).values()))
+            found.update(dict.fromkeys(world.path for world in decl.worlds))
+            for judge in decl.judges:
+                found[judge.path] = None
+                found.update(dict.fromkeys(_imported(load_modules(parse(read_source(judge.path))))))
+    return tuple(file for file in found if file.is_file())
+
+
+def _imported(modules: tuple[Module, ...]) -> Iterator[Path]:
+    for module in modules:
+        yield Path(module.spec.source.name)
+        yield from _imported(module.imports)

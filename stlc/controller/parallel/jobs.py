@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, Protocol
 
 from stlc.stopping import CHILD, PATIENCE, leaving
 
@@ -41,17 +41,17 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class JobResult:
-    """What came of an errand.
+    """Result of a job.
 
     Attributes:
-        errand: that was run.
+        job: that was run.
         code: exit code; negative where a signal ended the process.
         document: that it printed; None where it did not get so far.
         said: the last lines of its standard error.
         cores: that it had to itself.
     """
 
-    errand: Job
+    job: Job
     code: int
     document: dict[str, Any] | None
     said: str
@@ -70,68 +70,87 @@ class JobResult:
         return "\n".join(lines) or self.said
 
 
-def side_by_side(
-    errands: Sequence[Job], *, jobs: int, begun: Callable[[Job], None] = lambda _: None
-) -> Iterator[JobResult]:
-    """Run errands, `jobs` at a time, and give each as it ends.
+class Executor(Protocol):
+    """Runs jobs, on this machine or on others."""
 
-    With several jobs every process keeps to its own share of the cores. When the caller is interrupted, or
-    wants no more, every process is asked to save and stop, and is waited for; a second time it is ended.
+    def run(self, jobs: Sequence[Job], begun: Callable[[Job], None] = ...) -> Iterator[JobResult]:
+        """Run jobs and give the result of each as it ends.
+
+        When the caller is interrupted, or wants no more, every process is asked to save and stop, and is
+        waited for.
+
+        Args:
+            jobs: in order.
+            begun: called as each starts.
+        """
+
+
+def executor(workers: int = 1, cluster: str | None = None, *, cores: int = 1, gpus: int = 0) -> Executor:
+    """The executor of a command: processes of this machine, or a Ray cluster where one is named.
 
     Args:
-        errands: what to run, in order.
-        jobs: processes at a time.
-        begun: called (in another thread) as each starts.
+        workers: processes at a time, here.
+        cluster: its address; None for this machine.
+        cores: processors of a job on a cluster, which decides how many run at a time.
+        gpus: graphics processors of a job on a cluster.
     """
-    crew = _Crew(jobs)
-    with ThreadPoolExecutor(jobs) as pool, leaving(crew.kill):
-        futures = [pool.submit(crew.send, errand, begun) for errand in errands]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        except BaseException:
-            for future in futures:
-                future.cancel()
-            crew.stop()
-            raise
+    if cluster is None:
+        return LocalExecutor(workers)
+    from stlc.controller.parallel.ray_cluster import RayExecutor
+
+    return RayExecutor(cluster, cores, gpus)
 
 
 @dataclass(slots=True)
-class _Crew:
-    """The processes that are going, and the cores that they share."""
+class LocalExecutor:
+    """Processes of this machine, `workers` at a time; of several each keeps to its own share of the cores.
 
-    jobs: int
+    A second interruption ends all processes at once. One object runs one list of jobs.
+    """
+
+    workers: int
     live: set[subprocess.Popen[str]] = field(default_factory=set)
     stopped: bool = False
     lock: threading.Lock = field(default_factory=threading.Lock)
     shares: SimpleQueue[frozenset[int]] = field(default_factory=SimpleQueue)
 
-    def __post_init__(self) -> None:
-        for share in core_shares(self.jobs):
+    def run(self, jobs: Sequence[Job], begun: Callable[[Job], None] = lambda _: None) -> Iterator[JobResult]:
+        """Run jobs and give the result of each as it ends; `begun` is called in another thread."""
+        for share in core_shares(self.workers):
             self.shares.put(share)
+        with ThreadPoolExecutor(self.workers) as pool, leaving(self.kill):
+            futures = [pool.submit(self.send, job, begun) for job in jobs]
+            try:
+                for future in as_completed(futures):
+                    yield future.result()
+            except BaseException:
+                for future in futures:
+                    future.cancel()
+                self.stop()
+                raise
 
-    def send(self, errand: Job, begun: Callable[[Job], None]) -> JobResult:
-        """Run one errand from beginning to end."""
+    def send(self, job: Job, begun: Callable[[Job], None]) -> JobResult:
+        """Run one job from beginning to end."""
         share = self.shares.get()
         try:
-            process = self._start(errand, share)
+            process = self._start(job, share)
             if process is None:
-                return JobResult(errand, -signal.SIGINT, None, "", len(share))
-            begun(errand)
+                return JobResult(job, -signal.SIGINT, None, "", len(share))
+            begun(job)
             out, said = process.communicate()
             with self.lock:
                 self.live.discard(process)
         finally:
             self.shares.put(share)
         tail = "\n".join(said.splitlines()[-TAIL:])
-        return JobResult(errand, process.returncode, document_of(out), tail, len(share))
+        return JobResult(job, process.returncode, document_of(out), tail, len(share))
 
-    def _start(self, errand: Job, share: frozenset[int]) -> subprocess.Popen[str] | None:
+    def _start(self, job: Job, share: frozenset[int]) -> subprocess.Popen[str] | None:
         """The process, on its share of the cores; None once everything is to stop."""
         with self.lock:
             if self.stopped:
                 return None
-            process = start(errand.arguments, share if self.jobs > 1 else None)
+            process = start(job.arguments, share if self.workers > 1 else None)
             self.live.add(process)
         return process
 

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
-from stlc.controller.parallel.bundle import JobBundle, bring_home, carry, wrap
+from stlc.controller.parallel.bundle import JobBundle, import_run, run_bundle
 from stlc.controller.parallel.jobs import Job, JobResult
 from stlc.diagnostics import Diagnostic, MissingError
 
 LOST = -signal.SIGKILL
-"""Code of an errand whose worker is gone."""
+"""Exit code of a job whose worker is gone."""
 
 _QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 _PATIENCE = 60.0
@@ -23,54 +23,53 @@ _PATIENCE = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Cluster:
-    """Where errands are sent, and what each asks for.
+class RayExecutor:
+    """Tasks of a Ray cluster, as many at a time as it has processors for.
 
     Attributes:
-        address: of a cluster; `auto` for the one that this machine belongs to, `local` for this machine.
-        cores: processors of an errand.
-        gpus: graphics processors of an errand.
+        address: of the cluster; `auto` for the one that this machine belongs to, `local` for this machine.
+        cores: processors of a job.
+        gpus: graphics processors of a job.
     """
 
     address: str
     cores: int = 1
     gpus: int = 0
 
+    def run(self, jobs: Sequence[Job], begun: Callable[[Job], None] = lambda _: None) -> Iterator[JobResult]:
+        """Run jobs, each of which names the folder of its runs, and give the result of each as it ends.
 
-def on_cluster(
-    errands: Sequence[Job], cluster: Cluster, *, begun: Callable[[Job], None] = lambda _: None
-) -> Iterator[JobResult]:
-    """Run errands on a cluster, as many at a time as it has processors for, and give each as it ends.
+        When the caller is interrupted, or wants no more, what jobs have saved is brought back.
 
-    When the caller is interrupted, or wants no more, every errand is asked to save and stop, and what it
-    saved is brought back.
+        Raises:
+            MissingError: R301, Ray is not installed; R302, there is no such cluster.
+        """
+        ray = _connected(self.address)
+        going: dict[Any, _Sent] = {}
+        try:
+            remote = ray.remote(run_bundle).options(num_cpus=self.cores, num_gpus=self.gpus, max_retries=0)
+            for job in jobs:
+                bundle = JobBundle.of(job, self.cores)
+                going[remote.remote(bundle)] = _Sent(job, bundle)
+                begun(job)
+            while going:
+                (done, *_), _ = ray.wait(list(going))
+                yield _received(ray, done, going.pop(done))
+        except BaseException:
+            _call_back(ray, going)
+            raise
+        finally:
+            for sent in going.values():
+                sent.bundle.close()
+            ray.shutdown()
 
-    Args:
-        errands: what to run; each must name the folder of its runs.
-        cluster: where.
-        begun: called as each is sent.
 
-    Raises:
-        MissingError: R301, Ray is not installed; R302, there is no such cluster.
-    """
-    ray = _connected(cluster.address)
-    going: dict[Any, tuple[Job, JobBundle]] = {}
-    try:
-        task = ray.remote(carry).options(num_cpus=cluster.cores, num_gpus=cluster.gpus, max_retries=0)
-        for errand in errands:
-            parcel = wrap(errand, cluster.cores)
-            going[task.remote(parcel)] = (errand, parcel)
-            begun(errand)
-        while going:
-            (done, *_), _ = ray.wait(list(going))
-            yield _received(ray, done, *going.pop(done))
-    except BaseException:
-        _call_back(ray, going)
-        raise
-    finally:
-        for _, parcel in going.values():
-            parcel.close()
-        ray.shutdown()
+@dataclass(frozen=True, slots=True)
+class _Sent:
+    """A job on its way, and what was sent of it."""
+
+    job: Job
+    bundle: JobBundle
 
 
 def _connected(address: str) -> Any:
@@ -96,25 +95,25 @@ def _connected(address: str) -> Any:
     return ray
 
 
-def _received(ray: Any, done: Any, errand: Job, parcel: JobBundle) -> JobResult:
-    """What came of an errand, with its run among those of the caller."""
+def _received(ray: Any, done: Any, sent: _Sent) -> JobResult:
+    """The result of a job, with its run among those of the caller."""
     try:
-        delivery = ray.get(done)
+        found = ray.get(done)
     except ray.exceptions.RayError as error:
         said = str(error).strip().splitlines()[-1:]
-        return JobResult(errand, LOST, None, "".join(said), 0)
+        return JobResult(sent.job, LOST, None, "".join(said), 0)
     finally:
-        parcel.close()
-    return bring_home(errand, parcel, delivery)
+        sent.bundle.close()
+    return import_run(sent.job, sent.bundle, found)
 
 
-def _call_back(ray: Any, going: dict[Any, tuple[Job, JobBundle]]) -> None:
-    """Ask every errand to save and stop, and bring back what it saved."""
-    for each, (_, parcel) in going.items():
-        parcel.close()
+def _call_back(ray: Any, going: dict[Any, _Sent]) -> None:
+    """Ask every job to save and stop, and bring back what it saved."""
+    for each, sent in going.items():
+        sent.bundle.close()
         with suppress(Exception):
             ray.cancel(each, force=False)
     ended, _ = ray.wait(list(going), num_returns=len(going), timeout=_PATIENCE) if going else ([], [])
     for each in ended:
         with suppress(Exception):
-            _received(ray, each, *going.pop(each))
+            _received(ray, each, going.pop(each))

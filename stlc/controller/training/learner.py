@@ -20,13 +20,11 @@ from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.native import torch_reasons
 from stlc.controller.problem.task import rank, satisfied
-from stlc.controller.training.divergence import Step, diagnose
+from stlc.controller.training.diagnose import Step, diagnose
 from stlc.controller.training.exploration import EFFORTS, Exploration
 from stlc.controller.training.local_search import THOROUGH, Search, Searcher, SearchResult
-from stlc.controller.training.missions import Missions
 from stlc.controller.training.objective import loss
-from stlc.controller.training.replay import Buffer
-from stlc.controller.training.samplers import Draws, Fixed, Supply
+from stlc.controller.training.samplers import Buffer, Draws, Fixed, Missions, Supply
 from stlc.native import never
 from stlc.registry import METHODS
 

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from stlc.controller.parallel.ddp import ALONE, Ranks
-from stlc.controller.problem.symmetry import check_mirror
 from stlc.controller.training.budget import PROVISIONAL, Pace, StepSchedule, TimeBudget, clock_of
 from stlc.controller.training.checkpoint import load_checkpoint, never_saved, restoring
 from stlc.controller.training.config import ResolvedConfig, TrainConfig, resolve_config
-from stlc.controller.training.conflict import refuted
+from stlc.controller.training.diagnose import check_mirror, refuted
 from stlc.controller.training.final_evaluation import FinalEvaluation, Outcome
 from stlc.controller.training.run import Run, RunWriter, load_config, load_task, spec_hash, system_hash
 from stlc.diagnostics import Diagnostic, MissingError, RunError, StlcError, UsageError
@@ -27,9 +26,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from contextlib import AbstractContextManager
 
-    from stlc.controller.methods import Learner, Method
+    from stlc.controller.methods import Method
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.learner import Validation
+    from stlc.controller.training.learner import Trainer, Validation
     from stlc.rundir import RunDir
 
 DEFAULT_BUDGET = 60.0
@@ -234,7 +233,7 @@ class _Session:
     """A session of training: from wherever the learner stands to the end, or to an interruption."""
 
     def __init__(
-        self, writer: RunWriter, learner: Learner, watch: Watch, time: TimeBudget, schedule: StepSchedule
+        self, writer: RunWriter, learner: Trainer, watch: Watch, time: TimeBudget, schedule: StepSchedule
     ) -> None:
         """`schedule` is followed to its end; with a budget it is planned again as the pace demands."""
         self.writer = writer

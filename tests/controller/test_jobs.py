@@ -8,7 +8,7 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.controller.parallel.jobs import Job, core_shares, side_by_side
+from stlc.controller.parallel.jobs import Job, LocalExecutor, core_shares
 from stlc.rundir import every_run
 
 ROOT = Path(__file__).parents[2]
@@ -30,8 +30,8 @@ def test_every_job_has_cores_and_no_core_is_left_out(jobs: int) -> None:
 def test_what_breaks_off_is_told() -> None:
     begun: list[str] = []
     bad = [Job(name, ("--stepps", "2")) for name in ("a", "b")]
-    found = list(side_by_side(bad, jobs=1, begun=lambda errand: begun.append(errand.name)))
-    assert begun == [back.errand.name for back in found] == ["a", "b"]
+    found = list(LocalExecutor(1).run(bad, lambda job: begun.append(job.name)))
+    assert begun == [back.job.name for back in found] == ["a", "b"]
     assert all((back.code, back.result) == (2, {}) for back in found)
     assert found[0].document is not None
     assert found[0].document["diagnostics"][0]["code"] == "U101"
@@ -40,8 +40,8 @@ def test_what_breaks_off_is_told() -> None:
 def test_what_is_no_longer_wanted_is_saved(tmp_path: Path) -> None:
     long = Job("long", (SPEC, "--steps", "100000", "--runs", str(tmp_path), *QUICK))
     bad = Job("bad", ("--stepps", "2"))
-    waiting = side_by_side([long, bad], jobs=2)
-    assert next(waiting).errand.name == "bad"
+    waiting = LocalExecutor(2).run([long, bad])
+    assert next(waiting).job.name == "bad"
     deadline = time.monotonic() + 60
     while not any(run.record().get("engine") for run in every_run(tmp_path)):
         assert time.monotonic() < deadline

@@ -8,8 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.controller.guard.margin_calibration import measured_margin
-from stlc.controller.guard.margin_request import Asked, parse_margins
+from stlc.controller.guard.margins import MarginRequest, calibrated_margins, parse_margins
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
 from stlc.dynamics.declaration.load import parse_system
@@ -57,7 +56,7 @@ class Onward:
 
 
 def margins(scenario: str, steps: int = 1) -> dict[str, float]:
-    return dict(measured_margin(task_of(scenario), Onward(), steps))
+    return dict(calibrated_margins(task_of(scenario), Onward(), steps))
 
 
 @pytest.mark.parametrize(
@@ -84,7 +83,7 @@ def test_noise_is_lost_where_a_plan_begins() -> None:
     """Who believes to be lower than it is loses that; 99 % of even noise of 0.2 m is 0.196 m."""
     assert margins("blurred") == {"q_low": pytest.approx(0.196, abs=0.003)}
     assert margins("blurred", 3) == margins("blurred")
-    whole = measured_margin(task_of("blurred"), Onward(), 1, 1.0)
+    whole = calibrated_margins(task_of("blurred"), Onward(), 1, 1.0)
     assert whole["q_low"] == pytest.approx(0.2, abs=0.005)
 
 
@@ -98,7 +97,7 @@ def test_without_a_safe_plan_nothing_is_measured() -> None:
         def plan(self, x0: Tensor) -> Tensor:
             return torch.full((len(x0), 6, 1), 9.0, dtype=x0.dtype)
 
-    assert measured_margin(task_of("windy"), Away()) == {}
+    assert calibrated_margins(task_of("windy"), Away()) == {}
 
 
 def test_where_nothing_is_wrong_nothing_is_lost_but_digits(car_task: Task) -> None:
@@ -107,13 +106,13 @@ def test_where_nothing_is_wrong_nothing_is_lost_but_digits(car_task: Task) -> No
             drawn = torch.rand((len(x0), car_task.horizon, 1), generator=torch.Generator().manual_seed(0))
             return 12.0 * drawn.to(x0) - 9.0
 
-    assert measured_margin(car_task, Anyhow()) == {}
+    assert calibrated_margins(car_task, Anyhow()) == {}
 
 
 def test_margins_are_asked_for_by_number_by_name_or_measured() -> None:
-    assert parse_margins([]) == Asked()
-    assert parse_margins(["0.2", "p_low=0.5", "0.3"]) == Asked(0.3, {"p_low": 0.5})
-    assert parse_margins(["auto", "q_low = 1"]) == Asked(0.0, {"q_low": 1.0}, 0.99)
+    assert parse_margins([]) == MarginRequest()
+    assert parse_margins(["0.2", "p_low=0.5", "0.3"]) == MarginRequest(0.3, {"p_low": 0.5})
+    assert parse_margins(["auto", "q_low = 1"]) == MarginRequest(0.0, {"q_low": 1.0}, 0.99)
     assert parse_margins(["auto:95"]).share == 0.95
     windy, policy = task_of("windy"), Onward()
     assert parse_margins(["0.2", "q_low=0.5"]).of(windy, policy, "full") == {"p_low": 0.2, "q_low": 0.5}

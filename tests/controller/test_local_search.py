@@ -9,7 +9,7 @@ from stlc import native
 from stlc.controller.problem.native import Effort
 from stlc.controller.problem.task import Task
 from stlc.controller.training.local_search import Searcher
-from stlc.controller.training.replay import CAPACITY, Buffer
+from stlc.controller.training.samplers import CAPACITY, Buffer
 from stlc.dynamics.model.system import System
 
 

@@ -13,7 +13,7 @@ import pytest
 from benchmarks.__main__ import main as measure
 from stlc.cli.framework.app import main
 from stlc.controller.parallel.jobs import Job
-from stlc.controller.parallel.ray_cluster import Cluster, on_cluster
+from stlc.controller.parallel.ray_cluster import RayExecutor
 from stlc.rundir import every_run
 
 ROOT = Path(__file__).parents[2]
@@ -63,8 +63,8 @@ def test_what_is_no_longer_wanted_is_saved(tmp_path: Path) -> None:
     pytest.importorskip("ray")
     long = Job("long", (SPECS[0], "--steps", "100000", "--runs", str(tmp_path), *QUICK[2:]), (), tmp_path)
     bad = Job("bad", ("--stepps", "2"), (), tmp_path)
-    waiting = on_cluster([long, bad], Cluster("local"))
-    assert next(waiting).errand.name == "bad"
+    waiting = RayExecutor("local").run([long, bad])
+    assert next(waiting).job.name == "bad"
     while not any(run.record().get("engine") for run in every_run(tmp_path)):
         time.sleep(0.05)
     waiting.close()

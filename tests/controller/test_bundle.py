@@ -1,4 +1,4 @@
-"""Errands that travel: what they read goes along, their runs come back, and nothing leads out of a folder."""
+"""Jobs that travel: what they read goes along, their runs come back, and nothing leads out of a folder."""
 
 from __future__ import annotations
 
@@ -9,9 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from stlc.controller.parallel.bundle import BundleResult, bring_home, carry, claimed, pack, unpack, wrap
+from stlc.controller.parallel.bundle import (
+    BundleResult,
+    JobBundle,
+    claimed,
+    import_run,
+    input_files,
+    pack,
+    run_bundle,
+    unpack,
+)
 from stlc.controller.parallel.jobs import Job, core_shares
-from stlc.controller.training.inputs import input_files
 from stlc.rundir import RunDir, every_run
 
 ROOT = Path(__file__).parents[2]
@@ -34,7 +42,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return home
 
 
-def errand(*more: str, runs: Path = Path("runs")) -> Job:
+def job(*more: str, runs: Path = Path("runs")) -> Job:
     spec = Path("specs/drive.stl")
     words = (str(spec), "--steps", "2", "--runs", str(runs), *QUICK, *more)
     return Job("one", words, input_files(spec), runs)
@@ -54,13 +62,13 @@ def test_what_a_training_reads(project: Path) -> None:
 @pytest.mark.slow
 def test_a_worker_that_does_not_see_the_folders_sends_the_run(project: Path) -> None:
     home = project / "results"
-    sent = wrap(errand("--name", "far", runs=home), cores=1)
+    sent = JobBundle.of(job("--name", "far", runs=home), cores=1)
     assert sent.shared
-    back = carry(replace(sent, probe="/not/here"))
+    back = run_bundle(replace(sent, probe="/not/here"))
     assert (back.code in (0, 1), back.cores) == (True, 1), back.said
     assert every_run(home) == []
     RunDir.create(home, "traffic", "earlier")
-    document = bring_home(errand(runs=home), sent, back).document
+    document = import_run(job(runs=home), sent, back).document
     sent.close()
     (run,) = every_run(home)
     assert run.name == "0002-far"
@@ -75,26 +83,26 @@ def test_a_worker_that_does_not_see_the_folders_sends_the_run(project: Path) -> 
 
 @pytest.mark.usefixtures("project")
 def test_a_worker_that_sees_the_folders_leaves_the_run_there() -> None:
-    sent = wrap(errand("--stepps", "2"), cores=1)
-    back = carry(sent)
+    sent = JobBundle.of(job("--stepps", "2"), cores=1)
+    back = run_bundle(sent)
     assert (back.code, back.run, back.files) == (2, None, b"")
-    assert bring_home(errand(), sent, back).why.startswith("error[U101]")
+    assert import_run(job(), sent, back).why.startswith("error[U101]")
 
 
 def test_a_run_that_was_sent_is_written_over(project: Path) -> None:
     run = RunDir.create(Path("runs"), "drive", "old")
     run.update({"status": "interrupted"})
     going = Job("on", ("--resume", str(run.path)), (run.path,), Path("runs"))
-    sent = wrap(going, 1)
+    sent = JobBundle.of(going, 1)
     (project / "later.json").write_text('{"status": "finished"}')
     files = pack({"run.json": project / "later.json"})
-    bring_home(going, sent, BundleResult(0, "", "", 1, str(project.resolve() / run.path), files))
+    import_run(going, sent, BundleResult(0, "", "", 1, str(project.resolve() / run.path), files))
     assert [(each.name, each.status) for each in every_run(Path("runs"))] == [("0001-old", "finished")]
 
 
 @pytest.mark.usefixtures("project")
 def test_another_version_is_refused() -> None:
-    back = carry(replace(wrap(errand(), 1), version="0.0.0"))
+    back = run_bundle(replace(JobBundle.of(job(), 1), version="0.0.0"))
     assert back.code == 5
     assert "0.0.0 is needed" in back.said
 
@@ -123,7 +131,7 @@ def test_nothing_leads_out_of_the_folder(name: str, link: str, tmp_path: Path) -
     assert not (tmp_path / "out.txt").exists()
 
 
-def test_two_errands_have_different_cores(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_two_jobs_have_different_cores(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     everything = core_shares(1)[0]
     with claimed(1) as first:

@@ -14,7 +14,7 @@ from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.search import StagedSearch
 from stlc.controller.guard.stages.gradient_refine import GradientAscent
 from stlc.controller.problem.task import Task
-from tests.controller.test_backup import F64, Constant, failing, grid
+from tests.controller.test_prefix_shooting import F64, Constant, failing, grid
 
 QUICK = Limits(seconds=None, tries=256, drawn=30, places=2)
 

@@ -16,7 +16,7 @@ from stlc.controller.problem.task import Task
 from stlc.dynamics.model.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
-from tests.controller.test_backup import F64, failing
+from tests.controller.test_prefix_shooting import F64, failing
 
 ROOT = Path(__file__).parents[2]
 ENOUGH = 0.01

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from stlc.controller.guard.candidates import REPAIRED, Limits
 from stlc.controller.guard.guard import Decision, Guard
+from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.search import RelaxedSearch, StagedSearch
-from stlc.controller.guard.tightened import sparing
 from stlc.controller.problem.task import Task
 from stlc.dynamics.declaration.load import parse_system
 from stlc.dynamics.model.system import System
@@ -68,7 +68,7 @@ def test_whom_the_plain_guard_can_save_is_saved_with_a_margin_too() -> None:
     x = task.sample(60, seed=1, dtype=torch.float64)
     plain = StagedSearch(task, Onward(), "full", limits=Limits(seconds=None)).search(x, Onward().plan(x))
     found = decided(task, x)
-    strict = sparing(task, LIMITS.margin)
+    strict = with_margins(task, LIMITS.margin)
     assert 10 < int(plain.is_safe.sum()) < 60
     assert bool((found.safe | ~plain.is_safe).all())
     enough = strict.judge(x, found.plan).safe >= -1e-6
@@ -80,7 +80,7 @@ def test_whom_the_plain_guard_can_save_is_saved_with_a_margin_too() -> None:
 def test_it_spares_more_than_a_guard_that_asks_for_nothing() -> None:
     task = cart()
     x = task.sample(60, seed=2, dtype=torch.float64)
-    strict = sparing(task, LIMITS.margin)
+    strict = with_margins(task, LIMITS.margin)
     guard = RelaxedSearch(task, strict, Onward(), limits=LIMITS)
     found = guard.search(x, Onward().plan(x))
     plain = StagedSearch(task, Onward(), "full", limits=Limits(seconds=None)).search(x, Onward().plan(x))

@@ -1,0 +1,178 @@
+"""Robustness margins of guards: requested, measured, and required of a task.
+
+A guard passes a plan that is safe by the model. When it judges again the agent is where the truth has brought
+it, from where it really was. Had the plan a larger margin than its robustness has lost by then, what is left
+of it is still safe by the model, and so there is a safe plan to be found. That loss is measured: plans of the
+policy, from starts as in training, are followed on the truth of the scenario until a guard judges again, and
+by the model from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, TypeAlias
+
+import torch
+from torch import Tensor
+
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.traverse import map_children
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.deployment.disturbance import Disturbance
+from stlc.controller.problem.task import Task
+from stlc.controller.streams import seeded
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.dynamics.model.algebra import add
+from stlc.registry import closest
+
+if TYPE_CHECKING:
+    from stlc.compile.pipeline import CompiledRequirement
+    from stlc.controller.guard.guard import Mode
+    from stlc.controller.policies.policy import Policy
+    from stlc.controller.problem.task import Task
+
+RobustnessMargins: TypeAlias = Mapping[str, float]
+"""Safety requirement -> robustness that plans must keep, in its own unit; none if left out."""
+
+
+def with_margins(task: Task, margin: RobustnessMargins) -> Task:
+    """The task whose safety requirements are tightened: their robustness is less by their `margin`.
+
+    Time tests and constants, which never limit a robustness, stay.
+    """
+    if not any(margin.values()):
+        return task
+    safe = {rule.name: _tightened(rule, margin.get(rule.name, 0.0)) for rule in task.compiled.safety}
+    rules = tuple(safe.get(rule.name, rule) for rule in task.rules)
+    return Task(replace(task.compiled, requirements=rules), task.plain)
+
+
+def _tightened(rule: CompiledRequirement, margin: float) -> CompiledRequirement:
+    return replace(rule, formula=tightened(rule.formula, margin), lowered=tightened(rule.lowered, margin))
+
+
+def tightened(formula: ir.Formula, margin: float) -> ir.Formula:
+    """The formula whose robustness is less by `margin`, everywhere and exactly."""
+    if isinstance(formula, ir.Predicate):
+        less = add(formula.num, ir.Const(-formula.sign * margin))
+        return formula if formula.guard else replace(formula, num=less)
+    return map_children(formula, formulas=lambda part: tightened(part, margin))
+
+
+SHARE = 0.99
+"""Of plans whose loss a margin covers."""
+STARTS = 4000
+SEED = 20_251
+
+
+@torch.no_grad()
+def calibrated_margins(task: Task, policy: Policy, steps: int = 1, share: float = SHARE) -> RobustnessMargins:
+    """Quantile of the robustness that safe plans lose, for each safety requirement.
+
+    Args:
+        task: under its scenario, whose errors, disturbances and noise count.
+        policy: planner.
+        steps: between two judgements of the guard; the full guard judges at every step.
+        share: of plans whose loss the margin covers.
+
+    Returns:
+        Requirement -> robustness, at least 0 each; empty where the scenario has nothing that is wrong, or the
+        policy has no safe plan.
+    """
+    x0 = task.sample(STARTS, generator=seeded(SEED, 0), dtype=torch.float64)
+    disturbance = Disturbance(task.plain, [seeded(SEED, 1)], STARTS)
+    seen = disturbance.seen(x0, 0)
+    plan = policy.plan(seen).to(x0.dtype)
+    planned = task.judge(seen, plan)
+    followed = task.requirement_robustness(_followed(task, disturbance, x0, plan, min(steps, task.horizon)))
+    lost = (planned.requirements - followed)[planned.safe >= 0.0]
+    safety = {rule.name for rule in task.compiled.safety}
+    found = {
+        rule.name: float(lost[:, index].nan_to_num(0.0, 0.0, 0.0).quantile(share))
+        for index, rule in enumerate(task.rules)
+        if rule.name in safety and len(lost)
+    }
+    return {name: loss for name, loss in found.items() if loss > TOLERANCE}
+
+
+def _followed(task: Task, disturbance: Disturbance, x: Tensor, plan: Tensor, steps: int) -> Tensor:
+    """States (B, T+1, n) of plans that are followed on the truth for some steps, then by the model."""
+    (truth,) = disturbance.truths(task.plain.truth)
+    count, states = len(task.plain.names), [x]
+    for step in range(steps):
+        known = x[:, :count]
+        moved = truth.step(known, disturbance.acted(plan[:, step]))
+        x = torch.cat((disturbance.pushed(moved, known, step + 1), task.system.added_later(x)), 1)
+        states.append(x)
+    later = task.rollout(x, plan[:, steps:])[:, 1:] if steps < task.horizon else x[:, None, :][:, :0]
+    return torch.cat((torch.stack(states, 1), later), 1)
+
+
+AUTO = "auto"
+FORMS = "--margin 0.2, --margin NAME=0.2, --margin auto, or auto:95 to cover 95 % of plans, not 99"
+
+
+@dataclass(frozen=True, slots=True)
+class MarginRequest:
+    """Margins of a command line; see `parse_margins`.
+
+    Attributes:
+        every: of each safety requirement that is not named.
+        named: requirement -> margin.
+        share: of plans that a measured margin covers; None where nothing is measured.
+    """
+
+    every: float = 0.0
+    named: Mapping[str, float] = field(default_factory=dict)
+    share: float | None = None
+
+    def of(self, task: Task, policy: Policy, mode: Mode, replan: int = 1) -> RobustnessMargins:
+        """The margins of a task under its scenario, where every agent plans every `replan` steps.
+
+        Raises UsageError (U101) where a name is no safety requirement.
+        """
+        names = [rule.name for rule in task.compiled.safety]
+        for name in self.named:
+            if name not in names:
+                near = closest(name, names)
+                help_ = (f"did you mean `{near}`?",) if near else ()
+                listed = f"safety requirements: {', '.join(names) or 'none'}"
+                raise UsageError(
+                    Diagnostic("U101", f"`{name}` is no safety requirement", help=(*help_, listed))
+                )
+        found = dict.fromkeys(names, self.every)
+        if self.share is not None and mode != "none":
+            steps = 1 if mode == "full" else replan
+            found |= calibrated_margins(task, policy, steps, self.share)
+        found |= self.named
+        return {name: margin for name, margin in found.items() if margin}
+
+
+def parse_margins(texts: Sequence[str]) -> MarginRequest:
+    """Margins such as `0.2`, `avoid=0.2`, `auto`, `auto:99`; of several of a kind the last counts.
+
+    Raises:
+        UsageError: U101, one is none of these.
+    """
+    asked = MarginRequest()
+    for text in texts:
+        name, equals, number = text.rpartition("=")
+        kind, colon, percent = text.partition(":")
+        if kind.strip() == AUTO:
+            asked = replace(asked, share=_number(percent, text, 100.0) / 100 if colon else SHARE)
+        elif equals:
+            asked = replace(asked, named={**asked.named, name.strip(): _number(number, text)})
+        else:
+            asked = replace(asked, every=_number(text, text))
+    return asked
+
+
+def _number(text: str, whole: str, most: float = 1e9) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 <= value <= most:
+        raise UsageError(Diagnostic("U101", f"`{whole}` is no margin", help=(FORMS,)))
+    return value

@@ -1,0 +1,482 @@
+"""Diagnosis of trainings: asymmetric mirrors, steps that are not finite, requirements without a plan.
+
+The chain of a training step is network -> plans -> states -> robustness of each requirement and performance
+terms -> gradient; the first link that is no number is named. A search for plans proves nothing where it finds
+none. Bounds do: interval arithmetic over all that a plan may do says how far the states can come within the
+horizon, and so how robust a requirement can be at most.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from stlc.compile.analysis.ranges import bounds
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.traverse import numbers, subexpressions
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.switch import Hard
+from stlc.controller.guard.feasibility import ENOUGH, solve
+from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.training.exploration import EFFORTS, Exploration
+from stlc.controller.training.objective import Objective, native_rolled
+from stlc.diagnostics import Diagnostic, Label, RunError, StlcError, SystemFileError
+from stlc.dynamics.model.system import System
+from stlc.native import never
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from stlc.compile.ir.functions import Bounds
+    from stlc.compile.pipeline import CompiledRequirement
+    from stlc.controller.policies.policy import PlanNetwork
+    from stlc.controller.problem.task import Task
+    from stlc.controller.training.local_search import SearchResult
+    from stlc.native import Stop
+
+HARD = Hard()
+SHOWN = 6
+"""Numbers of a plan that are told."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What a training step was made with.
+
+    Attributes:
+        task: that is trained for.
+        objective: what was minimised.
+        x0: where plans start, (B, n).
+        u: the network's plans, (B, T, m).
+        number: of the step.
+    """
+
+    task: Task
+    objective: Objective
+    x0: Tensor
+    u: Tensor
+    number: int
+
+    @classmethod
+    def of(cls, network: PlanNetwork, objective: Objective, x0: Tensor, number: int, task: Task) -> Step:
+        """The step with all plans of the network for states (B, n)."""
+        with torch.no_grad():
+            plans = network(x0)
+        return cls(task, objective, x0.repeat_interleave(plans.shape[1], 0), plans.flatten(0, 1), number)
+
+
+def diagnose(step: Step) -> StlcError:
+    """The first of what a training step needs that is no number, and where."""
+    for look in (_plans, _motion, _robustness, _cost):
+        found = look(step)
+        if found is not None:
+            return found
+    return RunError(
+        Diagnostic(
+            "R401",
+            f"training diverged: the loss or its gradient is not finite at step {step.number}",
+            help=("try a smaller --lr; `stlc compile` shows the dynamics that are rolled out",),
+        )
+    )
+
+
+def _plans(step: Step) -> StlcError | None:
+    row = _first(~torch.isfinite(step.u).flatten(1).all(1))
+    if row is None:
+        return None
+    return RunError(
+        Diagnostic(
+            "R401",
+            f"training diverged: at step {step.number} the network's plans are no numbers",
+            help=("try a smaller --lr",),
+            note=(f"for the start {_state(step, row)}",),
+        )
+    )
+
+
+def _motion(step: Step) -> StlcError | None:
+    with torch.no_grad():
+        states = step.task.system.rollout(step.x0, step.u, HARD)
+    bad = ~torch.isfinite(states)
+    row = _first(bad.flatten(1).any(1))
+    if row is None:
+        return None
+    when = int(bad[row].any(1).nonzero()[0])
+    name = step.task.names[int(bad[row, when].nonzero()[0])]
+    what = "NaN" if bool(states[row, when].isnan().any()) else "infinity"
+    then = f"{when} step{'s' * (when > 1)} ({when * step.task.dt:.3g} s) after a start"
+    return SystemFileError(
+        Diagnostic(
+            "S302",
+            f"the dynamics of {step.task.system.name} give {what} in `{name}`, {then}",
+            step.task.system.decl.places.get(name),
+            label="declared here",
+            help=("clamp the state, shorten the step, or keep divisors away from 0",),
+            note=(f"from {_state(step, row)}", f"with {_plan(step, row, when)}", _at(step)),
+        )
+    )
+
+
+def _robustness(step: Step) -> StlcError | None:
+    """A requirement whose value, or else whose gradient, is no finite number on states that are.
+
+    A value that is infinite spoils the gradients of all requirements, so values come first.
+    """
+    looks = [
+        _differentiated(step, lambda u, i=index: _each(step, u)[0][:, i])  # type: ignore[misc]
+        for index in range(len(step.task.rules))
+    ]
+    for what, bad_of, way in _WRONG:
+        for rule, look in zip(step.task.rules, looks, strict=True):
+            row = _first(bad_of(*look))
+            if row is not None:
+                return RunError(
+                    Diagnostic(
+                        "R401",
+                        f"the {what.format(rule.name)} on states that are",
+                        rule.span,
+                        label="this requirement",
+                        help=(way,),
+                        note=(f"from {_state(step, row)}", f"with {_plan(step, row)}", _at(step)),
+                    )
+                )
+    return None
+
+
+def _cost(step: Step) -> StlcError | None:
+    """A performance term whose value or gradient is no number."""
+    declared = step.task.system.decl
+    for term in declared.objective.terms:
+        alone = replace(declared, objective=replace(declared.objective, terms=(term,)))
+        task = Task(step.task.compiled, System(alone))
+
+        def cost(u: Tensor, task: Task = task) -> Tensor:
+            each, columns = _each(step, u)
+            return task.system.performance(
+                columns, torch.ones(len(u)).to(u), step.task.graph.overall(each), u
+            )
+
+        value, slope = _differentiated(step, cost)
+        row = _first(~torch.isfinite(value) | ~_finite(slope))
+        if row is not None:
+            return RunError(
+                Diagnostic(
+                    "R401",
+                    f"the performance term `{term.name}`, or its gradient, is not a number",
+                    help=("a root, a power, a logarithm or a quotient has no slope at 0: keep away from it",),
+                    note=(f"from {_state(step, row)}", f"with {_plan(step, row)}", _at(step)),
+                )
+            )
+    return None
+
+
+def _each(step: Step, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
+    """Robustness per requirement (B, R) and states (T+1, B), differentiable as training has them."""
+    native = native_rolled(step.task, step.objective, step.x0, u)
+    if native is not None:
+        return native
+    columns = step.task.system.rollout_columns(step.x0, u, step.objective.switch)
+    smoothing = step.objective.smoothing
+    return step.task.graph.per_requirement_columns(columns, ops=TORCH, smoothing=smoothing), columns
+
+
+def _differentiated(step: Step, value_of: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    """A value per plan (B,) and its gradient by the plan, (B, T, m)."""
+    u = step.u.detach().requires_grad_()
+    value = value_of(u)
+    if not value.requires_grad:
+        return value.detach(), torch.zeros_like(u)
+    (slope,) = torch.autograd.grad(value.sum(), u)
+    return value.detach(), slope
+
+
+def _finite(slope: Tensor) -> Tensor:
+    return torch.isfinite(slope).flatten(1).all(1)
+
+
+_ROOT = "a root, a power, a logarithm or a quotient has no slope at 0: keep away from it"
+_ENDLESS = "no plan is better than another there: keep its numbers finite, with `clip` for one"
+_WRONG: tuple[tuple[str, Callable[[Tensor, Tensor], Tensor], str], ...] = (
+    ("robustness of `{}` is not a number", lambda value, _: value.isnan(), _ROOT),
+    ("robustness of `{}` is minus infinity", lambda value, _: value == -torch.inf, _ENDLESS),
+    ("gradient of `{}` is not a number", lambda _, slope: ~_finite(slope), _ROOT),
+)
+"""What can be wrong with the value and the gradient of a requirement, and the way out."""
+
+
+def _first(marks: Tensor) -> int | None:
+    rows = marks.nonzero()
+    return int(rows[0]) if len(rows) else None
+
+
+def _state(step: Step, row: int) -> str:
+    columns = zip(step.task.system.signature.columns, step.x0[row].tolist(), strict=True)
+    return ", ".join(
+        f"{column.name} = {value:.4g} {column.unit}".removesuffix(" 1") for column, value in columns
+    )
+
+
+def _plan(step: Step, row: int, steps: int | None = None) -> str:
+    shown = min(SHOWN, step.u.shape[1] if steps is None else max(steps, 1))
+    values = zip(step.task.system.control_names, step.u[row, :shown].t().tolist(), strict=True)
+    more = ", …" if shown < step.u.shape[1] else ""
+    return "; ".join(f"{name} = {', '.join(f'{value:.4g}' for value in line)}{more}" for name, line in values)
+
+
+def _at(step: Step) -> str:
+    return f"at training step {step.number}"
+
+
+STARTS = 64
+TRIES = 4000
+
+
+def conflict(task: Task, enough: Stop = never) -> Diagnostic:
+    """What to say of a task that no plan was found for: R404, with the requirements that are to blame.
+
+    Those that are proved to have no plan, else what is left where requirements are left out one after the
+    other as long as no plan is found for the rest; that ends where `enough` says so.
+    """
+    proved = [rule for rule in task.rules if _impossible(task, rule)]
+    if proved:
+        return _told(task, proved[:1], _climbed(task, proved[:1], enough), proved=True)
+    core = list(task.rules)
+    nearest = _climbed(task, core, enough)
+    for rule in task.rules:
+        rest = [other for other in core if other is not rule]
+        if not rest or enough():
+            continue
+        found = _climbed(task, rest, enough)
+        if not (bool(found.solved.any()) or _explored(task, rest, enough) or enough()):
+            core, nearest = rest, found
+    return _told(task, core, nearest, proved=False)
+
+
+def refuted(task: Task) -> bool:
+    """Whether it is proved of some requirement that no plan satisfies it, from any of `STARTS` starts."""
+    return any(_impossible(task, rule) for rule in task.rules)
+
+
+def _alone(task: Task, rules: Sequence[CompiledRequirement]) -> Task:
+    return Task(replace(task.compiled, requirements=tuple(rules)), task.plain)
+
+
+def _starts(task: Task) -> torch.Tensor:
+    """Starts that are always the same, (STARTS, n)."""
+    return task.sample(STARTS, generator=torch.Generator().manual_seed(0))
+
+
+def _climbed(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> SearchResult:
+    """The best plans for these requirements alone."""
+    alone, x0 = _alone(task, rules), _starts(task)
+    nothing = x0.new_zeros(0, task.horizon, len(task.system.control_names))
+    return solve(alone, x0, library=nothing, passes=1, tries=TRIES, stop=enough)
+
+
+def _explored(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> bool:
+    """Whether exploration finds a plan for these requirements alone."""
+    generator = torch.Generator().manual_seed(0)
+    found = Exploration(_alone(task, rules)).solved(_starts(task)[:2], EFFORTS[0], generator, ENOUGH, enough)
+    return len(found.rho) > 0
+
+
+def _told(
+    task: Task, core: Sequence[CompiledRequirement], nearest: SearchResult, *, proved: bool
+) -> Diagnostic:
+    names = [f"`{rule.name}`" for rule in core]
+    row = int(nearest.rho.argmax())
+    columns = zip(task.system.signature.columns, nearest.states[row].tolist(), strict=True)
+    start = ", ".join(f"{column.name} = {value:.4g}" for column, value in columns)
+    if proved:
+        message, label = f"no plan satisfies {names[0]}", "out of reach whatever a plan does"
+    elif len(core) == 1:
+        message, label = (
+            f"no plan was found that satisfies {names[0]}",
+            "nothing that was tried satisfies this",
+        )
+    else:
+        message = f"no plan was found that satisfies {_listed(names)} together"
+        label = "not together with the others, as far as was tried"
+    return Diagnostic(
+        "R404",
+        message,
+        core[0].span,
+        label=label,
+        labels=tuple(Label(rule.span, "with this") for rule in core[1:] if rule.span is not None),
+        help=(
+            "ask for less, give it more time (`horizon`) or wider ranges of control, or other initial states",
+            "`stlc compile` shows what is asked for in steps",
+        ),
+        note=(
+            _proof() if proved else _tried(core),
+            f"the nearest misses by {-float(nearest.rho[row]):.4g}, from {start}",
+        ),
+    )
+
+
+def _proof() -> str:
+    return (
+        f"proved from each of {STARTS} starts, by bounds of the states over everything that the controls "
+        "can do within the horizon"
+    )
+
+
+def _tried(core: Sequence[CompiledRequirement]) -> str:
+    """How hard it was searched, and that this is no proof."""
+    rest = "" if len(core) == 1 else "; without one of these requirements some were found"
+    return (
+        f"{TRIES:,} plans were tried for each of {STARTS} starts, and plans were put together step by step "
+        f"from some of them{rest}; that is no proof that there is none"
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+# --------------------------------------------------------------------------------- proofs
+
+
+def _impossible(task: Task, rule: CompiledRequirement) -> bool:
+    """Whether bounds prove that no plan from any of the starts satisfies a requirement."""
+    return all(_most(rule.formula, _reached(task, x.tolist())) < -TOLERANCE for x in _starts(task).double())
+
+
+def _reached(task: Task, x: Sequence[float]) -> list[Mapping[str, Bounds]]:
+    """Between which values every state lies after each number of steps, whatever the controls do."""
+    step, system = task.system.exact_step, task.system
+    low, high = system.control_low.tolist(), system.control_high.tolist()
+    controls = dict(zip(system.control_names, zip(low, high, strict=True), strict=True))
+    here = {name: (value, value) for name, value in zip(task.names, x, strict=True)}
+    reached: list[Mapping[str, Bounds]] = [here]
+    for _ in range(task.horizon):
+        facts = {**here, **controls}
+        for name, num in step.lets:
+            facts |= _known(name, bounds(num, facts))
+        moved = {name: bounds(num, facts) for name, num in step.next.items()}
+        steady = {name: known for name, known in here.items() if name not in moved}
+        here = steady | {name: known for name, known in moved.items() if known is not None}
+        reached.append(here)
+    return reached
+
+
+def _known(name: str, reach: Bounds | None) -> dict[str, Bounds]:
+    return {} if reach is None else {name: reach}
+
+
+def _most(formula: ir.Formula, reached: Sequence[Mapping[str, Bounds]]) -> float:
+    """The greatest robustness that a formula can have at first; inf where the bounds do not say."""
+    return _Most(reached).at(formula, 0)
+
+
+class _Most:
+    """Greatest robustness at every instant of what is reached."""
+
+    def __init__(self, reached: Sequence[Mapping[str, Bounds]]) -> None:
+        self._reached = reached
+        self._known: dict[tuple[ir.Formula, int], float] = {}
+
+    def at(self, formula: ir.Formula, now: int) -> float:
+        """At one instant; beyond the last one anything can be."""
+        if now < 0 or now >= len(self._reached):
+            return math.inf
+        key = formula, now
+        if key not in self._known:
+            self._known[key] = self._of(formula, now)
+        return self._known[key]
+
+    def _of(self, formula: ir.Formula, now: int) -> float:
+        match formula:
+            case ir.Truth(value):
+                return math.inf if value else -math.inf
+            case ir.Predicate():
+                return self._atom(formula, now)
+            case ir.BoolOp(op, items):
+                return (min if op == "and" else max)(self.at(item, now) for item in items)
+            case ir.Temporal(op, window, body):
+                values = [self.at(body, k) for k in self._instants(window, now)]
+                return (min if op == "always" else max)(values, default=math.inf)
+            case ir.Until("until", window, _, right):
+                return max((self.at(right, k) for k in self._instants(window, now)), default=math.inf)
+            case ir.Shift(steps, body):
+                return self.at(body, now + steps)
+            case ir.Freeze(_, body):
+                return self.at(body, now)
+            case _:
+                return math.inf
+
+    def _atom(self, atom: ir.Predicate, now: int) -> float:
+        facts = self._reached[now]
+        if any(isinstance(part, ir.ShiftedSignal) for num in numbers(atom) for part in subexpressions(num)):
+            return math.inf
+        reach = bounds(atom.num, facts)
+        if reach is None or any(map(math.isnan, reach)):
+            return math.inf
+        most = reach[1] if atom.sign > 0 else -reach[0]
+        return math.copysign(math.inf, most + TOLERANCE) if atom.guard else most
+
+    def _instants(self, window: ir.Window, now: int) -> range:
+        last = len(self._reached) - 1 if window.hi is None else now + window.hi
+        return range(now + window.lo, last + 1)
+
+
+SAMPLES = 1024
+NEAR = 1e-6
+"""What rounding may change, relative to 1 or to the value, whichever is larger."""
+ODD = 0.02
+"""Share of samples that may disagree: rounding decides where a switch is nearly tied."""
+
+
+def check_mirror(task: Task) -> None:
+    """Drive random states and their images, and compare.
+
+    Raises SystemFileError (S304) where they differ: the mirror is no symmetry of system and specification.
+    """
+    mirror = task.system.mirror
+    if mirror is None:
+        return
+    generator = torch.Generator().manual_seed(0)
+    x0 = task.sample(SAMPLES, generator=generator, dtype=torch.float64)
+    low, high = task.system.control_low.double(), task.system.control_high.double()
+    shape = (SAMPLES, task.horizon, len(low))
+    u = low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
+    image, there = mirror.states(x0), mirror.plans(u)
+    _compare(task, task.names, mirror.states(image), x0, "the image of the image of a state")
+    _compare(task, task.system.control_names, mirror.plans(there), u, "the image of the image of a control")
+    one, two = task.judge(x0, u), task.judge(image, there)
+    names = tuple(f"`{rule.name}`" for rule in task.rules)
+    last = torch.stack([column[-1] for column in one.columns.values()], -1)
+    moved = torch.stack([column[-1] for column in two.columns.values()], -1)
+    _compare(task, task.names, moved, mirror.states(last), "where the image of a state gets to")
+    there_true, here_true = (satisfied(each.requirements).double() for each in (two, one))
+    _compare(task, names, there_true, here_true, "whether an image satisfies a requirement")
+
+
+def _compare(task: Task, names: tuple[str, ...], found: Tensor, wanted: Tensor, what: str) -> None:
+    """Report the column that differs most, where more of its rows do than a near-tie explains."""
+    found, wanted = found.reshape(-1, len(names)), wanted.reshape(-1, len(names))
+    off = ~torch.isclose(found, wanted, rtol=NEAR, atol=NEAR, equal_nan=True)
+    shares = off.double().mean(0)
+    worst = int(shares.argmax())
+    if float(shares[worst]) <= ODD:
+        return
+    row = int(off[:, worst].nonzero()[0])
+    raise SystemFileError(
+        Diagnostic(
+            "S304",
+            f"the `mirror` of the policy is not a symmetry: {what} differs in {names[worst]}",
+            task.system.decl.policy.mirror_span,
+            "declared here",
+            help=("write the image of every state and control that changes sides, or leave `mirror` out",),
+            note=(
+                f"{float(found[row, worst]):.6g} instead of {float(wanted[row, worst]):.6g} for one of "
+                f"{SAMPLES} random states, and something of the kind for {float(shares[worst]):.0%} of them",
+            ),
+        )
+    )
