@@ -10,8 +10,9 @@ from typing import Any
 from benchmarks.store import BENCHMARKS, Key, Result, ResultStore, inputs_of, load, spec_path
 from stlc.cli.framework.output import say
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.parallel import executor
 from stlc.controller.parallel.bundle import input_files
-from stlc.controller.parallel.jobs import Job, JobResult, executor
+from stlc.controller.parallel.jobs import Job, JobResult
 from stlc.controller.problem.task import satisfied
 from stlc.controller.training.checkpoint import load_checkpoint
 from stlc.controller.training.config import (

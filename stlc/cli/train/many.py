@@ -134,7 +134,7 @@ def train_many(many: Many, *, json: bool) -> NoReturn:
 
 def _backs(many: Many, begun: Callable[[Job], None]) -> Iterator[JobResult]:
     """The runs as they end: of processes here, or of a cluster."""
-    from stlc.controller.parallel.jobs import executor
+    from stlc.controller.parallel import executor
 
     cores, gpus = many.config.threads or 1, int(many.config.device != "cpu")
     jobs = [many.job(part) for part in many.parts]
