@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import torch
 import typer
 
-from benchmarks.options import ResultsOption, SeedsOption, TrainedOption
+from benchmarks.options import ResultsOption, TrainedOption
 from benchmarks.store import BENCHMARKS, Key, Result, ResultStore
 from benchmarks.training import Place, benchmark_order
+from stlc.cli.framework.options import SeedsOption
 from stlc.cli.framework.output import say
 from stlc.cli.framework.ranges import parse_limit, parse_seeds
 from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.options import JsonOption
+from stlc.cli.framework.options import JsonOption, SeedsOption
 from stlc.cli.framework.ranges import parse_clock, parse_seconds, parse_seeds
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.registry import closest
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 OnlyOption = Annotated[
     str | None, typer.Option("--only", metavar="NAMES", help="Some of them; all if not given.")
 ]
-SeedsOption = Annotated[str, typer.Option("--seeds", metavar="SEEDS", help="Such as 0..2 or 0,3.")]
 RunsArgument = Annotated[
     list[str] | None, typer.Argument(metavar="RUN…", help="Runs; the newest one if none.")
 ]

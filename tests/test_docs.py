@@ -25,7 +25,7 @@ from stlc.dynamics.schema.record import reference
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
-PROGRAM: Any = typer.main.get_command(STLC.made())
+PROGRAM: Any = STLC.parser()
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PLACEHOLDERS = re.compile(r"…|\.\.\.")
 
@@ -234,7 +234,7 @@ def test_running_text_names_commands_that_exist():
         assert {word for word in words if word.isidentifier()} <= set(PROGRAM.commands), page
 
 
-BENCHMARKS: Any = typer.main.get_command(MEASURE.made())
+BENCHMARKS: Any = MEASURE.parser()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)

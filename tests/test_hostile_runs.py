@@ -233,8 +233,8 @@ def lived(names: list[str], spec: str, system: str, capsys: pytest.CaptureFixtur
     training = ["--steps", "52", "--batch", "8", "--held-out", "20", "--method", "gradient", "--no-pictures"]
     commands = {
         "train": ["train", "h.stl", "--system", "h.yaml", "--log", "tensorboard", "--json", *training],
-        "simulate": ["simulate", "latest", "--backup", "--seeds", "1", "--json", "--scenario", system],
-        "told": ["simulate", "latest", "--seeds", "1", "--margins", "m.jsonl", "--no-pictures"],
+        "simulate": ["simulate", "latest", "--backup", "--seeds", "0", "--json", "--scenario", system],
+        "told": ["simulate", "latest", "--seeds", "0", "--robustness", "m.jsonl", "--no-pictures"],
         "report": ["report", "latest"],
         "plot": ["plot", "latest", "-o", "p.svg"],
         "check": ["check", "runs/latest/trace.npz"],

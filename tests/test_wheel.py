@@ -113,7 +113,7 @@ THREE = (
         *("train", "specs/traffic.stl", "--system", "car.yaml", "--steps", "3", "--held-out", "100"),
         *("--no-pictures", "--json"),
     ],
-    ["simulate", "--backup", "--seeds", "1", "--steps", "3", "--agents", "4", "--no-pictures", "--json"],
+    ["simulate", "--backup", "--seeds", "0", "--steps", "3", "--agents", "4", "--no-pictures", "--json"],
     ["check", "trace.npz", "--json"],
     ["doctor", "--quick", "--json"],
 )

@@ -63,7 +63,7 @@ def short(words: list[str]) -> list[str]:
             at = words.index("--budget")
             return [*words[:at], "--steps", "15", "--held-out", "200", *words[at + 2 :]]
         case "simulate":
-            return [*words, "--seeds", "1", "--agents", "2", "--steps", "35", "--no-pictures"]
+            return [*words, "--seeds", "0", "--agents", "2", "--steps", "35", "--no-pictures"]
         case _:
             return words
 

@@ -15,14 +15,14 @@ from fuzz_valid import battered
 
 RUN = "runs/small/0001-seed"
 _TRAIN = "train a.stl --system b.yaml --steps 6 --batch 8 --held-out 10 --no-pictures --name seed"
-_DRIVE = "simulate --backup --seeds 1 --steps 4 --agents 2 --no-pictures"
+_DRIVE = "simulate --backup --seeds 0 --steps 4 --agents 2 --no-pictures"
 
 COMMANDS = (
     *("runs show latest", "runs show latest --json", "runs list", "runs list --json", "runs diff latest 1"),
     *("check trace.npz", "check a.stl trace.npz", "explain trace.npz", "system show {run}/system.yaml"),
-    *("simulate --backup --seeds 1 --steps 2 --agents 2 --no-pictures", "explain latest --guarantee"),
+    *("simulate --backup --seeds 0 --steps 2 --agents 2 --no-pictures", "explain latest --guarantee"),
     *(
-        "simulate --seeds 1 --steps 2 --agents 2 --no-pictures",
+        "simulate --seeds 0 --steps 2 --agents 2 --no-pictures",
         "train --resume latest --steps 6 --no-pictures",
     ),
 )

@@ -68,7 +68,7 @@ LEAD_BYTES = 950_000
 def draw(spec: str, scenario: str | None, runs: Path, folder: Path) -> Iterator[Path]:
     """Deploy the newest run of `spec` and draw it; yields what was written."""
     run = RunDir.open(spec, runs)
-    _simulate(run, scenario, "--seeds", "1")
+    _simulate(run, scenario, "--seeds", "0")
     film = film_of(run, title=" · ".join(part for part in (spec, scenario) if part))
     if film is None:
         raise SystemExit(f"{run.shown} could not be drawn")
@@ -103,7 +103,7 @@ def lead(runs: Path, folder: Path, seed: int | None = None) -> Iterator[Path]:
     run = RunDir.open("ship_track", runs)
     size = ("--agents", str(SHIPS), "--steps", str(round(SECONDS / 0.15)))
     seed = _chosen(run, size) if seed is None else seed
-    _simulate(run, "shifted", "--seeds", "1", "--seed", str(seed), *size)
+    _simulate(run, "shifted", "--seeds", str(seed), *size)
     without, guarded = seen_in(run, guarded=False), seen_in(run)
     assert without is not None
     assert guarded is not None
@@ -129,7 +129,7 @@ def lead(runs: Path, folder: Path, seed: int | None = None) -> Iterator[Path]:
 
 def _chosen(run: RunDir, size: tuple[str, ...]) -> int:
     """The first seed in which a ship is unsafe without the guard, and none is lost from its start."""
-    _simulate(run, "shifted", "--seeds", str(len(SEEDS)), *size)
+    _simulate(run, "shifted", "--seeds", f"{SEEDS[0]}..{SEEDS[-1]}", *size)
     unsafe = unsafe_in(run)
     told = ", ".join(f"{sum(len(getattr(u, name)) for u in unsafe)} {word}" for name, word in _TOLD.items())
     print(f"of {SHIPS * len(SEEDS)} ships: {told}", file=sys.stderr)

@@ -17,9 +17,10 @@ import typer
 from numpy.typing import NDArray
 
 from benchmarks.drives import GUARDS, recorded
-from benchmarks.options import Output, RunsArgument, SeedsOption, opened
+from benchmarks.options import Output, RunsArgument, opened
 from benchmarks.table import Table, measured_here, show, write_section
 from benchmarks.timing import WARM, Times, one_thread
+from stlc.cli.framework.options import SeedsOption
 from stlc.cli.framework.program import command
 from stlc.cli.framework.ranges import parse_seeds
 from stlc.controller.deployment.simulator import Recording, Setting

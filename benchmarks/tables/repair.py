@@ -18,10 +18,11 @@ import typer
 from torch import Tensor
 
 from benchmarks.drives import recorded
-from benchmarks.options import Output, RunsArgument, SeedsOption, opened
+from benchmarks.options import Output, RunsArgument, opened
 from benchmarks.table import Table, measured_here, show, write_section
 from benchmarks.tables.latency import AGENTS, picked
 from benchmarks.timing import WARM, Times, one_thread
+from stlc.cli.framework.options import SeedsOption
 from stlc.cli.framework.program import command
 from stlc.cli.framework.ranges import parse_seeds
 from stlc.compile.semantics.semantics import TOLERANCE

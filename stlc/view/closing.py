@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from stlc.escape import operand, shell
@@ -90,11 +90,17 @@ def _simulate(material: Material) -> list[str]:
         words += ["--scenario", str(done["scenario"])]
     seeds = done.get("seeds") or range(10)
     if list(seeds) != list(range(10)):
-        words += ["--seeds", str(len(seeds))] + (["--seed", str(seeds[0])] if seeds[0] else [])
+        words += ["--seeds", _seeds(seeds)]
     for name, usual in (("agents", material.usual.get("agents")), ("steps", material.usual.get("steps"))):
         if done.get(name) not in (None, usual):
             words += [f"--{name}", str(done[name])]
     return words + _limits(done)
+
+
+def _seeds(seeds: Sequence[int]) -> str:
+    """As `--seeds` takes them: `0..9`, or `0,3`."""
+    whole = len(seeds) > 1 and list(seeds) == list(range(seeds[0], seeds[-1] + 1))
+    return f"{seeds[0]}..{seeds[-1]}" if whole else ",".join(map(str, seeds))
 
 
 def _limits(done: Mapping[str, Any]) -> list[str]:

@@ -15,7 +15,7 @@ from stlc.trace.formats import cells as trace_cells
 from stlc.trace.formats import csv as trace_csv
 
 TRAIN = ["train", "specs/cart.stl", "--steps", "2", "--held-out", "40", "--no-pictures"]
-SIMULATE = ["simulate", "--backup", "--seeds", "1", "--steps", "2", "--agents", "2", "--no-pictures"]
+SIMULATE = ["simulate", "--backup", "--seeds", "0", "--steps", "2", "--agents", "2", "--no-pictures"]
 CHECK = ["check", "low.stl", "big.csv"]
 SAID = "did nothing for 0.2 s and was ended"
 

@@ -19,7 +19,7 @@ from stlc.trace import load_trace
 
 ROOT = Path(__file__).parents[2]
 SCENARIO = "scenario: {slippery: {expect: ood, doc: wet leaves, model_mismatch: {vmax: 9 m/s}}}\n"
-SMALL = ["--seeds", "2", "--agents", "4", "--steps", "6", "--no-pictures"]
+SMALL = ["--seeds", "0..1", "--agents", "4", "--steps", "6", "--no-pictures"]
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_the_newest_run_is_simulated_with_and_without_guard(
 def test_a_trace_is_judged_by_the_constants_it_was_driven_with(
     there: RunDir, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    many = ["--seeds", "1", "--agents", "20", "--steps", "50", "--no-pictures", "--json"]
+    many = ["--seeds", "0", "--agents", "20", "--steps", "50", "--no-pictures", "--json"]
     assert main(["simulate", *many, "--set", "x_inter=-19 m", "--set", "vmax=9"]) == 0
     guard = json.loads(capsys.readouterr().out)["result"]["guards"]["none"]
     windows, driven = (
@@ -157,7 +157,7 @@ def test_what_was_driven_is_checked_by_the_rules_that_travel_with_it(
 
 
 def test_without_backup_nothing_is_guarded(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["simulate", there.name, *SMALL, "--seed", "5", "--json"]) == 0
+    assert main(["simulate", there.name, *SMALL, "--seeds", "5..6", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["schema"] == "simulate/1"
     assert misfits(document, load_schema("simulate/1")) == []
@@ -243,9 +243,16 @@ def test_margins_are_measured_and_what_is_wrong_is_told(
 
 
 @pytest.mark.usefixtures("there")
-def test_fail_under_is_exit_code_1() -> None:
-    assert main(["simulate", *SMALL, "--fail-under", "1.01"]) == 1
-    assert main(["simulate", *SMALL, "--fail-under", "0"]) == 0
+def test_fail_under_is_the_share_of_drives_that_satisfy_everything(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    many = ["--seeds", "0..4", "--agents", "20", "--steps", "50", "--no-pictures"]
+    assert main(["simulate", *many, "--json"]) == 0
+    drives = json.loads(capsys.readouterr().out)["result"]["guards"]["none"]["drives"]
+    share = drives["obeyed"] / drives["count"]
+    assert 0.0 < share < 1.0
+    assert main(["simulate", *many, "--fail-under", str(share + 0.001)]) == 1
+    assert main(["simulate", *many, "--fail-under", str(share)]) == 0
 
 
 @pytest.mark.parametrize(
@@ -256,13 +263,13 @@ def test_fail_under_is_exit_code_1() -> None:
         (["--backup", "--guard", "none"], "contradict"),
         (["--no-backup", "--guard", "paper"], "contradict"),
         (["0099"], "0099"),
-        (["--margins", "-", "--json"], "both want the standard output"),
-        (["--margins", "nowhere/m.jsonl"], "cannot write"),
+        (["--robustness", "-", "--json"], "both want the standard output"),
+        (["--robustness", "nowhere/m.jsonl"], "cannot write"),
         (["--scenario", "mismatch-200"], "every system has mismatch-5"),
         (["--margin", "wide"], "`wide` is no margin"),
         (["--guard", "full", "--margin", "gap=1"], "safety requirements: no_collision, give_way, red_light"),
         (["--agents", "63"], "63 cars"),
-        (["--seeds", "0"], "seeds"),
+        (["--seeds", "0..-1"], "seeds"),
     ],
 )
 @pytest.mark.usefixtures("there")
@@ -300,7 +307,7 @@ def test_a_world_that_fails_on_the_way_leaves_a_trace(
 
 def test_margins_come_as_json_lines(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
     """One object an agent and step, whose statuses at the end are those of `stlc check`."""
-    options = [*SMALL, "--steps", "30", "--backup", "--margins", "m.jsonl", "--live"]
+    options = [*SMALL, "--steps", "30", "--backup", "--robustness", "m.jsonl", "--live"]
     assert main(["simulate", there.name, *options]) == 0
     captured = capsys.readouterr()
     assert "step 30 / 30" in captured.err
@@ -324,7 +331,7 @@ def test_margins_come_as_json_lines(there: RunDir, capsys: pytest.CaptureFixture
 
 
 def test_margins_may_be_the_standard_output(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["simulate", there.name, *SMALL, "--margins", "-"]) == 0
+    assert main(["simulate", there.name, *SMALL, "--robustness", "-"]) == 0
     captured = capsys.readouterr()
     assert [json.loads(line)["step"] for line in captured.out.splitlines()][::8] == list(range(7))
     assert "of 8 drives obeyed every rule" in captured.err
@@ -352,7 +359,7 @@ def test_an_interruption_leaves_the_trace_and_the_margins(
         return real(worlds)
 
     monkeypatch.setattr(Worlds, "progress", interrupted)
-    assert main(["simulate", *SMALL, "--live", "--margins", "m.jsonl", "--record", "t.npz"]) == 130
+    assert main(["simulate", *SMALL, "--live", "--robustness", "m.jsonl", "--record", "t.npz"]) == 130
     assert "the first 3 steps are in" in capsys.readouterr().err
     assert load_trace("t.npz").samples == 4
     assert len(Path("m.jsonl").read_text().splitlines()) == 3 * 8

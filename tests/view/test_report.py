@@ -223,10 +223,10 @@ def test_the_deployment_can_be_repeated_as_it_was(deployed):
         return part_of(deployed, repeat_section)
 
     document = json.loads((deployed.path / "eval/simulate.json").read_text())
-    assert f"stlc simulate {deployed.shown} --backup --seeds 2 --agents 10\n" in commands()
+    assert f"stlc simulate {deployed.shown} --backup --seeds 0..1 --agents 10\n" in commands()
     told = {"steps": 70, "agents": 20, "time_limit": None, "margin": {"stop_sign": 0.2}, "ceiling": 0}
     text = commands(**told, scenario="mismatch-20", overrides={"T_red": "3 s"})
-    words = "--backup --scenario mismatch-20 --seeds 2 --steps 70 --time-limit none --margin stop_sign=0.2"
+    words = "--backup --scenario mismatch-20 --seeds 0..1 --steps 70 --time-limit none --margin stop_sign=0.2"
     assert f"{words} --set 'T_red=3 s'\n" in text
     assert "--time-limit" not in commands(time_limit=0.1)
     assert "--time-limit 25ms" in commands(time_limit=0.025)

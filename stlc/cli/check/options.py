@@ -58,9 +58,6 @@ MaxGap = Annotated[
         help="In longer gaps signals are unknown; three steps with --resample, else no gap may be.",
     ),
 ]
-FailUnder = Annotated[
-    float | None, typer.Option(min=0, max=1, help="Exit 0 if this share of starts satisfies all.")
-]
 Out = Annotated[
     Path | None,
     typer.Option(

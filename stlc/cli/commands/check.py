@@ -12,7 +12,7 @@ import typer
 
 from stlc.cli.check import options as given
 from stlc.cli.check.judge import Question, names_of, time_step, usage
-from stlc.cli.framework.options import JsonOption, SetOption, SystemOption, parse_overrides
+from stlc.cli.framework.options import FailUnderOption, JsonOption, SetOption, SystemOption, parse_overrides
 from stlc.cli.framework.output import COLOR, QUIET, emit, emit_json, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
 
@@ -43,7 +43,7 @@ def check(
     resample: given.Resample = None,
     max_gap: given.MaxGap = None,
     dt: given.Step = None,
-    fail_under: given.FailUnder = None,
+    fail_under: FailUnderOption = None,
     out: given.Out = None,
     junit: given.Junit = None,
     jobs: given.Jobs = 1,

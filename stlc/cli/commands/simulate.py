@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 import typer
 
 from stlc.cli.framework.options import (
+    FailUnderOption,
     JsonOption,
     RunArgument,
     RunsOption,
+    SeedsOption,
     SetOption,
     parse_overrides,
 )
 from stlc.cli.framework.program import command
-from stlc.cli.framework.ranges import parse_limit
+from stlc.cli.framework.ranges import parse_limit, parse_seeds
 from stlc.diagnostics import Diagnostic, RunError, UsageError
 
 if TYPE_CHECKING:
@@ -64,9 +66,6 @@ MarginOption = Annotated[
 RecordOption = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Write the trace there too (.npz, .csv, .mcap).")
 ]
-FailUnderOption = Annotated[
-    float | None, typer.Option(metavar="SHARE", help="Exit with 1 if the plan accuracy is less.")
-]
 ScenarioOption = Annotated[
     str | None,
     typer.Option(metavar="NAME", help="An overlay of the system file; all of them, or `disturbed`."),
@@ -75,16 +74,18 @@ LiveOption = Annotated[bool, typer.Option("--live", help="Show margins and decis
 MarginsOption = Annotated[
     str | None,
     typer.Option(
-        metavar="FILE", help="Write the margins there, a JSON object per agent and step; `-` prints them."
+        "--robustness",
+        metavar="FILE",
+        help="Write robustness margins there, a JSON object per agent and step; `-` prints them.",
     ),
 ]
 
 
 @command(
     "stlc simulate --backup",
-    "stlc simulate latest --backup --seeds 20 --record trace.npz",
+    "stlc simulate latest --backup --seeds 0..19 --record trace.npz",
     "stlc simulate specs/ship_track.stl --backup --scenario all",
-    "stlc simulate --backup --seeds 1 --live --margins margins.jsonl",
+    "stlc simulate --backup --seeds 0 --live --robustness robustness.jsonl",
 )
 def simulate(
     run: RunArgument = "latest",
@@ -97,8 +98,7 @@ def simulate(
         int, typer.Option(min=0, help="Visited states to search for a plan, where the followed one fails.")
     ] = 0,
     margin: MarginOption = None,
-    seeds: Annotated[int, typer.Option(min=1, help="How many deployments.")] = 10,
-    seed: Annotated[int, typer.Option(min=0, max=2**62, help="Seed of the first; the others follow.")] = 0,
+    seeds: SeedsOption = "0..9",
     steps: Annotated[int | None, typer.Option(min=1, help="Of each; by default the system's.")] = None,
     agents: Annotated[int | None, typer.Option(min=1, help="In each; by default the system's.")] = None,
     record: RecordOption = None,
@@ -139,13 +139,13 @@ def simulate(
     show_diagnostics(_longer(opened, steps or opened.task.system.decl.test.steps))
     if window:
         require_robots(opened)
-    test, which = opened.task.system.decl.test, tuple(range(seed, seed + seeds))
+    test, which = opened.task.system.decl.test, parse_seeds(seeds)
     size = agents or test.agents, steps or test.steps
     setting = _hurried(Setting(which, *size, test.replan, ceiling=ceiling), time_limit)
     several = _several(opened, scenario)
     order = _Order(opened, chosen, setting, record, live, margins, parse_overrides(set_), _asked(margin))
     document = _all(order, several) if several else _driven(order, scenario)
-    code = 1 if fail_under is not None and _accuracy(document, chosen) < fail_under else 0
+    code = 1 if fail_under is not None and _satisfied(document, chosen) < fail_under else 0
     if not json:  # before the pictures: they must not change what was measured
         _print(screen(document, windows=windows), printed)
     drawn = draw(opened) if pictures else {}
@@ -226,8 +226,8 @@ def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
     if margins != STANDARD_OUTPUT:
         return emit
     if json:
-        message = "`--json` and `--margins -` both want the standard output"
-        raise UsageError(Diagnostic("U101", message, help=("--margins margins.jsonl",)))
+        message = "`--json` and `--robustness -` both want the standard output"
+        raise UsageError(Diagnostic("U101", message, help=("--robustness robustness.jsonl",)))
     return say
 
 
@@ -249,10 +249,10 @@ def _needed_system(run: Run) -> str | None:
     return f"{run.dir.shown}/system.yaml" if run.task.system.decl.functions else None
 
 
-def _accuracy(document: Record, guard: Mode) -> float:
-    """The plan accuracy, the least one over all scenarios that were driven."""
-    each = [document, *document.get("scenarios", {}).values()]
-    return min(float(one["guards"][guard]["metrics"]["plan_accuracy"]["mean"]) for one in each)
+def _satisfied(document: Record, guard: Mode) -> float:
+    """The share of drives that satisfy everything, the least one over all scenarios that were driven."""
+    each = [one["guards"][guard]["drives"] for one in (document, *document.get("scenarios", {}).values())]
+    return min(float(drives["obeyed"] / drives["count"]) for drives in each)
 
 
 def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Record:

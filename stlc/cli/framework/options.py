@@ -42,6 +42,17 @@ SpecsArgument = Annotated[
     list[str] | None,
     typer.Argument(metavar="FILE…", help="Specifications, folders, or -; the current folder if none."),
 ]
+SeedsOption = Annotated[str, typer.Option("--seeds", metavar="SEEDS", help="Such as 0..9 or 0,3.")]
+FailUnderOption = Annotated[
+    float | None,
+    typer.Option(
+        "--fail-under",
+        metavar="SHARE",
+        min=0,
+        max=1,
+        help="Exit with 1 if a smaller share satisfies everything, else with 0.",
+    ),
+]
 RunsOption = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Folder of all runs.")]
 SetOption = Annotated[
     list[str] | None,

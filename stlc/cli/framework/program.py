@@ -159,12 +159,13 @@ class Program:
             self._add(app, name)
         return app
 
-    def parser(self, name: str) -> Any:
-        """The parser of one command, or of the program, made once in a process."""
-        key = (self.package, name if name in self.names() else "")
+    def parser(self, only: str = "") -> Any:
+        """The parser of one command, or of the program, made once in a process; see `name_values`."""
+        key = (self.package, only if only in self.names() else "")
         if key not in _PARSERS:
-            _PARSERS[key] = typer.main.get_command(self.made(name))
+            _PARSERS[key] = typer.main.get_command(self.made(only))
             spare_adapters(_PARSERS[key])
+            name_values(_PARSERS[key])
         return _PARSERS[key]
 
     def _add(self, app: typer.Typer, name: str) -> None:
@@ -284,7 +285,34 @@ def _stoppable() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-# ------------------------------------------------------- values of options without pydantic
+# ------------------------------------------------------- values of options: names, and no pydantic
+
+_METAVARS = {"int": "N", "float": "X", "str": "TEXT", "Path": "PATH"}
+_METAVARS |= {"integer": "N", "integer range": "N", "float range": "X", "text": "TEXT", "path": "PATH"}
+
+
+def _params(command: Any) -> Iterator[Any]:
+    """The parameters of a command and of those below it."""
+    queue = [command]
+    while queue:
+        entry = queue.pop()
+        queue.extend(getattr(entry, "commands", {}).values())
+        yield from getattr(entry, "params", ())
+        yield from _help_option(entry)
+
+
+def name_values(command: Any) -> None:
+    """Give options without a metavar one that says what is expected: no types of Python in a help text."""
+    for param in _params(command):
+        if hasattr(param, "display_type_rich") and param.param_type_name == "argument":
+            param.display_type_rich = lambda **_: ""  # its metavar says it
+        if param.metavar is None and param.param_type_name == "option" and not param.is_flag:
+            kind = getattr(getattr(param, "type_descriptor", None), "annotation", None)
+            words = get_args(kind) or getattr(getattr(param, "type", None), "choices", ())
+            name = getattr(kind, "__name__", getattr(getattr(param, "type", None), "name", ""))
+            param.metavar = "|".join(map(str, words)) if words else _METAVARS.get(name)
+
+
 #
 # Newer releases of typer build a pydantic adapter for every parameter of a command that runs, which takes a
 # tenth of a second. Most values are texts already; they are passed on, and typer converts the others.
@@ -295,13 +323,9 @@ _SLOT = "_runtime_param"
 
 def spare_adapters(command: Any) -> None:
     """Let the parameters of a command, and of those below it, convert only what needs it."""
-    queue = [command]
-    while queue:
-        entry = queue.pop()
-        queue.extend(getattr(entry, "commands", {}).values())
-        for param in (*getattr(entry, "params", ()), *_help_option(entry)):
-            if getattr(param, _SLOT, param) is None and hasattr(param, "type_descriptor"):
-                setattr(param, _SLOT, _AsGiven())
+    for param in _params(command):
+        if getattr(param, _SLOT, param) is None and hasattr(param, "type_descriptor"):
+            setattr(param, _SLOT, _AsGiven())
 
 
 def _help_option(command: Any) -> list[Any]:

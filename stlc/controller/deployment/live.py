@@ -61,7 +61,7 @@ class LiveMonitor:
         return f"{name} T0={t0}" if name == "backup" else name
 
     def records(self) -> Iterator[dict[str, Any]]:
-        """The present moment, one object an agent: the lines of `--margins`."""
+        """The present moment, one object an agent: the lines of `--robustness`."""
         assert self.moment is not None
         margins, decision = self.margins, self.moment.decision
         for row in range(len(self.moment.x)):
