@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from stlc.compile.ir.functions import callable_names
-from stlc.editor.document import Document
+from stlc.editor.document import Document, shared
 from stlc.editor.hover import about, about_shared, summary
-from stlc.editor.modules import shared
 from stlc.editor.symbols import inside
 from stlc.editor.vocabulary import BUILT_IN, FUNCTIONS, KEYWORDS, TAGS, TEMPORAL, TYPES
 from stlc.grammar import ast

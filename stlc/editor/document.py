@@ -2,22 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import re
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 
+from stlc.compile.frontend.declare import ranged
+from stlc.compile.frontend.evaluate import evaluate
+from stlc.compile.frontend.expressions import resolve_formula
+from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.modules import Module, load_modules
-from stlc.compile.ir.discretize import Grid
-from stlc.diagnostics import Diagnostic, Label, StlcError
+from stlc.compile.frontend.resolve import declared
+from stlc.compile.frontend.scope import Definition, Failed, Known, Scope
+from stlc.compile.frontend.values import Value
+from stlc.compile.ir import typed
+from stlc.compile.ir.discretize import Grid, to_window
+from stlc.compile.ir.nodes import Window
+from stlc.compile.ir.support import reach
+from stlc.compile.lowering.lower import lower
+from stlc.compile.lowering.simplify import simplify
+from stlc.diagnostics import Diagnostic, Label, SpecError, StlcError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.load import load_system_decl
-from stlc.editor.meaning import Meaning, understand
-from stlc.editor.reading import read
-from stlc.editor.symbols import Names, names_of
+from stlc.editor.symbols import Names, Symbol, names_of
 from stlc.files import find_system
 from stlc.grammar import ast
+from stlc.grammar.children import descendants
+from stlc.grammar.parse.parser import parse
+from stlc.grammar.scan import declaration_starts, lexemes
 from stlc.lint.lint import Surroundings, lint
+from stlc.signature import Column
 from stlc.source import Source, Span
+from stlc.units import Unit
 
 _ONLY_FOR_TRAINING = frozenset({"E306", "E307", "E309", "E310", "E312"})
 _MAX_LABELS = 8
@@ -153,3 +171,241 @@ def look_at(source: Source, systems: Systems) -> Document:
         reason = (error.strerror or type(error).__name__).lower()
         finding = Diagnostic("U102", f"cannot read `{spec.system}`: {reason}")
         return Document(source, spec, unread, None, (finding,))
+
+
+# ---------------------------------------------------------------------- reading
+
+
+_ROUNDS = 8
+_INK = re.compile(r"[^\r\n]")
+
+
+def read(source: Source) -> tuple[ast.Spec, tuple[Diagnostic, ...]]:
+    """The tree of everything that can be read, and what is wrong with the rest.
+
+    Spans of the tree point into `source` or into a text of the same length.
+    """
+    try:
+        return parse(source), ()
+    except SpecError as error:
+        findings = error.diagnostics
+    kept = source
+    faults = findings
+    for _ in range(_ROUNDS):
+        kept = _without(kept, faults)
+        try:
+            return parse(kept), findings
+        except SpecError as error:
+            faults = error.diagnostics
+    return parse(Source(source.name, _INK.sub(" ", source.text))), findings
+
+
+def _without(source: Source, faults: tuple[Diagnostic, ...]) -> Source:
+    """The text with every declaration blanked out that holds one of the faults; all of it if none does."""
+    starts = declaration_starts(source.text)
+    ends = [*starts[1:], len(source.text)]
+    text = source.text
+    places = [fault.span.start for fault in faults if fault.span is not None]
+    for place in places:
+        index = bisect_right(starts, place) - 1
+        start, end = starts[index], ends[index]
+        if not text[start:end].strip() and index:
+            start = starts[index - 1]
+        text = text[:start] + _INK.sub(" ", text[start:end]) + text[end:]
+    return Source(source.name, text if places and text != source.text else _INK.sub(" ", source.text))
+
+
+# ---------------------------------------------------------------------- meaning
+
+
+_OUTWARD = ("always", "historically", "release")
+
+
+@dataclass(frozen=True, slots=True)
+class Meaning:
+    """A specification as far as it can be understood.
+
+    Attributes:
+        scope: the names of the file.
+        columns: signals and parameters by the name of their declaration, with their ranges.
+        formulas: requirements and assumptions, and definitions without arguments that are formulas.
+        grid: of the system; empty where there is none.
+        interface: of the system, if there is one.
+    """
+
+    scope: Scope
+    columns: Mapping[str, tuple[Column, ...]]
+    formulas: Mapping[str, typed.Formula]
+    grid: Grid
+    interface: Interface | None = field(default=None, repr=False)
+
+    def value(self, name: str) -> Value | None:
+        """What a signal, constant, region or definition without arguments is; None where that fails."""
+        entry = self.scope.entries.get(name)
+        if isinstance(entry, Known):
+            return entry.value
+        if not isinstance(entry, Definition) or entry.formals or entry.span is None:
+            return None
+        try:
+            with self.scope.meter.fresh():
+                return evaluate(ast.Name(entry.span, name, quoted=True), self.scope)
+        except Failed:
+            return None
+
+    def steps(self, name: str) -> int | None:
+        """How many steps ahead a formula looks; None where the grid does not say."""
+        formula = self.formulas.get(name)
+        if formula is None:
+            return None
+        sink: list[Diagnostic] = []
+        lowered = lower(formula, self.grid, sink)
+        if any(finding.severity == "error" for finding in sink):
+            return None
+        return reach(simplify(lowered)).future
+
+    def interval(self, span: Span) -> tuple[typed.Interval, Window | None] | None:
+        """The interval that is written at `span`, and its window in steps where the grid is known."""
+        for formula in self.formulas.values():
+            for node in _temporal(formula):
+                if node.interval.span == span:
+                    return node.interval, self._window(node)
+        return None
+
+    def _window(self, node: typed.Temporal | typed.Until) -> Window | None:
+        sink: list[Diagnostic] = []
+        window = to_window(node.interval, self.grid, sink, outward=node.op in _OUTWARD)
+        return None if any(finding.severity == "error" for finding in sink) else window
+
+
+def understand(
+    spec: ast.Spec, modules: tuple[Module, ...], *, interface: Interface | None, grid: Grid
+) -> Meaning:
+    """What can be understood of a specification; findings are dropped, the compiler reports them."""
+    scope = Scope(temporal=True, time_unit=spec.time_unit)
+    file = declared(spec, modules, interface, {}, scope)
+    columns = {decl.name: _ranged(decl, plain, unit, file.scope) for decl, plain, unit in file.found.columns}
+    meaning = Meaning(file.scope, columns, {}, grid, interface)
+    return replace(meaning, formulas=_formulas(spec, meaning))
+
+
+def _ranged(
+    decl: ast.Signal | ast.Param, plain: tuple[Column, ...], unit: Unit, scope: Scope
+) -> tuple[Column, ...]:
+    try:
+        return ranged(plain, unit, decl, scope)
+    except Failed:
+        return plain
+
+
+def _formulas(spec: ast.Spec, meaning: Meaning) -> dict[str, typed.Formula]:
+    """By name; a requirement wins over a definition of the same name."""
+    found: dict[str, typed.Formula] = {}
+    for item in spec.items:
+        if isinstance(item, ast.Def):
+            value = meaning.value(item.name)
+            if isinstance(value, typed.Node):
+                found[item.name] = value
+    for item in spec.items:
+        if isinstance(item, ast.Require | ast.Assume):
+            try:
+                found[item.name] = resolve_formula(item.formula, meaning.scope)
+            except Failed:
+                continue
+    return found
+
+
+def _temporal(formula: object) -> Iterator[typed.Temporal | typed.Until]:
+    """Every temporal operator of a formula."""
+    if isinstance(formula, tuple):
+        for part in formula:
+            yield from _temporal(part)
+    elif isinstance(formula, typed.Node):
+        if isinstance(formula, typed.Temporal | typed.Until):
+            yield formula
+        for one in fields(formula):
+            if one.name not in ("span", "interval", "num"):
+                yield from _temporal(getattr(formula, one.name))
+
+
+# ---------------------------------------------------------------------- modules
+
+
+@dataclass(frozen=True, slots=True)
+class Borrowed:
+    """A name behind a dot.
+
+    Attributes:
+        span: of the name.
+        module: where it comes from.
+        item: its declaration there; None where the module has no such name.
+    """
+
+    span: Span
+    module: Module
+    item: ast.Item | None
+
+
+def shared(module: Module) -> tuple[ast.Item, ...]:
+    """What can be used of a module; its requirements are its own."""
+    return tuple(item for item in module.spec.items if not isinstance(item, ast.Require | ast.Assume))
+
+
+def borrowed_at(spec: ast.Spec, modules: tuple[Module, ...], offset: int) -> Borrowed | None:
+    """The name of a module that a cursor at `offset` touches."""
+    by_alias = {module.alias: module for module in modules}
+    for node in (part for item in spec.items for part in descendants(item)):
+        if not isinstance(node, ast.Attr) or not isinstance(node.base, ast.Name):
+            continue
+        if node.base.name not in by_alias:
+            continue
+        words = list(lexemes(node.span.source.text, node.base.span.end, node.span.end))
+        span = node.span.source.span(words[-1].start, words[-1].end)
+        if span.start <= offset <= span.end:
+            module = by_alias[node.base.name]
+            item = next((item for item in shared(module) if item.name == node.name), None)
+            return Borrowed(span, module, item)
+    return None
+
+
+# ---------------------------------------------------------------------- navigation
+
+
+def definition(document: Document, offset: int) -> tuple[Span, ...]:
+    """Where to go from a cursor.
+
+    From a use to the declaration; from the declaration of a signal, a parameter or a constant to the system
+    file that has it too; from `system "file"` into that file; from `module.name` into the module.
+    """
+    place = document.spec.system_span
+    if place is not None and place.start <= offset <= place.end:
+        return () if document.system is None else (document.system.source.span(0, 0),)
+    borrowed = borrowed_at(document.spec, document.modules, offset)
+    if borrowed is not None:
+        return () if borrowed.item is None else (borrowed.item.name_span,)
+    found = document.names.at(offset)
+    if found is None:
+        return ()
+    if not found.declares:
+        return (found.symbol.span,)
+    beyond = system_place(document, found.symbol)
+    return (found.symbol.span if beyond is None else beyond,)
+
+
+def system_place(document: Document, symbol: Symbol) -> Span | None:
+    """Where the system file declares a symbol, if it does."""
+    if document.system is None or symbol.kind not in ("signal", "param", "const", "extern"):
+        return None
+    item = symbol.item
+    name = item.column or symbol.name if isinstance(item, ast.Signal) else symbol.name
+    return document.system.places.get(name)
+
+
+def outline(document: Document) -> tuple[tuple[Symbol, Span], ...]:
+    """The declarations of a file, in order, each with all of its text."""
+    names = document.names
+    found = [
+        (one.symbol, one.symbol.item.span)
+        for one in names.occurrences
+        if one.declares and one.symbol.item is not None and one.symbol.kind not in ("argument", "member")
+    ]
+    return tuple(found)

@@ -11,8 +11,7 @@ from stlc.compile.frontend.values import Number, Value, Vector, describe
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, in_words
 from stlc.compile.ir.nodes import Window
-from stlc.editor.document import Document
-from stlc.editor.modules import borrowed_at
+from stlc.editor.document import Document, borrowed_at
 from stlc.editor.symbols import Symbol
 from stlc.editor.vocabulary import BUILT_IN, FUNCTIONS, KEYWORDS, TAGS, TEMPORAL, TYPES
 from stlc.escape import markdown, markdown_code, screen

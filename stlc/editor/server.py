@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Any
+import re
+from bisect import bisect_right
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 from lsprotocol import types as lsp
 from pygls import uris
 from pygls.exceptions import JsonRpcInvalidParams
 from pygls.lsp.server import LanguageServer
 
-from stlc.diagnostics import SpecError
-from stlc.editor import translate
-from stlc.editor.completion import complete
-from stlc.editor.document import Document, Systems, look_at
+from stlc.diagnostics import Diagnostic, SpecError
+from stlc.editor.completion import Kind as OfferKind
+from stlc.editor.completion import Offer, complete
+from stlc.editor.document import Document, Finding, Systems, definition, look_at, outline, system_place
 from stlc.editor.hover import hover, summary
-from stlc.editor.navigation import definition, outline, system_place
-from stlc.editor.positions import Encoding, Layout, Place
 from stlc.editor.rename import RenameError, can_rename, rename
+from stlc.editor.symbols import Kind
 from stlc.grammar.format.format import format_text
-from stlc.source import Source
+from stlc.source import Source, Span
 from stlc.version import __version__
 
 
@@ -63,7 +67,7 @@ class Server(LanguageServer):
     def publish(self, uri: str) -> None:
         """Look at a text and tell the client what was found."""
         findings = self.look(uri).findings
-        shown = [translate.diagnostic(finding, self.encoding) for finding in findings]
+        shown = [diagnostic(finding, self.encoding) for finding in findings]
         self._publish(uri, shown)
 
     def clear(self, uri: str) -> None:
@@ -114,29 +118,29 @@ def _hover(server: Server, params: lsp.HoverParams) -> lsp.Hover | None:
         return None
     span, text = found
     content = lsp.MarkupContent(lsp.MarkupKind.Markdown, text)
-    return lsp.Hover(content, translate.range_of(span, server.encoding))
+    return lsp.Hover(content, range_of(span, server.encoding))
 
 
 def _completion(server: Server, params: lsp.CompletionParams) -> lsp.CompletionList:
     document = server.document(params.text_document.uri)
     offset = server.offset(document, params.position)
     found = complete(document, offset)
-    place = translate.range_of(document.source.span(found.start, offset), server.encoding)
-    items = [translate.completion_item(offer, place) for offer in found.offers]
+    place = range_of(document.source.span(found.start, offset), server.encoding)
+    items = [completion_item(offer, place) for offer in found.offers]
     return lsp.CompletionList(is_incomplete=False, items=items)
 
 
 def _definition(server: Server, params: lsp.DefinitionParams) -> list[lsp.Location]:
     document = server.document(params.text_document.uri)
     spans = definition(document, server.offset(document, params.position))
-    return [translate.location(span, server.encoding) for span in spans]
+    return [location(span, server.encoding) for span in spans]
 
 
 def _implementation(server: Server, params: lsp.ImplementationParams) -> list[lsp.Location]:
     document = server.document(params.text_document.uri)
     found = document.names.at(server.offset(document, params.position))
     place = None if found is None else system_place(document, found.symbol)
-    return [] if place is None else [translate.location(place, server.encoding)]
+    return [] if place is None else [location(place, server.encoding)]
 
 
 def _references(server: Server, params: lsp.ReferenceParams) -> list[lsp.Location]:
@@ -146,7 +150,7 @@ def _references(server: Server, params: lsp.ReferenceParams) -> list[lsp.Locatio
         return []
     places = document.names.of(found.symbol)
     wanted = [one for one in places if params.context.include_declaration or not one.declares]
-    return [translate.location(one.span, server.encoding) for one in wanted]
+    return [location(one.span, server.encoding) for one in wanted]
 
 
 def _symbols(server: Server, params: lsp.DocumentSymbolParams) -> list[lsp.DocumentSymbol]:
@@ -155,9 +159,9 @@ def _symbols(server: Server, params: lsp.DocumentSymbolParams) -> list[lsp.Docum
         lsp.DocumentSymbol(
             name=symbol.name,
             detail=summary(document, symbol),
-            kind=translate.SYMBOLS[symbol.kind],
-            range=translate.range_of(whole, server.encoding),
-            selection_range=translate.range_of(symbol.span, server.encoding),
+            kind=SYMBOLS[symbol.kind],
+            range=range_of(whole, server.encoding),
+            selection_range=range_of(symbol.span, server.encoding),
         )
         for symbol, whole in outline(document)
     ]
@@ -169,7 +173,7 @@ def _symbols(server: Server, params: lsp.DocumentSymbolParams) -> list[lsp.Docum
 def _prepare_rename(server: Server, params: lsp.PrepareRenameParams) -> lsp.Range | None:
     document = server.document(params.text_document.uri)
     found = can_rename(document, server.offset(document, params.position))
-    return None if found is None else translate.range_of(found.span, server.encoding)
+    return None if found is None else range_of(found.span, server.encoding)
 
 
 def _rename(server: Server, params: lsp.RenameParams) -> lsp.WorkspaceEdit:
@@ -178,7 +182,7 @@ def _rename(server: Server, params: lsp.RenameParams) -> lsp.WorkspaceEdit:
         edits = rename(document, server.offset(document, params.position), params.new_name)
     except RenameError as error:
         raise JsonRpcInvalidParams(str(error)) from None
-    changes = [translate.text_edit(span, text, server.encoding) for span, text in edits]
+    changes = [text_edit(span, text, server.encoding) for span, text in edits]
     return lsp.WorkspaceEdit(changes={params.text_document.uri: changes})
 
 
@@ -191,7 +195,7 @@ def _formatting(server: Server, params: lsp.DocumentFormattingParams) -> list[ls
         return []
     if text == source.text:
         return []
-    return [translate.text_edit(source.span(0, len(source.text)), text, server.encoding)]
+    return [text_edit(source.span(0, len(source.text)), text, server.encoding)]
 
 
 def _actions(server: Server, params: lsp.CodeActionParams) -> list[lsp.CodeAction]:
@@ -204,12 +208,12 @@ def _actions(server: Server, params: lsp.CodeActionParams) -> list[lsp.CodeActio
         fix = finding.diagnostic.fix
         if fix is None or finding.span.end < first or finding.span.start > last:
             continue
-        edits = [translate.text_edit(span, text, server.encoding) for span, text in fix.edits]
+        edits = [text_edit(span, text, server.encoding) for span, text in fix.edits]
         actions.append(
             lsp.CodeAction(
                 title=f"write `{fix.text}`" if fix.text else f"mend {finding.diagnostic.code}",
                 kind=lsp.CodeActionKind.QuickFix,
-                diagnostics=[translate.diagnostic(finding, server.encoding)],
+                diagnostics=[diagnostic(finding, server.encoding)],
                 edit=lsp.WorkspaceEdit(changes={uri: edits}),
             )
         )
@@ -236,3 +240,166 @@ _FEATURES: dict[str, tuple[Any, Any]] = {
         lsp.CodeActionOptions(code_action_kinds=[lsp.CodeActionKind.QuickFix]),
     ),
 }
+
+
+# ---------------------------------------------------------------------- translate
+
+
+SYMBOLS: dict[Kind, lsp.SymbolKind] = {
+    "signal": lsp.SymbolKind.Variable,
+    "param": lsp.SymbolKind.Variable,
+    "const": lsp.SymbolKind.Constant,
+    "enum": lsp.SymbolKind.Enum,
+    "member": lsp.SymbolKind.EnumMember,
+    "region": lsp.SymbolKind.Object,
+    "def": lsp.SymbolKind.Function,
+    "extern": lsp.SymbolKind.Function,
+    "require": lsp.SymbolKind.Event,
+    "assume": lsp.SymbolKind.Event,
+    "argument": lsp.SymbolKind.Variable,
+    "variable": lsp.SymbolKind.Variable,
+    "module": lsp.SymbolKind.Module,
+}
+_OFFERS: dict[OfferKind, lsp.CompletionItemKind] = {
+    "keyword": lsp.CompletionItemKind.Keyword,
+    "function": lsp.CompletionItemKind.Function,
+    "unit": lsp.CompletionItemKind.Unit,
+    "tag": lsp.CompletionItemKind.Property,
+    "type": lsp.CompletionItemKind.Class,
+    "signal": lsp.CompletionItemKind.Variable,
+    "constant": lsp.CompletionItemKind.Constant,
+    "name": lsp.CompletionItemKind.Reference,
+    "member": lsp.CompletionItemKind.EnumMember,
+}
+
+
+def position(place: Place) -> lsp.Position:
+    """A place."""
+    return lsp.Position(place.line, place.column)
+
+
+def range_of(span: Span, encoding: Encoding) -> lsp.Range:
+    """A span of its own text."""
+    layout = Layout(span.source.text, encoding)
+    return lsp.Range(position(layout.place(span.start)), position(layout.place(span.end)))
+
+
+def location(span: Span, encoding: Encoding) -> lsp.Location:
+    """A span and the file that it is in."""
+    return lsp.Location(uri_of(span.source.name), range_of(span, encoding))
+
+
+def uri_of(name: str) -> str:
+    """The address of a file; a text that has none yet keeps the address that it was opened under."""
+    if "://" in name or name.startswith("untitled:"):
+        return name
+    return uris.from_fs_path(str(Path(name).resolve())) or name
+
+
+def diagnostic(finding: Finding, encoding: Encoding) -> lsp.Diagnostic:
+    """A finding, its secondary places and its advice."""
+    inner = finding.diagnostic
+    warns = finding.mild or inner.severity == "warning"
+    return lsp.Diagnostic(
+        range=range_of(finding.span, encoding),
+        message="\n".join(_lines(inner)),
+        severity=lsp.DiagnosticSeverity.Warning if warns else lsp.DiagnosticSeverity.Error,
+        code=inner.code,
+        source="stlc",
+        related_information=[
+            lsp.DiagnosticRelatedInformation(location(label.span, encoding), label.text or "see here")
+            for label in inner.labels
+        ],
+    )
+
+
+def _lines(finding: Diagnostic) -> list[str]:
+    head = f"{finding.message}: {finding.label}" if finding.label else finding.message
+    advice = [f"help: {line}" for line in finding.help]
+    fix = [] if finding.fix is None or not finding.fix.text else [f"fix: {finding.fix.text}"]
+    return [head, *advice, *fix, *(f"note: {line}" for line in finding.note)]
+
+
+def text_edit(span: Span, text: str, encoding: Encoding) -> lsp.TextEdit:
+    """A replacement."""
+    return lsp.TextEdit(range_of(span, encoding), text)
+
+
+def completion_item(offer: Offer, place: lsp.Range) -> lsp.CompletionItem:
+    """An offer, in place of what is written already."""
+    return lsp.CompletionItem(
+        label=offer.text,
+        kind=_OFFERS[offer.kind],
+        detail=offer.detail or None,
+        documentation=lsp.MarkupContent(lsp.MarkupKind.Markdown, offer.doc) if offer.doc else None,
+        sort_text=f"{offer.order}{offer.text}",
+        filter_text=offer.text,
+        text_edit=lsp.TextEdit(place, offer.text),
+    )
+
+
+# ---------------------------------------------------------------------- positions
+
+
+Encoding: TypeAlias = Literal["utf-8", "utf-16", "utf-32"]
+"""What a column counts: bytes, 16-bit units, or characters."""
+
+_BREAK = re.compile(r"\r\n|\r|\n")
+
+
+class Place(NamedTuple):
+    """A line and a column, both counted from 0."""
+
+    line: int
+    column: int
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The lines of a text. Columns beyond the end of a line mean its end, lines beyond the last the end."""
+
+    text: str
+    encoding: Encoding = "utf-16"
+
+    @cached_property
+    def _lines(self) -> tuple[tuple[int, int], ...]:
+        """First offset of every line, and the offset of its break."""
+        breaks = [(match.start(), match.end()) for match in _BREAK.finditer(self.text)]
+        starts = [0, *(end for _, end in breaks)]
+        ends = [*(start for start, _ in breaks), len(self.text)]
+        return tuple(zip(starts, ends, strict=True))
+
+    def place(self, offset: int) -> Place:
+        """Where the character at `offset` stands."""
+        offset = min(max(offset, 0), len(self.text))
+        row = bisect_right(self._lines, offset, key=lambda line: line[0]) - 1
+        start, end = self._lines[row]
+        return Place(row, self._units(self.text[start : min(offset, end)]))
+
+    def offset(self, place: Place) -> int:
+        """The offset of a place; a column inside of a character means the character."""
+        if place.line < 0:
+            return 0
+        if place.line >= len(self._lines):
+            return len(self.text)
+        start, end = self._lines[place.line]
+        left = place.column
+        for index in range(start, end):
+            left -= self._units(self.text[index])
+            if left < 0:
+                return index
+        return end
+
+    @property
+    def end(self) -> Place:
+        """Behind the last character."""
+        return self.place(len(self.text))
+
+    def _units(self, text: str) -> int:
+        match self.encoding:
+            case "utf-8":
+                return len(text.encode("utf-8", "surrogatepass"))
+            case "utf-16":
+                return len(text) + sum(char > "\uffff" for char in text)
+            case _:
+                return len(text)

@@ -18,14 +18,10 @@ from stlc.rundir import RunDir
 from stlc.trace import Trace, load_trace
 from stlc.view import bullet
 from stlc.view.chart import Chart, chart_film, chart_of
-from stlc.view.driven import monitor_of, trace_names
-from stlc.view.events import Event, events_of, marks
-from stlc.view.film import MAX_BYTES, MAX_FRAMES, Film, Taped, save_film, save_still
-from stlc.view.margins import Judged, judged_in, strip_of
+from stlc.view.film import MAX_BYTES, MAX_FRAMES, Film, Taped, encoder, save_film, save_still
+from stlc.view.judged import Event, Judged, events_of, judged_in, marks, monitor_of, strip_of, trace_names
 from stlc.view.scene import Key, Scene, Staging, frames_of, keys_of, ratio_of, scene_film
-from stlc.view.signal_film import signal_film
-from stlc.view.strip import Strip
-from stlc.view.video import encoder
+from stlc.view.signals import Strip, decisions_of, signal_film
 
 if TYPE_CHECKING:
     from stlc.controller.world import WorldType
@@ -310,7 +306,7 @@ def _trace_shots(run: RunDir) -> list[Shot]:
             dt=film.dt,
             t0=trace.t0,
             keys=(),
-            strip=None if judged is None else strip_of(judged, _decisions(trace)),
+            strip=None if judged is None else strip_of(judged, _decisions_shown(trace)),
             events=() if judged is None else tuple(events_of(judged.drove, trace.traces)),
             names=tuple(trace_names(trace)),
             requirements=() if judged is None else tuple(j.name for j in judged.drove),
@@ -319,13 +315,12 @@ def _trace_shots(run: RunDir) -> list[Shot]:
     ]
 
 
-def _decisions(trace: Trace) -> NDArray[np.int64] | None:
-    """Who decided, (samples, traces); None where that was not recorded."""
-    recorded = trace.extras.get("decision")
-    if recorded is None or recorded.shape != (trace.traces, trace.samples - 1):
+def _decisions_shown(trace: Trace) -> NDArray[np.int64] | None:
+    """Source of the decision at every sample, (samples, traces); None where it was not recorded."""
+    decided = decisions_of(trace)
+    if decided is None or decided.shape[1] != trace.samples - 1:
         return None
-    decided = recorded.T.astype(np.int64)
-    return np.concatenate((decided, decided[-1:]))
+    return np.concatenate((decided.T, decided.T[-1:]))
 
 
 def _scenario(run: RunDir) -> str | None:

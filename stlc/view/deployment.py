@@ -6,9 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from stlc.controller.evaluation.metrics import HOLDS, METRICS, is_progress
-from stlc.view.html import Child, Html, classed, el, join, table
+from stlc.view.html import Child, Html, Section, classed, el, join, table
 from stlc.view.material import Material
-from stlc.view.page import Section
 from stlc.view.words import cause_words, count, drives_of, seconds, share, spread
 
 Record = Mapping[str, Any]

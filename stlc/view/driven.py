@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,16 +10,14 @@ from numpy.typing import NDArray
 from stlc.compile.ir.traverse import margin_unit
 from stlc.diagnostics import StlcError
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse
 from stlc.monitor.explain.report import Cause, explain_all
 from stlc.monitor.prepared import beside
 from stlc.monitor.verdict import Judgement, Monitor, Verdict
-from stlc.source import Source
 from stlc.trace import Trace
 from stlc.view.chart import chart_of, draw_chart
-from stlc.view.html import Child, Html, classed, el, figure, join, table
+from stlc.view.html import Child, Html, Section, classed, el, figure, join, table
+from stlc.view.judged import judged_once, margins_of, monitor_of, trace_names, units_of
 from stlc.view.material import Material, untagged
-from stlc.view.page import Section
 from stlc.view.signals import DECISIONS, POLICY, acted_in, choose_traces, draw_signals, left_out
 from stlc.view.words import count, share
 
@@ -81,50 +77,6 @@ def _rules_part(material: Material, trace: Trace, names: list[str]) -> Html | No
     )
 
 
-def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None, drives: bool = False) -> Monitor:
-    """What judges a trace: by the specification that it carries, or else by `text`.
-
-    Args:
-        trace: what was recorded.
-        text: of a specification, where the trace carries none.
-        system: the system file, which provides the functions that a specification takes from outside.
-        drives: judge by the rules of drives where the trace carries them, not by what plans are made for.
-
-    Raises:
-        SpecError: the specification is invalid.
-    """
-    carried = trace.meta.carried if drives else trace.meta.planned
-    source = Source("spec.stl", carried.text or text)
-    spec = replace(parse(source), library=carried.library or None)
-    outside = any(isinstance(item, ast.Extern) for item in spec.items)
-    used = system if outside and system is not None and system.is_file() else None
-    return Monitor(spec, system=used, overrides=carried.overrides)
-
-
-def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, NDArray[np.float64]]:
-    """Robustness of each judged requirement from each sample on, (traces, samples); NaN where it has none.
-
-    What is judged once has the value that was judged at every sample: no other counts for its verdict.
-    """
-    once = judged_once(verdict)
-    found = monitor.requirement_robustness(trace)
-    rows = {judgement.name: np.atleast_2d(found[judgement.name]) for judgement in verdict}
-    for name in once:
-        rows[name] = np.repeat(verdict[name].least[:, None], rows[name].shape[1], 1)
-    return rows
-
-
-def units_of(verdict: Verdict) -> dict[str, str]:
-    """Requirement -> the unit of its robustness, where it has one."""
-    return {j.name: unit for j in verdict if (unit := margin_unit(j.rule.typed.formula))}
-
-
-def judged_once(verdict: Verdict) -> list[str]:
-    """Names of the requirements that speak about the start of a trace alone."""
-    planned = verdict.subject.horizon is not None
-    return [j.name for j in verdict if j.rule.absolute or not (j.rule.windowed and planned)]
-
-
 def _monitor(material: Material, trace: Trace) -> Monitor:
     text, system = material.texts.get("spec.stl", ""), material.run.path / "system.yaml"
     return monitor_of(trace, text, system=system)
@@ -144,17 +96,6 @@ def map_section(material: Material) -> Section | None:
         return None
     picture = draw_chart(chart)
     return Section("map", "Where it drives", figure(picture.data_uri(), picture.alt, MAP_CAPTION), picture)
-
-
-def trace_names(trace: Trace) -> list[str]:
-    """How traces are called: by seed and agent where that was recorded."""
-    seeds, agents = trace.extras.get("seed"), trace.extras.get("agent")
-    if seeds is None or agents is None or not len(seeds) == len(agents) == trace.traces:
-        return [f"trace {index}" for index in range(trace.traces)]
-    return [
-        f"trace {index} (seed {seed}, agent {agent})"
-        for index, (seed, agent) in enumerate(zip(seeds.tolist(), agents.tolist(), strict=True))
-    ]
 
 
 def _per_trace(verdict: Verdict) -> NDArray[np.float64]:

@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import io
+import shutil
+import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from stlc.files import write_atomic
-from stlc.view.gif import fitting
+from stlc.diagnostics import Diagnostic, MissingError
+from stlc.files import atomic_path, write_atomic
 from stlc.view.style import PAPER, look, new_figure
-from stlc.view.video import video
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from PIL.Image import Image
+
 
 MAX_FRAMES = 240
 MAX_BYTES = 4_000_000
@@ -187,3 +193,133 @@ def frames_in(film: Film, indices: range, dpi: int) -> Iterator[Image]:
             if not film.draws:
                 canvas.draw()
             yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+
+
+# ---------------------------------------------------------------------- gif
+
+
+COLOURS = 96
+SAMPLED = 8
+"""Pictures that the palette is taken from, the first and the last among them."""
+NARROWEST = 160  # pixels
+
+
+def fitting(pictures: Sequence[Image], milliseconds: int, max_bytes: int) -> bytes:
+    """`pictures` as a GIF, made smaller in width until it has at most `max_bytes`."""
+    data = encoded(pictures, milliseconds)
+    while len(data) > max_bytes and pictures[0].width > NARROWEST:
+        factor = max(0.6, 0.95 * (max_bytes / len(data)) ** 0.5)
+        size = (round(pictures[0].width * factor), round(pictures[0].height * factor))
+        pictures = [picture.resize(size) for picture in pictures]
+        data = encoded(pictures, milliseconds)
+    return data
+
+
+def encoded(pictures: Sequence[Image], milliseconds: int) -> bytes:
+    """`pictures` as a GIF that repeats for ever; the palette is taken from a few of them."""
+    from PIL import Image
+
+    many = min(SAMPLED, len(pictures))
+    sample = [pictures[row * (len(pictures) - 1) // max(many - 1, 1)] for row in range(many)]
+    sheet = Image.new("RGB", (sample[0].width, sample[0].height * len(sample)))
+    for row, picture in enumerate(sample):
+        sheet.paste(picture, (0, row * picture.height))
+    palette = _palette(sheet)
+    frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    buffer = io.BytesIO()
+    frames[0].save(
+        buffer,
+        format="GIF",
+        save_all=True,
+        append_images=frames[1:],
+        duration=milliseconds,
+        loop=0,
+        optimize=True,
+    )
+    return buffer.getvalue()
+
+
+def _palette(sheet: Image) -> Image:
+    """The colours that cover most, exactly (white paper stays white), then those that lack most.
+
+    A colour lacks the more, the farther it is from those that are there and the more often it occurs: a dot
+    of a legend, or a line that was violated, keeps its own however small it is.
+    """
+    from PIL import Image
+
+    counts: Any = sheet.getcolors(sheet.width * sheet.height)
+    often = np.array([count for count, _ in counts], dtype=float)
+    colours = np.array([colour for _, colour in counts], dtype=float)
+    chosen = np.argsort(-often, kind="stable")[: COLOURS // 2].tolist()
+    far = np.min([_apart(colours, colours[index]) for index in chosen], axis=0)
+    while len(chosen) < COLOURS and far.any():
+        chosen.append(int(np.argmax(far * np.sqrt(often))))
+        far = np.minimum(far, _apart(colours, colours[chosen[-1]]))
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(colours[chosen].astype(int).ravel().tolist())
+    return palette
+
+
+def _apart(colours: NDArray[np.float64], one: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Squared distances of `colours` (many, 3) from `one`."""
+    return np.asarray(((colours - one) ** 2).sum(1))
+
+
+# ---------------------------------------------------------------------- video
+
+
+ADVICE = "pip install 'stlc[video]', or ffmpeg on the path"
+_CODING = ("-c:v", "libx264", "-preset", "veryfast", "-crf", "23", "-pix_fmt", "yuv420p")
+
+
+def encoder() -> str | None:
+    """The program that writes videos: `ffmpeg` on the path, else that of imageio-ffmpeg."""
+    found = shutil.which("ffmpeg")
+    if found is not None or find_spec("imageio_ffmpeg") is None:
+        return found
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    try:
+        return str(get_ffmpeg_exe())
+    except RuntimeError:  # a platform for which the package brings none
+        return None
+
+
+@contextmanager
+def video(path: Path, size: tuple[int, int], milliseconds: int) -> Iterator[Callable[[Image], None]]:
+    """Write H.264 for every browser and player: what is yielded takes the next RGB picture.
+
+    Args:
+        path: of the file, replaced when the block ends well.
+        size: width and height of all pictures; an odd last row or column is cut off.
+        milliseconds: that each is seen.
+
+    Raises:
+        MissingError: R301, there is no ffmpeg, or it fails; R201, the file cannot be written.
+    """
+    program = encoder()
+    if program is None:
+        raise MissingError(Diagnostic("R301", "a video needs ffmpeg, which is not installed", help=(ADVICE,)))
+    width, height = (side - side % 2 for side in size)
+    with atomic_path(path) as beside:
+        command = [program, "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
+        command += ["-s", f"{width}x{height}", "-r", f"{1000 / milliseconds:.6g}", "-i", "-", "-an"]
+        command += [*_CODING, "-movflags", "+faststart", "-f", "mp4", str(beside)]
+        running = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+        assert running.stdin is not None
+
+        def write(picture: Image) -> None:
+            assert running.stdin is not None
+            with suppress(BrokenPipeError):  # why it went away is told below
+                running.stdin.write(picture.crop((0, 0, width, height)).tobytes())
+
+        try:
+            yield write
+        except BaseException:
+            running.kill()
+            raise
+        finally:
+            _, complaint = running.communicate()
+        if running.returncode:
+            said = complaint.decode(errors="replace").strip().splitlines()
+            raise MissingError(Diagnostic("R301", "ffmpeg cannot write the video", note=tuple(said[-1:])))

@@ -17,20 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.sketch import DECIDED
 from stlc.escape import script_json
 from stlc.jsontext import dumps
 from stlc.monitor.prepared import beside
 from stlc.view.animate import STILL, Shot, current, film_name, film_of, shots_of
-from stlc.view.events import Event
 from stlc.view.film import Taped, in_the_dark, speed_of, still_bytes
-from stlc.view.html import Child, Html, classed, el, join, table
+from stlc.view.html import Child, Html, Section, classed, el, join, table
+from stlc.view.judged import Event
 from stlc.view.material import Material
-from stlc.view.page import Section
-from stlc.view.signals import margin_limits
-from stlc.view.strip import Strip
+from stlc.view.signals import Strip, finite, margin_limits, margin_text
 from stlc.view.style import SCENES_ON_DARK
-from stlc.view.words import count
+from stlc.view.words import count, labelled
 
 SCRIPT = "player.js"
 MOST_FRAMES = 160
@@ -58,29 +55,21 @@ def player_section(material: Material) -> Section | None:
     shown = range(0, frames, -(-frames // MOST_FRAMES))
     tapes = [shot.taped(shown) for shot in shots]
     tracks = [_tracks(shot, shown) for shot in shots]
-    body = join(
+    head = el(
+        "div",
+        _keys(shots),
         _stage(shots, tapes, material),
         _data(shots, tapes, tracks, shown),
-    )
-    tables = _events(shots)
-    head = classed(
-        "div",
-        "player",
-        _keys(shots),
-        body,
         _controls(len(shown)),
         _columns(shots, tracks),
+        attrs={"class": "player", "tabindex": "0"},
     )
-    return Section("film", "", join(_dressed(head), _files(material), tables))
+    return Section("film", "", join(head, _files(material), _events(shots)))
 
 
 def script() -> Html:
     """What runs in the page; it reads nothing but the page."""
     return Html((files("stlc.view") / SCRIPT).read_text(encoding="utf-8"))
-
-
-def _dressed(head: Html) -> Html:
-    return Html(head.replace('<div class="player">', '<div class="player" tabindex="0">', 1))
 
 
 # ------------------------------------------------------------------------------- stage
@@ -196,14 +185,9 @@ def _columns(shots: Sequence[Shot], tracks: Sequence[Sequence[_Track]]) -> Html:
         times = shot.strip.times if shot.strip is not None else np.zeros(1)
         foot = classed("div", "track axis", el("span"), classed("div", "ends", _ends(times)), el("span"))
         words = f"{shot.strip.words}, red where violated" if shot.strip is not None else ""
-        columns.append(
-            classed("div", "tracks", classed("p", "quiet", _titled(shot.title, words)), rows, foot)
-        )
+        words = f"{shot.title}: {words}" if shot.title else words
+        columns.append(classed("div", "tracks", classed("p", "quiet", words), rows, foot))
     return classed("div", "columns", columns)
-
-
-def _titled(title: str, words: str) -> str:
-    return f"{title}: {words}" if title else words
 
 
 def _ends(times: NDArray[np.float64]) -> list[Html]:
@@ -221,19 +205,17 @@ def _tracks(shot: Shot, shown: range) -> list[_Track]:
 def _acted(strip: Strip, shown: range) -> _Track:
     assert strip.decisions is not None
     agents = strip.decisions.shape[1]
-    top, base, areas = max(int(strip.acted.max()), 1), np.zeros(len(strip.times)), []
-    for source, color in enumerate(DECIDED[1:], start=1):
-        more = base + (strip.decisions == source).sum(1)
-        if (more > base).any():
-            path = _area(strip.times, _up(base, top), _up(more, top))
-            areas.append(el("path", attrs={"d": path, "class": "acted", "style": _inks(color)}))
-        base = more
+    top = max(int(strip.acted.max()), 1)
+    areas = [
+        _path(_area(strip.times, _up(low, top), _up(high, top)), "acted", style=_inks(color))
+        for color, low, high in strip.stacked()
+    ]
     values: list[str | None] = [f"{int(strip.acted[index])} of {agents}" for index in shown]
     return _Track("guard acted", _svg(areas), values)
 
 
 def _margin(strip: Strip, name: str, shown: range) -> _Track:
-    rho = np.where(np.isfinite(strip.margins[name]), strip.margins[name], np.nan)
+    rho, unit = finite(strip.margins[name]), strip.units.get(name, "")
     low, high = margin_limits(rho)
     fails = rho < -TOLERANCE
 
@@ -243,18 +225,18 @@ def _margin(strip: Strip, name: str, shown: range) -> _Track:
     zero = up(np.zeros(len(rho)))
     good, bad = np.where(fails, np.nan, rho), np.where(fails, rho, np.nan)
     parts = [
-        el("path", attrs={"d": f"M0 {zero[0]:.1f}H{_WIDE}", "class": "zero"}),
-        el("path", attrs={"d": _area(strip.times, zero, up(good)), "class": "spare"}),
-        el("path", attrs={"d": _area(strip.times, zero, up(bad)), "class": "lost"}),
-        el("path", attrs={"d": _line(strip.times, up(rho)), "class": "line"}),
-        el("path", attrs={"d": _line(strip.times, up(bad)), "class": "line lost"}),
+        _path(f"M0 {zero[0]:.1f}H{_WIDE}", "zero"),
+        _path(_area(strip.times, zero, up(good)), "spare"),
+        _path(_area(strip.times, zero, up(bad)), "lost"),
+        _path(_line(strip.times, up(rho)), "line"),
+        _path(_line(strip.times, up(bad)), "line lost"),
     ]
-    unit = f" {strip.units[name]}" if strip.units.get(name) else ""
-    words = [f"{rho[index]:+.2f}{unit}".replace("-0.00", "+0.00") for index in shown]
-    values: list[str | None] = [
-        None if np.isnan(rho[index]) else word for index, word in zip(shown, words, strict=True)
-    ]
-    return _Track(f"{name} [{strip.units[name]}]" if strip.units.get(name) else name, _svg(parts), values)
+    values = [margin_text(float(rho[index]), unit) or None for index in shown]
+    return _Track(labelled(name, unit), _svg(parts), values)
+
+
+def _path(outline: str, kind: str, **attrs: str) -> Html:
+    return el("path", attrs={"d": outline, "class": kind, **attrs})
 
 
 def _svg(parts: Iterable[Html]) -> Html:

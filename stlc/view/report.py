@@ -7,20 +7,38 @@ run, and follows the reader's light or dark scheme. What a run does not have (a 
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+from stlc.escape import operand, shell
 from stlc.files import write_atomic
 from stlc.rundir import RunDir
 from stlc.version import __version__
 from stlc.view import require_drawing
-from stlc.view.closing import failures_section, repeat_section, texts_section
+from stlc.view.curves import draw_curves
 from stlc.view.deployment import deployment_section, deployment_tiles
 from stlc.view.driven import driven_section, map_section
-from stlc.view.html import join
-from stlc.view.material import Material, gather
-from stlc.view.opening import headline, numbers, requirements_section, training_section
-from stlc.view.page import Section, page
+from stlc.view.held_out import draw_failures, unsolved_text
+from stlc.view.html import (
+    Child,
+    Html,
+    Section,
+    classed,
+    el,
+    facts,
+    figure,
+    join,
+    page,
+    spec_html,
+    table,
+    yaml_html,
+)
+from stlc.view.learning import Commands, clause, driven_lines, learning_on_record, recommended
+from stlc.view.material import Material, gather, untagged
 from stlc.view.player import player_section, script
+from stlc.view.words import count, interval, number, obeyed_sentence, seconds, share, viable_sentence
 
 REPORT = "report.html"
 
@@ -73,3 +91,340 @@ def render_report(material: Material, sections: list[Section]) -> str:
         f"Written by stlc {__version__} from {material.run.shown}",
         script() if film is not None else None,
     )
+
+
+# ---------------------------------------------------------------------- opening
+
+
+def headline(material: Material) -> Html:
+    """What came out, in one sentence.
+
+    A run that was deployed is judged by its drives, one that was not by its plans.
+    """
+    record, result, simulation = material.record, material.result, material.simulation or {}
+    driven, lost = obeyed_sentence(simulation), viable_sentence(simulation)
+    trial = [] if driven else driven_lines(result or {})
+    head = f"{trial[0][:1].upper()}{trial[0][1:]}" if trial else _verdict(material)
+    names = dict.fromkeys((material.spec, str(record.get("system", "")), f"run {material.run.name}"))
+    return join(
+        classed("p", "eyebrow", " · ".join(name for name in names if name)),
+        el("h1", driven or head),
+        el("p", *_spoken(". ".join((*trial[1:], _verdict(material))))) if trial else None,
+        el("p", f"{lost}.") if lost else None,
+        el("p", f"{_verdict(material)}. {_beside(result)}" if driven else _beside(result))
+        if result
+        else None,
+        _advice(material),
+    )
+
+
+def numbers(material: Material, tiles: list[tuple[str, str]]) -> Html | None:
+    """The same in a few numbers; `tiles` adds those of the deployment."""
+    return _tiles([*_training_tiles(material.result), *tiles])
+
+
+def _verdict(material: Material) -> str:
+    accuracy = material.result.get("accuracy")
+    if accuracy is None:
+        return f"Training of {material.spec} is {material.record.get('status', 'not finished')}"
+    held_out = material.result.get("held_out")
+    starts = f"{held_out:,} held-out starts" if held_out else "held-out starts"
+    return f"The policy's plan satisfies {material.spec} from {share(accuracy)} of {starts}"
+
+
+def _beside(result: Mapping[str, Any]) -> str:
+    accuracy, feasible, ends = result.get("accuracy"), result.get("feasible"), result.get("interval")
+    parts = [f"The 95 % interval is {interval(ends)}." if ends else ""]
+    if feasible and accuracy is not None:
+        parts.append(
+            f"Some satisfying plan is known for {share(feasible)} of them{_sampled(result)}; the policy "
+            f"finds {share(accuracy / feasible)} of what is known to be feasible."
+        )
+    return " ".join(part for part in parts if part)
+
+
+def _sampled(result: Mapping[str, Any]) -> str:
+    """That not all starts were searched, where it is so."""
+    searched, held_out = result.get("searched"), result.get("held_out")
+    if not searched or not held_out or searched >= held_out:
+        return ""
+    return f" (an estimate: {searched:,} were searched or solved)"
+
+
+def _advice(material: Material) -> Html | None:
+    """How far the training came, and what would help, where the policy falls short."""
+    where = clause(material.held_out, material.signature)
+    commands = Commands.of(shlex.quote(material.run.shown), guard=recommended(material.record))
+    learning = learning_on_record(material.record, material.rows, commands, where)
+    if learning is None or not learning.advice:
+        return None
+    level = f"{learning.level[0].upper()}{learning.level[1:]}."
+    told = (*learning.advice[:1], *filter(None, [learning.worst]), *learning.advice[1:])
+    items = [el("li", *_spoken(advice)) for advice in told]
+    return join(el("p", el("strong", level), " What helps:"), el("ul", items))
+
+
+def _spoken(advice: str) -> list[Child]:
+    """A sentence whose commands are set apart, and that begins and ends as sentences do."""
+    sentence = f"{advice[0].upper()}{advice[1:]}."
+    return [el("code", part) if i % 2 else part for i, part in enumerate(sentence.split("`"))]
+
+
+def _training_tiles(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    accuracy, feasible = result.get("accuracy"), result.get("feasible")
+    driven = result.get("closed_loop")
+    closed = driven.get("share") if isinstance(driven, Mapping) else None
+    tiles = [(share(closed), "of drives satisfied")] if closed is not None else []
+    tiles.append((share(accuracy), "plan accuracy"))
+    if accuracy is not None and feasible:
+        tiles.append((share(accuracy / feasible), "of what is known feasible"))
+    tiles.append((seconds(result.get("seconds")), "of training and verdict"))
+    return [(value, name) for value, name in tiles if value]
+
+
+def _tiles(tiles: list[tuple[str, str]]) -> Html | None:
+    if not tiles:
+        return None
+    return classed(
+        "div", "tiles", [classed("div", "tile", el("b", value), el("span", name)) for value, name in tiles]
+    )
+
+
+def requirements_section(material: Material) -> Section | None:
+    """Every requirement with its text and how often the policy's plans meet it."""
+    shares: Mapping[str, float] = material.result.get("requirements") or {}
+    names = list(shares) or list(material.requirements)
+    if not names:
+        return None
+    held_out = material.result.get("held_out")
+    worst = min(shares, key=shares.__getitem__) if shares else None
+    rows: list[tuple[Child, ...]] = []
+    for name in names:
+        value = shares.get(name)
+        fails = "" if value is None or not held_out else f"{round((1 - value) * held_out):,}"
+        kind = "bad" if name == worst and value is not None and value < 1 else "plain"
+        rows.append((_described(material, name), classed("span", kind, share(value)), fails))
+    header = ("requirement", "satisfied", f"fails of {held_out:,}" if held_out else "fails")
+    intro = el("p", "Each is judged alone, on the plans from the held-out starts; all must hold together.")
+    body = join(intro, table(header, rows, numeric=(1, 2)))
+    return Section("requirements", "Requirements", body)
+
+
+def _described(material: Material, name: str) -> Html:
+    declared = material.requirements.get(name)
+    if declared is None:
+        return el("strong", name)
+    tags = " ".join(" ".join(tag.span.text.split()) for tag in declared.tags)
+    return join(
+        el("strong", name),
+        classed("span", "quiet", f" {tags}") if tags else None,
+        el("small", declared.doc) if declared.doc else None,
+        el("pre", spec_html(untagged(declared).text)),
+    )
+
+
+def training_section(material: Material) -> Section:
+    """Curves, options, machine and versions."""
+    curves = draw_curves(material.rows)
+    shown = figure(curves.data_uri(), curves.alt, _CURVES) if curves else None
+    last = material.rows[-1] if material.rows else {}
+    search = None
+    if last.get("failing") is not None:
+        search = el(
+            "p",
+            f"In the last round the search repaired {last.get('repaired', 0)} of "
+            f"{count(int(last['failing']), 'failing start')}.",
+        )
+    body = join(shown, search, facts(_facts(material)))
+    return Section("training", "How it was trained", body, curves)
+
+
+_CURVES = (
+    "Plan accuracy while training, with the share of starts for which some satisfying plan is known; "
+    "each requirement alone; the loss over the learning rate (shaded). Faint what was measured, on a few "
+    "fresh starts each time; strong its running mean, with its last value."
+)
+
+
+def _facts(material: Material) -> list[tuple[str, Child]]:
+    record = material.record
+    hardware, git = record.get("hardware") or {}, record.get("git") or {}
+    versions = record.get("versions") or {}
+    budget = record.get("budget")
+    steps = record.get("steps")
+    taken = f"{steps:,} steps" if isinstance(steps, int) else ""
+    if budget:
+        taken += (
+            f" (a budget of {budget if isinstance(budget, str) else seconds(float(budget))}{_clock(record)})"
+        )
+    machine = (
+        str(hardware.get("processor") or hardware.get("machine") or ""),
+        count(int(hardware["cores"]), "core") if hardware.get("cores") else "",
+        f"{number(hardware['memory_gib'], 'GiB')}" if hardware.get("memory_gib") else "",
+        str(hardware.get("system", "")),
+    )
+    commit = str(git.get("commit", ""))[:12]
+    return [
+        ("steps", taken),
+        ("options", _options(record)),
+        ("seed", str(record.get("seed", ""))),
+        ("device", _device(record)),
+        ("machine", ", ".join(part for part in machine if part)),
+        ("versions", ", ".join(f"{name} {version}" for name, version in versions.items())),
+        ("source", f"{commit}{', with uncommitted changes' if git.get('dirty') else ''}" if commit else ""),
+        ("started", str(record.get("started", ""))),
+        ("specification", _hashed(record, "spec")),
+        ("system", _hashed(record, "system")),
+    ]
+
+
+def _clock(record: Mapping[str, Any]) -> str:
+    """What a budget was counted in, where that is not the clock on the wall."""
+    return " of processor time" if (record.get("options") or {}).get("clock") == "processor" else ""
+
+
+def _options(record: Mapping[str, Any]) -> str:
+    """What the engine decided, as far as the run says it."""
+    engine = record.get("engine") or record.get("options") or {}
+    shown = [f"{name} {engine[name]}" for name in _OPTIONS if engine.get(name) is not None]
+    if record.get("margin") is not None:
+        shown.append(f"margin {number(float(record['margin']))}")
+    return ", ".join(shown)
+
+
+_OPTIONS = ("method", "hidden", "plans", "batch", "lr")
+
+
+def _device(record: Mapping[str, Any]) -> str:
+    device, threads = str(record.get("device", "")), record.get("threads")
+    return f"{device}, {count(int(threads), 'thread')}" if threads else device
+
+
+def _hashed(record: Mapping[str, Any], what: str) -> Child:
+    path, digest = record.get(f"{what}_path") or record.get(what, ""), record.get(f"{what}_hash")
+    if not digest:
+        return str(path)
+    return join(str(path), " ", classed("span", "quiet", f"sha256 {str(digest)[:12]}"))
+
+
+# ---------------------------------------------------------------------- closing
+
+
+USUAL_LIMIT = 0.1
+"""Seconds of a decision of the full guard, where nothing else was said."""
+_TITLES = {
+    "spec.stl": "The specification",
+    "system.yaml": "The system",
+    "compiled.txt": "The specification as compiled",
+    "config.resolved.yaml": "Every option, resolved",
+}
+
+
+def failures_section(material: Material) -> Section | None:
+    """Where in the initial set the policy's plans fail."""
+    if material.held_out is None:
+        return None
+    picture = draw_failures(material.held_out, material.signature, material.units)
+    if picture is None:
+        text = f"None of the plans from {len(material.held_out.x0):,} held-out starts fails a requirement."
+        return Section("failures", "Where plans fail", el("p", text))
+    boxed = "; the dashed box is the region named above" if picture.figure.axes[0].patches else ""
+    caption = (
+        f"Held-out starts over the two columns that tell most about failing{boxed}. "
+        "Right: how far the plans are from failing (counts on a logarithmic scale)."
+    )
+    body = figure(picture.data_uri(), picture.alt, caption)
+    left = el("p", f"Unsolved: {unsolved_text(material.held_out)}.")
+    return Section("failures", "Where plans fail", join(left, el("p", picture.alt), body), picture)
+
+
+def repeat_section(material: Material) -> Section:
+    """The commands that lead here again."""
+    intro = el(
+        "p",
+        "The same seed and steps give the same weights on the same machine. The folder of the run "
+        "holds the specification and the system as they were.",
+    )
+    lines = "\n".join(_commands(material))
+    return Section("repeat", "How to repeat it", join(intro, el("pre", lines)))
+
+
+def _commands(material: Material) -> list[str]:
+    record, run = material.record, operand(material.run.shown)
+    spec = str(record.get("spec_path") or f"{material.run.shown}/spec.stl")
+    system = str(record.get("system_path") or f"{material.run.shown}/system.yaml")
+    train = ["stlc", "train", spec, "--system", system]
+    steps = record.get("schedule") or record.get("steps")
+    for option, value in (("seed", record.get("seed")), ("steps", steps)):
+        if value is not None:
+            train += [f"--{option}", str(value)]
+    options = record.get("options") or {}
+    for option in ("method", "plans", "lr", "batch", "threads"):
+        if options.get(option) not in (None, "guided"):
+            train += [f"--{option}", str(options[option])]
+    train += _set(record)
+    commands = [shell(train), shell([*_simulate(material), *_set(material.simulation or {})])]
+    if material.trace is not None:
+        check = ["stlc", "check", f"{material.run.shown}/trace.npz"]
+        if material.outside:
+            check += ["--system", f"{material.run.shown}/system.yaml"]
+        commands.append(shell(check))
+    return [*commands, shell(("stlc", "report", run))]
+
+
+def _set(record: Mapping[str, Any]) -> list[str]:
+    """The options for what was changed in specification and system."""
+    changed = record.get("overrides") or {}
+    return [word for name, value in changed.items() for word in ("--set", f"{name}={value}")]
+
+
+def _simulate(material: Material) -> list[str]:
+    """The command of the newest deployment; with the backup where there was none."""
+    done = material.simulation or {}
+    guard = list(done.get("guards") or {"paper": {}})[-1]
+    words = ["stlc", "simulate", material.run.shown, *_GUARDS.get(str(guard), ("--guard", str(guard)))]
+    if done.get("scenario"):
+        words += ["--scenario", str(done["scenario"])]
+    seeds = done.get("seeds") or range(10)
+    if list(seeds) != list(range(10)):
+        words += ["--seeds", _seeds(seeds)]
+    for name, usual in (("agents", material.usual.get("agents")), ("steps", material.usual.get("steps"))):
+        if done.get(name) not in (None, usual):
+            words += [f"--{name}", str(done[name])]
+    return words + _limits(done)
+
+
+def _seeds(seeds: Sequence[int]) -> str:
+    """As `--seeds` takes them: `0..9`, or `0,3`."""
+    whole = len(seeds) > 1 and list(seeds) == list(range(seeds[0], seeds[-1] + 1))
+    return f"{seeds[0]}..{seeds[-1]}" if whole else ",".join(map(str, seeds))
+
+
+def _limits(done: Mapping[str, Any]) -> list[str]:
+    """What a guard was told, where that is not the usual."""
+    words = []
+    hurried = done.get("paper_time_limit") is not None
+    if hurried or ("time_limit" in done and done["time_limit"] != USUAL_LIMIT):
+        limit = done["time_limit"]
+        words += ["--time-limit", "none" if limit is None else f"{1000 * float(limit):g}ms"]
+    words += ["--ceiling", str(done["ceiling"])] if done.get("ceiling") else []
+    asked = done.get("margin") or {}
+    return words + [word for name in asked for word in ("--margin", f"{name}={asked[name]:.6g}")]
+
+
+_GUARDS = {"none": (), "paper": ("--backup",)}
+
+
+def texts_section(material: Material) -> Section | None:
+    """The specification and the system word by word; what was derived from them can be unfolded."""
+    if not material.texts:
+        return None
+    blocks = []
+    for name, text in material.texts.items():
+        shown = (
+            spec_html(text) if name.endswith(".stl") else yaml_html(text) if name.endswith(".yaml") else text
+        )
+        attrs = {"open": ""} if name == "spec.stl" else {}
+        summary = el("summary", _TITLES[name], " ", classed("span", "quiet", name))
+        blocks.append(el("details", summary, el("pre", shown), attrs=attrs))
+    return Section("texts", "What it was made from", join(blocks))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stlc.controller.sketch import DECIDED, DECIDERS, VIOLATED
 from stlc.view.film import Film, speed_of, wipe
-from stlc.view.strip import Mover, Strip, draw_strip
+from stlc.view.signals import Mover, Strip, draw_strip
 from stlc.view.style import INK, MUTED, look, new_figure
 
 if TYPE_CHECKING:

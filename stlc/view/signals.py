@@ -1,11 +1,11 @@
-"""What was driven: signals of chosen traces, beneath them every requirement's robustness and who decided."""
+"""Signals and robustness margins over time: figures of traces, strip charts of films, films of traces."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,14 @@ from stlc.controller.sketch import DECIDED, DECIDERS
 from stlc.escape import picture
 from stlc.signature import Column
 from stlc.trace import Trace
+from stlc.view.film import Film
 from stlc.view.style import (
     BLUE,
     FAINT,
     GREEN,
     INK,
     MUTED,
+    PAPER,
     RED,
     SKY,
     Picture,
@@ -29,21 +31,89 @@ from stlc.view.style import (
     new_figure,
     quiet,
 )
+from stlc.view.words import labelled
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.text import Text
 
-Margins: TypeAlias = Mapping[str, NDArray[np.float64]]
+Floats: TypeAlias = NDArray[np.float64]
+Margins: TypeAlias = Mapping[str, Floats]
+"""Requirement -> robustness at every sample, (traces, samples), NaN where undefined."""
 
 POLICY, BACKUP, SAFEST, POLISHED = 0, 1, 2, 3
 DECISIONS = {
     POLICY: (DECIDERS[POLICY], FAINT),
     **{source: (DECIDERS[source], DECIDED[source]) for source in (BACKUP, SAFEST, POLISHED)},
 }
-MOST_LINES = 10  # panels of numbers; beyond that those that move come first
-MOST_LETTERS = 44  # of a title in one line
+"""Source of a decision -> its word and its colour."""
+MOST_LINES = 10
+"""Panels of numeric signals; of more, the signals that change come first."""
+MOST_LETTERS = 44
+"""Letters of a title in one line."""
+MOST_ROWS = 7
+"""Requirements in a strip chart, those with the least margin first."""
+MOST_PANELS, MOST_AGENTS = 6, 40
+"""Signals and agents in the film of a trace."""
 _HEIGHTS = {"line": 0.62, "strip": 0.2, "robustness": 0.5, "decision": 0.2}
+_VEIL = 0.72
+
+
+def decisions_of(trace: Trace) -> NDArray[np.int64] | None:
+    """Sources of the decisions, (traces, steps); None where they were not recorded."""
+    recorded = trace.extras.get("decision")
+    if recorded is None or recorded.ndim != 2 or len(recorded) != trace.traces:
+        return None
+    return recorded.astype(np.int64)
+
+
+def acted_in(trace: Trace) -> NDArray[np.int64] | None:
+    """Number of interventions of the guard, (traces,); None where decisions were not recorded."""
+    decisions = decisions_of(trace)
+    return None if decisions is None else np.asarray((decisions != POLICY).sum(1))
+
+
+# ---------------------------------------------------------------------- shared by figures and films
+
+
+def margin_limits(rho: Floats) -> tuple[float, float]:
+    """Vertical limits for robustness: large margins are cut so that violations stay visible; 0 is inside."""
+    finite = rho[np.isfinite(rho)]
+    if not len(finite):
+        return -1.0, 1.0
+    low, high = min(float(finite.min()), 0.0), max(float(np.quantile(finite, 0.95)), 0.0)
+    if low >= -TOLERANCE:
+        low = 0.0  # rounding: nothing to make visible
+    else:
+        high = min(high, 4 * -low)
+    room = 0.12 * (high - low) or 1.0
+    return low - room, high + room
+
+
+def finite(rho: Floats) -> Floats:
+    """Robustness with NaN in place of infinities."""
+    return np.where(np.isfinite(rho), rho, np.nan)
+
+
+def margin_text(rho: float, unit: str = "") -> str:
+    """A margin with its sign, two decimals and unit; "" for NaN."""
+    return "" if np.isnan(rho) else f"{rho:+.2f} {unit}".rstrip().replace("-0.00", "+0.00")
+
+
+def _plot_margin(axes: Axes, times: Floats, rho: Floats) -> None:
+    """Robustness as a staircase over zero, blue where it holds, red where it is violated."""
+    rho = finite(rho)
+    fails = rho < -TOLERANCE
+    axes.axhline(0, color=MUTED, lw=0.6)
+    axes.fill_between(times, rho, 0, where=~fails, step="post", color=BLUE, alpha=0.2, lw=0)
+    axes.fill_between(times, rho, 0, where=fails, step="post", color=RED, alpha=0.35, lw=0)
+    axes.step(times, rho, where="post", color=BLUE, lw=1)
+    axes.step(times, np.where(fails, rho, np.nan), where="post", color=RED, lw=1.4)
+
+
+# ---------------------------------------------------------------------------- figures of traces
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,14 +125,14 @@ class Choice:
 
 
 def choose_traces(
-    least: NDArray[np.float64], names: Sequence[str] = (), acted: NDArray[np.int64] | None = None
+    least: Floats, names: Sequence[str] = (), acted: NDArray[np.int64] | None = None
 ) -> tuple[Choice, ...]:
-    """The worst trace, and that in which the guard acted most, or a typical one; one where there is only one.
+    """The worst trace, and that with most interventions or else a typical one; one if both are the same.
 
     Args:
         least: robustness per trace, (traces,); NaN where it is not known.
-        names: how traces are called; by default by their number.
-        acted: how often the guard acted in each, (traces,).
+        names: of the traces; by default their numbers.
+        acted: number of interventions of the guard in each, (traces,).
     """
     order = np.argsort(least, kind="stable")
     worst, other, word = int(order[0]), int(order[max(1, int(np.isfinite(least).sum())) // 2]), "typical"
@@ -74,22 +144,32 @@ def choose_traces(
     return Choice(worst, f"worst: {called[worst]}"), Choice(other, f"{word}: {called[other]}")
 
 
-def acted_in(trace: Trace) -> NDArray[np.int64] | None:
-    """How often something else than the policy decided, (traces,); None where that was not recorded."""
-    decisions = _decisions(trace)
-    return None if decisions is None else np.asarray((decisions != POLICY).sum(1))
+@dataclass(frozen=True, slots=True)
+class _Agent:
+    """One trace of a recording."""
+
+    trace: Trace
+    margins: Margins
+    index: int
+
+    def decided(self) -> Iterator[tuple[float, float, int]]:
+        """Intervals of time with one source of decisions: from, to, source."""
+        decisions, trace = decisions_of(self.trace), self.trace
+        if decisions is not None:
+            for start, stop, value in _runs(decisions[self.index].astype(np.float64)):
+                yield trace.t0 + start * trace.dt, trace.t0 + stop * trace.dt, int(value)
 
 
 def draw_signals(
     trace: Trace, margins: Margins, choices: Sequence[Choice], units: Mapping[str, str] | None = None
 ) -> Picture:
-    """A column of panels per chosen trace.
+    """A column of panels per chosen trace: signals, decisions, and the robustness of each requirement.
 
     Args:
-        trace: what was recorded.
+        trace: the recording.
         margins: requirement -> robustness at every sample, (traces, samples), NaN where undefined.
         choices: the traces to show.
-        units: requirement -> that of its robustness, where it has one.
+        units: requirement -> unit of its robustness, where it has one.
     """
     rows = _rows(trace, margins)
     heights = [_HEIGHTS[kind] for kind, _ in rows]
@@ -100,30 +180,50 @@ def draw_signals(
             len(rows), len(choices), squeeze=False, sharex=True, sharey="row", height_ratios=heights
         )
         for column, choice in zip(grid.T, choices, strict=True):
-            column[0].set_title(_in_lines(choice.title), pad=8)
+            column[0].set_title(_wrapped(choice.title), pad=8)
             for axes, (kind, name) in zip(column, rows, strict=True):
                 _draw_row(axes, kind, name, _Agent(trace, margins, choice.index))
             column[-1].set_xlabel("time [s]")
             column[-1].tick_params(labelbottom=True)
         for axes, (kind, name) in zip(grid[:, 0], rows, strict=True):
-            _name_row(axes, kind, name, trace, units or {})
+            unit = trace.signature[name].unit.text if kind == "line" else (units or {}).get(name, "")
+            axes.set_ylabel(picture(labelled(name, unit)), rotation=0, ha="right", va="center", labelpad=6)
+            axes.yaxis.set_label_coords(-0.085, 0.5)
         grid[0][0].set_xlim(trace.times[0], trace.times[-1])
         _legend(figure, trace, bool(margins))
     shown = " and ".join(choice.title for choice in choices)
     return Picture(figure, f"Signals, decisions and robustness per requirement; {shown}.")
 
 
+def left_out(trace: Trace) -> list[str]:
+    """Names of the numeric signals that have no panel."""
+    shown = {name for kind, name in _rows(trace, {}) if kind == "line"}
+    return [c.name for c in trace.signature.columns if c.kind in ("real", "int") and c.name not in shown]
+
+
+def _rows(trace: Trace, margins: Margins) -> list[tuple[str, str]]:
+    """(kind, name) of each panel: numeric signals, discrete signals, decisions, requirements."""
+    columns = trace.signature.columns
+    rows = [("line", c.name) for c in columns if c.kind in ("real", "int")]
+    if len(rows) > MOST_LINES:
+        rows = [row for row in rows if np.ptp(trace.data[row[1]]) > 0][:MOST_LINES]
+    rows += [("strip", c.name) for c in columns if c.kind in ("bool", "enum")]
+    if decisions_of(trace) is not None:
+        rows.append(("decision", "decision"))
+    return rows + [("robustness", name) for name in margins]
+
+
 def _legend(figure: Figure, trace: Trace, judged: bool) -> None:
-    """What the colours are: margins that hold and do not, and who decided."""
+    """Colours of margins and of decisions."""
     from matplotlib.patches import Patch
 
     handles = []
     if judged:
-        handles += [
+        handles = [
             Patch(color=BLUE, alpha=0.5, lw=0, label="to spare"),
             Patch(color=RED, lw=0, label="violated"),
         ]
-    decisions = _decisions(trace)
+    decisions = decisions_of(trace)
     for source in sorted(set() if decisions is None else {*np.unique(decisions).tolist()} - {POLICY}):
         word, color = DECISIONS.get(int(source), ("", MUTED))
         handles.append(Patch(color=color, lw=0, label=f"{word} decided"))
@@ -131,70 +231,39 @@ def _legend(figure: Figure, trace: Trace, judged: bool) -> None:
         figure.legend(handles=handles, loc="outside upper right", ncols=len(handles), handlelength=1.0)
 
 
-@dataclass(frozen=True, slots=True)
-class _Agent:
-    """One trace of a recording."""
-
-    trace: Trace
-    margins: Margins
-    index: int
-
-
-def _rows(trace: Trace, margins: Margins) -> list[tuple[str, str]]:
-    """Numbers first, then what is discrete, who decided, and the requirements."""
-    columns = trace.signature.columns
-    rows = [("line", c.name) for c in columns if c.kind in ("real", "int")]
-    if len(rows) > MOST_LINES:
-        rows = [row for row in rows if np.ptp(trace.data[row[1]]) > 0][:MOST_LINES]
-    rows += [("strip", c.name) for c in columns if c.kind in ("bool", "enum")]
-    if _decisions(trace) is not None:
-        rows.append(("decision", "decision"))
-    return rows + [("robustness", name) for name in margins]
-
-
-def _in_lines(title: str) -> str:
-    """What a panel is wide enough for; the name of the trace stands in a line of its own where it is not."""
+def _wrapped(title: str) -> str:
+    """A title in one line, or in two where it is wider than its panel."""
     return title if len(title) <= MOST_LETTERS else title.replace(": ", ":\n", 1)
 
 
-def left_out(trace: Trace) -> list[str]:
-    """Names of the numbers that have no panel."""
-    shown = {name for kind, name in _rows(trace, {}) if kind == "line"}
-    return [c.name for c in trace.signature.columns if c.kind in ("real", "int") and c.name not in shown]
-
-
 def _draw_row(axes: Axes, kind: str, name: str, agent: _Agent) -> None:
+    """One panel; interventions of the guard are shaded behind numbers and margins."""
+    trace = agent.trace
     match kind:
         case "line":
-            _draw_line(axes, agent, name)
+            axes.plot(trace.times, _broken(trace.data[name][agent.index]), color=INK, lw=1.1)
         case "strip":
-            _draw_strip(axes, agent, agent.trace.signature[name])
-        case "decision":
-            _draw_decisions(axes, agent)
-        case _:
-            _draw_robustness(axes, agent, name)
+            _draw_discrete(axes, agent, trace.signature[name])
+        case "robustness":
+            rho = agent.margins[name][agent.index]
+            _plot_margin(axes, trace.times[: len(rho)], rho)
+            axes.set_ylim(*margin_limits(agent.margins[name]))
     if kind in ("line", "robustness"):
-        _mark_backup(axes, agent)
+        axes.locator_params(axis="y", nbins=3)
+    elif kind == "decision":
+        axes.set_ylim(0, 1)
+        quiet(axes)
+    if kind != "strip":
+        for left, right, source in agent.decided():
+            _, color = DECISIONS.get(source, ("", MUTED))
+            if kind == "decision":
+                axes.axvspan(left, right, color=color, lw=0)
+            elif source != POLICY:
+                axes.axvspan(left, right, color=color, alpha=0.13, lw=0)
 
 
-def _name_row(axes: Axes, kind: str, name: str, trace: Trace, units: Mapping[str, str]) -> None:
-    unit = ""
-    if kind == "line":
-        unit = trace.signature[name].unit.text
-    elif kind == "robustness":
-        unit = units.get(name, "")
-    label = f"{name} [{unit}]" if unit not in ("", "1") else name
-    axes.set_ylabel(picture(label), rotation=0, ha="right", va="center", labelpad=6)
-    axes.yaxis.set_label_coords(-0.085, 0.5)
-
-
-def _draw_line(axes: Axes, agent: _Agent, name: str) -> None:
-    axes.plot(agent.trace.times, _broken(agent.trace.data[name][agent.index]), color=INK, lw=1.1)
-    axes.locator_params(axis="y", nbins=3)
-
-
-def _broken(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`values` with a gap where they jump (a reset, the next junction); a staircase stays whole."""
+def _broken(values: Floats) -> Floats:
+    """A signal with a gap where it jumps (a reset, the next junction); a staircase stays whole."""
     steps = np.abs(np.diff(values))
     moves = steps[steps > 0]
     span = float(np.ptp(values))
@@ -205,14 +274,14 @@ def _broken(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return broken
 
 
-def _draw_strip(axes: Axes, agent: _Agent, column: Column) -> None:
-    """A discrete signal as coloured stretches with its labels written into them."""
+def _draw_discrete(axes: Axes, agent: _Agent, column: Column) -> None:
+    """A discrete signal as coloured intervals with their labels inside."""
     trace = agent.trace
     values = trace.data[column.name][agent.index]
     labels = {value: label for label, value in column.labels} or {0.0: "", 1.0: "yes"}
     levels = sorted({*labels, *np.unique(values[np.isfinite(values)]).tolist()})
     tints = (FAINT, SKY, MUTED, BLUE, GREEN)
-    for start, stop, value in _stretches(values):
+    for start, stop, value in _runs(values):
         left, right = trace.times[start], trace.times[stop - 1] + trace.dt
         axes.axvspan(left, right, color=tints[levels.index(value) % len(tints)], alpha=0.75, lw=0)
         label = labels.get(value, f"{value:g}")
@@ -222,64 +291,185 @@ def _draw_strip(axes: Axes, agent: _Agent, column: Column) -> None:
     quiet(axes)
 
 
-def _stretches(values: NDArray[np.float64]) -> list[tuple[int, int, float]]:
+def _runs(values: Floats) -> list[tuple[int, int, float]]:
     """(start, stop, value) of each run of equal values."""
     edges = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
     return [(a, b, float(values[a])) for a, b in pairwise(edges) if b > a]
 
 
-def _decisions(trace: Trace) -> NDArray[np.int64] | None:
-    """Who decided, (traces, steps), or None where that was not recorded."""
-    recorded = trace.extras.get("decision")
-    if recorded is None or recorded.ndim != 2 or len(recorded) != trace.traces:
-        return None
-    return recorded.astype(np.int64)
+# ------------------------------------------------------------------------------ strip charts of films
 
 
-def _draw_decisions(axes: Axes, agent: _Agent) -> None:
-    trace, decisions = agent.trace, _decisions(agent.trace)
-    assert decisions is not None
-    for start, stop, value in _stretches(decisions[agent.index].astype(np.float64)):
-        _, color = DECISIONS.get(int(value), ("", MUTED))
-        axes.axvspan(trace.t0 + start * trace.dt, trace.t0 + stop * trace.dt, color=color, lw=0)
-    axes.set_ylim(0, 1)
-    quiet(axes)
+@dataclass(frozen=True, slots=True)
+class Strip:
+    """Strip charts beneath a film: least margin of each requirement, and interventions of the guard.
+
+    Attributes:
+        times: of the frames, in seconds, (frames,).
+        margins: requirement -> least robustness of all agents from each instant on, (frames,); NaN where it
+            is not known.
+        decisions: sources of the decisions, (frames, agents); None where they were not recorded.
+        words: meaning of the margins.
+        units: requirement -> unit of its margin, where it has one.
+    """
+
+    times: Floats
+    margins: Mapping[str, Floats]
+    decisions: NDArray[np.int64] | None = None
+    words: str = "least margin of all agents, from each instant on"
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def rows(self) -> list[str]:
+        """Names of the requirements that are shown, in their order."""
+        known = [name for name, rho in self.margins.items() if np.isfinite(rho).any()]
+        least = sorted(known, key=lambda name: float(np.nanmin(finite(self.margins[name]))))[:MOST_ROWS]
+        return [name for name in known if name in least]
+
+    @property
+    def height(self) -> int:
+        """Number of charts."""
+        return len(self.rows) + bool(self.acted.any())
+
+    @property
+    def acted(self) -> NDArray[np.int64]:
+        """Number of agents with an intervention of the guard, (frames,)."""
+        if self.decisions is None:
+            return np.zeros(len(self.times), dtype=np.int64)
+        return np.asarray((self.decisions > 0).sum(1))
+
+    def stacked(self) -> Iterator[tuple[str, Floats, Floats]]:
+        """Interventions stacked by source: colour, lower and upper edge, (frames,)."""
+        base = np.zeros(len(self.times))
+        for source, color in enumerate(DECIDED[1:], start=1):
+            more = base + (0 if self.decisions is None else (self.decisions == source).sum(1))
+            if (more > base).any():
+                yield color, base, more
+            base = more
 
 
-def _mark_backup(axes: Axes, agent: _Agent) -> None:
-    """Faint uprights at the instants where the backup acted."""
-    trace, decisions = agent.trace, _decisions(agent.trace)
-    if decisions is None:
-        return
-    for start, stop, value in _stretches(decisions[agent.index].astype(np.float64)):
-        if value != POLICY:
-            _, color = DECISIONS.get(int(value), ("", MUTED))
-            left, right = trace.t0 + start * trace.dt, trace.t0 + stop * trace.dt
-            axes.axvspan(left, right, color=color, alpha=0.13, lw=0)
+@dataclass(frozen=True, slots=True)
+class Mover:
+    """Function that turns artists to a frame, and the artists that it changes."""
+
+    turn: Callable[[int], None]
+    artists: tuple[Artist, ...]
 
 
-def _draw_robustness(axes: Axes, agent: _Agent, name: str) -> None:
-    rho = agent.margins[name][agent.index]
-    rho = np.where(np.isposinf(rho), np.nan, rho)
-    times = agent.trace.times[: len(rho)]
-    axes.axhline(0, color=MUTED, lw=0.7)
-    axes.fill_between(times, rho, 0, where=rho >= -TOLERANCE, step="post", color=BLUE, alpha=0.16, lw=0)
-    axes.fill_between(times, rho, 0, where=rho < -TOLERANCE, step="post", color=RED, alpha=0.3, lw=0)
-    axes.step(times, rho, where="post", color=BLUE, lw=1)
-    axes.step(times, np.where(rho < -TOLERANCE, rho, np.nan), where="post", color=RED, lw=1.4)
-    axes.set_ylim(*margin_limits(agent.margins[name]))
-    axes.locator_params(axis="y", nbins=3)
+def draw_strip(strip: Strip, panels: list[Axes]) -> list[Mover]:
+    """Draw the strip charts, one a panel; returns the parts that change from frame to frame."""
+    movers: list[Mover] = []
+    free = list(panels)
+    if strip.acted.any():
+        movers.append(_draw_interventions(strip, free.pop(0)))
+    movers += [_draw_margin(strip, name, axes) for name, axes in zip(strip.rows, free, strict=True)]
+    for axes in panels:
+        movers.append(_veil(axes, strip.times))
+        axes.grid(visible=False)
+        axes.set_yticks([])
+        axes.spines["left"].set_visible(False)
+        axes.spines["bottom"].set_visible(axes is panels[-1])
+        axes.tick_params(labelbottom=axes is panels[-1])
+    panels[-1].set_xlabel("time [s]", color=MUTED, fontsize=7.5, labelpad=1)
+    return movers
 
 
-def margin_limits(rho: NDArray[np.float64]) -> tuple[float, float]:
-    """Down to the least value; large margins are cut so that violations stay visible; zero is always seen."""
-    finite = rho[np.isfinite(rho)]
-    if not len(finite):
-        return -1.0, 1.0
-    low, high = min(float(finite.min()), 0.0), max(float(np.quantile(finite, 0.95)), 0.0)
-    if low >= -TOLERANCE:
-        low = 0.0  # rounding: nothing to make visible
-    else:
-        high = min(high, 4 * -low)
-    room = 0.12 * (high - low) or 1.0
-    return low - room, high + room
+def _draw_interventions(strip: Strip, axes: Axes) -> Mover:
+    assert strip.decisions is not None
+    agents = strip.decisions.shape[1]
+    for color, low, high in strip.stacked():
+        axes.fill_between(strip.times, low, high, step="post", color=color, lw=0)
+    axes.set_ylim(0, max(float(strip.acted.max()), 0.25 * agents) * 1.05)
+    value = _titled(axes, "guard acted")
+
+    def turn(index: int) -> None:
+        count = int(strip.acted[index])
+        value.set_text(f"{count} of {agents}")
+        value.set_color(INK if count else MUTED)
+
+    return Mover(turn, (value,))
+
+
+def _draw_margin(strip: Strip, name: str, axes: Axes) -> Mover:
+    rho = finite(strip.margins[name])
+    _plot_margin(axes, strip.times, rho)
+    axes.set_ylim(*margin_limits(rho))
+    value = _titled(axes, name)
+
+    def turn(index: int) -> None:
+        now = float(rho[index])
+        value.set_text(margin_text(now, strip.units.get(name, "")))
+        value.set_color(RED if now < -TOLERANCE else INK)
+
+    return Mover(turn, (value,))
+
+
+def _titled(axes: Axes, name: str) -> Text:
+    """Write a chart's name on its left; returns the text on its right, which holds the present value."""
+    axes.axhspan(*axes.get_ylim(), color=FAINT, alpha=0.25, lw=0, zorder=0)
+    beside: Any = {"transform": axes.transAxes, "va": "center", "fontsize": 8, "color": INK}
+    axes.text(-0.012, 0.5, picture(name), ha="right", **beside)
+    return axes.text(1.01, 0.5, "", ha="left", **beside)
+
+
+def _veil(axes: Axes, times: Floats) -> Mover:
+    """A cover over the future, and a line at the present."""
+    from matplotlib.patches import Rectangle
+
+    axes.set_xlim(float(times[0]), float(times[-1]))
+    transform = axes.get_xaxis_transform()
+    cover = Rectangle((0, 0), 0, 1, transform=transform, color=PAPER, alpha=_VEIL, lw=0, zorder=4)
+    axes.add_patch(cover)
+    present = axes.axvline(float(times[0]), color=INK, lw=1, zorder=5)
+
+    def turn(index: int) -> None:
+        now = float(times[index])
+        cover.set_bounds(now, 0, float(times[-1]) - now, 1)
+        present.set_xdata([now, now])
+
+    return Mover(turn, (cover, present))
+
+
+# ---------------------------------------------------------------------------- film of a trace
+
+
+def signal_film(trace: Trace, *, title: str = "") -> Film:
+    """The film of a trace without a world or places: the signals of all agents, a panel each."""
+    names = [c.name for c in trace.signature.columns if c.kind in ("real", "int")][:MOST_PANELS]
+    names = names or list(trace.signature.names[:MOST_PANELS])
+
+    def begin(figure: Figure) -> Callable[[int], None]:
+        grid = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+        panels = [_panel(axes, trace, name) for axes, name in zip(grid, names, strict=True)]
+        head = grid[0].set_title(f"{title}   {trace.times[-1]:.1f} s")
+        grid[-1].set_xlabel("time [s]")
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
+
+        def turn(index: int) -> None:
+            head.set_text(f"{title}   {trace.times[index]:.1f} s")
+            for panel in panels:
+                panel(index)
+
+        return turn
+
+    height = 0.7 + 0.8 * len(names)
+    alt = f"{title}: signals of {trace.traces} agents."
+    return Film(trace.samples, trace.dt, (6.4, height), begin, alt, trace.samples - 1)
+
+
+def _panel(axes: Axes, trace: Trace, name: str) -> Callable[[int], None]:
+    """One signal of at most `MOST_AGENTS` agents; all curves are one line with gaps."""
+    values = trace.data[name][:MOST_AGENTS]
+    gap = np.full((len(values), 1), np.nan)
+    axes.set_ylabel(labelled(name, trace.signature[name].unit.text).replace(" [", "\n[", 1))
+    times = np.broadcast_to(trace.times, values.shape)
+    axes.plot(np.hstack([times, gap]).ravel(), np.hstack([values, gap]).ravel(), color=INK, lw=0.8, alpha=0.7)
+    (present,) = axes.plot([], [], "o", color=BLUE, ms=3, zorder=5)
+    cover = _veil(axes, trace.times)
+
+    def turn(index: int) -> None:
+        present.set_data(times[:, index], values[:, index])
+        cover.turn(index)
+
+    return turn

@@ -49,6 +49,11 @@ def seconds(value: float | None) -> str:
     return f"{minutes} min {rest} s" if rest else f"{minutes} min"
 
 
+def labelled(name: str, unit: str) -> str:
+    """A name with its unit, `v [m/s]`, as axes have it; the name alone for a number without unit."""
+    return f"{name} [{unit}]" if unit not in ("", "1") else name
+
+
 def count(many: int, what: str) -> str:
     """`1 trace`, `20 traces`."""
     return f"{many:,} {what}{'' if many == 1 else 's'}"

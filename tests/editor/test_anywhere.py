@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stlc.editor.completion import complete
-from stlc.editor.document import Systems, look_at
+from stlc.editor.document import Systems, definition, look_at, outline
 from stlc.editor.hover import hover
-from stlc.editor.navigation import definition, outline
 from stlc.editor.rename import RenameError, rename
 from stlc.source import Source
 

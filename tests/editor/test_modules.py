@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from stlc.editor.completion import complete
-from stlc.editor.document import Document, Systems, look_at
+from stlc.editor.document import Document, Systems, definition, look_at
 from stlc.editor.hover import hover
-from stlc.editor.navigation import definition
 from stlc.source import Source
 
 LIMITS = "const top [m] = 3\n## near enough\ndef near(d) = d < top\nsignal z\nrequire r: z > 0\n"

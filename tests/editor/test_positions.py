@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.editor.positions import Layout, Place
+from stlc.editor.server import Layout, Place
 
 TEXTS = st.text(alphabet="ab \t\r\né€😀\u2028", max_size=30)
 

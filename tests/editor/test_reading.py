@@ -3,7 +3,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.editor.reading import read
+from stlc.editor.document import read
 from stlc.source import Source
 
 GOOD = "signal x [m]\nconst c = 2 m\nrequire a: x > c\nrequire b: always[0 s, 1 s] x > 0 m\n"

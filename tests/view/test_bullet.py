@@ -9,7 +9,7 @@ import pytest
 from stlc.controller.stage import Ball, Stage
 from stlc.diagnostics import MissingError
 from stlc.view import bullet
-from stlc.view.bodies import dressed
+from stlc.view.bullet import dressed
 
 PANDA = Path(__file__).parents[2] / "examples/panda.urdf"
 needs_pybullet = pytest.mark.skipif(not bullet.available(), reason="PyBullet is not installed")

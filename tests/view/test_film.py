@@ -1,17 +1,19 @@
 """Films: frames, time, size."""
 
+import io
 import re
 import subprocess
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageDraw
 
+from stlc.controller.sketch import DECIDED
 from stlc.diagnostics import MissingError
-from stlc.view.film import save_film, save_still
+from stlc.view.film import COLOURS, encoded, encoder, fitting, save_film, save_still
 from stlc.view.scene import Staging, scene_film
-from stlc.view.signal_film import signal_film
-from stlc.view.video import encoder
+from stlc.view.signals import signal_film
+from stlc.view.style import GREEN, RED
 
 
 def draw_dot(axes, scene, index):
@@ -105,7 +107,7 @@ def test_a_video_has_the_same_pictures_twice_as_fine(tmp_path):
 
 
 def test_without_ffmpeg_there_is_no_video(tmp_path, monkeypatch):
-    monkeypatch.setattr("stlc.view.video.encoder", lambda: None)
+    monkeypatch.setattr("stlc.view.film.encoder", lambda: None)
     film = film_of({"x": np.linspace(1, 19, 2)})
     with pytest.raises(MissingError, match="R301"):
         save_film(film, tmp_path / "a.gif", tmp_path / "a.mp4")
@@ -116,9 +118,65 @@ def test_an_ffmpeg_that_fails_leaves_nothing(tmp_path, monkeypatch):
     broken = tmp_path / "ffmpeg"
     broken.write_text("#!/bin/sh\necho no such codec >&2\nexit 1\n")
     broken.chmod(0o755)
-    monkeypatch.setattr("stlc.view.video.encoder", lambda: str(broken))
+    monkeypatch.setattr("stlc.view.film.encoder", lambda: str(broken))
     film = film_of({"x": np.linspace(1, 19, 2)})
     with pytest.raises(MissingError) as raised:
         save_film(film, tmp_path / "a.gif", tmp_path / "a.mp4")
     assert raised.value.diagnostics[0].note == ("no such codec",)
     assert list(tmp_path.iterdir()) == [broken]
+
+
+# ---------------------------------------------------------------------- test_gif
+
+
+def rgb(color):
+    return np.array([int(color[k : k + 2], 16) for k in (1, 3, 5)])
+
+
+def legends(count=3):
+    """A large soft gradient, as renderers make them, and above it a dot in each colour of a legend."""
+    shades = np.linspace(120, 250, 400 * 200).reshape(200, 400)
+    ground = np.stack([shades, shades, shades + 5], axis=2).astype(np.uint8)
+    pictures = []
+    for _ in range(count):
+        picture = Image.fromarray(ground)
+        pen = ImageDraw.Draw(picture)
+        for index, color in enumerate((*DECIDED, GREEN, RED)):
+            pen.ellipse((10 + 20 * index, 4, 16 + 20 * index, 10), fill=color)
+        pictures.append(picture)
+    return pictures
+
+
+def frame(data, index=0):
+    with Image.open(io.BytesIO(data)) as image:
+        image.seek(index)
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
+def test_a_dot_of_the_legend_keeps_its_colour():
+    shown = frame(encoded(legends(), 50))
+    for index, color in enumerate((*DECIDED, GREEN, RED)):
+        assert np.abs(shown[7, 13 + 20 * index] - rgb(color)).max() <= 8, color
+
+
+def test_what_is_seen_at_the_end_alone_keeps_its_colour():
+    pictures = legends(40)
+    ImageDraw.Draw(pictures[-1]).rectangle((300, 100, 320, 110), fill="#7700ff")
+    shown = frame(encoded(pictures, 50), 1)  # equal frames are stored once
+    assert np.abs(shown[105, 310] - rgb("#7700ff")).max() <= 8
+
+
+def test_few_colours_are_kept_as_they_are():
+    picture = Image.new("RGB", (60, 40), "white")
+    ImageDraw.Draw(picture).point((5, 5), fill=RED)
+    data = encoded([picture], 50)
+    assert frame(data)[5, 5].tolist() == rgb(RED).tolist()
+    assert frame(data)[0, 0].tolist() == [255, 255, 255]
+
+
+def test_there_are_no_more_colours_than_allowed_and_a_large_film_is_made_smaller():
+    whole = encoded(legends(), 50)
+    assert len(np.unique(frame(whole).reshape(-1, 3), axis=0)) <= COLOURS
+    small = fitting(legends(), 50, len(whole) - 1)
+    assert len(small) < len(whole)
+    assert frame(small).shape[1] < 400

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stlc.view.failures import draw_failures
 from stlc.view.held_out import (
     HeldOut,
+    draw_failures,
     find_weakness,
     load_held_out,
     region_text,

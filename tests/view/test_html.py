@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stlc.escape import html as text_of
-from stlc.view.highlight import spec_html, yaml_html
-from stlc.view.html import Html, el, facts, figure, join, table
+from stlc.view.html import Html, el, facts, figure, join, spec_html, table, yaml_html
 
 HOSTILE = "<script>alert('1')</script> & \"quoted\""
 

@@ -14,10 +14,9 @@ import stlc.view
 from stlc.diagnostics import MissingError, RunError
 from stlc.rundir import RunDir
 from stlc.trace import save_trace
-from stlc.view.closing import repeat_section
 from stlc.view.deployment import deployment_section
 from stlc.view.material import gather
-from stlc.view.report import render_report, sections_of, write_report
+from stlc.view.report import render_report, repeat_section, sections_of, write_report
 
 VOID = {"meta", "img", "br", "hr", "input"}
 

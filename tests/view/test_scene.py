@@ -6,7 +6,7 @@ import pytest
 from stlc.controller.sketch import DECIDERS
 from stlc.view.film import DPI
 from stlc.view.scene import TALLEST, WIDTH, Staging, scene_film
-from stlc.view.strip import MOST_ROWS, Strip
+from stlc.view.signals import MOST_ROWS, Strip
 from stlc.view.style import PAPER, look, new_figure
 
 FRAMES = 21

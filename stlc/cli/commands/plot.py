@@ -67,7 +67,7 @@ def plot(
     from stlc.cli.check.judge import Question, laid_out, monitor_of, names_of, specification, time_step
     from stlc.trace import read_recording
     from stlc.view import require_drawing
-    from stlc.view.driven import margins_of, units_of
+    from stlc.view.judged import margins_of, units_of
     from stlc.view.signals import draw_signals
 
     require_drawing()
@@ -187,7 +187,7 @@ def _require_trace(traces: int, wanted: int) -> None:
 def _choices(trace: Trace, margins: Margins, wanted: int | None) -> tuple[Choice, ...]:
     import numpy as np
 
-    from stlc.view.driven import trace_names
+    from stlc.view.judged import trace_names
     from stlc.view.signals import Choice, acted_in, choose_traces
 
     names = trace_names(trace)

@@ -21,8 +21,8 @@ def draw(run: Run) -> dict[str, str]:
     from stlc.view.animate import animate, seen_in
     from stlc.view.bullet import ADVICE as BODIES
     from stlc.view.bullet import available as in_space
+    from stlc.view.film import ADVICE as VIDEO
     from stlc.view.report import write_report
-    from stlc.view.video import ADVICE as VIDEO
 
     seen = seen_in(run.dir)
     if seen is not None and seen.stage is not None and not in_space():

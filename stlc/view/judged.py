@@ -1,0 +1,237 @@
+"""Recorded drives under the specification that they carry: monitor, margins, violations as events."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.ir.traverse import margin_unit
+from stlc.grammar import ast
+from stlc.grammar.parse.parser import parse
+from stlc.monitor.explain.report import explain_at
+from stlc.monitor.judgement import Judgement
+from stlc.monitor.verdict import Monitor, Verdict
+from stlc.source import Source
+from stlc.trace import Trace
+from stlc.view.signals import Strip
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+ENOUGH = 0.4
+"""Least share of model-consistent instants for which margins of these alone are shown."""
+AS_FORESEEN = "least margin from each instant on, of the agents for which the world did as the model says"
+MOST = 240
+"""Events of one requirement that are looked for."""
+FLASH = (True, True, True, False)
+"""Frames in which a mark is shown, repeated."""
+FLASHES = 4
+
+
+def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None, drives: bool = False) -> Monitor:
+    """The monitor of the specification that a trace carries, or else of `text`.
+
+    Args:
+        trace: the recording.
+        text: specification for a trace that carries none.
+        system: the system file, which provides external functions.
+        drives: judge by the rules of drives where the trace carries them, not by the specification of plans.
+
+    Raises:
+        SpecError: the specification is invalid.
+    """
+    carried = trace.meta.carried if drives else trace.meta.planned
+    spec = replace(parse(Source("spec.stl", carried.text or text)), library=carried.library or None)
+    outside = any(isinstance(item, ast.Extern) for item in spec.items)
+    used = system if outside and system is not None and system.is_file() else None
+    return Monitor(spec, system=used, overrides=carried.overrides)
+
+
+def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, Floats]:
+    """Robustness of each judged requirement from each sample on, (traces, samples); NaN where undefined.
+
+    A requirement that is judged once has that value at every sample.
+    """
+    found = monitor.requirement_robustness(trace)
+    rows = {judgement.name: np.atleast_2d(found[judgement.name]) for judgement in verdict}
+    for name in judged_once(verdict):
+        rows[name] = np.repeat(verdict[name].least[:, None], rows[name].shape[1], 1)
+    return rows
+
+
+def units_of(verdict: Verdict) -> dict[str, str]:
+    """Requirement -> unit of its robustness, where it has one."""
+    return {j.name: unit for j in verdict if (unit := margin_unit(j.rule.typed.formula))}
+
+
+def judged_once(verdict: Verdict) -> list[str]:
+    """Names of the requirements that are judged at the start of a trace alone."""
+    planned = verdict.subject.horizon is not None
+    return [j.name for j in verdict if j.rule.absolute or not (j.rule.windowed and planned)]
+
+
+def trace_names(trace: Trace) -> list[str]:
+    """Names of traces: their numbers, with seed and agent where these were recorded."""
+    seeds, agents = trace.extras.get("seed"), trace.extras.get("agent")
+    if seeds is None or agents is None or not len(seeds) == len(agents) == trace.traces:
+        return [f"trace {index}" for index in range(trace.traces)]
+    return [
+        f"trace {index} (seed {seed}, agent {agent})"
+        for index, (seed, agent) in enumerate(zip(seeds.tolist(), agents.tolist(), strict=True))
+    ]
+
+
+# ------------------------------------------------------------------------------ agents of a scene
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """The drives of a scene's agents, those of the first seed, and the verdict on them.
+
+    Attributes:
+        trace: of these agents.
+        monitor: of the specification of plans.
+        verdict: by it.
+        drove: verdict by the rules of drives, where the trace carries them; else the same.
+        foreseen: samples from which the world followed the model for the length of a plan,
+            (agents, samples); None: not recorded.
+    """
+
+    trace: Trace
+    monitor: Monitor
+    verdict: Verdict
+    drove: Verdict
+    foreseen: Mask | None
+
+    @property
+    def marked(self) -> set[str]:
+        """Requirements whose violations are marked: all rules of drives, else what is tagged `@safety`."""
+        names = {judgement.name for judgement in self.drove if "safety" in judgement.rule.tags}
+        ruled = bool(self.trace.meta.judge_text)
+        return names if names and not ruled else {judgement.name for judgement in self.drove}
+
+
+def judged_in(trace: Trace, agents: int, *, system: Path) -> Judged:
+    """The first `agents` of a trace, judged by the specification that it carries.
+
+    Raises:
+        StlcError: the trace cannot be judged.
+    """
+    first = {name: values[:agents] for name, values in trace.data.items()}
+    monitor, seen = monitor_of(trace, system=system), replace(trace, data=first, extras={})
+    verdict = drove = monitor.check(seen)
+    if trace.meta.judge_text:
+        drove = monitor_of(trace, system=system, drives=True).check(seen)
+    return Judged(seen, monitor, verdict, drove, as_foreseen(trace, agents))
+
+
+def strip_of(judged: Judged, decisions: NDArray[np.int64] | None) -> Strip:
+    """Strip charts of the agents' margins and of the decisions, (frames, agents)."""
+    rows, units = margins_of(judged.monitor, judged.verdict, judged.trace), units_of(judged.verdict)
+    times, every = judged.trace.times, {name: least(rho) for name, rho in rows.items()}
+    if judged.foreseen is not None:
+        margins = {name: least(rho, judged.foreseen) for name, rho in rows.items()}
+        if _known(margins) >= ENOUGH * _known(every):
+            return Strip(times, margins, decisions, AS_FORESEEN, units)
+    return Strip(times, every, decisions, units=units)
+
+
+def as_foreseen(trace: Trace, agents: int) -> Mask | None:
+    """Model-consistent samples: the world follows the model from there for the length of a plan.
+
+    Returns:
+        (agents, samples), or None where that was not recorded.
+    """
+    steps, horizon = trace.extras.get("foreseen"), trace.meta.horizon
+    if steps is None or horizon is None or steps.shape != (trace.traces, trace.samples - 1):
+        return None
+    wrong = np.cumsum(np.pad(steps[:agents] == 0, ((0, 0), (1, horizon))), axis=1)
+    return np.asarray(wrong[:, horizon : horizon + trace.samples] == wrong[:, : trace.samples])
+
+
+def least(rho: Floats, counts: Mask | bool = True) -> Floats:
+    """Least robustness of the agents that count, (agents, samples) -> (samples,); NaN where none is known."""
+    known = np.where(counts & ~np.isnan(rho), rho, np.inf).min(0)
+    return np.where(np.isfinite(known), known, np.nan)
+
+
+def _known(margins: Mapping[str, Floats]) -> int:
+    return sum(int(np.isfinite(rho).sum()) for rho in margins.values())
+
+
+# ------------------------------------------------------------------------------------- violations
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One violation by one agent.
+
+    Attributes:
+        requirement: its name.
+        agent: number of the trace.
+        sample: of the violation.
+        until: last sample of violations that follow one another without a gap.
+        start: first sample of the window in which it was judged.
+        because: cause in one line.
+    """
+
+    requirement: str
+    agent: int
+    sample: int
+    until: int
+    start: int
+    because: str
+
+
+def events_of(verdict: Verdict, agents: int, *, most: int = MOST) -> list[Event]:
+    """Violations by the first `agents` traces, in the order of time.
+
+    A violation is placed at the instant that explains it. The search goes on with windows that begin after
+    that instant, so that each instant is found once; it ends after `most` of a requirement.
+    """
+    found: list[Event] = []
+    for judgement in verdict:
+        own: list[Event] = []
+        for agent in range(min(agents, verdict.traces)):
+            own += _events(verdict, judgement, agent, most - len(own))
+        found += own
+    return sorted(found, key=lambda event: (event.sample, event.agent))
+
+
+def _events(verdict: Verdict, judgement: Judgement, agent: int, most: int) -> list[Event]:
+    if judgement.scope is not None and not judgement.scope[agent]:
+        return []
+    starts = judgement.start + np.flatnonzero(judgement.fails[:, agent])
+    found: list[Event] = []
+    while len(starts) and len(found) < most:
+        start = int(starts[0])
+        cause = explain_at(verdict, judgement.name, agent, start)
+        if found and cause.sample <= found[-1].until + 1:
+            found[-1] = replace(found[-1], until=max(cause.sample, found[-1].until))
+        else:
+            found.append(Event(judgement.name, agent, cause.sample, cause.sample, start, cause.because))
+        starts = starts[starts > max(start, cause.sample)]
+    return found
+
+
+def marks(events: Iterable[Event], frames: int, agents: int, names: Collection[str] | None = None) -> Mask:
+    """Marks of a film, (frames, agents): during a violation, and flashing for a moment after it.
+
+    Args:
+        events: violations.
+        frames: instants of the film.
+        agents: number of agents in it.
+        names: requirements that count; None: all.
+    """
+    shown = np.zeros((frames, agents), dtype=bool)
+    pattern = np.array(FLASH * FLASHES)
+    for event in events:
+        if event.agent < agents and (names is None or event.requirement in names):
+            shown[event.sample : event.until + 1, event.agent] = True
+            after = shown[event.until : event.until + len(pattern), event.agent]
+            after |= pattern[: len(after)]
+    return shown
