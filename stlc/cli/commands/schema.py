@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -13,7 +12,6 @@ from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.registry import closest
 
-FOLDER = Path(__file__).parents[2] / "schemas"
 SYSTEM_FILE = "system-file"
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -35,9 +33,10 @@ def schema(
 
 
 def names() -> list[str]:
-    """All schemas, such as `check/1`; `system-file/1` is that of what users write."""
-    commands = (path.stem for path in FOLDER.glob("*.json") if path.stem != "frame")
-    return sorted(f"{name}/1" for name in (*commands, SYSTEM_FILE))
+    """All schemas, such as `check/1`; `system-file/1` is that of system files."""
+    from stlc.cli.framework.documents import RESULTS
+
+    return sorted(f"{name}/1" for name in (*RESULTS, SYSTEM_FILE))
 
 
 def load_schema(name: str) -> dict[str, Any]:
@@ -56,14 +55,8 @@ def load_schema(name: str) -> dict[str, Any]:
         from stlc.dynamics.declaration.load import system_schema
 
         return {"$schema": _DIALECT, "title": wanted, **system_schema()}
-    frame = _read("frame")
-    properties = {**frame["properties"], "schema": {"const": wanted}}
-    result = _read(command)
-    shared = {"$defs": result.pop("$defs")} if "$defs" in result else {}
-    properties["result"] = {"anyOf": [result, {"type": "null"}]}
-    return {"$schema": _DIALECT, "title": wanted, **frame, "properties": properties, **shared}
+    from stlc.cli.framework.documents import RESULTS, Document, schema_of
 
-
-def _read(name: str) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
-    return found
+    frame = schema_of(Document)
+    frame["properties"] |= {"schema": {"const": wanted}, "result": schema_of(RESULTS[command] | None)}
+    return {"$schema": _DIALECT, "title": wanted, **frame}

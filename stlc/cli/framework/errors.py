@@ -15,7 +15,6 @@ import typer
 from stlc.cli.framework.output import emit_json, show_diagnostics
 from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError
 
-SCHEMAS = Path(__file__).parents[2] / "schemas"
 INTERNAL_ERROR = 70
 INTERRUPTED = 130
 TERMINATED = 143
@@ -73,8 +72,9 @@ def wants_json(argv: Sequence[str]) -> bool:
 
 def _schema(argv: Sequence[str]) -> str:
     """That of the command, where it has one; `stlc/1` is the frame with no result."""
-    known = {path.stem for path in SCHEMAS.glob("*.json")}
-    return f"{argv[0]}/1" if argv and argv[0] in known else "stlc/1"
+    from stlc.cli.framework.documents import RESULTS
+
+    return f"{argv[0]}/1" if argv and argv[0] in RESULTS else "stlc/1"
 
 
 def _known(error: BaseException) -> StlcError | None:

@@ -1,0 +1,666 @@
+"""Documents that commands print with `--json`, as typed records: their JSON Schemas are derived from these.
+
+Times are in seconds, positions in files count from 1; a `Num` that is not finite is a text.
+Within a major number of a schema keys are added and never taken away.
+"""
+
+from __future__ import annotations
+
+from types import NoneType
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NotRequired,
+    TypeAlias,
+    TypedDict,
+    get_args,
+    get_origin,
+    get_type_hints,
+    is_typeddict,
+)
+
+Num: TypeAlias = float | str
+Count = Annotated[int, 0]
+Positive = Annotated[float, 0]
+"""Numbers of at least 0."""
+
+
+class Horizon(TypedDict):
+    seconds: Num
+    steps: int
+
+
+class UnknownSamples(TypedDict):
+    samples: int
+    first: float
+    last: float
+
+
+class WorstStart(TypedDict):
+    trace: int
+    start: Num
+    time: Num
+
+
+class Robustness(TypedDict):
+    min: Num | None
+    mean: Num | None
+    low: Num | None
+    high: Num | None
+    argmin: WorstStart
+    unit: str
+
+
+class Reading(TypedDict):
+    signal: str
+    value: Num
+    text: str
+    unit: str
+
+
+class Place(TypedDict):
+    line: int
+    column: int
+
+
+class Cause(TypedDict):
+    signal: str | None
+    value: Num | None
+    predicate: str
+    readings: list[Reading]
+    trace: int
+    start: int
+    sample: int
+    time: Num
+    span: Place
+    requirement: Place
+    because: str
+
+
+class CheckedRequirement(TypedDict):
+    name: str
+    doc: str
+    tags: list[str]
+    verdict: Literal["satisfied", "violated", "inconclusive"]
+    robustness: Robustness
+    starts: int
+    satisfied_share: Num
+    violated_traces: int
+    cause: Cause | None
+
+
+class CheckedTrace(TypedDict):
+    trace: str
+    spec: str
+    spec_sha256: str
+    dt: Num
+    horizon: Horizon | None
+    end: Literal["open", "strict", "truncate"]
+    traces: int
+    samples: int
+    unknown: dict[str, UnknownSamples]
+    in_scope: int
+    verdict: Literal["satisfied", "violated", "inconclusive", "out of scope"]
+    robustness: Num | None
+    satisfied_traces: int
+    satisfied_share: Num
+    requirements: list[CheckedRequirement]
+
+
+class InvalidTrace(TypedDict):
+    trace: str
+    verdict: Literal["invalid"]
+
+
+class CheckedTraces(TypedDict):
+    verdict: Literal["satisfied", "violated", "inconclusive", "out of scope"]
+    files: list[CheckedTrace | InvalidTrace]
+
+
+class AddedState(TypedDict):
+    name: str
+
+
+class WrittenInterval(TypedDict):
+    operator: str
+    steps: list[int | None]
+    seconds: list[Num | None]
+    written: str
+    line: int | None
+
+
+class RequirementInSteps(TypedDict):
+    name: str
+    doc: str
+    tags: list[str]
+    weight: Num
+    scale: Num
+    reach: Horizon
+    intervals: list[WrittenInterval]
+
+
+class CompiledSpec(TypedDict):
+    spec: str
+    spec_sha256: str
+    system: str
+    dt: Num
+    horizon: Horizon
+    states: list[str]
+    added: list[AddedState]
+    safety: list[str]
+    requirements: list[RequirementInSteps]
+
+
+class SyntaxTree(TypedDict):
+    node: str
+    line: int
+    column: int
+
+
+class ParsedFile(TypedDict):
+    file: str
+    tree: SyntaxTree
+
+
+class ParsedFiles(TypedDict):
+    files: list[ParsedFile]
+
+
+class InstallationFinding(TypedDict):
+    name: str
+    state: Literal["ok", "missing", "off"]
+    detail: str
+
+
+class InstallationReport(TypedDict):
+    findings: list[InstallationFinding]
+
+
+class CodeList(TypedDict):
+    codes: dict[str, str]
+
+
+class PageExample(TypedDict):
+    language: str
+    notes: list[str]
+    text: str
+
+
+class ManualPage(TypedDict):
+    name: str
+    title: str
+    text: str
+    examples: list[PageExample]
+
+
+class RequirementInWords(TypedDict):
+    name: str
+    kind: Literal["require", "assume"]
+    tags: list[str]
+    doc: str
+    sentence: str
+    where: dict[str, str]
+
+
+class SpecInWords(TypedDict):
+    spec: str
+    requirements: list[RequirementInWords]
+
+
+class CauseNode(TypedDict):
+    depth: int
+    text: str
+    line: int
+    column: int
+    holds: bool
+    time: Num
+    robustness: Num
+    readings: list[str]
+    unit: str
+
+
+class ViolationCause(TypedDict):
+    requirement: str
+    trace: int
+    start: Num
+    because: str
+    tree: list[CauseNode]
+
+
+class Explanation(TypedDict):
+    trace: str
+    verdict: Literal["satisfied", "violated", "inconclusive"]
+    causes: list[ViolationCause]
+
+
+class TriedControl(TypedDict):
+    name: str
+    low: float
+    high: float
+    values: list[float]
+
+
+class ChanceOfPrefix(TypedDict):
+    radius: float
+    length: int
+    candidates: int
+    theorem: float
+    bound: float
+    exact: float
+    sampled: bool
+
+
+class Guarantee(TypedDict):
+    run: str
+    assumptions: list[str]
+    controls: list[TriedControl]
+    chances: list[ChanceOfPrefix]
+
+
+class ExportCheck(TypedDict):
+    states: int
+    plan: float
+    rho: float
+
+
+class ExportLatency(TypedDict):
+    median_ms: float
+    p99_ms: float
+
+
+class ExportedRun(TypedDict):
+    run: str
+    target: Literal["torch", "c", "onnx"]
+    folder: str
+    files: list[str]
+    checked: ExportCheck | None
+    latency: ExportLatency | None
+
+
+class FormattedFiles(TypedDict):
+    files: list[str]
+    changed: list[str]
+    written: bool
+    diff: NotRequired[str]
+
+
+class Range(TypedDict):
+    start: Place
+    end: Place
+
+
+class Label(TypedDict):
+    file: str | None
+    range: Range | None
+    text: str
+
+
+class Edit(TypedDict):
+    file: str | None
+    range: Range | None
+    replacement: str
+
+
+class Fix(TypedDict):
+    text: str
+    edits: list[Edit]
+
+
+class Diagnostic(TypedDict):
+    code: str
+    severity: Literal["error", "warning"]
+    message: str
+    file: str | None
+    range: Range | None
+    label: str
+    labels: list[Label]
+    help: list[str]
+    note: list[str]
+    fix: Fix | None
+
+
+class Document(TypedDict):
+    stlc: str
+    schema: str
+    ok: bool
+    exit_code: int
+    diagnostics: list[Diagnostic]
+    result: Any
+
+
+class CreatedFiles(TypedDict):
+    files: list[str]
+
+
+class LintedFiles(TypedDict):
+    files: list[str]
+    findings: int
+    fixed: int
+
+
+class PlottedTrace(TypedDict):
+    trace: str
+    picture: str
+    shown: list[int]
+
+
+class TrainingVerdict(TypedDict):
+    level: Literal["infeasible", "no plan known", "undertrained", "partly trained", "trained"]
+    share_of_feasible: float | None
+    sentence: str
+    advice: list[str]
+    next: str
+    worst: NotRequired[str]
+
+
+class WrittenReport(TypedDict):
+    run: str
+    report: str
+    verdict: NotRequired[TrainingVerdict]
+
+
+class RunList(TypedDict):
+    runs: list[dict[str, Any]]
+
+
+class RunComparison(TypedDict):
+    runs: list[str]
+    facts: list[dict[str, Any]]
+    files: list[str]
+
+
+class RunContent(TypedDict):
+    run: str
+    record: dict[str, Any]
+    files: list[str]
+
+
+class RemovedRuns(TypedDict):
+    removed: list[str]
+
+
+class ScenarioResult(TypedDict):
+    doc: str
+    expect: Literal["nominal", "ood"]
+    guards: dict[str, Any]
+    judge: NotRequired[dict[str, Any] | None]
+
+
+class MetricValues(TypedDict):
+    mean: Num
+    low: Num
+    high: Num
+    values: list[Num]
+
+
+class UnsafeStart(TypedDict):
+    seed: int
+    agent: int
+    savable: bool
+
+
+class DecisionLatency(TypedDict):
+    median: Num
+    p99: Num
+    samples: int
+
+
+class RuleCounts(TypedDict):
+    obeyed: Count
+    broken: Count
+    undecided: Count
+
+
+class LossCause(TypedDict):
+    why: Literal["start", "told", "later", "missed"]
+    time: Positive
+
+
+class BrokenRun(TypedDict):
+    seed: int
+    agent: Count
+    lost: bool
+    rules: dict[str, float | None]
+    cause: LossCause | None
+
+
+class JudgedRuns(TypedDict):
+    count: Count
+    obeyed: Count
+    undecided: Count
+    lost: Count
+    told: Count
+    rules: dict[str, RuleCounts]
+    broken: list[BrokenRun]
+
+
+class GuardedRuns(TypedDict):
+    metrics: dict[str, MetricValues]
+    units: dict[str, str]
+    decisions: dict[str, Num]
+    unsafe: NotRequired[list[UnsafeStart]]
+    latency: DecisionLatency
+    drives: NotRequired[JudgedRuns]
+
+
+class ModelErrors(TypedDict):
+    actuator_gain: NotRequired[float]
+    parameters: NotRequired[float]
+    actuator_noise: NotRequired[float]
+    sensor_noise: NotRequired[float]
+    numbers: NotRequired[list[str]]
+
+
+class JudgeSpec(TypedDict):
+    spec: str
+    path: str
+    rules: dict[str, str]
+
+
+class Simulation(TypedDict):
+    scenarios: NotRequired[dict[str, ScenarioResult]]
+    spec: str
+    system: str
+    run: str
+    world: str | None
+    scenario: str | None
+    trace: str
+    seeds: list[int]
+    agents: int
+    steps: int
+    replan: int
+    starts: NotRequired[Literal["any", "savable", "feasible"]]
+    redrawn: NotRequired[Count]
+    time_limit: NotRequired[float | None]
+    paper_time_limit: NotRequired[float | None]
+    ceiling: NotRequired[int]
+    overrides: NotRequired[dict[str, str]]
+    interval: str
+    guards: dict[str, GuardedRuns]
+    animation: NotRequired[str]
+    video: NotRequired[str]
+    report: NotRequired[str]
+    errors: NotRequired[ModelErrors]
+    margin: NotRequired[dict[str, Positive]]
+    safety: NotRequired[list[str]]
+    judge: NotRequired[JudgeSpec | None]
+
+
+class ListedSystem(TypedDict):
+    name: str
+    path: str
+    doc: str
+
+
+class SystemList(TypedDict):
+    systems: list[ListedSystem]
+
+
+class StateFacts(TypedDict):
+    name: str
+    kind: str
+    unit: str
+    role: str
+    low: Num | None
+    high: Num | None
+    labels: dict[str, Num]
+    flow: str | None
+
+
+class ControlRange(TypedDict):
+    name: str
+    unit: str
+    low: Num
+    high: Num
+
+
+class KinematicsCheck(TypedDict):
+    name: str
+    distance_m: float | None
+    why_not: str | None
+
+
+class DrivenSteps(TypedDict):
+    steps: int
+    seed: int
+
+
+class SystemFacts(TypedDict):
+    name: str
+    doc: str
+    path: str
+    dt: Num
+    horizon: Horizon
+    states: list[StateFacts]
+    controls: list[ControlRange]
+    constants: dict[str, Num]
+    jumps: list[str]
+    situations: list[str]
+    kinematics: NotRequired[list[KinematicsCheck]]
+    driven: NotRequired[DrivenSteps]
+
+
+class GuardResult(TypedDict):
+    guard: Literal["none", "paper", "full"]
+    drives: int
+    satisfied: int
+    share: Num
+    interval: list[Num]
+    safe: Num | None
+    compared: int
+    gained: int
+    lost: int
+
+
+class ClosedLoop(TypedDict):
+    recommended: Literal["none", "paper", "full", None]
+    share: Num | None
+    interval: list[Num] | None
+    guards: list[GuardResult]
+    seed: int
+    steps: int
+    judge: str | None
+    why: str
+
+
+class Training(TypedDict):
+    accuracy: NotRequired[Num]
+    interval: NotRequired[list[Num]]
+    held_out: NotRequired[int]
+    requirements: NotRequired[dict[str, Num]]
+    feasible: NotRequired[Num]
+    searched: NotRequired[int]
+    closed_loop: NotRequired[ClosedLoop]
+    verdict: NotRequired[TrainingVerdict]
+    steps: NotRequired[int | None]
+    schedule: NotRequired[str | None]
+
+
+class TrainedRun(Training):
+    run: str
+    seconds: Num
+
+
+class TrainedJob(Training):
+    spec: str
+    seed: NotRequired[int]
+    exit_code: int
+    why: NotRequired[str]
+    run: NotRequired[str]
+    seconds: NotRequired[Num]
+
+
+class TrainedRuns(TypedDict):
+    runs: list[TrainedJob]
+
+
+RESULTS: dict[str, Any] = {
+    "check": CheckedTrace | CheckedTraces,
+    "compile": CompiledSpec | ParsedFile | ParsedFiles,
+    "doctor": InstallationReport,
+    "explain": CodeList | ManualPage | SpecInWords | Explanation | Guarantee,
+    "export": ExportedRun,
+    "fmt": FormattedFiles,
+    "init": CreatedFiles,
+    "lint": LintedFiles,
+    "plot": PlottedTrace,
+    "report": WrittenReport,
+    "runs": RunList | RunComparison | RunContent | RemovedRuns,
+    "simulate": Simulation,
+    "stlc": NoneType,
+    "system": SystemList | SystemFacts,
+    "train": TrainedRun | TrainedRuns,
+}
+"""The result of each command's document, by the name of its schema."""
+
+
+# ------------------------------------------------------------------------------ JSON Schema
+
+_OPEN = (SyntaxTree,)
+"""Records with further keys."""
+_NAMES: dict[Any, str] = {str: "string", int: "integer", float: "number", bool: "boolean", NoneType: "null"}
+
+
+def schema_of(kind: Any) -> dict[str, Any]:
+    """JSON Schema (draft 2020-12) of the values of a type."""
+    origin, args = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return {}
+    if kind in _NAMES:
+        return {"type": _NAMES[kind]}
+    if is_typeddict(kind):
+        return _object(kind)
+    if origin is Annotated:
+        return {**schema_of(args[0]), "minimum": args[1]}
+    if origin is Literal:
+        return {"enum": list(args)}
+    if origin is dict:
+        return {"type": "object"} | ({} if args[1] is Any else {"additionalProperties": schema_of(args[1])})
+    if origin is list:
+        return {"type": "array", "items": schema_of(args[0])}
+    if origin is tuple:
+        return {"type": "array", "items": schema_of(args[0]), "minItems": len(args), "maxItems": len(args)}
+    return _union([schema_of(each) for each in args])
+
+
+def _object(kind: Any) -> dict[str, Any]:
+    properties, required = {}, []
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        optional = get_origin(hint) is NotRequired
+        properties[name] = schema_of(get_args(hint)[0] if optional else hint)
+        required += [] if optional else [name]
+    found: dict[str, Any] = {"type": "object", "properties": properties}
+    found |= {"required": required} if required else {}
+    return found | ({"additionalProperties": True} if kind in _OPEN else {})
+
+
+def _union(parts: list[dict[str, Any]]) -> dict[str, Any]:
+    """Alternatives; a type or null, and several plain types, are one schema."""
+    plain = [part["type"] for part in parts if part.keys() == {"type"}]
+    rest = [part for part in parts if part.keys() != {"type"}]
+    if not rest:
+        return {"type": plain}
+    if len(rest) == 1 and plain == ["null"] and "type" in rest[0]:
+        return {**rest[0], "type": [rest[0]["type"], "null"]}
+    return {"anyOf": parts}
