@@ -17,7 +17,7 @@ from formula_strategies import GRID, SPAN, formulas
 from hypothesis import strategies as st
 from reference import EXTREMA, Interval, Robustness, Trace
 
-from stlc.compile.augment.lift import lifted, recorded
+from stlc.compile.augment.lift import from_first_sample, hoist_absolute
 from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
@@ -298,7 +298,7 @@ def check_moved(draw: Draw, env: dict[str, Any]) -> None:
     ops = st.sampled_from(["always", "eventually"])
     beside = logic(draw(BOTH), draw(part), draw(absolutes()))
     whole = windowed(draw(ops), interval(draw), beside if draw(st.booleans()) else draw(absolutes()))
-    moved = lifted(whole, sink := [])
+    moved = hoist_absolute(whole, sink := [])
     assert not sink
     # a window behind the end of a trace is empty where it is cut, whatever is constant in it
     for end in ("open",) if len(env["x"]) < 7 else ENDS:
@@ -312,7 +312,7 @@ def check_clock(draw: Draw, env: dict[str, Any]) -> None:
     for name in ALL:
         for end in ENDS:
             one = defined(mission, env, name, end, OnTheClock)[0]
-            assert one == defined(recorded(mission), env, name, end)[0]
+            assert one == defined(from_first_sample(mission), env, name, end)[0]
 
 
 # -------------------------------------------------------------------- whole formulas

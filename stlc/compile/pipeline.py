@@ -20,13 +20,13 @@ from fractions import Fraction
 from typing import Literal, TypeAlias, final
 
 from stlc.compile.analysis.margins import as_written
-from stlc.compile.analysis.ranges import Facts
+from stlc.compile.analysis.ranges import KnownRanges
 from stlc.compile.analysis.warnings import jumps
 from stlc.compile.augment.augment import Augmented, augment
-from stlc.compile.augment.guidance import pull
-from stlc.compile.augment.lift import recorded
-from stlc.compile.augment.mission import Goal, endless, mission_steps
-from stlc.compile.augment.timers import Ledger, Timer
+from stlc.compile.augment.guidance import guidance_cost
+from stlc.compile.augment.lift import from_first_sample
+from stlc.compile.augment.mission import Goal, mission_steps, never_over
+from stlc.compile.augment.timers import Timer, TimerTable
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.resolve import resolve
 from stlc.compile.frontend.tags import nominal
@@ -127,7 +127,7 @@ class Compiled:
     assumptions: tuple[CompiledRequirement, ...]
     timers: tuple[Timer, ...]
     parameters: tuple[typed.Parameter, ...]
-    pull: ir.Num | None = field(repr=False)
+    guidance_cost: ir.Num | None = field(repr=False)
     mission: int | None
     recurring: int | None
     grid: Grid
@@ -192,7 +192,7 @@ def compile_resolved(spec: typed.Spec, grid: Grid, purpose: Purpose = "train") -
             requirements=tuple(map(as_written, spec.requirements)),
             assumptions=tuple(map(as_written, spec.assumptions)),
         )
-    stage = _Stage(grid, purpose, Ledger(spec.taken), sink, nominal(spec.signature.columns))
+    stage = _Stage(grid, purpose, TimerTable(spec.taken), sink, nominal(spec.signature.columns))
     requirements = tuple(map(stage.rule, spec.requirements))
     goals = tuple(stage.goals)
     assumptions = tuple(map(stage.rule, spec.assumptions))
@@ -204,14 +204,14 @@ def compile_resolved(spec: typed.Spec, grid: Grid, purpose: Purpose = "train") -
     return Compiled(
         name=spec.name,
         spec=spec.source_ast,
-        signature=_signature(spec, (*requirements, *assumptions), stage.ledger.timers),
+        signature=_signature(spec, (*requirements, *assumptions), stage.table.timers),
         requirements=requirements,
         assumptions=assumptions,
-        timers=stage.ledger.timers,
+        timers=stage.table.timers,
         parameters=tuple(each for each in spec.parameters if not each.carried),
-        pull=pull(goals),
+        guidance_cost=guidance_cost(goals),
         mission=max(map(mission_steps, goals), default=None),
-        recurring=_remembered(stage.ledger.timers) if any(map(endless, goals)) else None,
+        recurring=_remembered(stage.table.timers) if any(map(never_over, goals)) else None,
         grid=grid,
         warnings=tuple(sink),
         typed=spec,
@@ -225,9 +225,9 @@ class _Stage:
 
     grid: Grid
     purpose: Purpose
-    ledger: Ledger
+    table: TimerTable
     sink: list[Diagnostic]
-    ranges: Facts
+    ranges: KnownRanges
     goals: list[Goal] = field(default_factory=list)
 
     def rule(self, requirement: typed.Requirement) -> CompiledRequirement:
@@ -260,9 +260,9 @@ class _Stage:
 
     def _rewritten(self, requirement: typed.Requirement) -> Augmented:
         if self.purpose == "train":
-            return augment(requirement, self.grid, self.ledger, self.sink)
+            return augment(requirement, self.grid, self.table, self.sink)
         written = requirement.formula
-        formula = recorded(written) if absolute(written) else written
+        formula = from_first_sample(written) if absolute(written) else written
         return Augmented(formula, typed.Truth(written.span, True), None)
 
     def _lowered(self, formula: typed.Formula) -> ir.Formula:

@@ -106,8 +106,8 @@ def cost(task: Task) -> list[str]:
         lines += _mean(controlled, at | inputs, task.horizon)
     for promise in task.promises.items:
         lines += _promise(promise, task, at)
-    if task.compiled.pull is not None:
-        lines += _mean(ir.Op("mul", (ir.Const(PULL), task.compiled.pull)), at, task.horizon + 1)
+    if task.compiled.guidance_cost is not None:
+        lines += _mean(ir.Op("mul", (ir.Const(PULL), task.compiled.guidance_cost)), at, task.horizon + 1)
     if task.compiled.timers:
         gamma = literal(task.system.decl.objective.gamma)
         lines.append(f"cost += {literal(SHORT)} * MIN(MAX({gamma} - rho, 0.0), {gamma});")

@@ -138,8 +138,8 @@ def _cost(task: Task, states: Columns, controls: Columns, rho: Value) -> Value:
         parts.append(_mean(over_controls, before | dict(controls), rows))
     if task.promises.items:
         parts.append(_short(task, states) * KEPT)
-    if task.compiled.pull is not None:
-        parts.append(_mean(task.compiled.pull, states, rows + 1) * PULL)
+    if task.compiled.guidance_cost is not None:
+        parts.append(_mean(task.compiled.guidance_cost, states, rows + 1) * PULL)
     if task.compiled.timers:
         parts.append(_lacking(task, rho) * SHORT)
     return reduce(ONNX.add, parts).spread(1, BATCH, like=rho)

@@ -20,7 +20,7 @@ from stlc.grammar.children import descendants
 from stlc.grammar.scan import Lexeme, lexemes
 from stlc.source import Span
 
-Kind: TypeAlias = Literal["scope", "mixed", "chain", "until", "implication"]
+AmbiguityKind: TypeAlias = Literal["scope", "mixed", "chain", "until", "implication"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Ambiguity:
     """
 
     span: Span
-    kind: Kind
+    kind: AmbiguityKind
     outer: str
 
 
@@ -85,7 +85,7 @@ def _operands(node: ast.Logic | ast.Until, words: _Words) -> Iterator[Ambiguity]
             yield Ambiguity(operand.span, kind, node.op)
 
 
-def _clash(node: ast.Logic | ast.Until, operand: ast.Expr, *, left: bool) -> Kind | None:
+def _clash(node: ast.Logic | ast.Until, operand: ast.Expr, *, left: bool) -> AmbiguityKind | None:
     if isinstance(operand, ast.Until):
         return "until"
     if not isinstance(operand, ast.Logic):

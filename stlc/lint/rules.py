@@ -11,12 +11,12 @@ from typing import TypeAlias
 
 from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar import ast
-from stlc.grammar.ambiguity import Ambiguity, Kind, ambiguities
+from stlc.grammar.ambiguity import Ambiguity, AmbiguityKind, ambiguities
 from stlc.grammar.children import descendants
 from stlc.grammar.scan import Lexeme, lexemes
 from stlc.grammar.words import BINARY_TEMPORAL, UNARY_TEMPORAL
 
-_WHY: dict[Kind, str] = {
+_WHY: dict[AmbiguityKind, str] = {
     "scope": "here a temporal word ends before `{outer}`; RTAMT, MoonLight and FalCAuN take in what follows",
     "mixed": "`and` binds tighter here; `or` does in RTAMT and MoonLight, and STLRom has one rank for both",
     "chain": "`->` goes from the right here; RTAMT and MoonLight read it from the left",
@@ -169,7 +169,7 @@ Check: TypeAlias = Callable[[ast.Spec], Iterator[Diagnostic]]
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class LintRule:
     """One thing to look for.
 
     Attributes:
@@ -181,13 +181,13 @@ class Rule:
     usual: bool = True
 
 
-RULES: Mapping[str, Rule] = MappingProxyType(
+RULES: Mapping[str, LintRule] = MappingProxyType(
     {
-        "W105": Rule(unused_names),
-        "W106": Rule(foreign_spellings),
-        "W301": Rule(missing_parentheses),
-        "W302": Rule(unclear_implications, usual=False),
-        "W504": Rule(nothing_required),
+        "W105": LintRule(unused_names),
+        "W106": LintRule(foreign_spellings),
+        "W301": LintRule(missing_parentheses),
+        "W302": LintRule(unclear_implications, usual=False),
+        "W504": LintRule(nothing_required),
     }
 )
 """Code -> rule; the code's page says why (`stlc explain CODE`)."""

@@ -205,8 +205,8 @@ def test_what_recurs_for_ever_is_known_and_draws() -> None:
         "require a: always@[2 s, end] once[0, 2 s] x > 1 m\nrequire b: always@[2 s, end] once[0, 1 s] y > 1 m"
     )
     assert (spec.mission, spec.recurring) == (20, 21)
-    assert spec.pull is not None
-    gap = Program({"gap": spec.pull})
+    assert spec.guidance_cost is not None
+    gap = Program({"gap": spec.guidance_cost})
 
     def drawn(clock: float, a: float, b: float) -> float:
         timers = {"clock": clock, "a_since": a, "b_since": b, "a": 0.0, "b": 0.0}

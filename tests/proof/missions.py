@@ -13,8 +13,8 @@ from mission_strategies import GRID, SAMPLES, augmented, requirement, walks
 from reference import Interval, Trace
 
 from stlc.compile.augment.augment import augment
-from stlc.compile.augment.lift import recorded
-from stlc.compile.augment.timers import Ledger
+from stlc.compile.augment.lift import from_first_sample
+from stlc.compile.augment.timers import TimerTable
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
@@ -50,13 +50,13 @@ def _bounds(
 def _planned(formula: typed.Formula, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Whether the rewritten formula holds in every planning window, (starts, batch)."""
     sink: list[Diagnostic] = []
-    ledger = Ledger(frozenset(columns))
-    found = augment(requirement(formula), GRID, ledger, sink)
+    table = TimerTable(frozenset(columns))
+    found = augment(requirement(formula), GRID, table, sink)
     errors = {finding.code for finding in sink if finding.severity == "error"}
     assume(not errors & {"E312", "E307"})
     assert not errors
     compiled = simplify(lower(found.formula, GRID, sink))
-    env = augmented(ledger.timers, columns)
+    env = augmented(table.timers, columns)
     (margins,) = evaluate([compiled], env, ops=NUMPY, count=SAMPLES - HORIZON)
     return np.broadcast_to(margins, (SAMPLES - HORIZON, BATCH)) >= -TOLERANCE
 
@@ -89,18 +89,18 @@ def check_nested(formula: typed.Formula, seed: int) -> bool:
     """The same of absolute operators over formulas that look ahead; False where no state holds them."""
     columns = walks(seed, BATCH, LONG)
     sink: list[Diagnostic] = []
-    ledger = Ledger(frozenset(columns))
+    table = TimerTable(frozenset(columns))
     beside = typed.Temporal(
         SPAN, "always", typed.Interval(typed.Time(), typed.Time(), clock="start"), typed.Truth(SPAN, True)
     )
     whole = typed.Logic(SPAN, "and", (formula, beside))  # so that it is judged at the start
-    found = augment(requirement(whole), GRID, ledger, sink)
+    found = augment(requirement(whole), GRID, table, sink)
     errors = {finding.code for finding in sink if finding.severity == "error"}
     assert errors <= {"E307", "E309", "E310", "E312"}, errors
     if errors:
         return False
     compiled = simplify(lower(found.formula, GRID, sink))
-    env = augmented(ledger.timers, columns)
+    env = augmented(table.timers, columns)
     starts = LONG - HORIZON
     plans = {
         name: np.stack([column[k : k + HORIZON + 1] for k in range(starts)], 1)
@@ -134,10 +134,10 @@ def check_past(formula: typed.Formula, seed: int) -> None:
         np.testing.assert_array_equal(planned[k], _defined(whole, columns, k))
 
 
-def _formula(formula: typed.Formula, ledger: Ledger) -> ir.Formula:
+def _formula(formula: typed.Formula, table: TimerTable) -> ir.Formula:
     """What plans are asked for."""
     sink: list[Diagnostic] = []
-    found = augment(requirement(formula), GRID, ledger, sink)
+    found = augment(requirement(formula), GRID, table, sink)
     assert not [finding for finding in sink if finding.severity == "error"]
     return simplify(lower(found.formula, GRID, sink))
 
@@ -146,9 +146,9 @@ def check_margins(formula: typed.Formula, seed: int) -> None:
     """By how much plans satisfy formulas of the past: as defined on a whole trace, finite from anywhere."""
     columns = walks(seed, BATCH)
     whole = typed.Temporal(SPAN, "always", typed.Interval(typed.Time(), typed.Time(horizons=1)), formula)
-    ledger = Ledger(frozenset(columns))
-    compiled = _formula(whole, ledger)
-    env = augmented(ledger.timers, columns)
+    table = TimerTable(frozenset(columns))
+    compiled = _formula(whole, table)
+    env = augmented(table.timers, columns)
     starts = SAMPLES - HORIZON
     (margins,) = evaluate([compiled], env, ops=NUMPY, count=starts)
     margins = np.broadcast_to(margins, (starts, BATCH))
@@ -167,7 +167,7 @@ def check_recorded(formula: typed.Formula, seed: int) -> None:
     assume(absolute(formula))
     sink: list[Diagnostic] = []
     cut = {name: column[: 1 + seed % SAMPLES] for name, column in walks(seed, BATCH).items()}
-    compiled = simplify(lower(recorded(formula), GRID, sink))
+    compiled = simplify(lower(from_first_sample(formula), GRID, sink))
     ends = {end: evaluate([compiled], cut, ops=NUMPY, end=end)[0] for end in ("truncate", "lower", "upper")}
     judged = {end: np.broadcast_to(values, (1, BATCH))[0] for end, values in ends.items()}
     np.testing.assert_array_equal(judged["truncate"], [low for low, _ in _bounds(formula, cut, "truncate")])

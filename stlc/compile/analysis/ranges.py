@@ -18,7 +18,7 @@ _CHANGES: Mapping[str, Callable[[float, float], float]] = MappingProxyType(
 """Units of random draws: points are shifted, deviations are scaled."""
 
 
-def spread(num: ir.Num) -> tuple[float, float] | None:
+def usual_range(num: ir.Num) -> tuple[float, float] | None:
     """Where nearly all draws of a sampler with known arguments lie; None where nothing is known."""
     match num:
         case ir.Const(value):
@@ -33,13 +33,13 @@ def spread(num: ir.Num) -> tuple[float, float] | None:
         case ir.Op("bernoulli", _):
             return 0.0, 1.0
         case ir.Op("choice", options):
-            known = [spread(option) for option in options]
+            known = [usual_range(option) for option in options]
             found = [ends for ends in known if ends is not None]
             if len(found) < len(known):
                 return None
             return min(low for low, _ in found), max(high for _, high in found)
         case ir.Op("add" | "sub" | "mul" | "div" as op, (inner, ir.Const(amount))) if amount:
-            ends = spread(inner)
+            ends = usual_range(inner)
             if ends is None:
                 return None
             moved = [_CHANGES[op](end, amount) for end in ends]
@@ -48,10 +48,10 @@ def spread(num: ir.Num) -> tuple[float, float] | None:
             return None
 
 
-Facts: TypeAlias = Mapping[str, Bounds]
+KnownRanges: TypeAlias = Mapping[str, Bounds]
 
 
-def bounds(num: ir.Num, facts: Facts) -> Bounds | None:
+def bounds(num: ir.Num, facts: KnownRanges) -> Bounds | None:
     """The least interval that interval arithmetic finds for `num`, or None where the facts do not say.
 
     Args:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from stlc.compile.analysis.ranges import Facts, bounds
+from stlc.compile.analysis.ranges import KnownRanges, bounds
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.normal_form import normal
@@ -113,7 +113,7 @@ def _linear(num: ir.Num) -> _Linear:
             return _Linear({num: 1.0})
 
 
-def jumps(formula: typed.Formula, ranges: Facts) -> Iterator[Diagnostic]:
+def jumps(formula: typed.Formula, ranges: KnownRanges) -> Iterator[Diagnostic]:
     """One warning for every predicate with a modulo that jumps within the ranges of its signals.
 
     Args:
@@ -134,7 +134,7 @@ def jumps(formula: typed.Formula, ranges: Facts) -> Iterator[Diagnostic]:
             )
 
 
-def _jumps(num: ir.Num, ranges: Facts) -> bool:
+def _jumps(num: ir.Num, ranges: KnownRanges) -> bool:
     """Whether `num` is a modulo whose left side may pass a multiple of its right side."""
     if not isinstance(num, ir.Op) or num.name != "mod":
         return False
@@ -147,7 +147,7 @@ def _jumps(num: ir.Num, ranges: Facts) -> bool:
 _DECIDED = 1e-6
 
 
-def vacuous(formula: typed.Formula, signature: Signature, facts: Facts) -> Iterator[Diagnostic]:
+def vacuous(formula: typed.Formula, signature: Signature, facts: KnownRanges) -> Iterator[Diagnostic]:
     """W503 for implications whose left side is never true, and for a formula that is never false.
 
     Only enforced ranges count: a nominal range says where a signal should be, not where it is.
@@ -166,12 +166,12 @@ def vacuous(formula: typed.Formula, signature: Signature, facts: Facts) -> Itera
         yield Diagnostic("W503", f"this can never be false{why}", formula.span, "always true")
 
 
-def truth(formula: typed.Formula, facts: Facts) -> bool | None:
+def truth(formula: typed.Formula, facts: KnownRanges) -> bool | None:
     """What enforced ranges say: True or False at every instant of every trace, or None."""
     return _truth(normal(formula), facts)
 
 
-def _truth(formula: typed.Formula, facts: Facts) -> bool | None:
+def _truth(formula: typed.Formula, facts: KnownRanges) -> bool | None:
     match formula:
         case typed.Truth(_, value):
             return value
@@ -207,7 +207,7 @@ def _antecedents(formula: typed.Formula) -> Iterator[typed.Formula]:
             return
 
 
-def _because(formula: typed.Formula, signature: Signature, facts: Facts) -> str:
+def _because(formula: typed.Formula, signature: Signature, facts: KnownRanges) -> str:
     """`: x is in [0, 5]`, for the columns with an enforced range that decide it."""
     parts = []
     read = (leaf for num in numbers(formula) for leaf in leaves(num))
@@ -222,7 +222,7 @@ def _because(formula: typed.Formula, signature: Signature, facts: Facts) -> str:
 # ----------------------------------------------------------------------- safety
 
 
-def toothless(requirement: typed.Requirement, tag: ast.Tag | None) -> Diagnostic | None:
+def safety_never_violated(requirement: typed.Requirement, tag: ast.Tag | None) -> Diagnostic | None:
     """W502 for a `@safety` requirement that no finite prefix can violate."""
     formula = normal(requirement.formula)
     if "safety" not in requirement.tags or _constrains(formula):

@@ -5,21 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import final
 
-from stlc.compile.augment.lift import lifted
+from stlc.compile.augment.lift import hoist_absolute
 from stlc.compile.augment.mission import (
     Absolute,
-    Branch,
+    AbsoluteOp,
     Goal,
-    Leaf,
-    Op,
+    GoalBranch,
+    GoalLeaf,
     last_step,
-    obligation,
     possible,
+    progress,
     update,
 )
-from stlc.compile.augment.nested import TooFarError, unnested
+from stlc.compile.augment.nested import TooFarError, in_past_form
 from stlc.compile.augment.past import Past
-from stlc.compile.augment.timers import Ledger, Timer, tolerant
+from stlc.compile.augment.timers import Timer, TimerTable, tolerant
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, report, to_window
@@ -44,8 +44,10 @@ class Augmented:
     goal: Goal | None
 
 
-def augment(requirement: typed.Requirement, grid: Grid, ledger: Ledger, sink: list[Diagnostic]) -> Augmented:
-    """Rewrite the formula of a requirement; the states that it needs go to `ledger`.
+def augment(
+    requirement: typed.Requirement, grid: Grid, table: TimerTable, sink: list[Diagnostic]
+) -> Augmented:
+    """Rewrite the formula of a requirement; the states that it needs go to `table`.
 
     Findings go to `sink`: E307 for an absolute interval that cannot be moved out of the operators around
     it, E309 for a past operator without a timer, E310 for an absolute operator whose body looks ahead, E312
@@ -55,20 +57,20 @@ def augment(requirement: typed.Requirement, grid: Grid, ledger: Ledger, sink: li
     always = typed.Truth(formula.span, True)
     if not absolute(formula) and not looks_back(formula):
         return Augmented(formula, always, None)
-    past = Past(grid, ledger, sink, requirement.name)
+    past = Past(grid, table, sink, requirement.name)
     if not absolute(formula):
         return Augmented(past.rewrite(normal(formula)), always, None)
     if grid.horizon is None:
         report(sink, _without_horizon(formula.span))
         return Augmented(always, always, None)
     try:
-        flat = unnested(lifted(normal(formula), sink), grid, ledger, sink)
+        flat = in_past_form(hoist_absolute(normal(formula), sink), grid, table, sink)
     except TooFarError as problem:
         report(sink, _looks_ahead(problem.span, str(problem)))
         return Augmented(always, always, None)
     plain = past.rewrite(flat)
-    goal = _Goals(grid, ledger, sink, requirement.name).of(plain)
-    return Augmented(obligation(goal, grid.horizon), possible(goal), goal)
+    goal = _Goals(grid, table, sink, requirement.name).of(plain)
+    return Augmented(progress(goal, grid.horizon), possible(goal), goal)
 
 
 @final
@@ -77,7 +79,7 @@ class _Goals:
     """The absolute formulas of a requirement that is judged at the start of the mission."""
 
     grid: Grid
-    ledger: Ledger
+    table: TimerTable
     sink: list[Diagnostic]
     name: str
 
@@ -90,7 +92,7 @@ class _Goals:
             return self._leaf(node, ("always", ir.Window(0, 0)), (typed.Truth(node.span, True), node))
         match node:
             case typed.Logic(span, "and" | "or" as op, items):
-                return Branch(op, tuple(map(self.of, items)), span)
+                return GoalBranch(op, tuple(map(self.of, items)), span)
             case typed.Temporal(_, "always" | "eventually" as op, interval, body):
                 window = to_window(interval, self.grid, self.sink, outward=op == "always")
                 return self._leaf(node, (op, window), (typed.Truth(node.span, True), body))
@@ -102,7 +104,10 @@ class _Goals:
                 return self.of(typed.Truth(node.span, True))
 
     def _leaf(
-        self, node: typed.Formula, how: tuple[Op, ir.Window], operands: tuple[typed.Formula, typed.Formula]
+        self,
+        node: typed.Formula,
+        how: tuple[AbsoluteOp, ir.Window],
+        operands: tuple[typed.Formula, typed.Formula],
     ) -> Goal:
         op, window = how
         for body in operands:
@@ -113,12 +118,12 @@ class _Goals:
             report(self.sink, _without_deadline(node.span))
         left, right = (condition(at_hand(body), flat=True) for body in operands)
         formula = Absolute(op, window, node.span, *operands, tolerant(left), tolerant(right), right)
-        clock = self.ledger.clock(last_step(formula) + (self.grid.horizon or 0) + 1)
+        clock = self.table.clock(last_step(formula) + (self.grid.horizon or 0) + 1)
         draft = Timer(self.name, "status", 0.0, ir.Const(0.0), -1.0, 1.0, _about(formula))
-        return Leaf(formula, self.ledger.add(draft, update(formula, clock)), clock)
+        return GoalLeaf(formula, self.table.add(draft, update(formula, clock)), clock)
 
 
-_LATCHED: dict[Op, str] = {
+_LATCHED: dict[AbsoluteOp, str] = {
     "always": "false where {right} fails",
     "eventually": "true where {right} holds",
     "until": "true where {right} holds, false where {left} fails before",

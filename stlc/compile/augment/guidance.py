@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import reduce
 from typing import assert_never
 
-from stlc.compile.augment.mission import Branch, Goal, Leaf
+from stlc.compile.augment.mission import Goal, GoalBranch, GoalLeaf
 from stlc.compile.augment.timers import at_least
 from stlc.compile.ir import nodes as ir
 
@@ -29,7 +29,7 @@ class _Draw:
     left: ir.Num
 
 
-def pull(goals: Sequence[Goal]) -> ir.Num | None:
+def guidance_cost(goals: Sequence[Goal]) -> ir.Num | None:
     """The gap of the goal that is due first, at one sample; None where no goal ever draws."""
     draws = [draw for goal in goals if (draw := _draw(goal)) is not None]
     if not draws:
@@ -39,9 +39,9 @@ def pull(goals: Sequence[Goal]) -> ir.Num | None:
 
 def _draw(goal: Goal) -> _Draw | None:
     match goal:
-        case Leaf():
+        case GoalLeaf():
             return _leaf(goal)
-        case Branch(op, items):
+        case GoalBranch(op, items):
             draws = [draw for item in items if (draw := _draw(item)) is not None]
             if not draws:
                 return None
@@ -54,7 +54,7 @@ def _draw(goal: Goal) -> _Draw | None:
             assert_never(goal)
 
 
-def _leaf(leaf: Leaf) -> _Draw | None:
+def _leaf(leaf: GoalLeaf) -> _Draw | None:
     """Promises draw until they are met, `always` until its window begins."""
     formula, window = leaf.formula, leaf.formula.window
     if formula.op == "always" and window.hi is None and (rounds := _rounds(leaf)):
@@ -75,7 +75,7 @@ def _leaf(leaf: Leaf) -> _Draw | None:
     return _Draw(_where(waiting, gap, _ZERO), _where(waiting, left, over))
 
 
-def _rounds(leaf: Leaf) -> _Draw | None:
+def _rounds(leaf: GoalLeaf) -> _Draw | None:
     """Recurring goals, `always@[a, end] once[0, c] p`: p draws, and is due c after it was last there."""
     margin = leaf.formula.margin
     parts = margin.items if isinstance(margin, ir.BoolOp) and margin.op == "and" else (margin,)
@@ -83,7 +83,7 @@ def _rounds(leaf: Leaf) -> _Draw | None:
     return _first_due(draws) if draws else None
 
 
-def _round(part: ir.Formula, leaf: Leaf) -> _Draw | None:
+def _round(part: ir.Formula, leaf: GoalLeaf) -> _Draw | None:
     """Of `p or c - since >= 0`."""
     if not isinstance(part, ir.BoolOp) or part.op != "or":
         return None

@@ -16,17 +16,17 @@ from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
 
-def lifted(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
+def hoist_absolute(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
     """A formula in negation normal form with no absolute interval under another temporal operator."""
     if not absolute(formula):
         return formula
     match formula:
         case typed.Logic(_, "and" | "or"):
-            return map_children(formula, formulas=lambda item: lifted(item, sink))
+            return map_children(formula, formulas=lambda item: hoist_absolute(item, sink))
         case typed.Temporal(_, _, interval, body) if absolute(body):
             if not _reaches_now(interval, formula):
                 return _stuck(formula, sink)
-            return _out_of(formula, lifted(body, sink), sink)
+            return _out_of(formula, hoist_absolute(body, sink), sink)
         case typed.Temporal() | typed.Until() if not any(map(absolute, operands(formula))):
             return formula
         case _:
@@ -81,7 +81,7 @@ def _nested(span: Span, outer: Span) -> Diagnostic:
     ).with_note(f"the operator around it starts at line {outer.line}, column {outer.column}")
 
 
-def recorded(formula: typed.Formula) -> typed.Formula:
+def from_first_sample(formula: typed.Formula) -> typed.Formula:
     """The formula of a requirement for a recorded trace that is judged at its first sample alone.
 
     There the mission clock and the time from now agree, so absolute intervals become relative ones. Those
@@ -91,4 +91,4 @@ def recorded(formula: typed.Formula) -> typed.Formula:
         return from_now(formula)
     if isinstance(formula, (typed.Shift, typed.Edge)):
         return formula
-    return map_children(formula, formulas=recorded)
+    return map_children(formula, formulas=from_first_sample)

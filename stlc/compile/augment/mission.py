@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal, TypeAlias, assert_never
 
-from stlc.compile.augment.timers import FALSE, OPEN, TRUE, at_least, both, choose, guard
+from stlc.compile.augment.timers import FALSE, OPEN, TRUE, at_least, both, choose, time_test
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.normal_form import negate
 from stlc.source import Span
 
-Op: TypeAlias = Literal["always", "eventually", "until", "release"]
+AbsoluteOp: TypeAlias = Literal["always", "eventually", "until", "release"]
 
 _OPEN, _TRUE, _FALSE = ir.Const(OPEN), ir.Const(TRUE), ir.Const(FALSE)
 _KNOWN = ir.Const(0.5)
@@ -40,7 +40,7 @@ class Absolute:
         margin: `right` as a formula of the IR.
     """
 
-    op: Op
+    op: AbsoluteOp
     window: ir.Window
     span: Span
     left: typed.Formula
@@ -51,7 +51,7 @@ class Absolute:
 
 
 @dataclass(frozen=True, slots=True)
-class Leaf:
+class GoalLeaf:
     """An absolute formula with its columns."""
 
     formula: Absolute
@@ -60,7 +60,7 @@ class Leaf:
 
 
 @dataclass(frozen=True, slots=True)
-class Branch:
+class GoalBranch:
     """`and` or `or` of goals."""
 
     op: Literal["and", "or"]
@@ -68,7 +68,7 @@ class Branch:
     span: Span
 
 
-Goal: TypeAlias = Leaf | Branch
+Goal: TypeAlias = GoalLeaf | GoalBranch
 """The Boolean structure of a requirement above its absolute formulas."""
 
 
@@ -79,16 +79,16 @@ def last_step(formula: Absolute) -> int:
 
 def mission_steps(goal: Goal) -> int:
     """The last step of which any of its formulas speaks by name."""
-    if isinstance(goal, Leaf):
+    if isinstance(goal, GoalLeaf):
         return last_step(goal.formula)
     return max(map(mission_steps, goal.items))
 
 
-def endless(goal: Goal) -> bool:
+def never_over(goal: Goal) -> bool:
     """True where a mission is never over: one of its formulas has no end."""
-    if isinstance(goal, Leaf):
+    if isinstance(goal, GoalLeaf):
         return goal.formula.window.hi is None
-    return any(map(endless, goal.items))
+    return any(map(never_over, goal.items))
 
 
 # ----------------------------------------------------------------------------- the latch
@@ -135,20 +135,20 @@ def _passed(window: ir.Window, clock: ir.Signal) -> ir.Formula:
 # ------------------------------------------------------------------------- what plans do
 
 
-def obligation(goal: Goal, horizon: int) -> typed.Formula:
+def progress(goal: Goal, horizon: int) -> typed.Formula:
     """What a plan has to satisfy, from where it starts: true unless falsified by its end."""
     match goal:
-        case Branch(op, items, span):
-            return typed.Logic(span, op, tuple(obligation(item, horizon) for item in items))
-        case Leaf(formula):
+        case GoalBranch(op, items, span):
+            return typed.Logic(span, op, tuple(progress(item, horizon) for item in items))
+        case GoalLeaf(formula):
             return _remainder(goal, formula, horizon)
         case _:
             assert_never(goal)
 
 
-def _remainder(leaf: Leaf, formula: Absolute, horizon: int) -> typed.Formula:
+def _remainder(leaf: GoalLeaf, formula: Absolute, horizon: int) -> typed.Formula:
     span, left, right = formula.span, formula.left, formula.right
-    known = guard(leaf.status, _KNOWN, span)
+    known = time_test(leaf.status, _KNOWN, span)
     alive = possible(leaf)
     inside = typed_inside(formula.window, leaf.clock, span)
     asked = typed.Logic(span, "->", (inside, right))
@@ -177,20 +177,20 @@ def _remainder(leaf: Leaf, formula: Absolute, horizon: int) -> typed.Formula:
 def possible(goal: Goal) -> typed.Formula:
     """Whether the mission so far leaves a way to satisfy it; a guard on the state at hand."""
     match goal:
-        case Branch(op, items, span):
+        case GoalBranch(op, items, span):
             return typed.Logic(span, op, tuple(map(possible, items)))
-        case Leaf(formula):
-            return guard(goal.status, ir.Const(-0.5), formula.span)
+        case GoalLeaf(formula):
+            return time_test(goal.status, ir.Const(-0.5), formula.span)
         case _:
             assert_never(goal)
 
 
 def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formula:
     """Whether the sample at hand is in a window of the mission."""
-    begun = guard(clock, ir.Const(float(window.lo)), span)
+    begun = time_test(clock, ir.Const(float(window.lo)), span)
     if window.hi is None:
         return begun
-    not_over = guard(ir.Const(float(window.hi)), clock, span)
+    not_over = time_test(ir.Const(float(window.hi)), clock, span)
     return not_over if window.lo == 0 else typed.Logic(span, "and", (begun, not_over))
 
 
@@ -199,7 +199,7 @@ def _beyond(formula: Absolute, clock: ir.Signal, horizon: int) -> typed.Formula:
     hi = formula.window.hi
     if hi is None or hi - horizon < 1:
         return typed.Truth(formula.span, hi is None)
-    return guard(ir.Const(float(hi - horizon - 1)), clock, formula.span)
+    return time_test(ir.Const(float(hi - horizon - 1)), clock, formula.span)
 
 
 def _all_along(body: typed.Formula) -> typed.Formula:

@@ -16,7 +16,7 @@ from typing import Literal, TypeAlias, final
 
 from stlc.compile.augment.mission import typed_inside
 from stlc.compile.augment.past import REGISTER
-from stlc.compile.augment.timers import Ledger, guard
+from stlc.compile.augment.timers import TimerTable, time_test
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, to_window
@@ -57,13 +57,15 @@ def _forwards(node: typed.Formula) -> bool:
             return False
 
 
-def unnested(formula: typed.Formula, grid: Grid, ledger: Ledger, sink: list[Diagnostic]) -> typed.Formula:
+def in_past_form(
+    formula: typed.Formula, grid: Grid, table: TimerTable, sink: list[Diagnostic]
+) -> typed.Formula:
     """A formula in negation normal form, judged at the start of the mission, of operators that look back.
 
     Args:
         formula: absolute operators, and others that begin at the start, under `and` and `or`.
         grid: of time.
-        ledger: takes the mission clock where latest moments are asked for.
+        table: takes the mission clock where latest moments are asked for.
         sink: takes findings about bounds.
 
     Raises:
@@ -71,11 +73,11 @@ def unnested(formula: typed.Formula, grid: Grid, ledger: Ledger, sink: list[Diag
     """
     match formula:
         case typed.Logic(_, _, items):
-            return replace(formula, items=tuple(unnested(item, grid, ledger, sink) for item in items))
+            return replace(formula, items=tuple(in_past_form(item, grid, table, sink) for item in items))
         case typed.Temporal(_, "always" | "eventually" as op, interval, body) if looks_ahead(body):
             window = to_window(interval, grid, sink, outward=op == "always")
             body = _on_grid(body, grid, sink)
-            writer = _Writer(ledger, formula.span, soon=op == "eventually")
+            writer = _Writer(table, formula.span, soon=op == "eventually")
             if op == "eventually":
                 return writer.met(window, (), body)
             return normal(writer.met(window, (), normal(body, -1)), -1)
@@ -84,7 +86,7 @@ def unnested(formula: typed.Formula, grid: Grid, ledger: Ledger, sink: list[Diag
         ) or looks_ahead(right):
             window = to_window(interval, grid, sink, outward=op == "release")
             left, right = _on_grid(left, grid, sink), _on_grid(right, grid, sink)
-            writer = _Writer(ledger, formula.span, soon=op == "until")
+            writer = _Writer(table, formula.span, soon=op == "until")
             if op == "until":
                 return writer.until(window, left, right)
             return normal(writer.until(window, normal(left, -1), normal(right, -1)), -1)
@@ -167,13 +169,13 @@ class _Writer:
     """Writes what is known of a promise in terms of the past.
 
     Args:
-        ledger: takes the mission clock.
+        table: takes the mission clock.
         span: of the absolute operator.
         soon: whether it is worth a state to know at once that the promise is lost.
     """
 
-    def __init__(self, ledger: Ledger, span: Span, *, soon: bool) -> None:
-        self._ledger, self._span, self._soon = ledger, span, soon
+    def __init__(self, table: TimerTable, span: Span, *, soon: bool) -> None:
+        self._ledger, self._span, self._soon = table, span, soon
 
     def met(self, window: ir.Window, when: Formulas, what: typed.Formula) -> typed.Formula:
         """At some sample of `window` there is all of `when`, which looks back, and from it on `what`."""
@@ -326,7 +328,7 @@ class _Writer:
         """Whether the mission is at most so many samples old; always where None is said."""
         if step is None or step < 0:
             return typed.Truth(self._span, step is None)
-        return guard(ir.Const(float(step)), self._ledger.clock(step + 1), self._span)
+        return time_test(ir.Const(float(step)), self._ledger.clock(step + 1), self._span)
 
     def _on_clock(self, op: _Wide, window: ir.Window, body: typed.Formula) -> typed.Formula:
         return typed.Temporal(self._span, op, _steps(window, self._span, "start"), body)

@@ -16,13 +16,13 @@ from typing import Literal, TypeAlias, final
 
 from stlc.compile.augment.timers import (
     MISSING,
-    Kind,
-    Ledger,
     Timer,
+    TimerKind,
+    TimerTable,
     at_least,
     choose,
-    guard,
-    recalled,
+    time_test,
+    timer_test,
     tolerant,
 )
 from stlc.compile.ir import nodes as ir
@@ -59,13 +59,13 @@ class _Test:
     def decides(self) -> typed.Recalled:
         """As one of several ways: it decides, or has no say."""
         return typed.Recalled(
-            self.span, guard(self.left, self.right, self.span), guard(*self._then, self.span)
+            self.span, time_test(self.left, self.right, self.span), time_test(*self._then, self.span)
         )
 
     def lacks(self) -> typed.Recalled:
         """As one of several conditions: what is missing counts."""
         return typed.Recalled(
-            self.span, guard(self.left, self.right, self.span), recalled(*self._then, self.span)
+            self.span, time_test(self.left, self.right, self.span), timer_test(*self._then, self.span)
         )
 
     @property
@@ -87,13 +87,13 @@ class Past:
 
     Attributes:
         grid: of time.
-        ledger: takes the timers.
+        table: takes the timers.
         sink: takes the findings, E309 for what no timer can hold.
         name: of the requirement; timers are named after it.
     """
 
     grid: Grid
-    ledger: Ledger
+    table: TimerTable
     sink: list[Diagnostic]
     name: str
 
@@ -149,11 +149,11 @@ class Past:
         condition = self._condition(body)
         if most is None:
             draft = self._draft("latch", "seen", 0.0, 1.0, f"whether {_short(node.body)} ever held")
-            seen = self.ledger.add(draft, lambda own: choose(condition, _ONE, own))
+            seen = self.table.add(draft, lambda own: choose(condition, _ONE, own))
             return _Test(seen, _ONE, node.span).decides()
         about = f"steps since {_short(node.body)} last held, up to {most}"
         draft = self._draft("timer", "since", most + 1.0, most + 1.0, about)
-        since = self.ledger.add(draft, lambda own: choose(condition, _ONE, _counted(own, most + 1)))
+        since = self.table.add(draft, lambda own: choose(condition, _ONE, _counted(own, most + 1)))
         return _Test(ir.Const(float(most)), since, node.span, later=1).decides()
 
     def _held(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
@@ -161,11 +161,11 @@ class Past:
         condition = self._condition(body)
         if most is None:
             draft = self._draft("latch", "kept", 1.0, 1.0, f"whether {_short(node.body)} always held")
-            kept = self.ledger.add(draft, lambda own: choose(condition, own, _ZERO))
+            kept = self.table.add(draft, lambda own: choose(condition, own, _ZERO))
             return _Test(kept, _ONE, node.span).lacks()
         about = f"steps for which {_short(node.body)} has held, up to {most}"
         draft = self._draft("timer", "held", float(most), float(most), about)
-        held = self.ledger.add(draft, lambda own: choose(condition, _counted(own, most), _ZERO))
+        held = self.table.add(draft, lambda own: choose(condition, _counted(own, most), _ZERO))
         return _Test(held, ir.Const(float(most)), node.span, later=1).lacks()
 
     # ------------------------------------------------------------------------------ since
@@ -207,12 +207,12 @@ class Past:
         about = f"{_short(node.right)}, and {_short(node.left)} from there on"
         if most is None:
             draft = self._draft("latch", "since", 0.0, 1.0, f"whether there was {about}")
-            begun = self.ledger.add(draft, lambda own: choose(held, choose(met, _ONE, own), _ZERO))
+            begun = self.table.add(draft, lambda own: choose(held, choose(met, _ONE, own), _ZERO))
             test = _Test(begun, _ONE, node.span) if positive else _Test(_ZERO, begun, node.span)
             return test.decides()
         far = ir.Const(most + 1.0)
         draft = self._draft("timer", "since", far.value, far.value, f"steps since {about}, up to {most}")
-        since = self.ledger.add(
+        since = self.table.add(
             draft, lambda own: choose(held, choose(met, _ONE, _counted(own, most + 1)), far)
         )
         if positive:
@@ -244,17 +244,17 @@ class Past:
         known = _short(node.body if not isinstance(node, typed.Until) else node)
         about = f"whether {known} held at the sample before"
         draft = self._draft("latch", "before", initial, 1.0, about)
-        latch = self.ledger.add(draft, lambda _own: choose(condition, _ONE, _ZERO))
+        latch = self.table.add(draft, lambda _own: choose(condition, _ONE, _ZERO))
         for ago in range(2, steps + 1):
             about = f"whether {known} held {ago} samples before"
             draft = self._draft("latch", "before", initial, 1.0, about)
-            latch = self.ledger.add(draft, lambda _own, last=latch: last)  # type: ignore[misc]
-        begun = guard(ir.Signal(ir.ELAPSED), ir.Const(float(steps)), node.span)
-        first = typed.Logic(node.span, "or", (begun, recalled(latch, _ONE, node.span)))
+            latch = self.table.add(draft, lambda _own, last=latch: last)  # type: ignore[misc]
+        begun = time_test(ir.Signal(ir.ELAPSED), ir.Const(float(steps)), node.span)
+        first = typed.Logic(node.span, "or", (begun, timer_test(latch, _ONE, node.span)))
         inside = typed.Shift(node.span, -steps, body, outside=True)
         return typed.Recalled(
             node.span,
-            now=guard(latch, _ONE, node.span),
+            now=time_test(latch, _ONE, node.span),
             along=typed.Logic(node.span, "and", (inside, first)),
         )
 
@@ -286,7 +286,7 @@ class Past:
             running = ir.Where(at_least(own, _ONE), _counted(own, least), choose(met, _ONE, _ZERO))
             return choose(held, running, _ZERO)
 
-        age = self.ledger.add(draft, update)
+        age = self.table.add(draft, update)
         span, bound = node.span, ir.Const(float(least))
         first, elapsed = ir.at_first(age), ir.Signal(ir.ELAPSED)
         after = ir.Op("add", (first, elapsed))
@@ -298,32 +298,32 @@ class Past:
                 "or",
                 (
                     typed.Temporal(span, "once", whole, left),
-                    guard(_ZERO, first, span),
-                    guard(ir.Const(least - 1.0), after, span),
+                    time_test(_ZERO, first, span),
+                    time_test(ir.Const(least - 1.0), after, span),
                 ),
             )
-            now = typed.Logic(span, "or", (left, guard(ir.Const(least - 1.0), age, span)))
+            now = typed.Logic(span, "or", (left, time_test(ir.Const(least - 1.0), age, span)))
             return typed.Recalled(span, now=now, along=typed.Logic(span, "and", (inside, none)))
         memory = typed.Logic(
             span,
             "and",
             (
                 typed.Temporal(span, "historically", whole, left),
-                guard(first, _ONE, span),
-                guard(after, bound, span),
+                time_test(first, _ONE, span),
+                time_test(after, bound, span),
             ),
         )
         missing = ir.Op("min", (ir.Op("sub", (elapsed, bound)), ir.Const(-1.0)))
         lacks = typed.Predicate(span, ir.Op("mul", (missing, ir.Const(MISSING))), strict=False)
         return typed.Recalled(
             span,
-            now=typed.Logic(span, "and", (left, guard(age, bound, span))),
+            now=typed.Logic(span, "and", (left, time_test(age, bound, span))),
             along=typed.Logic(span, "or", (inside, memory, lacks)),
         )
 
     # -------------------------------------------------------------------------- in common
 
-    def _draft(self, kind: Kind, what: str, initial: float, high: float, about: str) -> Timer:
+    def _draft(self, kind: TimerKind, what: str, initial: float, high: float, about: str) -> Timer:
         return Timer(f"{self.name}_{what}", kind, initial, _ZERO, 0.0, high, about)
 
     def _condition(self, body: typed.Formula) -> ir.Formula:

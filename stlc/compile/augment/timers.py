@@ -19,7 +19,7 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.signature import Column
 from stlc.source import Span
 
-Kind: TypeAlias = Literal["clock", "status", "latch", "timer"]
+TimerKind: TypeAlias = Literal["clock", "status", "latch", "timer"]
 
 OPEN, TRUE, FALSE = 0.0, 1.0, -1.0
 """Values of a status."""
@@ -43,7 +43,7 @@ class Timer:
     """
 
     name: str
-    kind: Kind
+    kind: TimerKind
     initial: float
     update: ir.Num
     low: float
@@ -62,7 +62,7 @@ def clock_of(name: str, high: int) -> Timer:
     return Timer(name, "clock", 0.0, later, 0.0, float(high), "counts the samples of the mission")
 
 
-class Ledger:
+class TimerTable:
     """The timers of a specification, gathered requirement by requirement; equal ones are kept once."""
 
     def __init__(self, taken: frozenset[str]) -> None:
@@ -111,19 +111,19 @@ def at_least(left: ir.Num, right: ir.Num) -> ir.Predicate:
     return ir.Predicate(ir.Op("sub", (left, right)))
 
 
-def guard(left: ir.Num, right: ir.Num, span: Span) -> typed.Predicate:
+def time_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Predicate:
     """`left >= right` as a test of time: it decides truth and never limits the margin."""
     return typed.Predicate(span, ir.Op("sub", (left, right)), strict=False, guard=True)
 
 
-def recalled(left: ir.Num, right: ir.Num, span: Span) -> typed.Formula:
+def timer_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Formula:
     """`left >= right` as a test of what no plan changes any more: where it fails, what is missing counts.
 
     Each missing step counts as much as no predicate reaches, so that of several instants those are preferred
     at which a plan can do something; and it is finite, so that there is a best of plans that all fail.
     """
     gap = ir.Op("mul", (ir.Op("sub", (left, right)), ir.Const(MISSING)))
-    return typed.Logic(span, "or", (guard(left, right, span), typed.Predicate(span, gap, strict=False)))
+    return typed.Logic(span, "or", (time_test(left, right, span), typed.Predicate(span, gap, strict=False)))
 
 
 def choose(condition: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:

@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 from stlc.compile.frontend.arithmetic import absolute, agree, apply, broadcast, cross, dot, minus, norm
 from stlc.compile.frontend.coerce import (
-    Need,
+    Expectation,
     as_formula,
     as_number,
     as_state_formula,
@@ -28,11 +28,11 @@ from stlc.compile.frontend.values import (
     Complement,
     Dilated,
     HalfSpace,
-    Moment,
     Number,
     Polygon,
     Region,
     Swept,
+    TimeExpr,
     Value,
     Vector,
     literal,
@@ -77,16 +77,16 @@ def region(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> 
             return _box_of(call, given, scope)
         case "halfspace":
             normal = as_vector(
-                given[0][1], given[0][0], Need("the normal of a half-space is a vector"), scope
+                given[0][1], given[0][0], Expectation("the normal of a half-space is a vector"), scope
             )
             offset = as_number(
-                given[1][1], given[1][0], Need("the offset of a half-space is a number"), scope
+                given[1][1], given[1][0], Expectation("the offset of a half-space is a number"), scope
             )
             return HalfSpace(normal, offset, call.span)
         case "complement":
             return Complement(_as_region(name, *given[0], scope), call.span)
         case _:
-            margin = as_number(given[1][1], given[1][0], Need("`dilate` grows by a length"), scope)
+            margin = as_number(given[1][1], given[1][0], Expectation("`dilate` grows by a length"), scope)
             return Dilated(_as_region(name, *given[0], scope), margin, call.span)
 
 
@@ -115,8 +115,8 @@ def _as_region(name: str, expr: ast.Expr, value: Value, scope: Scope) -> Region:
 
 
 def _ball_of(name: str, call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> Ball:
-    center = as_vector(given[0][1], given[0][0], Need(f"the center of a {name} is a vector"), scope)
-    radius = as_number(given[1][1], given[1][0], Need(f"the radius of a {name} is a number"), scope)
+    center = as_vector(given[0][1], given[0][0], Expectation(f"the center of a {name} is a vector"), scope)
+    radius = as_number(given[1][1], given[1][0], Expectation(f"the radius of a {name} is a number"), scope)
     if name == "circle" and len(center.items) != 2:
         message = f"a circle lies in the plane, this center has {len(center.items)} components"
         scope.fail(
@@ -129,7 +129,7 @@ def _ball_of(name: str, call: ast.Call, given: Sequence[tuple[ast.Expr, Value]],
 
 def _box_of(call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> Box:
     lower, upper = (
-        as_vector(value, expr, Need("a corner of a box is a vector"), scope) for expr, value in given
+        as_vector(value, expr, Expectation("a corner of a box is a vector"), scope) for expr, value in given
     )
     if len(lower.items) != len(upper.items):
         message = f"corners of {len(lower.items)} and {len(upper.items)} components do not span a box"
@@ -147,7 +147,7 @@ def _box_of(call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scop
 
 
 def _polygon_of(call: ast.Call, pairs: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> Polygon:
-    need = Need("a corner of a polygon is a vector")
+    need = Expectation("a corner of a polygon is a vector")
     corners = tuple(as_vector(value, expr, need, scope) for expr, value in pairs)
     known = points(corners)
     if len(corners) < 3:
@@ -181,11 +181,11 @@ def stepping(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -
     value, expr = values[0], call.args[0].value
     match name:
         case "rise":
-            return typed.Edge(call.span, "rise", as_formula(value, expr, Need("`rise`"), scope))
+            return typed.Edge(call.span, "rise", as_formula(value, expr, Expectation("`rise`"), scope))
         case "fall":
-            return typed.Edge(call.span, "fall", as_formula(value, expr, Need("`fall`"), scope))
+            return typed.Edge(call.span, "fall", as_formula(value, expr, Expectation("`fall`"), scope))
         case "sweep":
-            return Swept(_swept_point(value, expr, Need("`sweep` follows a point"), scope), call.span)
+            return Swept(_swept_point(value, expr, Expectation("`sweep` follows a point"), scope), call.span)
         case "delta":
             return _delta(value, expr, call.span, scope)
     delay = typed.Time(steps=Fraction({"next": 1, "prev": -1}.get(name, 0)))
@@ -205,7 +205,7 @@ def _shifted(
         case Vector(items):
             return Vector(tuple(_later(item, delay, span) for item in items), span)
         case _:
-            return _delayed_formula(as_formula(value, expr, Need(name), scope), delay, span)
+            return _delayed_formula(as_formula(value, expr, Expectation(name), scope), delay, span)
 
 
 def _delayed_number(num: ir.Num, delay: typed.Time) -> ir.Num:
@@ -228,13 +228,17 @@ def _later(number: Number, delay: typed.Time, span: Span) -> Number:
 
 def _delta(value: Value, expr: ast.Expr, span: Span, scope: Scope) -> Value:
     """What changed since the sample before."""
-    now = value if isinstance(value, Vector) else as_number(value, expr, Need("`delta` takes numbers"), scope)
+    now = (
+        value
+        if isinstance(value, Vector)
+        else as_number(value, expr, Expectation("`delta` takes numbers"), scope)
+    )
     before = _shifted(now, typed.Time(steps=Fraction(-1)), (expr, span), "`delta`", scope)
     assert isinstance(before, Number | Vector)
     return broadcast("sub", (now, before), span, scope)
 
 
-def _swept_point(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> Vector:
+def _swept_point(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> Vector:
     if isinstance(value, Vector):
         return value
     return Vector((as_number(value, expr, need, scope),), expr.span)
@@ -246,7 +250,7 @@ def _delay(value: Value, expr: ast.Expr, scope: Scope) -> typed.Time:
     Raises Failed: E205 where it is none.
     """
     match value:
-        case Moment(end=False):
+        case TimeExpr(end=False):
             time = typed.Time(value.seconds, value.steps, value.horizons, expr.span)
         case Number(bare=True, exact=known) if known is not None:
             time = typed.Time(steps=known, span=expr.span)
@@ -270,7 +274,9 @@ def outside(entry: External, call: ast.Call, values: Sequence[Value], scope: Sco
     _check_arguments(entry, call, scope)
     flat: list[ir.Num] = []
     for arg, value, size in zip(call.args, values, entry.arguments, strict=True):
-        need = Need(f"`{entry.name}` takes {'a number' if size is None else f'a vector of {size}'}", "this")
+        need = Expectation(
+            f"`{entry.name}` takes {'a number' if size is None else f'a vector of {size}'}", "this"
+        )
         if size is None:
             flat.append(absolute(loose_number(value, arg.value, need, scope)).num)
             continue
@@ -365,7 +371,7 @@ def _function(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) 
     """A function of the table: component by component, or over all components at once."""
     items: list[Number | Vector] = []
     for index, (arg, value) in enumerate(zip(call.args, values, strict=True), start=1):
-        need = Need(f"`{name}` takes numbers", f"argument {index}")
+        need = Expectation(f"`{name}` takes numbers", f"argument {index}")
         if isinstance(value, Vector):
             items.append(value)
         elif name == "choice":
@@ -383,16 +389,16 @@ def _function(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) 
 def _rewritten(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
     span, exprs = call.span, [arg.value for arg in call.args]
     if name in ("deg", "rad"):
-        angle = as_number(values[0], exprs[0], Need(f"`{name}` converts an angle"), scope)
+        angle = as_number(values[0], exprs[0], Expectation(f"`{name}` converts an angle"), scope)
         return _convert(name, angle, span, scope)
     if name == "sdist":
-        point = as_vector(values[0], exprs[0], Need("`sdist` takes a point"), scope)
+        point = as_vector(values[0], exprs[0], Expectation("`sdist` takes a point"), scope)
         place = values[1]
         if not isinstance(place, REGION_TYPES):
             scope.fail(Diagnostic("E205", f"`sdist` takes a region, this is {noun(place)}", exprs[1].span))
         return signed_distance(point, place, span, scope)
     left, right = (
-        as_vector(value, expr, Need(f"`{name}` takes two vectors", f"argument {index}"), scope)
+        as_vector(value, expr, Expectation(f"`{name}` takes two vectors", f"argument {index}"), scope)
         for index, (value, expr) in enumerate(zip(values, exprs, strict=True), start=1)
     )
     if name == "cross":
@@ -427,11 +433,11 @@ def _indicator(call: ast.Call, values: Sequence[Value], scope: Scope) -> Number:
                     help=("its second argument is `sharpness`",),
                 )
             )
-        width = as_number(values[1], arg.value, Need("the sharpness of `ind` is a number"), scope)
+        width = as_number(values[1], arg.value, Expectation("the sharpness of `ind` is a number"), scope)
         sharpness = width.constant
         if sharpness is None or sharpness <= 0:
             scope.fail(Diagnostic("E205", "the sharpness of `ind` is a positive constant", arg.value.span))
-    cond = as_state_formula(values[0], call.args[0].value, Need("`ind`", "argument 1"), scope)
+    cond = as_state_formula(values[0], call.args[0].value, Expectation("`ind`", "argument 1"), scope)
     if isinstance(cond, ir.Truth):
         return replace(literal(int(cond.value), call.span), flexible=False, bare=False)
     return Number(ir.Indicator(cond, sharpness), kind="int", span=call.span)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from stlc.compile.frontend.arithmetic import apply, half
 from stlc.compile.frontend.intervals import out_of_place
 from stlc.compile.frontend.scope import Scope
-from stlc.compile.frontend.values import Label as Member
-from stlc.compile.frontend.values import Moment, Number, Value, Vector, describe, noun
+from stlc.compile.frontend.values import EnumMember as Member
+from stlc.compile.frontend.values import Number, TimeExpr, Value, Vector, describe, noun
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.normal_form import condition
@@ -19,7 +19,7 @@ from stlc.source import Span
 
 
 @dataclass(frozen=True, slots=True)
-class Need:
+class Expectation:
     """Who wants a value, for messages.
 
     Attributes:
@@ -33,7 +33,7 @@ class Need:
     span: Span | None = None
 
 
-def as_number(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> Number:
+def as_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> Number:
     """The value as a real or whole number or an enum. Raises Failed (E202, E205)."""
     match value:
         case Number(kind="bool"):
@@ -46,14 +46,14 @@ def as_number(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> Number:
             return member_number(value, expr.span, scope)
         case typed.Node():
             return scope.fail(_formula_for_number(value, expr, need))
-        case Moment():
+        case TimeExpr():
             return scope.fail(_moment_for_number(value, expr))
         case _:
             message = f"{need.who}; {need.which} is {noun(value)}"
             return scope.fail(Diagnostic("E205", message, expr.span, describe(value)))
 
 
-def loose_number(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> Number:
+def loose_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> Number:
     """Like `as_number`, but a bool stands for its 0 or 1: where a value is stored or compared."""
     match value:
         case Number():
@@ -64,7 +64,7 @@ def loose_number(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> Numb
             return as_number(value, expr, need, scope)
 
 
-def as_formula(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> typed.Formula:
+def as_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> typed.Formula:
     """The value as a formula; a bool signal holds where it is above 1/2. Raises Failed (E201)."""
     match value:
         case Number(formula=formula) if formula is not None:
@@ -78,7 +78,7 @@ def as_formula(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> typed.
             return scope.fail(_number_for_formula(value, expr, need))
 
 
-def as_state_formula(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> ir.Formula:
+def as_state_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> ir.Formula:
     """The value as a formula over one instant, in negation normal form. Raises Failed (E201, E202)."""
     formula = as_formula(value, expr, need, scope)
     if not is_state(formula):
@@ -88,7 +88,7 @@ def as_state_formula(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> 
     return condition(formula)
 
 
-def as_vector(value: Value, expr: ast.Expr, need: Need, scope: Scope) -> Vector:
+def as_vector(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> Vector:
     """The value as a vector of numbers. Raises Failed (E205)."""
     if isinstance(value, Vector):
         return value
@@ -106,7 +106,7 @@ def member_number(member: Member, span: Span, scope: Scope) -> Number:
     return Number(ir.Const(float(values.pop())), kind="enum", labels=labels, span=span)
 
 
-def _number_for_formula(value: Value, expr: ast.Expr, need: Need) -> Diagnostic:
+def _number_for_formula(value: Value, expr: ast.Expr, need: Expectation) -> Diagnostic:
     labels = () if need.span is None else (Label(need.span, "wants something that is true or false"),)
     message = f"{need.who} needs a formula, {need.which} is {noun(value)}"
     return Diagnostic("E201", message, expr.span, describe(value), labels, help=_as_comparison(value, expr))
@@ -127,7 +127,7 @@ def _as_comparison(value: Value, expr: ast.Expr) -> tuple[str, ...]:
             return ()
 
 
-def _formula_for_number(value: typed.Formula, expr: ast.Expr, need: Need) -> Diagnostic:
+def _formula_for_number(value: typed.Formula, expr: ast.Expr, need: Expectation) -> Diagnostic:
     message = f"{need.who}; {need.which} is a formula"
     if is_state(value):
         help_ = (f"`ind({expr.span.text})` is 1 where it holds and 0 elsewhere",)
@@ -139,7 +139,7 @@ def _formula_for_number(value: typed.Formula, expr: ast.Expr, need: Need) -> Dia
     return Diagnostic("E202", message, expr.span, "formula", help=help_)
 
 
-def _moment_for_number(value: Moment, expr: ast.Expr) -> Diagnostic:
+def _moment_for_number(value: TimeExpr, expr: ast.Expr) -> Diagnostic:
     text = expr.span.text
     if value.end:
         return Diagnostic("E205", f"`{text}` is only known as the end of an interval", expr.span)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from stlc.compile.frontend.arithmetic import agree, apply, gap, half, in_unit
-from stlc.compile.frontend.coerce import Need, as_formula, as_number, loose_number
+from stlc.compile.frontend.coerce import Expectation, as_formula, as_number, loose_number
 from stlc.compile.frontend.regions import signed_distance
 from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.sweep import swept_distance
@@ -22,7 +22,7 @@ from stlc.compile.frontend.values import (
     is_formula,
     noun,
 )
-from stlc.compile.frontend.values import Label as Member
+from stlc.compile.frontend.values import EnumMember as Member
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.diagnostics import Diagnostic
@@ -64,8 +64,8 @@ def _pair(
         return equal if op == "==" else typed.Not(whole, equal)
     _refuse_vectors(left, right, op, scope)
     need = f"`{op}` compares numbers"
-    a = as_number(left[1], left[0], Need(need, "the left side"), scope)
-    b = as_number(right[1], right[0], Need(need, "the right side"), scope)
+    a = as_number(left[1], left[0], Expectation(need, "the left side"), scope)
+    b = as_number(right[1], right[0], Expectation(need, "the right side"), scope)
     if "enum" in (a.kind, b.kind):
         help_ = ("use `==`, `!=` or `in {…}`",)
         scope.fail(
@@ -126,7 +126,7 @@ def _equality(
     whole, place = spans
     _refuse_vectors(left, right, "==", scope)
     if any(is_formula(value) for _, value in (left, right)):
-        need = Need("`==` between truth values", "the other side")
+        need = Expectation("`==` between truth values", "the other side")
         sides = [as_formula(value, expr, need, scope) for expr, value in (left, right)]
         return typed.Logic(whole, "<->", (sides[0], sides[1]))
     a, b = _meet(left, right, scope), _meet(right, left, scope)
@@ -148,7 +148,7 @@ def _meet(side: tuple[ast.Expr, Value], other: tuple[ast.Expr, Value], scope: Sc
             message = f"`{value.name}` is not a member of the enum of `{other[0].span.text}`"
             scope.fail(Diagnostic("E205", message, expr.span, help=(f"its members are {names}",)))
         return Number(ir.Const(dict(labels)[value.name]), kind="enum", labels=labels, span=expr.span)
-    return loose_number(value, expr, Need("`==` compares numbers", "one side"), scope)
+    return loose_number(value, expr, Expectation("`==` compares numbers", "one side"), scope)
 
 
 def _real_equality(a: Number, b: Number, left: ast.Expr, right: ast.Expr, place: Span) -> Diagnostic:
@@ -201,8 +201,8 @@ def in_range(
 ) -> typed.Formula:
     """`x in [lo, hi]`: min(x - lo, hi - x), or under `@product` the paper's (x - lo) (hi - x)."""
     need = "`in [lo, hi]` compares numbers"
-    x = as_number(item[1], item[0], Need(need, "the left side"), scope)
-    low, high = (as_number(value, expr, Need(need, "a bound"), scope) for expr, value in ends)
+    x = as_number(item[1], item[0], Expectation(need, "the left side"), scope)
+    low, high = (as_number(value, expr, Expectation(need, "a bound"), scope) for expr, value in ends)
     (x, low, high), _ = agree((x, low, high), "compare", span, scope)
     if low.constant is not None and high.constant is not None and low.constant > high.constant:
         scope.fail(
@@ -231,7 +231,7 @@ def sweeps(
         )
     if len(region) == 2:
         ends = [
-            as_number(value, end, Need("`in [lo, hi]` compares numbers", "a bound"), scope)
+            as_number(value, end, Expectation("`in [lo, hi]` compares numbers", "a bound"), scope)
             for end, value in region
         ]
         place: Region = Box(Vector((ends[0],)), Vector((ends[1],)), expr.region.span)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 
 from stlc.compile.frontend.arithmetic import in_unit, on_scale, rebased
-from stlc.compile.frontend.coerce import Need, as_number
+from stlc.compile.frontend.coerce import Expectation, as_number
 from stlc.compile.frontend.evaluate import evaluate_all
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.scope import (
@@ -23,7 +23,7 @@ from stlc.compile.frontend.scope import (
     member_entries,
 )
 from stlc.compile.frontend.tags import refuse_tags
-from stlc.compile.frontend.values import Moment, Number, Value, Vector
+from stlc.compile.frontend.values import Number, TimeExpr, Value, Vector
 from stlc.compile.ir.functions import FUNCTIONS, callable_names, sampler_names
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
@@ -295,10 +295,10 @@ def _stored(exprs: Sequence[ast.Expr], target: tuple[Column, Unit], scope: Scope
     """Constants in the unit of the column; bare numbers are read in the unit that was declared."""
     column, unit = target
     for expr, value in zip(exprs, evaluate_all(exprs, scope), strict=True):
-        if isinstance(value, Moment) and value.end:
+        if isinstance(value, TimeExpr) and value.end:
             yield None
             continue
-        number = as_number(value, expr, Need("the ends of a range are numbers"), scope)
+        number = as_number(value, expr, Expectation("the ends of a range are numbers"), scope)
         if number.bare:
             number = in_unit(number, unit if unit.text else column.unit, scope)
         elif not number.flexible and column.unit.text and not same_dims(number.unit, column.unit):

@@ -19,10 +19,20 @@ from stlc.compile.frontend import comparisons
 from stlc.compile.frontend import intervals as moments
 from stlc.compile.frontend.arithmetic import agree, broadcast, negate, refuse_point, too_large
 from stlc.compile.frontend.builtins import builtin, outside, unsupported
-from stlc.compile.frontend.coerce import Need, as_formula, as_number, as_state_formula, loose_number
+from stlc.compile.frontend.coerce import Expectation, as_formula, as_number, as_state_formula, loose_number
 from stlc.compile.frontend.macros import arguments, cycle, finished, outgrown
 from stlc.compile.frontend.scope import TIME_WORDS, Cost, Definition, External, Failed, Scope, reserved
-from stlc.compile.frontend.values import Moment, Number, Origin, Swept, Value, Vector, at, is_formula, literal
+from stlc.compile.frontend.values import (
+    Number,
+    Origin,
+    Swept,
+    TimeExpr,
+    Value,
+    Vector,
+    at,
+    is_formula,
+    literal,
+)
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.functions import OPERATORS
@@ -73,7 +83,7 @@ def choose(expr: ast.IfThenElse, values: Branches, scope: Scope) -> Value:
         Failed: the condition is not a formula (E201), for numbers not one about a single instant (E202), or
             the branches do not go together (E203, E205).
     """
-    cond = as_formula(values[0], expr.cond, Need("`if`"), scope)
+    cond = as_formula(values[0], expr.cond, Expectation("`if`"), scope)
     yes, no = values[1:]
     if isinstance(yes, typed.Node) or isinstance(no, typed.Node):
         return _choice_of_formulas(expr, cond, (yes, no), scope)
@@ -96,8 +106,8 @@ def _choice_of_formulas(
     expr: ast.IfThenElse, cond: typed.Formula, branches: tuple[Value, Value], scope: Scope
 ) -> typed.Formula:
     """`(cond and yes) or (not cond and no)`."""
-    yes = as_formula(branches[0], expr.yes, Need("`then`"), scope)
-    no = as_formula(branches[1], expr.no, Need("`else`"), scope)
+    yes = as_formula(branches[0], expr.yes, Expectation("`then`"), scope)
+    no = as_formula(branches[1], expr.no, Expectation("`else`"), scope)
     first = typed.Logic(expr.yes.span, "and", (cond, yes))
     second = typed.Logic(expr.no.span, "and", (typed.Not(expr.cond.span, cond), no))
     return typed.Logic(expr.span, "or", (first, second))
@@ -105,8 +115,8 @@ def _choice_of_formulas(
 
 def _choose(expr: ast.IfThenElse, cond: typed.Formula, branches: tuple[Value, Value], scope: Scope) -> Number:
     """One of two numbers, by a state formula; of two bools the choice between formulas as well."""
-    decides = as_state_formula(cond, expr.cond, Need("`if`"), scope)
-    need = Need("the branches of `if` are of one sort", "this")
+    decides = as_state_formula(cond, expr.cond, Expectation("`if`"), scope)
+    need = Expectation("the branches of `if` are of one sort", "this")
     yes = loose_number(branches[0], expr.yes, need, scope)
     no = loose_number(branches[1], expr.no, need, scope)
     (yes, no), blank = agree((yes, no), "choose between", expr.span, scope)
@@ -137,7 +147,7 @@ def _quantity(expr: ast.Quantity, _values: Sequence[Value], scope: Scope) -> Val
     if expr.unit in ("step", "steps"):
         if not scope.in_spec:
             scope.fail(unsupported("a number of steps", expr.span, scope))
-        return Moment(steps=expr.value, span=expr.span)
+        return TimeExpr(steps=expr.value, span=expr.span)
     try:
         number = _measured(expr.value, expr.unit)
     except ValueError as error:
@@ -166,11 +176,11 @@ def _string(expr: ast.String, _values: Sequence[Value], scope: Scope) -> Value:
 
 
 def _inf(expr: ast.Inf, _values: Sequence[Value], _scope: Scope) -> Value:
-    return Moment(end=True, span=expr.span)
+    return TimeExpr(end=True, span=expr.span)
 
 
 def _vector(expr: ast.Vector, values: Sequence[Value], scope: Scope) -> Value:
-    need = Need("a vector holds numbers", "this component")
+    need = Expectation("a vector holds numbers", "this component")
     pairs = zip(values, expr.items, strict=True)
     return Vector(tuple(as_number(value, item, need, scope) for value, item in pairs), expr.span)
 
@@ -179,7 +189,7 @@ def _index(expr: ast.Index, values: Sequence[Value], scope: Scope) -> Value:
     base, index = values
     if not isinstance(base, Vector):
         scope.fail(Diagnostic("E205", "only a vector has components", expr.base.span))
-    number = as_number(index, expr.index, Need("an index is a whole number"), scope)
+    number = as_number(index, expr.index, Expectation("an index is a whole number"), scope)
     value = number.constant
     if value is None or value != int(value):
         message = "an index is a whole number that is known at compile time"
@@ -193,10 +203,10 @@ def _index(expr: ast.Index, values: Sequence[Value], scope: Scope) -> Value:
 
 def _neg(expr: ast.Neg, values: Sequence[Value], scope: Scope) -> Value:
     (value,) = values
-    if isinstance(value, Moment):
+    if isinstance(value, TimeExpr):
         return moments.negative(value, expr.span, scope)
     if not isinstance(value, Vector):
-        value = as_number(value, expr.operand, Need("`-` takes a number"), scope)
+        value = as_number(value, expr.operand, Expectation("`-` takes a number"), scope)
     if not isinstance(expr.operand, ast.Quantity):  # -5 degC is below zero; a temperature has no negation
         for item in value.items if isinstance(value, Vector) else (value,):
             refuse_point("`-`", item, expr.operand.span, scope)
@@ -205,7 +215,7 @@ def _neg(expr: ast.Neg, values: Sequence[Value], scope: Scope) -> Value:
 
 def _binary(expr: ast.Binary, values: Sequence[Value], scope: Scope) -> Value:
     left, right = values
-    if isinstance(left, Moment) or isinstance(right, Moment):
+    if isinstance(left, TimeExpr) or isinstance(right, TimeExpr):
         return moments.combine(expr.op, (expr.left, left), (expr.right, right), expr.span, scope)
     who = f"`{expr.op}` {_VERBS[expr.op]} numbers"
     sides: list[Number | Vector] = []
@@ -213,7 +223,7 @@ def _binary(expr: ast.Binary, values: Sequence[Value], scope: Scope) -> Value:
         if isinstance(value, Vector):
             sides.append(value)
         else:
-            sides.append(as_number(value, side, Need(who, f"the {which} side"), scope))
+            sides.append(as_number(value, side, Expectation(who, f"the {which} side"), scope))
     place = comparisons.sign_span(expr.op, expr.left.span, expr.right.span)
     _refuse_products(expr, sides, place, scope)
     return broadcast(OPERATORS[expr.op], sides, place if expr.op in "+-%" else expr.span, scope)
@@ -336,12 +346,12 @@ def evaluate_all(exprs: Sequence[ast.Expr], scope: Scope) -> list[Value]:
     return values
 
 
-def formula(expr: ast.Expr, need: Need, scope: Scope) -> typed.Formula:
+def formula(expr: ast.Expr, need: Expectation, scope: Scope) -> typed.Formula:
     """The expression as a formula. Raises Failed."""
     return as_formula(evaluate(expr, scope), expr, need, scope)
 
 
-def formulas(exprs: Sequence[tuple[ast.Expr, Need]], scope: Scope) -> list[typed.Formula]:
+def formulas(exprs: Sequence[tuple[ast.Expr, Expectation]], scope: Scope) -> list[typed.Formula]:
     """Independent expressions as formulas. Raises Failed."""
     found: list[typed.Formula] = []
     for expr, need in exprs:
@@ -504,7 +514,7 @@ def _called(expr: ast.Call, name: ast.Name, home: Scope, scope: Scope) -> Value:
 
 def _not(expr: ast.Not, scope: Scope) -> Value:
     return typed.Not(
-        expr.span, formula(expr.operand, Need("`not`", span=_head(expr.span, expr.operand)), scope)
+        expr.span, formula(expr.operand, Expectation("`not`", span=_head(expr.span, expr.operand)), scope)
     )
 
 
@@ -516,7 +526,7 @@ def _logic(expr: ast.Logic, scope: Scope) -> Value:
         operands.append(left.right)
         left = left.left
     operands.append(left)
-    need = Need(f"`{expr.op}`")
+    need = Expectation(f"`{expr.op}`")
     return typed.Logic(
         expr.span, expr.op, tuple(formulas([(item, need) for item in reversed(operands)], scope))
     )
@@ -524,18 +534,24 @@ def _logic(expr: ast.Logic, scope: Scope) -> Value:
 
 def _temporal(expr: ast.Temporal, scope: Scope) -> Value:
     place = _head(expr.span, expr.interval or expr.body, len(expr.alias or expr.op))
-    return _timed(expr, [(expr.body, Need(f"`{expr.op}`", span=place))], place, scope)
+    return _timed(expr, [(expr.body, Expectation(f"`{expr.op}`", span=place))], place, scope)
 
 
 def _until(expr: ast.Until, scope: Scope) -> Value:
     after = expr.interval.span if expr.interval is not None else expr.right.span
     place = comparisons.sign_span(expr.alias or expr.op, expr.left.span, after)
-    sides = [(expr.left, Need(f"`{expr.op}`", span=place)), (expr.right, Need(f"`{expr.op}`", span=place))]
+    sides = [
+        (expr.left, Expectation(f"`{expr.op}`", span=place)),
+        (expr.right, Expectation(f"`{expr.op}`", span=place)),
+    ]
     return _timed(expr, sides, place, scope)
 
 
 def _timed(
-    expr: ast.Temporal | ast.Until, operands: Sequence[tuple[ast.Expr, Need]], place: Span, scope: Scope
+    expr: ast.Temporal | ast.Until,
+    operands: Sequence[tuple[ast.Expr, Expectation]],
+    place: Span,
+    scope: Scope,
 ) -> typed.Formula:
     """Operands and interval of a temporal operator, each looked at even where the other failed."""
     if not scope.temporal:
@@ -564,7 +580,7 @@ def _head(span: Span, inner: ast.Node, length: int | None = None) -> Span:
 def _quantifier(expr: ast.Quantifier, scope: Scope) -> Value:
     """The conjunction or disjunction over a finite domain."""
     items: list[typed.Formula] = []
-    need = Need(f"`{expr.kind}`")
+    need = Expectation(f"`{expr.kind}`")
     for value in _domain(expr, scope):
         inner = replace(scope, locals={**scope.locals, expr.var: (value, Cost(1, 1))})
         items.append(formula(expr.body, need, inner))
@@ -590,10 +606,10 @@ def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
             items = [_held(item, f"{name}[{i}]", expr, bindings) for i, item in enumerate(value.items)]
             bound[name] = (Vector(tuple(items), written.span), Cost(1, 1))
         else:
-            number = loose_number(value, written, Need("`freeze` binds numbers and vectors"), scope)
+            number = loose_number(value, written, Expectation("`freeze` binds numbers and vectors"), scope)
             bound[name] = (_held(number, name, expr, bindings), Cost(1, 1))
     inner = replace(scope, locals={**scope.locals, **bound})
-    body = formula(expr.body, Need("`freeze`"), inner)
+    body = formula(expr.body, Expectation("`freeze`"), inner)
     return typed.Freeze(expr.span, tuple(bindings), body) if bindings else body
 
 
@@ -610,11 +626,11 @@ def _domain(expr: ast.Quantifier, scope: Scope) -> Iterator[Number]:
     if isinstance(expr.domain, ast.SetLiteral):
         values = evaluate_all(expr.domain.items, scope)
         for item, value in zip(expr.domain.items, values, strict=True):
-            yield as_number(value, item, Need(f"`{expr.kind}` runs over numbers"), scope)
+            yield as_number(value, item, Expectation(f"`{expr.kind}` runs over numbers"), scope)
         return
     ends = []
     for end, value in zip(expr.domain, evaluate_all(expr.domain, scope), strict=True):
-        number = as_number(value, end, Need(f"`{expr.kind}` runs over whole numbers"), scope)
+        number = as_number(value, end, Expectation(f"`{expr.kind}` runs over whole numbers"), scope)
         if number.exact is None or number.exact.denominator != 1:
             message = f"`{expr.kind}` runs over whole numbers that are known at compile time"
             scope.fail(Diagnostic("E205", message, end.span))

@@ -5,10 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 
 from stlc.compile.frontend.arithmetic import difference_for_point, in_unit, rebased
-from stlc.compile.frontend.coerce import Need, as_formula, loose_number
+from stlc.compile.frontend.coerce import Expectation, as_formula, loose_number
 from stlc.compile.frontend.evaluate import evaluate
 from stlc.compile.frontend.scope import Failed, Scope
-from stlc.compile.frontend.values import REGION_TYPES, Label, Number, Region, Value, Vector, describe, noun
+from stlc.compile.frontend.values import (
+    REGION_TYPES,
+    EnumMember,
+    Number,
+    Region,
+    Value,
+    Vector,
+    describe,
+    noun,
+)
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.normal_form import condition
@@ -66,7 +75,7 @@ def resolve_formula(expr: ast.Expr, scope: Scope, *, what: str = "a requirement"
         Failed: the findings are in the sink.
     """
     with scope.meter.fresh():
-        return as_formula(evaluate(expr, scope), expr, Need(what), scope)
+        return as_formula(evaluate(expr, scope), expr, Expectation(what), scope)
 
 
 def _formula(value: Value, expr: ast.Expr, what: str, scope: Scope) -> typed.Formula:
@@ -75,7 +84,7 @@ def _formula(value: Value, expr: ast.Expr, what: str, scope: Scope) -> typed.For
         help_ = (f"`{expr.span.text} > 0`",) if isinstance(value, Number) and not value.labels else ()
         message = f"{what} must be a formula, this is {noun(value)}"
         scope.fail(Diagnostic("S203", message, expr.span, describe(value), help=help_))
-    return as_formula(value, expr, Need(what), scope)
+    return as_formula(value, expr, Expectation(what), scope)
 
 
 __all__ = ["Number", "resolve_number", "resolve_numbers", "stored"]
@@ -139,7 +148,7 @@ def _stored_value(value: Value, expr: ast.Expr, column: Column | None, what: str
         cond = condition(value)
         truth = ir.Const(float(cond.value)) if isinstance(cond, ir.Truth) else ir.Indicator(cond)
         return Number(truth, kind="bool", span=expr.span)
-    if column is not None and column.labels and isinstance(value, Label):
+    if column is not None and column.labels and isinstance(value, EnumMember):
         return _member_of_column(value, expr, column, scope)
     if isinstance(value, typed.Node) and not isinstance(value, typed.Truth) and not scope.in_spec:
         help_ = (f"`ind({expr.span.text})` is 1 where it holds and 0 elsewhere",) if is_state(value) else ()
@@ -148,11 +157,11 @@ def _stored_value(value: Value, expr: ast.Expr, column: Column | None, what: str
                 "S203", f"{what} must be a number, this is a formula", expr.span, "formula", help=help_
             )
         )
-    number = loose_number(value, expr, Need(f"{what} is a number"), scope)
+    number = loose_number(value, expr, Expectation(f"{what} is a number"), scope)
     return number if column is None else _fitted(number, expr, column, scope)
 
 
-def _member_of_column(value: Label, expr: ast.Expr, column: Column, scope: Scope) -> Number:
+def _member_of_column(value: EnumMember, expr: ast.Expr, column: Column, scope: Scope) -> Number:
     known = dict(column.labels)
     if value.name not in known:
         names = ", ".join(f"`{name}`" for name in known)

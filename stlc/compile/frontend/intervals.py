@@ -7,7 +7,7 @@ from dataclasses import replace
 from fractions import Fraction
 
 from stlc.compile.frontend.scope import Scope
-from stlc.compile.frontend.values import Moment, Number, Value, noun
+from stlc.compile.frontend.values import Number, TimeExpr, Value, noun
 from stlc.compile.ir import typed
 from stlc.diagnostics import Diagnostic, Fix, Label
 from stlc.grammar import ast
@@ -19,37 +19,37 @@ _PAST = ("once", "historically", "since")
 _MIRROR = {"always": "historically", "eventually": "once"}
 
 
-def time_word(name: str, span: Span) -> Moment:
+def time_word(name: str, span: Span) -> TimeExpr:
     """`T`, `dt` or `end`."""
     match name:
         case "T":
-            return Moment(horizons=Fraction(1), span=span)
+            return TimeExpr(horizons=Fraction(1), span=span)
         case "dt":
-            return Moment(steps=Fraction(1), span=span)
+            return TimeExpr(steps=Fraction(1), span=span)
         case _:
-            return Moment(end=True, span=span)
+            return TimeExpr(end=True, span=span)
 
 
 def combine(
     op: str, left: tuple[ast.Expr, Value], right: tuple[ast.Expr, Value], span: Span, scope: Scope
-) -> Moment:
+) -> TimeExpr:
     """Arithmetic where at least one side is a time on the grid: sums, and multiples by plain numbers."""
     if op in ("+", "-"):
         a, b = moment(*left, scope), moment(*right, scope)
         sign = 1 if op == "+" else -1
         if not (a.end or b.end):
-            return Moment(
+            return TimeExpr(
                 a.seconds + sign * b.seconds,
                 a.steps + sign * b.steps,
                 a.horizons + sign * b.horizons,
                 span=span,
             )
-    times, factor = (left, right) if isinstance(left[1], Moment) else (right, left)
+    times, factor = (left, right) if isinstance(left[1], TimeExpr) else (right, left)
     if isinstance(factor[1], Number) and factor[1].constant is None:
         scope.fail(out_of_place(times[0].span))
     if (
         op in ("*", "/")
-        and isinstance(times[1], Moment)
+        and isinstance(times[1], TimeExpr)
         and not times[1].end
         and not (op == "/" and times is right)
     ):
@@ -67,15 +67,15 @@ def out_of_place(span: Span) -> Diagnostic:
     return Diagnostic("E311", message, span, help=("name the time: `const tau = 2 s`",))
 
 
-def negative(value: Moment, span: Span, scope: Scope) -> Moment:
+def negative(value: TimeExpr, span: Span, scope: Scope) -> TimeExpr:
     """`-value`."""
     if value.end:
         scope.fail(Diagnostic("E205", "`end` has no sign", span))
     return _scaled(value, Fraction(-1), span)
 
 
-def _scaled(value: Moment, factor: Fraction, span: Span) -> Moment:
-    return Moment(value.seconds * factor, value.steps * factor, value.horizons * factor, span=span)
+def _scaled(value: TimeExpr, factor: Fraction, span: Span) -> TimeExpr:
+    return TimeExpr(value.seconds * factor, value.steps * factor, value.horizons * factor, span=span)
 
 
 def _factor(expr: ast.Expr, value: Value, scope: Scope) -> Fraction:
@@ -86,9 +86,9 @@ def _factor(expr: ast.Expr, value: Value, scope: Scope) -> Fraction:
     )
 
 
-def moment(expr: ast.Expr, value: Value, scope: Scope) -> Moment:
+def moment(expr: ast.Expr, value: Value, scope: Scope) -> TimeExpr:
     """A value as a time. Raises Failed (E303 not constant, E203 not a time)."""
-    if isinstance(value, Moment):
+    if isinstance(value, TimeExpr):
         return value
     if not isinstance(value, Number) or value.kind in ("bool", "enum"):
         scope.fail(Diagnostic("E205", f"an interval bound is a time, this is {noun(value)}", expr.span))
@@ -99,13 +99,13 @@ def moment(expr: ast.Expr, value: Value, scope: Scope) -> Moment:
         return _bare(exact, expr, scope)
     if value.unit.dims != _SECOND.dims and not value.flexible:
         scope.fail(Diagnostic("E203", f"an interval bound is a time, this is [{value.unit}]", expr.span))
-    return Moment(exact, span=expr.span)
+    return TimeExpr(exact, span=expr.span)
 
 
-def _bare(value: Fraction, expr: ast.Expr, scope: Scope) -> Moment:
+def _bare(value: Fraction, expr: ast.Expr, scope: Scope) -> TimeExpr:
     """A bare number in the unit of the pragma; in seconds, with a warning, where there is none."""
     if scope.time_unit in ("step", "steps"):
-        return Moment(steps=value, span=expr.span)
+        return TimeExpr(steps=value, span=expr.span)
     if not scope.time_unit and value != 0:
         fix = Fix(((expr.span, f"{expr.span.text} s"),), f"{expr.span.text} s")
         help_ = ("say the unit, or set it for the whole file: `time s`",)
@@ -120,7 +120,7 @@ def _bare(value: Fraction, expr: ast.Expr, scope: Scope) -> Moment:
             )
         )
     ratio = parse_unit(scope.time_unit).ratio if scope.time_unit else Fraction(1)
-    return Moment(value * ratio, span=expr.span)
+    return TimeExpr(value * ratio, span=expr.span)
 
 
 def _not_constant(expr: ast.Expr, value: Number, scope: Scope) -> Diagnostic:
@@ -179,11 +179,11 @@ def interval(
     return typed.Interval(lo, hi, node.lo_open, node.hi_open, node.clock, node.span)
 
 
-def _time(value: Moment) -> typed.Time:
+def _time(value: TimeExpr) -> typed.Time:
     return typed.Time(value.seconds, value.steps, value.horizons, value.span)
 
 
-def _difference(left: Moment, right: Moment) -> Moment:
+def _difference(left: TimeExpr, right: TimeExpr) -> TimeExpr:
     return replace(
         left,
         seconds=left.seconds - right.seconds,
@@ -192,7 +192,7 @@ def _difference(left: Moment, right: Moment) -> Moment:
     )
 
 
-def _sign(value: Moment) -> int:
+def _sign(value: TimeExpr) -> int:
     """-1 where the time is negative whatever the grid, else 0 or 1."""
     parts = (value.seconds, value.steps, value.horizons)
     if all(part <= 0 for part in parts):
@@ -208,7 +208,7 @@ def _reversed(node: ast.Interval) -> Diagnostic:
     return Diagnostic("E301", "the interval ends before it starts", low.to(high), label, fix=fix)
 
 
-def _negative(name: str, node: ast.Interval, ends: tuple[Moment, Moment], body: ast.Expr) -> Diagnostic:
+def _negative(name: str, node: ast.Interval, ends: tuple[TimeExpr, TimeExpr], body: ast.Expr) -> Diagnostic:
     low, high = ends
     bound = node.lo if _sign(low) < 0 else node.hi
     if name in _PAST:
@@ -227,7 +227,7 @@ def _negative(name: str, node: ast.Interval, ends: tuple[Moment, Moment], body: 
     return Diagnostic("E302", "a future operator cannot look into the past", bound.span, help=hints)
 
 
-def _shown(value: Moment, expr: ast.Expr) -> str:
+def _shown(value: TimeExpr, expr: ast.Expr) -> str:
     """A bound as written, without its sign."""
     text = expr.span.text.strip()
     return text.removeprefix("-").strip() if _sign(value) < 0 else text

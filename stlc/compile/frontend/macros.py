@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from stlc.compile.frontend.arithmetic import in_unit, on_scale
-from stlc.compile.frontend.coerce import Need, as_formula, as_number
+from stlc.compile.frontend.coerce import Expectation, as_formula, as_number
 from stlc.compile.frontend.scope import MAX_LEVELS, MAX_NODES, Definition, Meter, Scope
-from stlc.compile.frontend.values import REGION_TYPES, Moment, Number, Value, Vector, noun, unit_text
+from stlc.compile.frontend.values import REGION_TYPES, Number, TimeExpr, Value, Vector, noun, unit_text
 from stlc.compile.ir import typed
 from stlc.compile.ir.functions import REGIONS
 from stlc.diagnostics import Diagnostic
@@ -40,9 +40,9 @@ def finished(entry: Definition, value: Value, scope: Scope) -> Value:
     body = entry.body
     match entry.sort:
         case "formula":
-            return as_formula(value, body, Need(f"`{entry.name}`"), scope)
+            return as_formula(value, body, Expectation(f"`{entry.name}`"), scope)
         case "number":
-            value = as_number(value, body, Need(f"`{entry.name}` is a number"), scope)
+            value = as_number(value, body, Expectation(f"`{entry.name}` is a number"), scope)
         case "region":
             if not isinstance(value, REGION_TYPES):
                 help_ = ("a region is made by " + ", ".join(f"`{name}`" for name in REGIONS),)
@@ -59,7 +59,7 @@ def _check_constant(entry: Definition, value: Value, scope: Scope) -> None:
     items = value.items if isinstance(value, Vector) else (value,)
     for item in items:
         known = isinstance(item, Number) and item.constant is not None
-        if known or isinstance(item, typed.Truth) or (isinstance(item, Moment) and not item.end):
+        if known or isinstance(item, typed.Truth) or (isinstance(item, TimeExpr) and not item.end):
             continue
         message = f"`const {entry.name}` must be a number that is known at compile time"
         help_ = (f"def {entry.name} = {entry.body.span.text}",)

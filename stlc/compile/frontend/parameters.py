@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from stlc.compile.analysis.ranges import spread
+from stlc.compile.analysis.ranges import usual_range
 from stlc.compile.frontend.arithmetic import in_unit, on_scale
-from stlc.compile.frontend.coerce import Need, loose_number
+from stlc.compile.frontend.coerce import Expectation, loose_number
 from stlc.compile.frontend.declare import ends_of
 from stlc.compile.frontend.evaluate import evaluate
 from stlc.compile.frontend.expressions import resolve_numbers, stored
@@ -93,7 +93,7 @@ def parameters(
         draws = distribution(domain, columns, unit, scope)
     found = []
     for column, draw in zip(columns, draws, strict=True):
-        ends = spread(draw) if column.low is None else None
+        ends = usual_range(draw) if column.low is None else None
         known = column if ends is None else replace(column, low=ends[0], high=ends[1])
         found.append(typed.Parameter(decl.name_span, known, draw, _text(decl), carried))
     return tuple(found)
@@ -138,7 +138,7 @@ def distribution(expr: ast.Expr, columns: Sequence[Column], unit: Unit, scope: S
             message = f"this has {len(first.items)} components, not {len(columns)}"
             scope.fail(Diagnostic("E205", message, expr.span))
         values = list(first.items)
-    need = Need("a parameter is a number")
+    need = Expectation("a parameter is a number")
     numbers = [loose_number(value, expr, need, scope) for value in values]
     return tuple(
         _in_column(number, expr, (column, unit), scope)

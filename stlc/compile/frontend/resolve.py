@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import PurePath
 from typing import TypeVar
 
-from stlc.compile.analysis.ranges import Facts
-from stlc.compile.analysis.warnings import contradictions, toothless, vacuous
+from stlc.compile.analysis.ranges import KnownRanges
+from stlc.compile.analysis.warnings import contradictions, safety_never_violated, vacuous
 from stlc.compile.frontend.arithmetic import absolute
 from stlc.compile.frontend.declare import Declared, check_names, declare, ranged
 from stlc.compile.frontend.evaluate import evaluate
@@ -316,7 +316,7 @@ def _items(spec: ast.Spec, kind: type[Item]) -> list[Item]:
 
 
 def _requirements(
-    spec: ast.Spec, kind: type[ast.Require | ast.Assume], scope: Scope, ranges: Facts
+    spec: ast.Spec, kind: type[ast.Require | ast.Assume], scope: Scope, ranges: KnownRanges
 ) -> tuple[typed.Requirement, ...]:
     """The requirements (or assumptions) that can be typed."""
     found: list[typed.Requirement] = []
@@ -346,7 +346,7 @@ def _requirements(
     return tuple(found)
 
 
-def _scale(tags: Tags, formula: typed.Formula, ranges: Facts, scope: Scope) -> float:
+def _scale(tags: Tags, formula: typed.Formula, ranges: KnownRanges, scope: Scope) -> float:
     """What the robustness is divided by. Raises Failed (E205) where a range is not known."""
     if isinstance(tags.scale, ir.Const):
         return tags.scale.value
@@ -362,5 +362,5 @@ def _warnings(
     """W502, W503 and W505."""
     tag = next((tag for tag in item.tags if tag.name == "safety"), None)
     found = [*vacuous(requirement.formula, signature, scope.facts), *contradictions(requirement.formula)]
-    weak = toothless(requirement, tag)
+    weak = safety_never_violated(requirement, tag)
     return found if weak is None else [*found, weak]

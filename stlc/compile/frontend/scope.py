@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, Literal, NoReturn, TypeAlias
 
-from stlc.compile.frontend.values import Label, Number, Origin, Value, Vector
+from stlc.compile.frontend.values import EnumMember, Number, Origin, Value, Vector
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import Bounds, callable_names, sampler_names
 from stlc.diagnostics import Diagnostic, Findings, SpecError, StlcError, SystemFileError, tell
@@ -284,7 +284,7 @@ def member_entries(enums: Iterable[tuple[tuple[str, float], ...]]) -> dict[str, 
     for labels in dict.fromkeys(enums):
         for name, _ in labels:
             options.setdefault(name, []).append(labels)
-    return {name: Known(Label(name, tuple(found)), "enum member") for name, found in options.items()}
+    return {name: Known(EnumMember(name, tuple(found)), "enum member") for name, found in options.items()}
 
 
 def constant_value(value: float, unit: Unit = DIMENSIONLESS) -> Number:

@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from stlc.compile.analysis.ranges import Facts, bounds
+from stlc.compile.analysis.ranges import KnownRanges, bounds
 from stlc.compile.frontend.arithmetic import refuse_point
-from stlc.compile.frontend.coerce import Need, as_number
+from stlc.compile.frontend.coerce import Expectation, as_number
 from stlc.compile.frontend.evaluate import evaluate
 from stlc.compile.frontend.scope import Failed, Scope
 from stlc.compile.ir import nodes as ir
@@ -32,7 +32,7 @@ def nominal(columns: Iterable[Column]) -> dict[str, Bounds]:
     }
 
 
-def reach_of_formula(formula: typed.Formula, ranges: Facts, place: Span, scope: Scope) -> float:
+def reach_of_formula(formula: typed.Formula, ranges: KnownRanges, place: Span, scope: Scope) -> float:
     """The greatest magnitude of a predicate in `formula`. Raises Failed (E205) where a range is missing."""
     known = dict(ranges)
     found = [reach_of_number(pred.num, known, place, scope) for pred in _predicates(formula, known)]
@@ -41,7 +41,7 @@ def reach_of_formula(formula: typed.Formula, ranges: Facts, place: Span, scope: 
     return max(found)
 
 
-def reach_of_number(num: ir.Num, ranges: Facts, place: Span, scope: Scope) -> float:
+def reach_of_number(num: ir.Num, ranges: KnownRanges, place: Span, scope: Scope) -> float:
     """The greatest magnitude of a number. Raises Failed (E205) where a range is missing."""
     ends = bounds(num, ranges)
     if ends is not None and all(map(math.isfinite, ends)) and ends != (0.0, 0.0):
@@ -175,7 +175,7 @@ def _number(tag: ast.Tag, scope: Scope) -> ir.Num:
     expr = _only(tag)
     if expr is None:
         scope.fail(Diagnostic("E501", f"`@{tag.name}` takes one number: `@{tag.name}(2)`", tag.span))
-    number = as_number(evaluate(expr, scope), expr, Need(f"`@{tag.name}` takes a number"), scope)
+    number = as_number(evaluate(expr, scope), expr, Expectation(f"`@{tag.name}` takes a number"), scope)
     refuse_point(f"`@{tag.name}`", number, expr.span, scope)
     if number.constant is not None and number.constant <= 0:
         scope.fail(Diagnostic("E205", f"`@{tag.name}` takes a positive constant", expr.span))

@@ -70,7 +70,7 @@ class Vector:
 
 
 @dataclass(frozen=True, slots=True)
-class Label:
+class EnumMember:
     """A member of one or several enums, told apart by what it is compared with."""
 
     name: str
@@ -79,7 +79,7 @@ class Label:
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class TimeExpr:
     """A time that needs the grid: `seconds + steps * dt + horizons * T`, or `end` (and `inf`)."""
 
     seconds: Fraction = Fraction(0)
@@ -160,7 +160,7 @@ class Complement:
 
 Region: TypeAlias = Ball | Box | Polygon | HalfSpace | Combined | Dilated | Complement
 REGION_TYPES = (Ball, Box, Polygon, HalfSpace, Combined, Dilated, Complement)
-Value: TypeAlias = Number | Vector | Swept | Label | Moment | Region | typed.Formula
+Value: TypeAlias = Number | Vector | Swept | EnumMember | TimeExpr | Region | typed.Formula
 
 
 def is_formula(value: Value) -> bool:
@@ -195,9 +195,9 @@ def describe(value: Value) -> str:
             return f"vector of {len(value.items)} {unit}".rstrip()
         case Swept():
             return "segment"
-        case Label():
+        case EnumMember():
             return "enum member"
-        case Moment():
+        case TimeExpr():
             return "time"
         case typed.Node():
             return "formula"
@@ -210,7 +210,7 @@ def noun(value: Value) -> str:
     match value:
         case Number():
             return f"a number {unit_text(value)}".rstrip()
-        case Label():
+        case EnumMember():
             return "an enum member"
         case _:
             return f"a {describe(value)}"

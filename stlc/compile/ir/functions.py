@@ -21,7 +21,7 @@ from types import MappingProxyType
 from typing import Any, Final, Literal, TypeAlias
 
 UnitRule: TypeAlias = Literal["same", "mul", "div", "pow", "sqrt", "square", "plain", "ratio", "sign"]
-Kind: TypeAlias = Literal["operator", "function", "sampler"]
+FunctionKind: TypeAlias = Literal["operator", "function", "sampler"]
 Bounds: TypeAlias = tuple[float, float]
 RangeRule: TypeAlias = Callable[[Sequence[Bounds]], Bounds]
 
@@ -64,7 +64,7 @@ class Function:
     least: int
     most: int | None
     rule: UnitRule
-    kind: Kind = "function"
+    kind: FunctionKind = "function"
     doc: str = ""
     fold: Callable[..., Any] | None = None
     array: Callable[..., Any] | None = None

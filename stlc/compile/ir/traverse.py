@@ -14,7 +14,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 
 Node: TypeAlias = ir.Formula | ir.Num | typed.Formula
-Leaf: TypeAlias = ir.Const | ir.Signal | ir.ShiftedSignal | ir.FrozenVar
+NumberLeaf: TypeAlias = ir.Const | ir.Signal | ir.ShiftedSignal | ir.FrozenVar
 LEAVES = (ir.Const, ir.Signal, ir.ShiftedSignal, ir.FrozenVar)
 """Numbers without parts."""
 _NUMBERS = get_args(ir.Num)
@@ -138,7 +138,7 @@ def subexpressions(num: Node) -> Iterator[ir.Num]:
         yield from subexpressions(child)
 
 
-def leaves(num: Node) -> Iterator[Leaf]:
+def leaves(num: Node) -> Iterator[NumberLeaf]:
     """The parts of a number without parts of their own, those of its conditions too."""
     for part in subexpressions(num):
         if isinstance(part, LEAVES):

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stlc.compile.augment.lift import recorded
+from stlc.compile.augment.lift import from_first_sample
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir.support import reach
@@ -82,7 +82,7 @@ def as_driven(rule: CompiledRequirement, task: Task) -> CompiledRequirement:
     """A requirement on the mission clock is judged as it was written, once, on all that was driven."""
     if not rule.absolute:
         return rule
-    lowered = lower(recorded(rule.typed.formula), task.compiled.grid, [])
+    lowered = lower(from_first_sample(rule.typed.formula), task.compiled.grid, [])
     written = simplify(lowered)
     return replace(rule, formula=written, lowered=lowered, reach=reach(written).future, windowed=False)
 

@@ -279,7 +279,7 @@ class Task:
     @cached_property
     def _pull(self) -> Program | None:
         """How far the next goal of the mission is, sample by sample."""
-        return None if self.compiled.pull is None else Program({"gap": self.compiled.pull})
+        return None if self.compiled.guidance_cost is None else Program({"gap": self.compiled.guidance_cost})
 
     def alive(self, x: Tensor) -> Tensor:
         """Whether the mission so far leaves a way to satisfy every requirement: (B, n) -> (B,) booleans."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias, get_args
 
-from stlc.compile.analysis.ranges import spread
+from stlc.compile.analysis.ranges import usual_range
 from stlc.compile.frontend.declare import MAX_COMPONENTS
 from stlc.compile.frontend.scope import column_entries, member_entries
 from stlc.compile.ir import nodes as ir
@@ -264,7 +264,7 @@ def _even(column: Column) -> tuple[ir.Num, str]:
 def _ranged(column: Column, assigns: tuple[Assign, ...]) -> Column:
     """The column with the range of its distribution, where none is written."""
     draw = next((assign.value for assign in assigns if assign.name == column.name), None)
-    ends = None if draw is None or column.low is not None else spread(draw)
+    ends = None if draw is None or column.low is not None else usual_range(draw)
     return column if ends is None or ends[0] == ends[1] else replace(column, low=ends[0], high=ends[1])
 
 

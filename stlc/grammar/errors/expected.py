@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from stlc.diagnostics import Diagnostic, Fix, Label
-from stlc.grammar.errors.failure import Stumble
+from stlc.grammar.errors.failure import ParseFailure
 from stlc.grammar.parse.literals import near_unit
 from stlc.grammar.scan import Lexeme, brackets, closes
 from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, RESERVED, ROLES, UNARY_TEMPORAL
@@ -49,38 +49,38 @@ _BEFORE_FORMULA = frozenset(
 )
 
 
-def expected(stumble: Stumble) -> Diagnostic:
-    """E010 for a stumble that no recogniser knows."""
-    repair = _repair(stumble)
+def expected(failure: ParseFailure) -> Diagnostic:
+    """E010 for a failure that no recogniser knows."""
+    repair = _repair(failure)
     if repair is not None:
         return repair
-    words = _words(stumble)
-    message = f"expected {_joined(words)}{_context(stumble)}, found {_found(stumble)}"
-    label = "" if stumble.found is not None else f"expected {words[0]} here"
-    advice = _product(stumble)
-    return Diagnostic("E010", message, stumble.span, label, _labels(stumble), advice, _notes(stumble))
+    words = _words(failure)
+    message = f"expected {_joined(words)}{_context(failure)}, found {_found(failure)}"
+    label = "" if failure.found is not None else f"expected {words[0]} here"
+    advice = _product(failure)
+    return Diagnostic("E010", message, failure.span, label, _labels(failure), advice, _notes(failure))
 
 
-def point(stumble: Stumble, lexeme: Lexeme) -> Span:
+def point(failure: ParseFailure, lexeme: Lexeme) -> Span:
     """The first character of a lexeme."""
-    return stumble.piece.source.span(lexeme.start, lexeme.start + 1)
+    return failure.piece.source.span(lexeme.start, lexeme.start + 1)
 
 
 # ---------------------------------------------------------------------- recognisers
 
 
-def misspelt_operator(stumble: Stumble) -> Diagnostic | None:
+def misspelt_operator(failure: ParseFailure) -> Diagnostic | None:
     """A word that is nearly an operator, and with that the piece parses: `alwyas[0, T] p`, `p adn q`."""
-    near_by = [x for x in (stumble.found, *reversed(stumble.before)) if x is not None and x.kind == "word"]
+    near_by = [x for x in (failure.found, *reversed(failure.before)) if x is not None and x.kind == "word"]
     for lexeme in near_by[:_NEAR_BY]:
         if lexeme.text in RESERVED or len(lexeme.text) < _LEAST_LETTERS:
             continue
         near = closest(lexeme.text, _OPERATORS)
-        if near is not None and stumble.piece.repaired_by(lexeme.start, lexeme.end, near):
+        if near is not None and failure.piece.repaired_by(lexeme.start, lexeme.end, near):
             return Diagnostic(
                 "E010",
                 f"unknown operator `{lexeme.text}`",
-                stumble.of(lexeme),
+                failure.of(lexeme),
                 help=(f"did you mean `{near}`?",),
             )
     return None
@@ -93,49 +93,49 @@ _OPERATORS = (
 _NEAR_BY, _LEAST_LETTERS = 4, 3
 
 
-def unknown_unit(stumble: Stumble) -> Diagnostic | None:
+def unknown_unit(failure: ParseFailure) -> Diagnostic | None:
     """A word behind a number that is no unit: `5 furlong`, `2 x`."""
-    found, previous = stumble.found, stumble.previous
+    found, previous = failure.found, failure.previous
     if found is None or previous is None or previous.kind != "number" or found.kind != "word":
         return None
-    if found.text in RESERVED or "UNIT" not in stumble.accepts or _begins_line(stumble, found):
+    if found.text in RESERVED or "UNIT" not in failure.accepts or _begins_line(failure, found):
         return None
     near = near_unit(found.text)
     advice = (CELSIUS,) if means_celsius(found.text) else (f"did you mean `{near}`?",) if near else ()
     product = f"a product is written with a sign: `{previous.text} * {found.text}`"
-    return Diagnostic("E101", f"unknown unit `{found.text}`", stumble.of(found), help=(*advice, product))
+    return Diagnostic("E101", f"unknown unit `{found.text}`", failure.of(found), help=(*advice, product))
 
 
-def unknown_declaration(stumble: Stumble) -> Diagnostic | None:
+def unknown_declaration(failure: ParseFailure) -> Diagnostic | None:
     """A word at the start of a line that begins no declaration: `requre a: …`."""
-    found = stumble.found
-    if found is None or found.kind != "word" or found.text in RESERVED or "_REQUIRE" not in stumble.accepts:
+    found = failure.found
+    if found is None or found.kind != "word" or found.text in RESERVED or "_REQUIRE" not in failure.accepts:
         return None
-    if not _begins_line(stumble, found):
+    if not _begins_line(failure, found):
         return None
     near = closest(found.text, (*DECLARATIONS, *ROLES, "spec", "system", "time"))
     advice = f"did you mean `{near}`?  " if near else ""
     return Diagnostic(
         "E010",
         f"expected a declaration, found `{found.text}`",
-        stumble.of(found),
+        failure.of(found),
         help=(f"{advice}declarations: {' '.join(DECLARATIONS)}",),
     )
 
 
-def wrong_name(stumble: Stumble) -> Diagnostic | None:
+def wrong_name(failure: ParseFailure) -> Diagnostic | None:
     """A reserved word where a name is due: `def F = …`, `const in = 3`."""
-    if "NAME" not in stumble.accepts or stumble.wants_operand:
+    if "NAME" not in failure.accepts or failure.wants_operand:
         return None
-    found = stumble.found
-    if found is None and stumble.previous is not None and stumble.follower is not None:
-        same_line = "\n" not in stumble.piece.source.text[stumble.previous.end : stumble.follower.start]
-        found = stumble.follower if same_line else None
+    found = failure.found
+    if found is None and failure.previous is not None and failure.follower is not None:
+        same_line = "\n" not in failure.piece.source.text[failure.previous.end : failure.follower.start]
+        found = failure.follower if same_line else None
     if found is None or found.text not in RESERVED:
         return None
     meaning = UNARY_TEMPORAL.get(found.text) or BINARY_TEMPORAL.get(found.text)
     means = f" (it means `{meaning}`)" if meaning not in (None, found.text) else ""
-    span = stumble.of(found)
+    span = failure.of(found)
     return Diagnostic(
         "E010",
         f"`{found.text}` is a reserved word{means}, not a name",
@@ -145,26 +145,26 @@ def wrong_name(stumble: Stumble) -> Diagnostic | None:
     )
 
 
-def stray_bracket(stumble: Stumble) -> Diagnostic | None:
+def stray_bracket(failure: ParseFailure) -> Diagnostic | None:
     """A closing bracket that closes nothing, or something else."""
-    found = stumble.found
+    found = failure.found
     if found is None or found.text not in (")", "]", "}"):
         return None
-    if not stumble.open_brackets:
-        return Diagnostic("E010", f"this `{found.text}` closes nothing", stumble.of(found))
-    bracket = stumble.open_brackets[-1]
+    if not failure.open_brackets:
+        return Diagnostic("E010", f"this `{found.text}` closes nothing", failure.of(found))
+    bracket = failure.open_brackets[-1]
     if closes(bracket, found.text):
         return None
     return Diagnostic(
         "E010",
         f"this `{found.text}` does not close `{bracket.opening.text}`",
-        stumble.of(found),
-        labels=(Label(stumble.of(bracket.opening), "opened here"),),
+        failure.of(found),
+        labels=(Label(failure.of(bracket.opening), "opened here"),),
     )
 
 
-def _begins_line(stumble: Stumble, lexeme: Lexeme) -> bool:
-    source = stumble.piece.source
+def _begins_line(failure: ParseFailure, lexeme: Lexeme) -> bool:
+    source = failure.piece.source
     line = source.line_starts[source.position(lexeme.start)[0] - 1]
     return not source.text[line : lexeme.start].strip()
 
@@ -172,99 +172,101 @@ def _begins_line(stumble: Stumble, lexeme: Lexeme) -> bool:
 # -------------------------------------------------------------------------- repairs
 
 
-def _repair(stumble: Stumble) -> Diagnostic | None:
+def _repair(failure: ParseFailure) -> Diagnostic | None:
     """The finding that one sign is missing or wrong, if with it the piece parses."""
-    previous, found = stumble.previous, stumble.found
+    previous, found = failure.previous, failure.found
     if previous is None:
         return None
-    definition = _definition_colon(stumble)
+    definition = _definition_colon(failure)
     if definition is not None:
         return definition
     for terminal in _REPAIRS:
-        if terminal not in stumble.accepts or (terminal == "_IN" and stumble.wants_operator):
+        if terminal not in failure.accepts or (terminal == "_IN" and failure.wants_operator):
             continue
-        sign = _closing(stumble) or _SIGNS[terminal] if terminal in _CLOSING else _SIGNS[terminal]
+        sign = _closing(failure) or _SIGNS[terminal] if terminal in _CLOSING else _SIGNS[terminal]
         glued = sign in ":,)]}"
         inserted = sign if glued else f" {sign}"
-        sure = terminal not in _CLOSING or not _open_interval(stumble)
-        if stumble.piece.repaired_by(previous.end, previous.end, inserted):
-            return _missing(stumble, sign, (previous.end, previous.end, inserted), sure=sure)
-        if found is not None and stumble.piece.repaired_by(found.start, found.end, sign):
+        sure = terminal not in _CLOSING or not _open_interval(failure)
+        if failure.piece.repaired_by(previous.end, previous.end, inserted):
+            return _missing(failure, sign, (previous.end, previous.end, inserted), sure=sure)
+        if found is not None and failure.piece.repaired_by(found.start, found.end, sign):
             start = previous.end if glued else found.start
-            return _missing(stumble, sign, (start, found.end, sign), sure=sure)
+            return _missing(failure, sign, (start, found.end, sign), sure=sure)
     return None
 
 
-def _open_interval(stumble: Stumble) -> bool:
+def _open_interval(failure: ParseFailure) -> bool:
     """Whether an interval is open, which `]` and `)` close with different meanings."""
-    return bool(stumble.open_brackets) and stumble.open_brackets[-1].interval
+    return bool(failure.open_brackets) and failure.open_brackets[-1].interval
 
 
-def _closing(stumble: Stumble) -> str | None:
+def _closing(failure: ParseFailure) -> str | None:
     """What closes the bracket that was opened last."""
-    if not stumble.open_brackets:
+    if not failure.open_brackets:
         return None
-    return {"(": ")", "[": "]", "{": "}"}.get(stumble.open_brackets[-1].opening.text)
+    return {"(": ")", "[": "]", "{": "}"}.get(failure.open_brackets[-1].opening.text)
 
 
-def _definition_colon(stumble: Stumble) -> Diagnostic | None:
+def _definition_colon(failure: ParseFailure) -> Diagnostic | None:
     """`def name: …`, where `=` is due; the parser took what follows for a type."""
-    declared = _declared(stumble)
-    sign = next((lexeme for lexeme in stumble.before if lexeme.text == ":"), None)
+    declared = _declared(failure)
+    sign = next((lexeme for lexeme in failure.before if lexeme.text == ":"), None)
     if declared is None or sign is None or declared[1] not in ("definition", "constant", "region"):
         return None
-    if not stumble.piece.repaired_by(sign.start, sign.end, " ="):
+    if not failure.piece.repaired_by(sign.start, sign.end, " ="):
         return None
-    return _missing(Stumble(stumble.piece, sign.start), "=", (sign.start, sign.end, " ="))
+    return _missing(ParseFailure(failure.piece, sign.start), "=", (sign.start, sign.end, " ="))
 
 
-def _missing(stumble: Stumble, sign: str, edit: tuple[int, int, str], *, sure: bool = True) -> Diagnostic:
+def _missing(
+    failure: ParseFailure, sign: str, edit: tuple[int, int, str], *, sure: bool = True
+) -> Diagnostic:
     """That a sign is missing; where it is not `sure` that no other one was meant, nothing is repaired."""
     low, high, text = edit
-    label = f"expected `{sign}` before this" if low == high and stumble.found is not None else ""
+    label = f"expected `{sign}` before this" if low == high and failure.found is not None else ""
     return Diagnostic(
         "E010",
-        f"expected `{sign}`{_context(stumble)}, found {_found(stumble)}",
-        stumble.span,
+        f"expected `{sign}`{_context(failure)}, found {_found(failure)}",
+        failure.span,
         label,
-        _labels(stumble),
-        help=(stumble.line_with(edit),),
-        fix=Fix(((stumble.piece.source.span(low, high), text),)) if sure else None,
+        _labels(failure),
+        help=(failure.line_with(edit),),
+        fix=Fix(((failure.piece.source.span(low, high), text),)) if sure else None,
     )
 
 
-def _product(stumble: Stumble) -> tuple[str, ...]:
+def _product(failure: ParseFailure) -> tuple[str, ...]:
     """`2 (x + 1)`, `x y`: a product without its sign."""
-    previous, found = stumble.previous, stumble.found
-    if previous is None or found is None or "MULOP" not in stumble.accepts or "UNIT" in stumble.accepts:
+    previous, found = failure.previous, failure.found
+    if previous is None or found is None or "MULOP" not in failure.accepts or "UNIT" in failure.accepts:
         return ()
     if previous.text in ("deg", "°") and found.text == "C":
         return (CELSIUS,)
-    if not stumble.piece.repaired_by(previous.end, previous.end, " *"):
+    if not failure.piece.repaired_by(previous.end, previous.end, " *"):
         return ()
-    return (f"a product is written with a sign: {stumble.line_with((previous.end, previous.end, ' *'))}",)
+    return (f"a product is written with a sign: {failure.line_with((previous.end, previous.end, ' *'))}",)
 
 
 # ---------------------------------------------------------------------------- words
 
 
-def _words(stumble: Stumble) -> list[str]:
-    accepts = stumble.accepts
+def _words(failure: ParseFailure) -> list[str]:
+    accepts = failure.accepts
     words: list[str] = []
-    if stumble.wants_operand:
-        words.append(_operand(stumble))
+    if failure.wants_operand:
+        words.append(_operand(failure))
     elif "NAME" in accepts:
-        words.append("a type" if stumble.previous and stumble.previous.text == ":" else "a name")
-    optional = _POSTFIX if stumble.wants_operator or "_REQUIRE" in accepts else frozenset()
-    if not stumble.wants_operand:
+        words.append("a type" if failure.previous and failure.previous.text == ":" else "a name")
+    optional = _POSTFIX if failure.wants_operator or "_REQUIRE" in accepts else frozenset()
+    if not failure.wants_operand:
         words += [
             f"`{sign}`" for name, sign in _SIGNS.items() if name in accepts - optional - {"_IN", "_SIGNAL"}
         ]
-        words += ["`in`"] if "_IN" in accepts and not stumble.wants_operator else []
-    words += [word for name, word in _CLASSES.items() if name in accepts and not stumble.wants_operand]
-    words += ["an operator"] if stumble.wants_operator else []
+        words += ["`in`"] if "_IN" in accepts and not failure.wants_operator else []
+    words += [word for name, word in _CLASSES.items() if name in accepts and not failure.wants_operand]
+    words += ["an operator"] if failure.wants_operator else []
     words += ["a declaration"] if "_REQUIRE" in accepts else []
-    words += ["the end of the expression"] if stumble.piece.rule == "expr" and "$END" in accepts else []
+    words += ["the end of the expression"] if failure.piece.rule == "expr" and "$END" in accepts else []
     return words[:MAX_WORDS] or ["something else"]
 
 
@@ -277,56 +279,56 @@ _CLASSES: Mapping[str, str] = MappingProxyType(
 )
 
 
-def _operand(stumble: Stumble) -> str:
-    if "UNARY" not in stumble.accepts:
+def _operand(failure: ParseFailure) -> str:
+    if "UNARY" not in failure.accepts:
         return "a value"
-    previous = stumble.previous
+    previous = failure.previous
     if previous is None or previous.text in _BEFORE_FORMULA or previous.text in UNARY_TEMPORAL:
-        return "a formula" if stumble.piece.rule == "start" else "an expression"
-    if previous.text in BINARY_TEMPORAL or ("RPAR" not in stumble.accepts and previous.text in ("]", ")")):
+        return "a formula" if failure.piece.rule == "start" else "an expression"
+    if previous.text in BINARY_TEMPORAL or ("RPAR" not in failure.accepts and previous.text in ("]", ")")):
         return "a formula"
     return "an expression"
 
 
-def _context(stumble: Stumble) -> str:
-    previous = stumble.previous
+def _context(failure: ParseFailure) -> str:
+    previous = failure.previous
     if previous is None:
         return ""
-    name = _declared(stumble)
+    name = _declared(failure)
     if name is not None and name[0] == previous:
         return f" after the {name[1]}'s name"
-    if any(bracket.interval and bracket.closing == previous for bracket in brackets(stumble.before)):
+    if any(bracket.interval and bracket.closing == previous for bracket in brackets(failure.before)):
         return " after the interval"
     return f" after `{_shortened(previous.text)}`"
 
 
-def _declared(stumble: Stumble) -> tuple[Lexeme, str] | None:
+def _declared(failure: ParseFailure) -> tuple[Lexeme, str] | None:
     """The name that the piece declares, and what it is the name of."""
-    for keyword, name in zip(stumble.before, stumble.before[1:], strict=False):
+    for keyword, name in zip(failure.before, failure.before[1:], strict=False):
         if keyword.text in NOUNS and name.kind in ("word", "quoted"):
             return name, NOUNS[keyword.text]
     return None
 
 
-def _labels(stumble: Stumble) -> tuple[Label, ...]:
-    name = _declared(stumble)
-    if name is None or name[0] != stumble.previous:
+def _labels(failure: ParseFailure) -> tuple[Label, ...]:
+    name = _declared(failure)
+    if name is None or name[0] != failure.previous:
         return ()
-    return (Label(stumble.of(name[0]), f"the {name[1]}'s name"),)
+    return (Label(failure.of(name[0]), f"the {name[1]}'s name"),)
 
 
-def _found(stumble: Stumble) -> str:
-    if stumble.found is not None:
-        return f"`{_shortened(stumble.found.text)}`"
-    if stumble.piece.rule == "expr":
+def _found(failure: ParseFailure) -> str:
+    if failure.found is not None:
+        return f"`{_shortened(failure.found.text)}`"
+    if failure.piece.rule == "expr":
         return "the end of the expression"
-    return "the end of the file" if stumble.follower is None else "the next declaration"
+    return "the end of the file" if failure.follower is None else "the next declaration"
 
 
-def _notes(stumble: Stumble) -> tuple[str, ...]:
-    if not stumble.wants_operand:
+def _notes(failure: ParseFailure) -> tuple[str, ...]:
+    if not failure.wants_operand:
         return ()
-    for lexeme in (stumble.found, stumble.previous):
+    for lexeme in (failure.found, failure.previous):
         if lexeme is not None and lexeme.text in ("F", "G", "U"):
             name, meaning = lexeme.text, UNARY_TEMPORAL.get(lexeme.text, "until")
             return (f"`{name}` means `{meaning}`; a name of your own is written `` `{name}` ``",)

@@ -45,7 +45,7 @@ class Piece:
 
 
 @dataclass(frozen=True)
-class Stumble:
+class ParseFailure:
     """The place in a piece at which no rule goes on."""
 
     piece: Piece

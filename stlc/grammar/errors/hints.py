@@ -1,6 +1,6 @@
 """Malformed texts -> diagnostics: the slips that deserve a word of their own, in a table.
 
-Each recogniser looks at one `Stumble` and returns a finding or None; the first that knows it wins, and
+Each recogniser looks at one `ParseFailure` and returns a finding or None; the first that knows it wins, and
 `expected.py` says something about every other.
 """
 
@@ -18,25 +18,25 @@ from stlc.grammar.errors.expected import (
     unknown_unit,
     wrong_name,
 )
-from stlc.grammar.errors.failure import Piece, Stumble
+from stlc.grammar.errors.failure import ParseFailure, Piece
 from stlc.grammar.errors.unicode import replacement, unexpected_character
 from stlc.grammar.scan import Bracket, Lexeme, brackets, opens_interval
 from stlc.grammar.words import BINARY_TEMPORAL
 from stlc.source import Span
 
-Recogniser = Callable[[Stumble], Diagnostic | None]
+Recogniser = Callable[[ParseFailure], Diagnostic | None]
 
 _TAKES_LEFT = frozenset({"in", "not", "<", "<=", ">", ">=", "==", "!=", "*", "/", "%", "^"})
 
 
 def diagnose(piece: Piece, at: int) -> Diagnostic:
     """What is wrong with a piece in which the parser gave up at offset `at`."""
-    stumble = Stumble(piece, at)
+    failure = ParseFailure(piece, at)
     for recognise in RECOGNISERS:
-        finding = recognise(stumble)
+        finding = recognise(failure)
         if finding is not None:
             return finding
-    return expected(stumble)
+    return expected(failure)
 
 
 def too_deep(span: Span, limit: int) -> Diagnostic:
@@ -53,22 +53,22 @@ def too_deep(span: Span, limit: int) -> Diagnostic:
 # ---------------------------------------------------------------- E001: characters
 
 
-def _unclosed_text(stumble: Stumble) -> Diagnostic | None:
-    found = stumble.found
+def _unclosed_text(failure: ParseFailure) -> Diagnostic | None:
+    found = failure.found
     if found is None or found.text not in ('"', "`"):
         return None
     what = "text" if found.text == '"' else "name"
     return Diagnostic(
-        "E011", f"this `{found.text}` is never closed", point(stumble, found), f"a {what} ends on its line"
+        "E011", f"this `{found.text}` is never closed", point(failure, found), f"a {what} ends on its line"
     )
 
 
-def _character(stumble: Stumble) -> Diagnostic | None:
-    found = stumble.found
+def _character(failure: ParseFailure) -> Diagnostic | None:
+    found = failure.found
     if found is None or not unexpected_character(found):
         return None
     char = found.text[0]
-    span = stumble.piece.source.span(found.start, found.start + 1)
+    span = failure.piece.source.span(found.start, found.start + 1)
     named = f"`{char}`" if char.isprintable() else f"U+{ord(char):04X} (invisible)"
     message = f"unexpected character {named}"
     advice = replacement(char)
@@ -76,17 +76,17 @@ def _character(stumble: Stumble) -> Diagnostic | None:
         return Diagnostic("E001", message, span)
     if advice.text is None:
         return Diagnostic("E001", message, span, help=(advice.help,))
-    edits = _all_replacements(stumble, found)
-    fix = Fix(tuple((stumble.piece.source.span(low, high), text) for low, high, text in edits))
-    return Diagnostic("E001", message, span, help=(f"{advice.help}:  {stumble.line_with(*edits)}",), fix=fix)
+    edits = _all_replacements(failure, found)
+    fix = Fix(tuple((failure.piece.source.span(low, high), text) for low, high, text in edits))
+    return Diagnostic("E001", message, span, help=(f"{advice.help}:  {failure.line_with(*edits)}",), fix=fix)
 
 
-def _all_replacements(stumble: Stumble, found: Lexeme) -> list[tuple[int, int, str]]:
+def _all_replacements(failure: ParseFailure, found: Lexeme) -> list[tuple[int, int, str]]:
     """Edits for all characters of this line that have a spelling in the language."""
-    source = stumble.piece.source
+    source = failure.piece.source
     line = source.position(found.start)[0]
     edits: list[tuple[int, int, str]] = []
-    for lexeme in stumble.lexemes:
+    for lexeme in failure.lexemes:
         advice = replacement(lexeme.text[0]) if unexpected_character(lexeme) else None
         if advice is None or advice.text is None or source.position(lexeme.start)[0] != line:
             continue
@@ -102,16 +102,16 @@ def _all_replacements(stumble: Stumble, found: Lexeme) -> list[tuple[int, int, s
 # ------------------------------------------------------------------- E002: bars
 
 
-def _bars(stumble: Stumble) -> Diagnostic | None:
-    found = stumble.found
-    if found is None or found.text not in ("|", "||") or not stumble.wants_operand:
+def _bars(failure: ParseFailure) -> Diagnostic | None:
+    found = failure.found
+    if found is None or found.text not in ("|", "||") or not failure.wants_operand:
         return None
-    closing = next((lexeme for lexeme in stumble.after[1:] if lexeme.text == found.text), None)
+    closing = next((lexeme for lexeme in failure.after[1:] if lexeme.text == found.text), None)
     if closing is None:
         return None
-    span = stumble.of(found, closing)
+    span = failure.of(found, closing)
     function = "abs" if found.text == "|" else "norm"
-    inner = stumble.piece.source.text[found.end : closing.start].strip()
+    inner = failure.piece.source.text[found.end : closing.start].strip()
     what = "absolute value" if function == "abs" else "a norm"
     return Diagnostic(
         "E002",
@@ -125,29 +125,29 @@ def _bars(stumble: Stumble) -> Diagnostic | None:
 # ------------------------------------------------------------------ E011: brackets
 
 
-def _unclosed(stumble: Stumble) -> Diagnostic | None:
-    if stumble.found is not None or not stumble.open_brackets:
+def _unclosed(failure: ParseFailure) -> Diagnostic | None:
+    if failure.found is not None or not failure.open_brackets:
         return None
-    bracket = stumble.open_brackets[-1]
+    bracket = failure.open_brackets[-1]
     opening = bracket.opening
     labels: tuple[Label, ...] = ()
-    if stumble.follower is not None:
-        labels = (Label(stumble.of(stumble.follower), "the next declaration starts here"),)
+    if failure.follower is not None:
+        labels = (Label(failure.of(failure.follower), "the next declaration starts here"),)
     return Diagnostic(
         "E011",
         f"this `{opening.text}` is never closed",
-        stumble.of(opening),
+        failure.of(opening),
         "opened here",
         labels,
-        note=_closed_inside(stumble, bracket),
+        note=_closed_inside(failure, bracket),
     )
 
 
-def _closed_inside(stumble: Stumble, outer: Bracket) -> tuple[str, ...]:
-    for inner in brackets(stumble.before):
+def _closed_inside(failure: ParseFailure, outer: Bracket) -> tuple[str, ...]:
+    for inner in brackets(failure.before):
         same = inner.opening.text == outer.opening.text and inner.opening.start > outer.opening.start
         if same and inner.closing is not None:
-            line, column = stumble.piece.source.position(inner.opening.start)
+            line, column = failure.piece.source.position(inner.opening.start)
             return (f"the inner `{inner.opening.text}` on line {line}, column {column} is closed",)
     return ()
 
@@ -155,26 +155,26 @@ def _closed_inside(stumble: Stumble, outer: Bracket) -> tuple[str, ...]:
 # ----------------------------------------------------------- E012: chains of until
 
 
-def _chain(stumble: Stumble) -> Diagnostic | None:
-    found = stumble.found
-    if found is None or _operator(found) not in BINARY_TEMPORAL or "AND" not in stumble.accepts:
+def _chain(failure: ParseFailure) -> Diagnostic | None:
+    found = failure.found
+    if found is None or _operator(found) not in BINARY_TEMPORAL or "AND" not in failure.accepts:
         return None
-    second = len(stumble.before)
-    first = _until_before(stumble, second)
+    second = len(failure.before)
+    first = _until_before(failure, second)
     if first is None:
         return None
-    text = stumble.piece.source.text
-    start = stumble.lexemes[stumble.operand_before(first)].start
-    middle = stumble.lexemes[_behind_interval(stumble, first)].start
-    last = stumble.operand_after(_behind_interval(stumble, second)) - 1
-    left, head = text[start:middle].rstrip(), text[start : stumble.lexemes[second - 1].end]
-    right = text[middle : stumble.lexemes[last].end]
-    tail = text[found.start : stumble.lexemes[last].end]
+    text = failure.piece.source.text
+    start = failure.lexemes[failure.operand_before(first)].start
+    middle = failure.lexemes[_behind_interval(failure, first)].start
+    last = failure.operand_after(_behind_interval(failure, second)) - 1
+    left, head = text[start:middle].rstrip(), text[start : failure.lexemes[second - 1].end]
+    right = text[middle : failure.lexemes[last].end]
+    tail = text[found.start : failure.lexemes[last].end]
     return Diagnostic(
         "E012",
         f"`{_operator(found)}` does not chain; say which one is inside",
-        stumble.of(found),
-        labels=(Label(stumble.of(stumble.lexemes[first]), f"first `{_operator(stumble.lexemes[first])}`"),),
+        failure.of(found),
+        labels=(Label(failure.of(failure.lexemes[first]), f"first `{_operator(failure.lexemes[first])}`"),),
         help=(f"{left} ({right})     or     ({head}) {tail}",),
     )
 
@@ -183,21 +183,21 @@ def _operator(lexeme: Lexeme) -> str:
     return lexeme.text.rstrip("_") if lexeme.kind == "word" else lexeme.text
 
 
-def _until_before(stumble: Stumble, index: int) -> int | None:
+def _until_before(failure: ParseFailure, index: int) -> int | None:
     depth = 0
     for i in range(index - 1, -1, -1):
-        text = stumble.lexemes[i].text
+        text = failure.lexemes[i].text
         depth += (text in (")", "]", "}")) - (text in ("(", "[", "{"))
         if depth < 0:
             return None
-        if depth == 0 and _operator(stumble.lexemes[i]) in BINARY_TEMPORAL:
+        if depth == 0 and _operator(failure.lexemes[i]) in BINARY_TEMPORAL:
             return i
     return None
 
 
-def _behind_interval(stumble: Stumble, index: int) -> int:
+def _behind_interval(failure: ParseFailure, index: int) -> int:
     """Index of what follows the operator at `index` and its interval."""
-    items = stumble.lexemes
+    items = failure.lexemes
     last = len(items) - 1
     behind = min(index + 1, last)
     if items[behind].text == "@":
@@ -213,36 +213,36 @@ def _behind_interval(stumble: Stumble, index: int) -> int:
 # -------------------------------------------------------------------- E013, E014
 
 
-def _equals(stumble: Stumble) -> Diagnostic | None:
-    found = stumble.found
-    if found is None or found.text != "=" or "CMP" not in stumble.accepts or "EQUAL" in stumble.accepts:
+def _equals(failure: ParseFailure) -> Diagnostic | None:
+    found = failure.found
+    if found is None or found.text != "=" or "CMP" not in failure.accepts or "EQUAL" in failure.accepts:
         return None
-    span = stumble.of(found)
+    span = failure.of(found)
     return Diagnostic(
         "E013", "`=` defines, `==` compares", span, fix=Fix(((span, "=="),), "replace `=` with `==`")
     )
 
 
-def _vector(stumble: Stumble) -> Diagnostic | None:
-    found, previous = stumble.found, stumble.previous
+def _vector(failure: ParseFailure) -> Diagnostic | None:
+    found, previous = failure.found, failure.previous
     if found is None or previous is None:
         return None
-    if previous.text == "]" and stumble.wants_operand and found.text in _TAKES_LEFT:
-        bracket = next((b for b in brackets(stumble.before) if b.closing == previous), None)
-        return None if bracket is None else _vector_read_as_interval(stumble, bracket, found)
-    if found.text in (",", "]") and stumble.open_brackets and stumble.open_brackets[-1].interval:
-        return _not_two_bounds(stumble, stumble.open_brackets[-1].opening, found)
+    if previous.text == "]" and failure.wants_operand and found.text in _TAKES_LEFT:
+        bracket = next((b for b in brackets(failure.before) if b.closing == previous), None)
+        return None if bracket is None else _vector_read_as_interval(failure, bracket, found)
+    if found.text in (",", "]") and failure.open_brackets and failure.open_brackets[-1].interval:
+        return _not_two_bounds(failure, failure.open_brackets[-1].opening, found)
     return None
 
 
-def _vector_read_as_interval(stumble: Stumble, bracket: Bracket, found: Lexeme) -> Diagnostic | None:
-    inside = [x for x in stumble.before if x.start > bracket.opening.start][:-1]
+def _vector_read_as_interval(failure: ParseFailure, bracket: Bracket, found: Lexeme) -> Diagnostic | None:
+    inside = [x for x in failure.before if x.start > bracket.opening.start][:-1]
     if not bracket.interval or bracket.closing is None or _looks_like_time(inside):
         return None
-    operator = stumble.before[stumble.before.index(bracket.opening) - 1]
-    index = len(stumble.before)
-    last = stumble.lexemes[max(stumble.operand_after(index) - 1, index)]
-    read, rest = stumble.of(bracket.opening, bracket.closing), stumble.of(found, last)
+    operator = failure.before[failure.before.index(bracket.opening) - 1]
+    index = len(failure.before)
+    last = failure.lexemes[max(failure.operand_after(index) - 1, index)]
+    read, rest = failure.of(bracket.opening, bracket.closing), failure.of(found, last)
     bounds = " to ".join(part.strip() for part in read.text[1:-1].split(",", 1))
     return Diagnostic(
         "E014",
@@ -262,19 +262,19 @@ def _looks_like_time(inside: list[Lexeme]) -> bool:
     )
 
 
-def _not_two_bounds(stumble: Stumble, opening: Lexeme, found: Lexeme) -> Diagnostic | None:
-    index = stumble.before.index(opening)
-    operator = stumble.before[index - 1]
+def _not_two_bounds(failure: ParseFailure, opening: Lexeme, found: Lexeme) -> Diagnostic | None:
+    index = failure.before.index(opening)
+    operator = failure.before[index - 1]
     if opening.text != "[" or not opens_interval(operator):
         return None
-    written = stumble.piece.source.text[opening.end : found.start].strip()
+    written = failure.piece.source.text[opening.end : found.start].strip()
     if found.text == "]":
         advice = f"{operator.text}[0, {written}] …" if written else f"{operator.text}[0, T] …"
         label = "it needs both ends"
     else:
         advice = f"a vector needs parentheses here:  {operator.text} ([{written}, …] in …)"
         label = "read as an interval, which has two ends"
-    span = stumble.of(opening, found)
+    span = failure.of(opening, found)
     return Diagnostic(
         "E014", f"`[` after `{operator.text}` starts a time interval", span, label, help=(advice,)
     )

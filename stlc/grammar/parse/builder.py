@@ -1,6 +1,6 @@
 """Parse tree -> AST, expressions. One function a rule of `stl.lark`; a rule without one is an error.
 
-A function takes the children of its node, already built: AST nodes, `Leaf`s for tokens, None where an
+A function takes the children of its node, already built: AST nodes, `TerminalToken`s, None where an
 optional part is not written.
 """
 
@@ -12,13 +12,13 @@ from types import MappingProxyType
 from typing import Any, TypeAlias
 
 from stlc.grammar import ast
-from stlc.grammar.parse.literals import Context, Leaf, name_of, number_of, own_name, unit_of
+from stlc.grammar.parse.literals import Context, TerminalToken, name_of, number_of, own_name, unit_of
 from stlc.grammar.words import BINARY_TEMPORAL, UNARY_TEMPORAL
 from stlc.source import Span
 
 _WORD = re.compile(r"[A-Za-z]+")
 
-Rule: TypeAlias = Callable[[Context, Span, Sequence[Any]], Any]
+BuildRule: TypeAlias = Callable[[Context, Span, Sequence[Any]], Any]
 
 
 # -------------------------------------------------------------------------- atoms
@@ -127,7 +127,7 @@ def _not(_: Context, span: Span, children: Sequence[Any]) -> ast.Not:
     return ast.Not(span, children[0])
 
 
-def _interval(*, lo_open: bool, hi_open: bool) -> Rule:
+def _interval(*, lo_open: bool, hi_open: bool) -> BuildRule:
     def build(_: Context, span: Span, children: Sequence[Any]) -> ast.Interval:
         lo, hi = children
         return ast.Interval(span, lo, hi, lo_open, hi_open)
@@ -135,13 +135,13 @@ def _interval(*, lo_open: bool, hi_open: bool) -> Rule:
     return build
 
 
-def _clocked(operator: Leaf, interval: ast.Interval) -> ast.Interval:
+def _clocked(operator: TerminalToken, interval: ast.Interval) -> ast.Interval:
     if not operator.kind.endswith("_AT"):
         return interval
     return ast.Interval(interval.span, interval.lo, interval.hi, interval.lo_open, interval.hi_open, "start")
 
 
-def _spelled(operator: Leaf, table: Mapping[str, str]) -> tuple[Any, str]:
+def _spelled(operator: TerminalToken, table: Mapping[str, str]) -> tuple[Any, str]:
     """The operator's name, and its alias if it is written as one."""
     match = _WORD.match(operator.text)
     assert match is not None
@@ -201,7 +201,7 @@ def _if_then_else(_: Context, span: Span, children: Sequence[Any]) -> ast.IfThen
     return ast.IfThenElse(span, cond, yes, no)
 
 
-EXPRESSIONS: Mapping[str, Rule] = MappingProxyType(
+EXPRESSIONS: Mapping[str, BuildRule] = MappingProxyType(
     {
         "quantity": _quantity,
         "string": _string,

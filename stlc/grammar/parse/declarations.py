@@ -10,8 +10,8 @@ from typing import Any, TypeAlias
 
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
-from stlc.grammar.parse.builder import Rule
-from stlc.grammar.parse.literals import Context, Leaf, name_of, number_of, own_name, unit_of
+from stlc.grammar.parse.builder import BuildRule
+from stlc.grammar.parse.literals import Context, TerminalToken, name_of, number_of, own_name, unit_of
 from stlc.source import Source, Span
 
 _SIZE_DIGITS = 4
@@ -70,7 +70,7 @@ def _type(context: Context, span: Span, children: Sequence[Any]) -> ast.TypeRef:
     return ast.TypeRef(span, name_of(leaf), None if size is None else _size(context, size))
 
 
-def _size(context: Context, leaf: Leaf) -> int:
+def _size(context: Context, leaf: TerminalToken) -> int:
     digits = leaf.text.strip("[] \t\r\n")
     if len(digits) <= _SIZE_DIGITS:
         return int(digits)
@@ -94,14 +94,14 @@ def _doc(context: Context, end: int) -> str:
     return "\n".join(lines)
 
 
-def _head(context: Context, span: Span, leaf: Leaf, tags: tuple[ast.Tag, ...]) -> dict[str, Any]:
+def _head(context: Context, span: Span, leaf: TerminalToken, tags: tuple[ast.Tag, ...]) -> dict[str, Any]:
     """The fields that all declarations share."""
     (head,) = _heads(context, span, (leaf,), tags)
     return head
 
 
 def _heads(
-    context: Context, span: Span, names: Sequence[Leaf], tags: tuple[ast.Tag, ...]
+    context: Context, span: Span, names: Sequence[TerminalToken], tags: tuple[ast.Tag, ...]
 ) -> list[dict[str, Any]]:
     """The same for a declaration of several names."""
     shared = {"span": span, "tags": tags, "doc": _doc(context, names[0].span.start)}
@@ -152,7 +152,7 @@ def _whole(context: Context, span: Span, children: Sequence[Any]) -> int:
     return -int(value) if minus is not None else int(value)
 
 
-def _member(_: Context, __: Span, children: Sequence[Any]) -> tuple[Leaf, int | None]:
+def _member(_: Context, __: Span, children: Sequence[Any]) -> tuple[TerminalToken, int | None]:
     leaf, value = children
     return leaf, value
 
@@ -192,7 +192,7 @@ def _assume(context: Context, span: Span, children: Sequence[Any]) -> ast.Assume
     return ast.Assume(**_head(context, span, leaf, tags), formula=formula)
 
 
-DECLARATIONS: Mapping[str, Rule] = MappingProxyType(
+DECLARATIONS: Mapping[str, BuildRule] = MappingProxyType(
     {
         "start": _several,
         "spec_name": _spec_name,

@@ -20,7 +20,7 @@ _WORD = re.compile(r"[A-Za-z]+")
 
 
 @dataclass(frozen=True, slots=True)
-class Leaf:
+class TerminalToken:
     """A token: the name of its terminal, its text and its place."""
 
     kind: str
@@ -43,12 +43,12 @@ class Context:
     documented: int = 0
 
 
-def name_of(leaf: Leaf) -> str:
+def name_of(leaf: TerminalToken) -> str:
     """The name that a NAME token writes, without its backticks."""
     return leaf.text[1:-1] if leaf.text.startswith("`") else leaf.text
 
 
-def own_name(context: Context, leaf: Leaf) -> str:
+def own_name(context: Context, leaf: TerminalToken) -> str:
     """The name that a declaration gives; `T`, `end` and `dt` only in backticks."""
     if leaf.text in BUILT_IN:
         context.findings.append(
@@ -63,7 +63,7 @@ def own_name(context: Context, leaf: Leaf) -> str:
     return name_of(leaf)
 
 
-def unit_of(context: Context, leaf: Leaf | None) -> str:
+def unit_of(context: Context, leaf: TerminalToken | None) -> str:
     """The unit that a UNIT or UNIT_BRACKET token writes; "" if there is none."""
     if leaf is None:
         return ""
@@ -79,7 +79,7 @@ def unit_of(context: Context, leaf: Leaf | None) -> str:
     return text
 
 
-def _bad_unit(leaf: Leaf, text: str, reason: str) -> Diagnostic:
+def _bad_unit(leaf: TerminalToken, text: str, reason: str) -> Diagnostic:
     if "," in text:
         advice: tuple[str, ...] = (f"a range is written `in {leaf.text}`",)
     elif means_celsius(text.strip("[] ")):
@@ -101,7 +101,7 @@ def near_unit(word: str) -> str | None:
     )
 
 
-def number_of(context: Context, leaf: Leaf) -> Fraction:
+def number_of(context: Context, leaf: TerminalToken) -> Fraction:
     """The exact value of a NUMBER token; E005 and 0 if it is beyond double precision."""
     match = _MANTISSA.fullmatch(leaf.text)
     assert match is not None

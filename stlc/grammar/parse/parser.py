@@ -17,9 +17,9 @@ from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar import ast
 from stlc.grammar.errors import hints
 from stlc.grammar.errors.failure import Piece
-from stlc.grammar.parse.builder import EXPRESSIONS, Rule
+from stlc.grammar.parse.builder import EXPRESSIONS, BuildRule
 from stlc.grammar.parse.declarations import DECLARATIONS, Item, assemble
-from stlc.grammar.parse.literals import Context, Leaf
+from stlc.grammar.parse.literals import Context, TerminalToken
 from stlc.grammar.parse.tables import load_parser
 from stlc.grammar.scan import declaration_starts, lexemes
 from stlc.source import Source
@@ -29,7 +29,7 @@ MAX_DEPTH = 150
 MAX_TEXT = 1_000_000
 MAX_LEXEMES = 30_000
 
-_RULES: Mapping[str, Rule] = MappingProxyType({**EXPRESSIONS, **DECLARATIONS})
+_RULES: Mapping[str, BuildRule] = MappingProxyType({**EXPRESSIONS, **DECLARATIONS})
 
 
 def parse(source: Source) -> ast.Spec:
@@ -138,7 +138,7 @@ def _child(child: Tree[Token] | Token | None, values: Mapping[int, Any], context
         case Token():
             assert child.start_pos is not None
             assert child.end_pos is not None
-            return Leaf(
+            return TerminalToken(
                 child.type, str(child), context.source.span(base + child.start_pos, base + child.end_pos)
             )
         case _:

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
-from stlc.compile.augment.lift import recorded
+from stlc.compile.augment.lift import from_first_sample
 from stlc.compile.ir import typed
 from stlc.compile.ir.traverse import margin_unit
 from stlc.diagnostics import Label
@@ -125,7 +125,7 @@ def _cause(
     stop = None if window is None else start + window + 1
     record = record if stop is None else record.cut(stop)
     going_on = stop if stop is not None and stop > record.samples else None
-    formula = recorded(rule.typed.formula) if rule.absolute else rule.typed.formula
+    formula = from_first_sample(rule.typed.formula) if rule.absolute else rule.typed.formula
     tree, alone = Blamer(record, subject.compiled.grid, stop=going_on).why(formula, start)
     words = _Words(subject, record, rule.typed.written, definitions)
     leaf = tree.leaf
