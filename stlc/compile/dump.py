@@ -17,8 +17,7 @@ from stlc.compile.ir.text import show_formula, shown
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.escape import screen
-from stlc.grammar.show.expressions import show_name
-from stlc.grammar.show.printer import show
+from stlc.grammar.show.printer import show, show_name
 
 WIDTH, LEFT = 110, 44
 """Columns of the whole text, and at most of what was written."""

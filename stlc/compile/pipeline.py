@@ -19,7 +19,6 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Literal, TypeAlias, final
 
-from stlc.compile.analysis.margins import as_written
 from stlc.compile.analysis.ranges import KnownRanges
 from stlc.compile.analysis.warnings import jumps
 from stlc.compile.augment.augment import Augmented, augment
@@ -35,8 +34,7 @@ from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, in_samples, in_words
 from stlc.compile.ir.support import columns, defined, reach, uses_end
 from stlc.compile.ir.traverse import absolute, margin_unit, mentions_horizon
-from stlc.compile.lowering.lower import lower
-from stlc.compile.lowering.safety import safe_part
+from stlc.compile.lowering.lower import as_written, lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.compile.semantics.semantics import Semantics
 from stlc.diagnostics import Diagnostic, SpecError
@@ -137,7 +135,7 @@ class Compiled:
     @property
     def safety(self) -> tuple[CompiledRequirement, ...]:
         """phi_safe: the requirements tagged `@safety`."""
-        return safe_part(self.requirements)
+        return tuple(rule for rule in self.requirements if "safety" in rule.tags)
 
     @property
     def reach(self) -> int:

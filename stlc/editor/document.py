@@ -29,9 +29,9 @@ from stlc.dynamics.declaration.load import load_system_decl
 from stlc.editor.symbols import Names, Symbol, names_of
 from stlc.files import find_system
 from stlc.grammar import ast
-from stlc.grammar.children import descendants
 from stlc.grammar.parse.parser import parse
 from stlc.grammar.scan import declaration_starts, lexemes
+from stlc.grammar.traverse import descendants
 from stlc.lint.lint import Surroundings, lint
 from stlc.signature import Column
 from stlc.source import Source, Span

@@ -10,7 +10,7 @@ from stlc.editor.document import Document
 from stlc.editor.symbols import Names, Occurrence, names_of
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
-from stlc.grammar.show.expressions import own_name
+from stlc.grammar.show.printer import own_name
 from stlc.source import Source, Span
 
 Edit = tuple[Span, str]

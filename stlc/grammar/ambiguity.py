@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from stlc.grammar import ast
-from stlc.grammar.children import descendants
 from stlc.grammar.scan import Lexeme, lexemes
+from stlc.grammar.traverse import descendants
 from stlc.source import Span
 
 AmbiguityKind: TypeAlias = Literal["scope", "mixed", "chain", "until", "implication"]

@@ -12,8 +12,8 @@ from typing import TypeAlias
 from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar import ast
 from stlc.grammar.ambiguity import Ambiguity, AmbiguityKind, ambiguities
-from stlc.grammar.children import descendants
 from stlc.grammar.scan import Lexeme, lexemes
+from stlc.grammar.traverse import descendants
 from stlc.grammar.words import BINARY_TEMPORAL, UNARY_TEMPORAL
 
 _WHY: dict[AmbiguityKind, str] = {

@@ -15,7 +15,7 @@ from stlc.compile.ir.traverse import operands
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import StlcError
 from stlc.grammar import ast
-from stlc.grammar.children import descendants
+from stlc.grammar.traverse import descendants
 from stlc.monitor.verdict import Monitor, Verdict
 from stlc.signature import Signature
 from stlc.source import Span

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.compile.analysis.margins import in_unit
 from stlc.compile.ir import nodes as ir
+from stlc.compile.lowering.lower import in_unit
 from stlc.monitor.explain.report import explain
 from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor

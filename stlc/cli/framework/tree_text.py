@@ -10,7 +10,7 @@ from typing import Any
 
 from stlc.escape import dot
 from stlc.grammar import ast
-from stlc.grammar.children import children
+from stlc.grammar.traverse import children
 from stlc.jsontext import dumps
 
 _HIDDEN = frozenset({"span", "name_span", "system_span", "source", "quoted"})

@@ -6,7 +6,7 @@ import re
 from typing import assert_never
 
 from stlc.compile.ir import nodes as ir
-from stlc.grammar.show.expressions import show_name
+from stlc.grammar.show.printer import show_name
 
 _INFIX = {
     "add": ("+", 1),

@@ -79,7 +79,7 @@ class Predicate(Node):
     """`num > 0` (`strict`) or `num >= 0`; a `guard` decides truth and never limits the margin.
 
     `num` and `unit`, that of the margin, are in SI; `written` is the unit of what is compared. Where recorded
-    traces are judged both are in that (`stlc.compile.analysis.margins`).
+    traces are judged both are in that (`stlc.compile.lowering.lower`).
     """
 
     num: ir.Num

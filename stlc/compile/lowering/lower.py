@@ -1,11 +1,14 @@
-"""From typed formulas to the IR: time in whole steps.
+"""From typed formulas to the IR: margins in the units that were written, and time in whole steps.
 
-Formulas are brought into negation normal form first, so that bounds are rounded for the operator that is
-judged in the end: `not always[0, b] p` is `eventually[0, b] not p`, which does not reach beyond its bound.
+In training everything is in SI, so that requirements can be weighed against each other. A person reads `speed
+< 120 km/h` in km/h: for recorded traces each predicate is divided by the scale of its unit, which changes no
+sign. Formulas are brought into negation normal form first, so that bounds are rounded for the operator that
+is judged in the end: `not always[0, b] p` is `eventually[0, b] not p`, which does not reach beyond its bound.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -14,9 +17,57 @@ from typing import final
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, to_window
+from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.ir.normal_form import DUAL, Sign, flip, literal, normal
-from stlc.compile.ir.traverse import from_now, on_clock, operands
+from stlc.compile.ir.traverse import from_now, map_children, nodes, on_clock, operands
 from stlc.diagnostics import Diagnostic
+from stlc.units import Unit, same_dims
+
+
+def as_written(requirement: typed.Requirement) -> typed.Requirement:
+    """The requirement with margins in the units of what is compared, and `@scale` where there is one unit."""
+    unit = _one_unit(requirement.formula)
+    scale = requirement.scale if unit is None or requirement.scale == 1 else requirement.scale / unit.scale
+    return replace(requirement, formula=_in_written_units(requirement.formula), scale=scale)
+
+
+def _one_unit(formula: typed.Formula) -> Unit | None:
+    """The unit that all predicates have; None where they differ."""
+    units = [node.written for node in nodes(formula) if isinstance(node, typed.Predicate) and not node.guard]
+    first = next(iter(units), None)
+    alike = first is not None and all(same_dims(u, first) and u.ratio == first.ratio for u in units)
+    return first if alike else None
+
+
+def _in_written_units(formula: typed.Formula) -> typed.Formula:
+    if isinstance(formula, typed.Predicate):
+        return replace(formula, num=in_unit(formula.num, formula.written), unit=formula.written)
+    return map_children(formula, formulas=_in_written_units)
+
+
+def in_unit(num: ir.Num, unit: Unit) -> ir.Num:
+    """A number in SI units as one in `unit`; columns of that unit are read as they are."""
+    if unit.ratio == 1:
+        return num
+    match num:
+        case ir.Const(value):
+            return ir.Const(_divided(value, unit))
+        case ir.Op("mul", (inner, ir.Const(factor))) if factor == unit.scale:
+            return inner
+        case ir.Op(name, args) if FUNCTIONS[name].linear:
+            return replace(num, args=tuple(in_unit(arg, unit) for arg in args))
+        case ir.Where():
+            return replace(num, yes=in_unit(num.yes, unit), no=in_unit(num.no, unit))
+        case _:
+            return ir.Op("div", (num, ir.Const(unit.scale)))
+
+
+def _divided(value: float, unit: Unit) -> float:
+    """A constant in a unit, as it was meant: 120 and not 120.00000000000001."""
+    found = value / unit.scale
+    short = float(f"{found:.14g}")
+    return short if math.isclose(short, found, rel_tol=1e-15) else found
+
 
 _CAUTIOUS = frozenset({"always", "historically", "release", "trigger"})
 """Operators that ask something of every sample: a bound off the grid is rounded outwards."""

@@ -25,7 +25,7 @@ from stlc.dynamics.schema.names import Context, Names, base_name
 from stlc.dynamics.schema.reader import Reader
 from stlc.dynamics.schema.yaml_nodes import Node
 from stlc.grammar import ast
-from stlc.grammar.children import children, descendants
+from stlc.grammar.traverse import children, descendants
 from stlc.units import SYMBOLS
 
 if TYPE_CHECKING:

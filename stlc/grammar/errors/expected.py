@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 from stlc.diagnostics import Diagnostic, Fix, Label
 from stlc.grammar.errors.failure import ParseFailure
-from stlc.grammar.parse.literals import near_unit
+from stlc.grammar.parse.builder import near_unit
 from stlc.grammar.scan import Lexeme, brackets, closes
 from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, RESERVED, ROLES, UNARY_TEMPORAL
 from stlc.registry import closest

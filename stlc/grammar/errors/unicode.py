@@ -1,5 +1,5 @@
 # ruff: noqa: RUF001 - the characters are the subject
-"""Characters of papers and word processors, and how the language spells them."""
+"""Characters of papers and word processors: what the language writes for them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from stlc.grammar.scan import Lexeme
+from stlc.grammar.scan import Lexeme, lexemes
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,3 +72,22 @@ def unexpected_character(lexeme: Lexeme) -> bool:
     if lexeme.kind == "sign":
         return lexeme.text[0] not in _OF_THE_LANGUAGE
     return lexeme.text[0] in _ADVICE and lexeme.kind == "word"
+
+
+def plain_text(text: str) -> str:
+    """The text with `□`, `≤`, `∧` and their like spelled out; comments and names in quotes stay."""
+    parts: list[str] = []
+    done = 0
+    for lexeme in lexemes(text):
+        advice = replacement(lexeme.text[0]) if unexpected_character(lexeme) else None
+        if advice is None or advice.text is None:
+            continue
+        behind = text[lexeme.start + 1 : lexeme.start + 2]
+        word = advice.text
+        if word[0].isalpha() and lexeme.start and text[lexeme.start - 1].isalnum():
+            word = f" {word}"
+        if word[-1].isalpha() and behind.isalnum():
+            word = f"{word} "
+        parts += [text[done : lexeme.start], word]
+        done = lexeme.start + 1
+    return "".join([*parts, text[done:]])

@@ -11,14 +11,323 @@ Law: formatting twice changes nothing more, and the tree before and after is the
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
 from stlc.diagnostics import SpecError
 from stlc.grammar import ast
-from stlc.grammar.ambiguity import ambiguities
-from stlc.grammar.errors.spelling import plain_text
-from stlc.grammar.format.lines import lay_out
+from stlc.grammar.ambiguity import Ambiguity, ambiguities
+from stlc.grammar.errors.unicode import plain_text
+from stlc.grammar.format.layout import (
+    BLANK,
+    LINE,
+    SOFT,
+    Column,
+    Doc,
+    Group,
+    Nest,
+    Word,
+    align,
+    is_plain,
+    render,
+)
+from stlc.grammar.format.tokens import Text, behind, gap, prepare
 from stlc.grammar.parse.parser import parse
-from stlc.grammar.parse.tokens import tokenize
+from stlc.grammar.parse.tokens import Comment, Item, Layout, Token, tokenize
 from stlc.source import Source
+
+# Operators that an expression breaks at, loosest first; those of one row break together.
+_ROWS = (
+    frozenset({"IFF"}),
+    frozenset({"IMPLIES"}),
+    frozenset({"OR"}),
+    frozenset({"AND"}),
+    frozenset({"BINARY", "BINARY_AT", "BINARY_BRACKET"}),
+)
+_WITHIN = (frozenset({"CMP", "_IN", "_NOT_IN"}), frozenset({"PLUS", "MINUS"}), frozenset({"MULOP"}))
+_UNARY = ("UNARY", "UNARY_AT", "UNARY_BRACKET")
+_PREFIX = frozenset({*_UNARY, "_NOT", "QUANTIFIER", "_FREEZE", "_IF"})
+
+
+def expression(text: Text, start: int, end: int) -> tuple[Doc, ...]:
+    """The tokens from `start` to `end` as an expression."""
+    for row in _ROWS:
+        splits = _splits(text, start, end, row)
+        if splits:
+            return (_infix(text, start, end, splits),)
+    if start < end and text.tokens[start].kind in _PREFIX:
+        return _prefix(text, start, end)
+    for row in _WITHIN:
+        splits = _splits(text, start, end, row)
+        if splits:
+            return (_infix(text, start, end, splits),)
+    return _sequence(text, start, end)
+
+
+def words(text: Text, start: int, end: int) -> tuple[Doc, ...]:
+    """The tokens from `start` to `end` on one line."""
+    parts: list[Doc] = []
+    for index in range(start, end):
+        if index > start and gap(text, index):
+            parts.append(BLANK)
+        parts.append(_word(text, index))
+    return tuple(parts)
+
+
+def hangs(text: Text, start: int, end: int) -> bool:
+    """Whether the tokens are one bracket, perhaps with a name before it, that can stay behind a `=`."""
+    last = end - 1
+    opening = text.partner.get(last, last)
+    return start <= opening < last and all(
+        text.tokens[i].kind in ("NAME", "DOT") for i in range(start, opening)
+    )
+
+
+def _word(text: Text, index: int) -> Word:
+    token = text.tokens[index]
+    return Word(token.text, token.before, token.after)
+
+
+def _splits(text: Text, start: int, end: int, row: frozenset[str]) -> list[int]:
+    """Where the operators of a row stand that are not within brackets or between `if` and `else`."""
+    found: list[int] = []
+    index, conditions = start, 0
+    while index < end:
+        kind = text.tokens[index].kind
+        conditions += (kind == "_IF") - (kind == "_ELSE")
+        if not conditions and kind in row and index > start and not text.is_sign(index):
+            found.append(index)
+        index = behind(text, index)
+    return found
+
+
+def _infix(text: Text, start: int, end: int, splits: Sequence[int]) -> Group:
+    """Operands with a line break before each operator."""
+    parts = [*expression(text, start, splits[0])]
+    for at, following in zip(splits, [*splits[1:], end], strict=True):
+        operand = at + 1
+        parts += [LINE, _word(text, at)]
+        if text.roles.get(operand) == "interval":
+            operand = text.partner[operand] + 1
+            parts += words(text, at + 1, operand)
+        parts += [BLANK, *expression(text, operand, following)]
+    return Group(tuple(parts))
+
+
+def _prefix(text: Text, start: int, end: int) -> tuple[Doc, ...]:
+    """A word that governs what follows it."""
+    kind = text.tokens[start].kind
+    if kind == "_IF":
+        return (_condition(text, start, end),)
+    body = behind(text, start)
+    if text.roles.get(body) == "interval":
+        body = text.partner[body] + 1
+    return (*words(text, start, body), BLANK, *expression(text, body, end))
+
+
+def _condition(text: Text, start: int, end: int) -> Group:
+    """`if … then … else …`, the last two in lines of their own where all does not fit."""
+    marks: list[int] = []
+    index, depth = start, 0
+    while index < end and depth >= 0:
+        kind = text.tokens[index].kind
+        depth += (kind == "_IF") - (kind == "_ELSE")
+        if (kind == "_THEN" and depth == 1) or (kind == "_ELSE" and depth == 0):
+            marks.append(index)
+        if len(marks) == 2:
+            break
+        index = behind(text, index)
+    then, other = marks
+    return Group(
+        (
+            *(_word(text, start), BLANK, *expression(text, start + 1, then)),
+            *(LINE, _word(text, then), BLANK, *expression(text, then + 1, other)),
+            *(LINE, _word(text, other), BLANK, *expression(text, other + 1, end)),
+        )
+    )
+
+
+def _sequence(text: Text, start: int, end: int) -> tuple[Doc, ...]:
+    """Tokens one behind the other; what a bracket holds may break."""
+    parts: list[Doc] = []
+    index = start
+    while index < end:
+        if index > start and gap(text, index):
+            parts.append(BLANK)
+        following = behind(text, index)
+        if following > index + 1:
+            parts.append(_bracket(text, index))
+        else:
+            parts.append(_word(text, index))
+        index = following
+    return tuple(parts)
+
+
+def _bracket(text: Text, opening: int) -> Group:
+    """What stands between two brackets, one entry a line where it does not fit."""
+    closing = text.partner[opening]
+    edge = LINE if text.roles[opening] == "enum" else SOFT
+    inside: list[Doc] = [edge]
+    start = opening + 1
+    while start < closing:
+        comma = _comma(text, start, closing)
+        inside += _entry(text, start, comma)
+        if comma < closing:
+            inside += [_word(text, comma), LINE]
+        start = comma + 1
+    if len(inside) == 1:
+        return Group((_word(text, opening), _word(text, closing)))
+    return Group((_word(text, opening), Nest(tuple(inside)), edge, _word(text, closing)))
+
+
+def _comma(text: Text, start: int, end: int) -> int:
+    """Index of the next comma, or `end`."""
+    index = start
+    while index < end and text.tokens[index].text != ",":
+        index = behind(text, index)
+    return index
+
+
+def _entry(text: Text, start: int, end: int) -> tuple[Doc, ...]:
+    """An expression, a named argument or a formal one."""
+    if end - start > 2 and text.tokens[start].kind == "NAME" and text.tokens[start + 1].text == "=":
+        return (*words(text, start, start + 2), BLANK, *expression(text, start + 2, end))
+    return expression(text, start, end)
+
+
+_OWN_COLUMN = {"const_decl": 2, "param_in": 2, "param_from": 2}
+_DEFINED = frozenset({"def_decl", "region_decl", "const_decl"})
+_REQUIRED = frozenset({"require_decl", "assume_decl"})
+
+
+@dataclass(slots=True)
+class _Page:
+    """Lines as they are collected; an entry is one line and what may be aligned in it."""
+
+    columns: list[Column] = field(default_factory=list)
+
+    def add(self, text: str, *, apart: bool = False, **more: object) -> None:
+        first = not self.columns
+        self.columns.append(Column(text, apart=apart and not first, **more))  # type: ignore[arg-type]
+
+
+def lay_out(layout: Layout, unclear: Sequence[Ambiguity], *, width: int) -> str:
+    """The text of a layout; `unclear` parts get parentheses."""
+    page = _Page()
+    spans = sorted((part.span.start, part.span.end) for part in unclear)
+    for item in layout.items:
+        first = bisect_left(spans, (item.tokens[0].start, 0))
+        last = bisect_left(spans, (item.tokens[-1].end, 0))
+        _item(_with_parentheses(item, spans[first:last]), page, width)
+    _comments(layout.rest, page)
+    lines = align(page.columns)
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _comments(comments: Sequence[Comment], page: _Page) -> None:
+    for comment in comments:
+        page.add(comment.text, apart=comment.apart, kind="comment")
+
+
+def _item(item: Item, page: _Page, width: int) -> None:
+    """The lines of an item: comments, tags, declaration."""
+    for tag in _tags(item.tokens):
+        _comments(tag[0].before, page)
+        _declaration(prepare(_bare(tag)), "tag", page, width)
+    body = item.tokens[sum(map(len, _tags(item.tokens))) :]
+    _comments(body[0].before, page)
+    _declaration(prepare(_bare(body)), item.rule, page, width)
+
+
+def _bare(tokens: Sequence[Token]) -> tuple[Token, ...]:
+    """The tokens without the comments above the first one, which have lines of their own."""
+    return (replace(tokens[0], before=()), *tokens[1:])
+
+
+def _tags(tokens: Sequence[Token]) -> list[Sequence[Token]]:
+    """The tags in front of a declaration, `@name` or `@name(…)` each."""
+    found: list[Sequence[Token]] = []
+    start = 0
+    while tokens[start].text == "@":
+        end = start + 2
+        depth = 0
+        while end < len(tokens) and (depth or tokens[end].text == "("):
+            depth += (tokens[end].text in ("(", "[", "{")) - (tokens[end].text in (")", "]", "}"))
+            end += 1
+        found.append(tokens[start:end])
+        start = end
+    return found
+
+
+def _declaration(text: Text, rule: str, page: _Page, width: int) -> None:
+    apart, last = text.tokens[0].apart, text.tokens[-1]
+    bare = Text((*text.tokens[:-1], replace(last, after=None)), text.partner, text.roles)
+    parts = _document(bare, rule)
+    lines = render(parts, width=width)
+    if len(lines) == 1 and is_plain(parts):
+        head = _head(bare, rule)
+        comment = last.after.text if last.after else ""
+        page.add(lines[0], apart=apart, kind=rule, head=head, comment=comment)
+        return
+    if last.after is not None:
+        lines[-1] += f"  {last.after.text}"
+    for number, line in enumerate(lines):
+        page.add(line, apart=apart and number == 0, kind="part")
+
+
+def _document(text: Text, rule: str) -> tuple[Doc, ...]:
+    """A declaration: its head, and behind `=` or `:` what breaks into lines of its own."""
+    count = len(text.tokens)
+    start = _body(text, rule)
+    if start >= count:
+        return (Group(expression(text, 0, count)),)
+    head, body = words(text, 0, start), expression(text, start, count)
+    if hangs(text, start, count):
+        return (*head, BLANK, *body)
+    return (Group((*head, Nest((LINE, Group(body))))),)
+
+
+def _body(text: Text, rule: str) -> int:
+    """Index of the first token behind the `=` or `:` of a declaration."""
+    sign = "=" if rule in _DEFINED else ":" if rule in _REQUIRED else ""
+    index = 0
+    while index < len(text.tokens) and sign:
+        if text.tokens[index].text == sign:
+            return index + 1
+        index = text.partner[index] + 1 if index in text.roles else index + 1
+    return len(text.tokens)
+
+
+def _head(text: Text, rule: str) -> int:
+    """How many columns of the line belong to its first column; 0 where it has none."""
+    if rule == "signal_decl":
+        count = 1 if text.tokens[0].kind == "ROLE" else 0
+    elif rule in _OWN_COLUMN:
+        count = _OWN_COLUMN[rule]
+    elif rule in _DEFINED:
+        count = _body(text, rule) - 1
+    else:
+        count = _body(text, rule) if rule in _REQUIRED else 0
+    return sum(len(text.tokens[i].text) + (len(gap(text, i)) if i else 0) for i in range(count))
+
+
+# ------------------------------------------------------------------------ parentheses
+
+
+def _with_parentheses(item: Item, spans: Sequence[tuple[int, int]]) -> Item:
+    """The item with parentheses around the parts at these offsets, which other tools read differently."""
+    tokens = list(item.tokens)
+    for start, end in spans:
+        first = next(i for i, token in enumerate(tokens) if token.start >= start)
+        last = max(i for i, token in enumerate(tokens) if token.end <= end)
+        opening = Token("LPAR", "(", start, start, before=tokens[first].before)
+        closing = Token("RPAR", ")", end, end, after=tokens[last].after)
+        tokens[first] = replace(tokens[first], before=())
+        tokens[last] = replace(tokens[last], after=None)
+        tokens[first : last + 1] = [opening, *tokens[first : last + 1], closing]
+    return Item(item.rule, tuple(tokens))
+
 
 WIDTH = 100
 

@@ -10,8 +10,15 @@ from typing import Any, TypeAlias
 
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
-from stlc.grammar.parse.builder import BuildRule
-from stlc.grammar.parse.literals import Context, TerminalToken, name_of, number_of, own_name, unit_of
+from stlc.grammar.parse.builder import (
+    BuildRule,
+    Context,
+    TerminalToken,
+    name_of,
+    number_of,
+    own_name,
+    unit_of,
+)
 from stlc.source import Source, Span
 
 _SIZE_DIGITS = 4

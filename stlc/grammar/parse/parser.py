@@ -17,9 +17,8 @@ from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar import ast
 from stlc.grammar.errors import hints
 from stlc.grammar.errors.failure import Piece
-from stlc.grammar.parse.builder import EXPRESSIONS, BuildRule
+from stlc.grammar.parse.builder import EXPRESSIONS, BuildRule, Context, TerminalToken
 from stlc.grammar.parse.declarations import DECLARATIONS, Item, assemble
-from stlc.grammar.parse.literals import Context, TerminalToken
 from stlc.grammar.parse.tables import load_parser
 from stlc.grammar.scan import declaration_starts, lexemes
 from stlc.source import Source

@@ -1,4 +1,4 @@
-"""`stl.lark` -> a Lark parser, once per process, its tables kept between processes.
+"""The Lark parser of `stl.lark`, once per process, its tables kept between processes.
 
 Building the LALR tables takes a tenth of a second, reading them back a fifth of that. They are kept as JSON
 (never a pickle) in the cache folder (`stlc.cache`), under a name that changes with the grammar, with Lark and
@@ -16,6 +16,7 @@ from importlib.resources import files
 from typing import Any
 
 import lark
+from lark import UnexpectedInput
 from lark.grammar import Rule
 from lark.lexer import TerminalDef
 
@@ -81,3 +82,20 @@ def _read(text: bytes | None) -> lark.Lark | None:
 def _with_numbers(value: dict[str, Any]) -> dict[str | int, Any]:
     """The tables are keyed by numbers, which JSON writes as texts."""
     return {int(key) if key.isdigit() else key: item for key, item in value.items()}
+
+
+def acceptable(text: str, rule: str = "start") -> frozenset[str] | None:
+    """The terminals that may follow `text`, or None where `text` itself cannot be read.
+
+    Args:
+        text: the beginning of a declaration, or of an expression.
+        rule: the start rule, `start` or `expr`.
+    """
+    interactive = load_parser().parse_interactive(text, start=rule)
+    try:
+        for _ in interactive.iter_parse():
+            pass
+        accepted: set[str] = interactive.accepts()  # type: ignore[no-untyped-call]
+    except UnexpectedInput:
+        return None
+    return frozenset(accepted)

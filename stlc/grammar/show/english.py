@@ -6,8 +6,8 @@ from collections import deque
 from typing import assert_never
 
 from stlc.grammar import ast
-from stlc.grammar.children import descendants
-from stlc.grammar.show.expressions import show_expr, show_set
+from stlc.grammar.show.printer import show_expr, show_set
+from stlc.grammar.traverse import descendants
 
 _EDGES = {"rise": "{} becomes true", "fall": "{} becomes false"}
 _OPENINGS = frozenset({"at", "if", "for", "let", "it", "either", "nothing"})

@@ -6,20 +6,260 @@ names that the language prefers. Names of one's own get backticks where they wou
 
 from __future__ import annotations
 
+import re
+from enum import IntEnum
+from fractions import Fraction
 from typing import assert_never
 
 from stlc.grammar import ast
-from stlc.grammar.show.expressions import (
-    Level,
-    own_name,
-    show_args,
-    show_at,
-    show_expr,
-    show_interval,
-    show_list,
-    show_name,
-    show_set,
-)
+from stlc.grammar.words import BUILT_IN, RESERVED
+
+_IDENTIFIER = re.compile(r"[^\W\d¹²³⁰⁴-⁹][^\W¹²³⁰⁴-⁹]*")
+_PLAIN_DIGITS = 16
+
+
+class Level(IntEnum):
+    """How tightly an expression binds, loosest first; an operand needs at least the level of its place."""
+
+    IFF = 0
+    IMPLIES = 1
+    OR = 2
+    AND = 3
+    UNTIL = 4
+    PREFIX = 5
+    COMPARE = 6
+    SUM = 7
+    PRODUCT = 8
+    SIGN = 9
+    POWER = 10
+    POSTFIX = 11
+    ATOM = 12
+
+
+_LOGIC = {"<->": Level.IFF, "->": Level.IMPLIES, "or": Level.OR, "xor": Level.OR, "and": Level.AND}
+_ARITHMETIC = {
+    **{"+": Level.SUM, "-": Level.SUM, "*": Level.PRODUCT, "/": Level.PRODUCT, "%": Level.PRODUCT},
+    "^": Level.POWER,
+}
+
+
+def _level(expr: ast.Expr) -> Level:
+    match expr:
+        case ast.Logic(op=op):
+            return _LOGIC[op]
+        case ast.Until():
+            return Level.UNTIL
+        case ast.Not() | ast.Temporal() | ast.Quantifier() | ast.Freeze() | ast.IfThenElse():
+            return Level.PREFIX
+        case ast.Compare() | ast.Member():
+            return Level.COMPARE
+        case ast.Binary(op=op):
+            return _ARITHMETIC[op]
+        case ast.Neg():
+            return Level.SIGN
+        case ast.Quantity(value=value) if value < 0:
+            return Level.SIGN
+        case ast.Index() | ast.Attr() | ast.Call():
+            return Level.POSTFIX
+        case _:
+            return Level.ATOM
+
+
+def show_at(expr: ast.Expr, least: Level) -> str:
+    """The expression, in parentheses if it binds less tightly than its place needs."""
+    text = show_expr(expr)
+    return text if _level(expr) >= least else f"({text})"
+
+
+def show_expr(expr: ast.Expr) -> str:
+    """The text of an expression."""
+    match expr:
+        case ast.Quantity() | ast.String() | ast.Bool() | ast.Inf() | ast.Name():
+            return _atom(expr)
+        case ast.Vector(items=items):
+            return f"[{show_list(items)}]"
+        case ast.Index() | ast.Attr() | ast.Call():
+            return _postfix(expr)
+        case ast.Neg() | ast.Binary() | ast.Compare() | ast.Member():
+            return _arithmetic(expr)
+        case ast.Not() | ast.Logic():
+            return _logic(expr)
+        case ast.Temporal() | ast.Until():
+            return _temporal(expr)
+        case ast.Quantifier() | ast.Freeze() | ast.IfThenElse():
+            return _binder(expr)
+        case _:
+            assert_never(expr)
+
+
+def _atom(expr: ast.Quantity | ast.String | ast.Bool | ast.Inf | ast.Name) -> str:
+    match expr:
+        case ast.Quantity(value=value, unit=unit):
+            written = "step" if unit == "steps" and value == 1 else unit
+            return _number(value) + (f" {written}" if written else "")
+        case ast.String(value=text):
+            return f'"{text}"'
+        case ast.Bool(value=truth):
+            return "true" if truth else "false"
+        case ast.Inf():
+            return "inf"
+        case ast.Name(name=name, quoted=quoted):
+            return f"`{name}`" if quoted and name in BUILT_IN else show_name(name)
+        case _:
+            assert_never(expr)
+
+
+def _postfix(expr: ast.Index | ast.Attr | ast.Call) -> str:
+    match expr:
+        case ast.Index(base=base, index=index):
+            return f"{_base(base)}[{show_expr(index)}]"
+        case ast.Attr(base=base, name=name):
+            return f"{_base(base)}.{show_name(name)}"
+        case ast.Call(func=func, args=args):
+            return f"{_base(func)}({show_args(args)})"
+        case _:
+            assert_never(expr)
+
+
+def _base(expr: ast.Expr) -> str:
+    """What an index, a point or an argument list follows; a number would swallow them."""
+    return f"({show_expr(expr)})" if isinstance(expr, ast.Quantity) else show_at(expr, Level.POSTFIX)
+
+
+def _has_unit(expr: ast.Expr) -> bool:
+    return isinstance(expr, ast.Quantity) and bool(expr.unit)
+
+
+def _arithmetic(expr: ast.Neg | ast.Binary | ast.Compare | ast.Member) -> str:
+    match expr:
+        case ast.Neg(operand=operand):
+            return f"-{show_at(operand, Level.SIGN)}"
+        case ast.Binary(op="^", left=left, right=right):
+            base = f"({show_expr(left)})" if _has_unit(left) else show_at(left, Level.POSTFIX)
+            return f"{base}^{show_at(right, Level.SIGN)}"
+        case ast.Binary(op=op, left=left, right=right):
+            level = _ARITHMETIC[op]
+            return f"{show_at(left, level)} {op} {show_at(right, Level(level + 1))}"
+        case ast.Compare(operands=operands, ops=ops):
+            first, *rest = (show_at(operand, Level.SUM) for operand in operands)
+            return first + "".join(f" {op} {operand}" for op, operand in zip(ops, rest, strict=True))
+        case ast.Member(item=item, region=region, negated=negated):
+            place = show_set(region) if isinstance(region, ast.SetLiteral) else show_at(region, Level.SUM)
+            return f"{show_at(item, Level.SUM)} {'not in' if negated else 'in'} {place}"
+        case _:
+            assert_never(expr)
+
+
+def _logic(expr: ast.Not | ast.Logic) -> str:
+    match expr:
+        case ast.Not(operand=operand):
+            return f"not {show_at(operand, Level.PREFIX)}"
+        case ast.Logic(op="->", left=left, right=right):
+            return f"{show_at(left, Level.OR)} -> {show_at(right, Level.IMPLIES)}"
+        case ast.Logic(op=op, left=left, right=right):
+            level = _LOGIC[op]
+            return f"{show_at(left, level)} {op} {show_at(right, Level(level + 1))}"
+        case _:
+            assert_never(expr)
+
+
+def _temporal(expr: ast.Temporal | ast.Until) -> str:
+    interval = "" if expr.interval is None else show_interval(expr.interval)
+    match expr:
+        case ast.Temporal(op=op, body=body):
+            return f"{op}{interval} {_body(body, interval)}"
+        case ast.Until(op=op, left=left, right=right):
+            return f"{show_at(left, Level.PREFIX)} {op}{interval} {_body(right, interval)}"
+        case _:
+            assert_never(expr)
+
+
+def _body(expr: ast.Expr, interval: str) -> str:
+    """What a temporal operator governs; a vector would be read as its interval."""
+    text = show_at(expr, Level.PREFIX)
+    return f"({text})" if text.startswith("[") and not interval else text
+
+
+def show_interval(interval: ast.Interval) -> str:
+    """The text of an interval, with its `@`."""
+    clock = "@" if interval.clock == "start" else ""
+    opening, closing = "(" if interval.lo_open else "[", ")" if interval.hi_open else "]"
+    return f"{clock}{opening}{show_expr(interval.lo)}, {show_expr(interval.hi)}{closing}"
+
+
+def _binder(expr: ast.Quantifier | ast.Freeze | ast.IfThenElse) -> str:
+    match expr:
+        case ast.Quantifier(kind=kind, var=var, domain=domain, body=body):
+            return f"{kind} {own_name(var)} in {_span(domain)}: {show_at(body, Level.PREFIX)}"
+        case ast.Freeze(bindings=bindings, body=body):
+            bound = ", ".join(f"{own_name(name)} = {show_at(value, Level.SUM)}" for name, value in bindings)
+            return f"freeze {bound} in {show_at(body, Level.PREFIX)}"
+        case ast.IfThenElse(cond=cond, yes=yes, no=no):
+            return f"if {show_expr(cond)} then {show_expr(yes)} else {show_at(no, Level.PREFIX)}"
+        case _:
+            assert_never(expr)
+
+
+def _span(domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral) -> str:
+    if isinstance(domain, ast.SetLiteral):
+        return show_set(domain)
+    low, high = domain
+    return f"{show_at(low, Level.SUM)}..{show_at(high, Level.SUM)}"
+
+
+def show_args(args: tuple[ast.Arg, ...]) -> str:
+    """Arguments, without the parentheses around them."""
+    named = (f"{show_name(arg.name)} = " if arg.name is not None else "" for arg in args)
+    return ", ".join(prefix + show_expr(arg.value) for prefix, arg in zip(named, args, strict=True))
+
+
+def show_set(literal: ast.SetLiteral) -> str:
+    """A set in braces."""
+    return f"{{{show_list(literal.items)}}}"
+
+
+def show_list(items: tuple[ast.Expr, ...]) -> str:
+    """Expressions with commas between them."""
+    return ", ".join(map(show_expr, items))
+
+
+# ------------------------------------------------------------------ names, numbers
+
+
+def show_name(name: str) -> str:
+    """A name where `T`, `end` and `dt` mean what they mean everywhere."""
+    return f"`{name}`" if name in RESERVED or not _IDENTIFIER.fullmatch(name) else name
+
+
+def own_name(name: str) -> str:
+    """A name where it is declared."""
+    return f"`{name}`" if name in BUILT_IN else show_name(name)
+
+
+def _number(value: Fraction) -> str:
+    """The shortest decimal; a fraction that has none is written as a quotient in parentheses."""
+    twos, fives, rest = 0, 0, value.denominator
+    while rest % 2 == 0:
+        twos, rest = twos + 1, rest // 2
+    while rest % 5 == 0:
+        fives, rest = fives + 1, rest // 5
+    if rest != 1:
+        return f"({value.numerator} / {value.denominator})"
+    places = max(twos, fives)
+    digits = str(abs(value.numerator) * 10**places // value.denominator)
+    sign = "-" if value < 0 else ""
+    if places:
+        return sign + _decimal(digits, places)
+    short = digits.rstrip("0")
+    zeros = len(digits) - len(short)
+    return sign + (f"{short}e{zeros}" if len(digits) > _PLAIN_DIGITS and zeros > 2 else digits)
+
+
+def _decimal(digits: str, places: int) -> str:
+    if places > _PLAIN_DIGITS:
+        return f"{digits}e-{places}"
+    padded = digits.rjust(places + 1, "0")
+    return f"{padded[:-places]}.{padded[-places:]}"
 
 
 def show(node: ast.Node) -> str:
@@ -28,7 +268,7 @@ def show(node: ast.Node) -> str:
         case ast.Spec():
             return _spec(node)
         case ast.Import():
-            return _import(node)
+            return _import_line(node)
         case ast.Declaration():
             return _declaration(node)
         case ast.Tag(name=name, args=args):
@@ -102,7 +342,7 @@ def _domain(domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral) -> str:
     return show_set(domain) if isinstance(domain, ast.SetLiteral) else f"[{show_list(domain)}]"
 
 
-def _import(item: ast.Import) -> str:
+def _import_line(item: ast.Import) -> str:
     target = f'"{item.target}"' if item.is_file else show_name(item.target)
     return f"import {target}" + (f" as {own_name(item.alias)}" if item.alias else "")
 
@@ -112,7 +352,7 @@ def _spec(spec: ast.Spec) -> str:
         *([f"spec {show_name(spec.name)}"] if spec.name else []),
         *([f'system "{spec.system}"'] if spec.system is not None else []),
         *([f"time {spec.time_unit}"] if spec.time_unit else []),
-        *map(_import, spec.imports),
+        *map(_import_line, spec.imports),
     ]
     text = "\n".join(pragmas) + "\n" if pragmas else ""
     for before, item in zip((None, *spec.items), spec.items, strict=False):

@@ -1,4 +1,4 @@
-"""The nodes of a tree, outermost first, without recursion."""
+"""The nodes of a syntax tree, outermost first, without recursion."""
 
 from __future__ import annotations
 
