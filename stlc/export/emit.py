@@ -7,8 +7,7 @@ from importlib.resources import files
 from string import Template
 from typing import TYPE_CHECKING, assert_never
 
-from stlc.compile.backends.c.emit import CHECK, HEAD, passes, roots_out, state_index
-from stlc.compile.backends.c.formulas import Forward
+from stlc.compile.backends.c.emit import CHECK, HEAD, forward_blocks, passes, state_index
 from stlc.compile.backends.c.numbers import literal
 from stlc.compile.backends.c.parts import declared, in_parts
 from stlc.compile.backends.c.plan import plan_of
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
 
     from stlc.compile.augment.timers import Timer
     from stlc.compile.backends.c.emit import Motion
-    from stlc.compile.backends.c.steps import Plan
+    from stlc.compile.backends.c.plan import Plan
     from stlc.compile.pipeline import CompiledRequirement
     from stlc.controller.policies.policy import PlanNetwork
     from stlc.controller.problem.task import Task
@@ -173,7 +172,5 @@ def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequi
 
 def _falling(motion: Motion, plan: Plan) -> list[str]:
     """`fall`: the least robustness of phi_safe on a prefix; row STATES is positive beyond its end."""
-    forward = Forward(plan, state_index(motion) | {BEYOND: len(motion.states)})
-    blocks = [forward.lines([step]) for step in plan.steps]
-    blocks.append(roots_out(plan))
+    blocks = forward_blocks(plan, state_index(motion) | {BEYOND: len(motion.states)})
     return in_parts(replace(CHECK, name="fall"), blocks, declared(plan))

@@ -20,7 +20,7 @@ from stlc.compile.backends.array.namespace import Array
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.support import defined
 from stlc.compile.pipeline import CompiledRequirement
-from stlc.compile.schedule.schedule import End
+from stlc.compile.schedule.schedule import Boundary
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.monitor.holes import unsure
 from stlc.monitor.values import Ends, Record, bounds, window_bounds
@@ -75,7 +75,7 @@ def rule_known(
     return np.array([whole and start + window < samples for start in starts], dtype=bool)
 
 
-def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, end: End) -> Array:
+def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, end: Boundary) -> Array:
     """Values at every sample, `(samples, batch)`; NaN where `end` "strict" leaves them undefined.
 
     So it is where they depend on what is not known, unless `end` is "lower" or "upper".
@@ -93,7 +93,7 @@ def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, 
     return _window_signal(rule, record, horizon or 0, end)
 
 
-def _window_signal(rule: CompiledRequirement, record: Record, window: int, end: End) -> Array:
+def _window_signal(rule: CompiledRequirement, record: Record, window: int, end: Boundary) -> Array:
     """The same where `end` moves along: windows that do not fit are NaN under "strict"."""
     whole = max(record.samples - window, 0)
     starts = range(whole if end == "strict" else record.samples)
@@ -109,7 +109,7 @@ def _window_signal(rule: CompiledRequirement, record: Record, window: int, end: 
 
 
 def rules_at(
-    rules: Sequence[CompiledRequirement], record: Record, at: int, horizon: int | None, end: End
+    rules: Sequence[CompiledRequirement], record: Record, at: int, horizon: int | None, end: Boundary
 ) -> list[Array]:
     """Values at one sample, `(1, batch)` each; NaN where `rule_signal` has it."""
     if record.holes:
@@ -139,17 +139,17 @@ def _sides(rule: CompiledRequirement, record: Record) -> tuple[CompiledRequireme
     return replace(rule, formula=least, lowered=least), replace(rule, formula=most, lowered=most)
 
 
-def _agreed(least: Array, most: Array, record: Record, end: End) -> Array:
+def _agreed(least: Array, most: Array, record: Record, end: Boundary) -> Array:
     if end in ("lower", "upper"):
         return least if end == "lower" else most
     return record.ops.where(least == most, least, math.nan)
 
 
-def _has_value(rule: CompiledRequirement, record: Record, at: int, end: End) -> bool:
+def _has_value(rule: CompiledRequirement, record: Record, at: int, end: Boundary) -> bool:
     return end != "strict" or bool(defined(rule.formula, record.samples)[at])
 
 
-def _alone(rule: CompiledRequirement, record: Record, at: int, horizon: int | None, end: End) -> Array:
+def _alone(rule: CompiledRequirement, record: Record, at: int, horizon: int | None, end: Boundary) -> Array:
     window = window_of(rule, horizon)
     stop = None if window is None else at + window + 1
     inner = record if stop is None else record.cut(stop)

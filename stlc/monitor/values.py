@@ -14,7 +14,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns_of, defined, history
 from stlc.compile.ir.traverse import map_children, subexpressions
-from stlc.compile.schedule.schedule import End
+from stlc.compile.schedule.schedule import Boundary
 from stlc.compile.semantics.semantics import Exact, Semantics
 from stlc.monitor.holes import holes_in, unsure, without_holes
 
@@ -62,7 +62,7 @@ class Record:
         return self if stop >= self.samples else replace(self, env={n: x[:stop] for n, x in self.env.items()})
 
     def values(
-        self, formulas: Sequence[ir.Formula], instants: range, end: End, stop: int | None = None
+        self, formulas: Sequence[ir.Formula], instants: range, end: Boundary, stop: int | None = None
     ) -> list[Array]:
         """Values `(instants, batch)` of each formula at consecutive instants; `stop` as in `evaluate`."""
         return evaluate(
@@ -90,7 +90,7 @@ def bounds(
         low, high = bounds(least, record.sure, starts, ends, stop)
         return low, (high if least == most else bounds(most, record.sure, starts, ends, stop)[1])
 
-    def at(end: End, stop: int | None = None) -> Array:
+    def at(end: Boundary, stop: int | None = None) -> Array:
         return record.values([formula], starts, end, stop)[0]
 
     if ends == "truncate":

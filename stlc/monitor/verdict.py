@@ -13,7 +13,7 @@ import numpy as np
 from stlc.compile.backends.array.namespace import Array
 from stlc.compile.ir.discretize import Grid, lacks
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolved, resolve_for
-from stlc.compile.schedule.schedule import End
+from stlc.compile.schedule.schedule import Boundary
 from stlc.compile.semantics.semantics import TOLERANCE, Exact, Semantics, semantics_of
 from stlc.diagnostics import Diagnostic, SpecError, UsageError
 from stlc.files import read_source
@@ -294,7 +294,7 @@ def _chosen(rules: Sequence[CompiledRequirement], names: Sequence[str]) -> tuple
     return tuple(rule for rule in rules if not names or rule.name in names)
 
 
-def _rows(ready: Prepared, end: End, at: int | None) -> list[Array]:
+def _rows(ready: Prepared, end: Boundary, at: int | None) -> list[Array]:
     """Values of every requirement, (samples, batch), or (1, batch) at one sample."""
     if at is None:
         return [rule_signal(rule, ready.record, ready.horizon, end) for rule in ready.rules]

@@ -27,8 +27,7 @@ from stlc.compile.backends.c import families as c_families
 from stlc.compile.backends.c.adjoint import emit_adjoint
 from stlc.compile.backends.c.emit import emit
 from stlc.compile.backends.c.families import families
-from stlc.compile.backends.c.plan import plan_of
-from stlc.compile.backends.c.steps import Tabled
+from stlc.compile.backends.c.plan import Tabled, plan_of
 from stlc.compile.ir import nodes as ir
 from stlc.native import Outcome
 
@@ -73,7 +72,8 @@ def balls(count: int, seed: int = 1) -> list[ir.Num]:
 
 def loops(rules: Sequence[ir.Formula]) -> list[int]:
     """How many rows the outermost tables of a plan have."""
-    return [step.table.rows for step in plan_of(rules, STEPS + 1).steps if isinstance(step, Tabled)]
+    steps = plan_of(rules, STEPS + 1).schedule.steps
+    return [step.node.table.rows for step in steps if isinstance(step.node, Tabled)]
 
 
 # ---------------------------------------------------------------------- what is found

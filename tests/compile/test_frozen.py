@@ -18,7 +18,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
-from stlc.compile.schedule import frozen
+from stlc.compile.backends.array import frozen
 
 Env = dict[str, np.ndarray]
 

@@ -19,7 +19,7 @@ from stlc.compile.ir import typed
 from stlc.compile.ir.traverse import nodes, operands
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
-from stlc.compile.schedule.schedule import Extent, Run
+from stlc.compile.schedule.schedule import TraceDomain, spanning
 from stlc.compile.semantics.semantics import Exact, LogSumExp, Semantics
 from stlc.signature import Column, Signature
 
@@ -272,8 +272,8 @@ def test_gradients_are_never_nan(formula: typed.Formula, env: Env, k: float | No
 def test_predicates_are_read_only_where_they_are_needed() -> None:
     x, y = ir.Signal("x"), ir.Signal("y")
     node = ir.BoolOp("or", (ir.Predicate(x), ir.Temporal("always", ir.Window(0, 25), ir.Predicate(y))))
-    plan = planned((node,), Run(0, 1), Extent(51))
-    assert sorted(inside.count for _, _, inside in plan.atoms.values()) == [1, 26]
+    plan = planned((node,), spanning(0, 1), TraceDomain(51))
+    assert sorted(source.inside.count for source in plan.predicates.values()) == [1, 26]
     assert not plan.batches
 
 
@@ -287,15 +287,15 @@ def test_predicates_over_one_stretch_share_a_program() -> None:
             ir.Temporal("always", ir.Window(0, 25), ir.BoolOp("and", (ir.Predicate(twice), more))),
         ),
     )
-    plan = planned((node,), Run(0, 1), Extent(51))
+    plan = planned((node,), spanning(0, 1), TraceDomain(51))
     assert sorted(batch.run.count for batch in plan.batches) == [1, 26]
 
 
 def test_equal_parts_are_computed_once() -> None:
     p = ir.Temporal("always", ir.Window(0, 3), ir.Predicate(ir.Signal("x")))
     twin = ir.Temporal("always", ir.Window(0, 3), ir.Predicate(ir.Signal("x")))
-    plan = planned((p, ir.BoolOp("or", (twin, ir.Predicate(ir.Signal("y"))))), Run(0, 1), Extent(5))
-    assert sum(isinstance(step.node, ir.Temporal) for step in plan.steps) == 1
+    plan = planned((p, ir.BoolOp("or", (twin, ir.Predicate(ir.Signal("y"))))), spanning(0, 1), TraceDomain(5))
+    assert sum(isinstance(step.node, ir.Temporal) for step in plan.schedule.steps) == 1
 
 
 def test_long_sequential_scan_and_log_depth_agree() -> None:

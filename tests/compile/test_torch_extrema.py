@@ -7,9 +7,9 @@ from functools import reduce
 import pytest
 import torch
 
-from stlc.compile.backends.array.namespace import Pick
 from stlc.compile.backends.torch.extrema import choice, reduction
 from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.schedule.schedule import Pick
 
 SHAPES = [(2, 3), (40, 700)]
 

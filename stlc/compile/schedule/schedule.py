@@ -1,22 +1,22 @@
-"""Which values a formula needs at which instants: a formula and a trace length -> steps in order.
+"""Which values a formula needs at which instants: formulas and a trace length -> steps in order.
 
 Nothing is computed where nobody asks: a state predicate at the root is read at one instant, the body of
-`always[0, T]` at T + 1. Equal sub-formulas at equal instants are one step; predicates that are needed at the
-same instants are one program.
+`always[0, T]` at T + 1. Equal sub-formulas at equal instants are one step. Every back end reads the same
+steps and matches on the node of each. Instants are whole numbers, or inside of a loop that a back end writes
+(`LoopIndex`) expressions in its index.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias, assert_never
+from typing import Any, Literal, TypeAlias, assert_never
 
-from stlc.compile.backends.array.arith import Program
-from stlc.compile.backends.array.namespace import Array
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import Reach, farthest, reach_of, tail
 
-End: TypeAlias = Literal["strict", "truncate", "lower", "upper", "both"]
+Boundary: TypeAlias = Literal["strict", "truncate", "lower", "upper", "both"]
 """What stands beyond the last sample.
 
 `strict`: nothing, and whoever asks is told. `truncate`: nothing, windows are cut. `lower` and `upper`: the
@@ -25,24 +25,134 @@ last known sample all the same. `both` (NumPy, without `freeze`): two traces, of
 its least and the second at its greatest.
 """
 
+Pick: TypeAlias = Literal["min", "max"]
+
+PICKS: Mapping[str, Pick] = {
+    **dict.fromkeys(("and", "always", "historically", "release", "trigger"), "min"),
+    **dict.fromkeys(("or", "eventually", "once", "until", "since"), "max"),
+}
+"""Operator -> the extremum that it takes, `until` and the like over its window."""
+
 _FAR = 256
 """Instants beyond the last sample that are computed without asking whether they are all alike."""
 
 
+def dual(pick: Pick) -> Pick:
+    """The other extremum."""
+    return "max" if pick == "min" else "min"
+
+
+def neutral(pick: Pick) -> float:
+    """The extremum of nothing."""
+    return math.inf if pick == "min" else -math.inf
+
+
+# ------------------------------------------------------------------------------ instants
+
+
 @dataclass(frozen=True, slots=True)
-class Extent:
-    """How long a trace is, and whether it may go on.
+class LoopIndex:
+    """An instant that follows from the loops around it.
+
+    Attributes:
+        text: expression in the language of the back end.
+        low: the least value it takes.
+        high: the greatest.
+    """
+
+    text: str
+    low: int
+    high: int
+
+    def __add__(self, steps: int) -> Instant:
+        """The instant so many samples later."""
+        if self.low == self.high:
+            return self.low + steps
+        if not steps:
+            return self
+        return LoopIndex(f"({self.text} + {steps})", self.low + steps, self.high + steps)
+
+    def __sub__(self, steps: int) -> Instant:
+        """The instant so many samples before."""
+        return self + -steps
+
+    def __str__(self) -> str:
+        return self.text
+
+
+Instant: TypeAlias = Any
+"""A whole number, or a `LoopIndex`."""
+
+
+def earliest(instant: Instant) -> int:
+    """The least value of an instant."""
+    return instant.low if isinstance(instant, LoopIndex) else int(instant)
+
+
+def latest(instant: Instant) -> int:
+    """The greatest value of an instant."""
+    return instant.high if isinstance(instant, LoopIndex) else int(instant)
+
+
+def at_least(instant: Instant, least: int) -> Instant:
+    """The later one of an instant and `least`."""
+    if isinstance(instant, int):
+        return max(instant, least)
+    if instant.low >= least:
+        return instant
+    later = LoopIndex(f"LATER({instant.text}, {least})", least, instant.high)
+    return least if instant.high <= least else later
+
+
+def at_most(instant: Instant, most: int) -> Instant:
+    """An instant; `most` where it may lie beyond that."""
+    return most if latest(instant) > most else instant
+
+
+@dataclass(frozen=True, slots=True)
+class IndexRange:
+    """Consecutive instants, both ends included; none where `last` is before `start`."""
+
+    start: Instant
+    last: Instant
+
+    @property
+    def count(self) -> int:
+        """Instants between the earliest start and the latest end; none if this is 0 or less."""
+        if isinstance(self.start, int) and isinstance(self.last, int):
+            return self.last - self.start + 1
+        return latest(self.last) - earliest(self.start) + 1
+
+    @property
+    def single(self) -> bool:
+        """Whether it is one instant, wherever."""
+        return bool(self.start == self.last)
+
+    @property
+    def settled(self) -> IndexRange:
+        """All instants that it covers in any turn of the loops around."""
+        return IndexRange(earliest(self.start), latest(self.last))
+
+
+def spanning(start: int, count: int) -> IndexRange:
+    """`count` instants from `start` on."""
+    return IndexRange(start, start + count - 1)
+
+
+@dataclass(frozen=True, slots=True)
+class TraceDomain:
+    """Length of a trace, and whether it may go on.
 
     Attributes:
         samples: how many are known.
         end: what stands beyond them.
-        stop: how many the trace will have where it goes on: windows to its end end there, and not with the
-            last known sample.
+        stop: final length where the trace goes on; windows to its end end there, and not with the last known
+            sample.
         counted: every instant counts, unknown ones as well: the semantics is a mean.
     """
 
     samples: int
-    end: End = "strict"
+    end: Boundary = "strict"
     stop: int | None = None
     counted: bool = False
 
@@ -53,84 +163,118 @@ class Extent:
 
     @property
     def length(self) -> int:
-        """Where windows to the end of the trace end."""
+        """Final length; unbounded windows are clipped here."""
         return self.samples if self.stop is None else self.stop
 
-    def last(self, window: ir.Window, latest: int, parts: Sequence[ir.Formula]) -> int:
-        """The last instant of `parts` that a window of the future needs when asked at `latest` at the latest.
+    def last(self, window: ir.Window, latest_start: Instant, parts: Sequence[ir.Formula]) -> Instant:
+        """The last instant of `parts` that a window of the future needs.
 
         Of the instants beyond the trace at which all parts stay as they are it takes one.
+
+        Args:
+            window: of the operator.
+            latest_start: the last instant at which the operator is needed.
+            parts: its operands.
         """
         if window.hi is None:
             return self.length - 1
+        last = latest_start + window.hi
         if not self.open:
-            return min(latest + window.hi, self.samples - 1)
-        last = latest + window.hi
-        if last < self.samples + _FAR or self.counted:
+            return at_most(last, self.samples - 1)
+        if latest(last) < self.samples + _FAR or self.counted:
             return last
         tails = [tail(part, self.samples, self.length) for part in parts]
         known = [found for found in tails if found is not None]
-        return min(last, max(*known, latest + window.lo)) if len(known) == len(tails) else last
+        if len(known) < len(tails):
+            return last
+        return min(latest(last), max(*known, latest(latest_start) + window.lo))
 
 
-@dataclass(frozen=True, slots=True)
-class Run:
-    """Consecutive instants: `count` of them from `start` on; none if `count` <= 0."""
-
-    start: int
-    count: int
-
-    @property
-    def last(self) -> int:
-        """The last instant."""
-        return self.start + self.count - 1
+# ------------------------------------------------------------------------------ operands
 
 
-def upto(start: int, last: int) -> Run:
-    """The instants from `start` to `last`, both included."""
-    return Run(start, last - start + 1)
-
-
-def operands(node: ir.Formula, run: Run, extent: Extent) -> tuple[tuple[ir.Formula, Run], ...]:
-    """What `node` at the instants `run` needs of its parts; runs may be empty."""
+def operands(
+    node: ir.Formula, run: IndexRange, domain: TraceDomain
+) -> tuple[tuple[ir.Formula, IndexRange], ...]:
+    """Operands of a formula that is needed at the instants `run`, each with its own instants, maybe none."""
     match node:
         case ir.Truth() | ir.Predicate() | ir.Freeze():
             return ()
         case ir.BoolOp(_, items):
             return tuple((item, run) for item in items)
         case ir.Temporal(_, window, body):
-            return ((body, upto(run.start + window.lo, extent.last(window, run.last, (body,)))),)
+            return ((body, IndexRange(run.start + window.lo, domain.last(window, run.last, (body,)))),)
         case ir.PastTemporal(_, window, body):
-            return ((body, upto(_first(window, run), run.last - window.lo)),)
+            return ((body, IndexRange(_first(window, run), run.last - window.lo)),)
         case ir.Until() | ir.Since():
-            return _both(node, run, extent)
+            return _both(node, run, domain)
         case ir.Shift(steps, body):
-            last = run.last + steps if extent.open else min(run.last + steps, extent.samples - 1)
-            return ((body, upto(max(run.start + steps, 0), last)),)
+            last = run.last + steps
+            last = last if domain.open else at_most(last, domain.samples - 1)
+            return ((body, IndexRange(at_least(run.start + steps, 0), last)),)
         case ir.AtStart(body):
-            return ((body, Run(0, 1)),)
+            return ((body, IndexRange(0, 0)),)
         case _:
             assert_never(node)
 
 
+_NEVER = IndexRange(0, -1)
+
+
 def _both(
-    node: ir.Until | ir.Since, run: Run, extent: Extent
-) -> tuple[tuple[ir.Formula, Run], tuple[ir.Formula, Run]]:
-    """What `until` and `since` need: the right side in the window, the left one from now up to there."""
+    node: ir.Until | ir.Since, run: IndexRange, domain: TraceDomain
+) -> tuple[tuple[ir.Formula, IndexRange], tuple[ir.Formula, IndexRange]]:
+    """Operands of `until` and `since`: the right one in the window, the left one from now up to there."""
     window, left, right = node.window, node.left, node.right
     if isinstance(node, ir.Until):
-        last = extent.last(window, run.last, (left, right))
-        if last >= run.start + window.lo:
-            return (left, upto(run.start, last)), (right, upto(run.start + window.lo, last))
-    elif run.last >= window.lo:
+        last = domain.last(window, run.last, (left, right))
+        held, met = IndexRange(run.start, last), IndexRange(run.start + window.lo, last)
+    else:
         first = _first(window, run)
-        return (left, upto(first, run.last)), (right, upto(first, run.last - window.lo))
-    return (left, Run(0, 0)), (right, Run(0, 0))
+        held, met = IndexRange(first, run.last), IndexRange(first, run.last - window.lo)
+    return ((left, held), (right, met)) if met.count > 0 else ((left, _NEVER), (right, _NEVER))
 
 
-def _first(window: ir.Window, run: Run) -> int:
+def _first(window: ir.Window, run: IndexRange) -> Instant:
     """The first instant that a window of the past reads."""
-    return 0 if window.hi is None else max(run.start - window.hi, 0)
+    return 0 if window.hi is None else at_least(run.start - window.hi, 0)
+
+
+def reads(num: ir.Num, domain: TraceDomain) -> Reach:
+    """Samples that have to exist for a number to have a value.
+
+    What reads the last sample instead of one beyond the trace has to wait for it while the trace goes on.
+    """
+    past, future = reach_of(num)
+    return Reach(past, future if domain.stop is None else max(future, farthest(num).future))
+
+
+def within(reach: Reach, run: IndexRange, domain: TraceDomain) -> IndexRange:
+    """The instants of `run` at which all samples exist that a number of this reach reads."""
+    first = max(earliest(run.start), reach.past)
+    return IndexRange(first, max(min(latest(run.last), domain.samples - 1 - reach.future), first - 1))
+
+
+# ----------------------------------------------------------------------------- schedules
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """Steps that a back end runs again and again: the inside of a `freeze`, or of a table of alike formulas.
+
+    Attributes:
+        index: name of the index in the language of the back end.
+        bound: numbers under which the frozen values stand, in the order of their bindings.
+        steps: filled anew in every turn.
+        own: numbers of everything that is, in the order in which they were given out.
+        root: number of the step that is the outcome of a turn.
+    """
+
+    index: str
+    bound: tuple[int, ...]
+    steps: tuple[Step, ...]
+    own: tuple[int, ...]
+    root: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,125 +282,87 @@ class Step:
     """One value to compute.
 
     Attributes:
-        node: the formula.
+        node: the formula; or what a back end computes beside formulas.
         run: at which instants.
-        parts: steps with the values of its parts; None where a part is not needed at any instant.
+        args: numbers of the steps with the values of its operands; None for an operand that is not needed at
+            any instant.
+        inner: what is run for every instant of a `freeze`, or for every row of a table; None where the back
+            end evaluates it itself.
+        number: of this step among all.
     """
 
-    node: ir.Formula
-    run: Run
-    parts: tuple[int | None, ...]
+    node: Any
+    run: IndexRange
+    args: tuple[int | None, ...]
+    inner: Loop | None = None
+    number: int = 0
 
-
-@dataclass(frozen=True, slots=True)
-class Batch:
-    """Predicates that are computed together at the same instants, all of them within the trace."""
-
-    run: Run
-    program: Program
-
-
-Runner: TypeAlias = Callable[..., Array]
-"""What computes a step."""
+    @property
+    def operands(self) -> tuple[int, ...]:
+        """Numbers of the operands that are needed."""
+        return tuple(number for number in self.args if number is not None)
 
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """What to compute, in order.
+    """Steps in order.
 
     Attributes:
-        extent: of the trace.
-        batches: programs of the predicates.
-        steps: values, parts first.
-        atoms: step of a predicate -> (batch, name of the output, at which instants it has a value); without
-            a batch the name is that of a column; absent where it has no value.
-        roots: steps of the formulas that were asked for.
-        beyond: how many values beyond the last sample there are in all.
-        runners: what computes the steps, by semantics and array library; made when it is first needed.
+        domain: of the trace.
+        steps: operands first.
+        roots: numbers of the formulas that were asked for.
     """
 
-    extent: Extent
-    batches: tuple[Batch, ...]
+    domain: TraceDomain
     steps: tuple[Step, ...]
-    atoms: dict[int, tuple[int | None, str, Run]]
     roots: tuple[int, ...]
-    beyond: int = 0
-    runners: dict[Hashable, tuple[Runner, ...]] = field(default_factory=dict, compare=False, repr=False)
 
 
-def schedule(formulas: Sequence[ir.Formula], run: Run, extent: Extent) -> Schedule:
-    """All steps that `formulas` at the instants `run` take."""
-    steps: list[Step] = []
-    known: dict[tuple[ir.Formula, Run], int] = {}
+@dataclass(slots=True)
+class Scope:
+    """Steps that are run together, and what they compute already."""
 
-    def place(node: ir.Formula, instants: Run) -> int | None:
-        if instants.count <= 0:
+    steps: list[Step] = field(default_factory=list)
+    known: dict[tuple[ir.Formula, IndexRange], int] = field(default_factory=dict)
+
+
+class Scheduler:
+    """Gives every formula that is needed at some instants one step."""
+
+    def __init__(self, domain: TraceDomain) -> None:
+        self.domain = domain
+        self.scope = Scope()
+        self._count = 0
+
+    def place(self, node: ir.Formula, run: IndexRange) -> int | None:
+        """The number of the step of a formula; None where it is needed at no instant."""
+        if run.count <= 0:
             return None
-        key = (node, instants)
-        if key not in known:
-            parts = tuple(place(part, its_run) for part, its_run in operands(node, instants, extent))
-            known[key] = len(steps)
-            steps.append(Step(node, instants, parts))
-        return known[key]
+        key, known = (node, run), self.scope.known
+        found = known.get(key)
+        if found is None:
+            found = known[key] = self.scheduled(node, run)
+        return found
 
-    roots = tuple(index for formula in formulas if (index := place(formula, run)) is not None)
-    batches, atoms = _batches(steps, extent)
-    beyond = sum(max(min(step.run.last - extent.samples + 1, step.run.count), 0) for step in steps)
-    return Schedule(extent, batches, tuple(steps), atoms, roots, beyond)
+    def scheduled(self, node: ir.Formula, run: IndexRange) -> int:
+        """A new step, those of its operands before it."""
+        args = tuple(self.place(part, its) for part, its in operands(node, run, self.domain))
+        return self.add(Step(node, run, args, number=self.number(run)))
 
+    def number(self, run: IndexRange) -> int:  # noqa: ARG002 - back ends give memory to it
+        """The next number, of something that has a value at each of these instants."""
+        self._count += 1
+        return self._count - 1
 
-def _batches(
-    steps: Sequence[Step], extent: Extent
-) -> tuple[tuple[Batch, ...], dict[int, tuple[int | None, str, Run]]]:
-    """One program for all predicates over the same stretch of the trace; bare columns need none."""
-    wanted: dict[ir.Num, list[tuple[Run, int]]] = {}
-    atoms: dict[int, tuple[int | None, str, Run]] = {}
-    for index, step in enumerate(steps):
-        if isinstance(step.node, ir.Predicate):
-            inside = within(reads(step.node.num, extent), step.run, extent)
-            if inside.count > 0 and isinstance(step.node.num, ir.Signal) and step.node.sign > 0:
-                atoms[index] = (None, step.node.num.name, inside)
-            elif inside.count > 0:
-                wanted.setdefault(_signed(step.node), []).append((inside, index))
-    grouped: dict[Run, dict[ir.Num, list[tuple[Run, int]]]] = {}
-    for num, asked in wanted.items():
-        for stretch, indices in _stretches(asked):
-            grouped.setdefault(stretch, {})[num] = indices
-    batches = []
-    for number, (stretch, nums) in enumerate(grouped.items()):
-        outputs = {str(i): num for i, num in enumerate(nums)}
-        batches.append(Batch(stretch, Program(outputs)))
-        for i, indices in enumerate(nums.values()):
-            atoms.update({index: (number, str(i), inside) for inside, index in indices})
-    return tuple(batches), atoms
+    def add(self, step: Step) -> int:
+        """Append a step; its number."""
+        self.scope.steps.append(step)
+        return step.number
 
 
-def _signed(atom: ir.Predicate) -> ir.Num:
-    return atom.num if atom.sign > 0 else ir.Op("neg", (atom.num,))
-
-
-def reads(num: ir.Num, extent: Extent) -> Reach:
-    """Samples that have to exist for a number to have a value.
-
-    What reads the last sample instead of one beyond the trace has to wait for it while the trace goes on.
-    """
-    past, future = reach_of(num)
-    return Reach(past, future if extent.stop is None else max(future, farthest(num).future))
-
-
-def within(reach: Reach, run: Run, extent: Extent) -> Run:
-    """The instants of `run` at which all samples exist that a number of this reach reads."""
-    first = max(run.start, reach.past)
-    return upto(first, max(min(run.last, extent.samples - 1 - reach.future), first - 1))
-
-
-def _stretches(asked: list[tuple[Run, int]]) -> list[tuple[Run, list[tuple[Run, int]]]]:
-    """Runs that touch are put together."""
-    out: list[tuple[Run, list[tuple[Run, int]]]] = []
-    for run, index in sorted(asked, key=lambda item: (item[0].start, item[0].count)):
-        if out and run.start <= out[-1][0].last + 1:
-            whole, indices = out[-1]
-            out[-1] = (upto(whole.start, max(whole.last, run.last)), [*indices, (run, index)])
-        else:
-            out.append((run, [(run, index)]))
-    return out
+def schedule(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDomain) -> Schedule:
+    """All steps that `formulas` at the instants `run` take; a `freeze` is one of them."""
+    scheduler = Scheduler(domain)
+    placed = (scheduler.place(formula, run) for formula in formulas)
+    roots = tuple(number for number in placed if number is not None)
+    return Schedule(domain, tuple(scheduler.scope.steps), roots)

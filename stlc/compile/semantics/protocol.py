@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar, Protocol, TypeAlias
 
-from stlc.compile.backends.array.namespace import Array, Ops, Pick
+from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.schedule.schedule import Pick
 
 Parts: TypeAlias = tuple[Array, ...]
 """What is known of some operands of an extremum: the extremum itself, or sums that it follows from."""

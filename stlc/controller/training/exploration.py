@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from stlc.compile.schedule.schedule import End
+    from stlc.compile.schedule.schedule import Boundary
     from stlc.controller.problem.task import Task
 
 Numbers = NDArray[np.float64]
@@ -267,7 +267,7 @@ class Exploration:
         kind = np.concatenate((met, counts), 1).astype(np.int64)
         return Layer(states, plans, met, kind, worth, np.zeros(len(worth)))
 
-    def _bounds(self, states: Numbers, end: End) -> Numbers:
+    def _bounds(self, states: Numbers, end: Boundary) -> Numbers:
         """Of the robustness of every piece, over all that may follow: (rows, samples, n) -> (rows, k)."""
         if not len(states):
             return np.empty((0, len(self.pieces)))

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import execute
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.array.steps import ArrayPlan, array_plan
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns as names_of_columns
-from stlc.compile.schedule.schedule import Extent, Run, Schedule, schedule
+from stlc.compile.schedule.schedule import TraceDomain, spanning
 from stlc.compile.semantics.semantics import Exact
 from stlc.monitor.endings import reads_seen, with_seen
 from stlc.monitor.holes import holes_in, unsure, without_holes
@@ -58,7 +59,7 @@ class Reader:
         self._unsure: dict[tuple[frozenset[str], bool], Reader] = {}
         self._stop = FAR if going_on else None
         self.names = frozenset().union(*map(names_of_columns, self.formulas))
-        self._known: dict[tuple[int, int, int], Schedule] = {}
+        self._known: dict[tuple[int, int, int], ArrayPlan] = {}
 
     def __call__(self, env: Mapping[str, Floats], start: int, count: int) -> list[Floats]:
         """Values (count, traces) from row `start` on; columns may be longer than the shortest of them."""
@@ -70,8 +71,8 @@ class Reader:
         if key not in self._known:
             if len(self._known) >= _REMEMBERED:
                 self._known.clear()
-            self._known[key] = schedule(
-                self.formulas, Run(start, count), Extent(length, self.end, self._stop)
+            self._known[key] = array_plan(
+                self.formulas, spanning(start, count), TraceDomain(length, self.end, self._stop)
             )
         inner = {name: env[name] if len(env[name]) == length else env[name][:length] for name in names}
         return execute(self._known[key], inner, _EXACT)

@@ -17,6 +17,7 @@ from stlc.compile.backends.array.tape import Instr, Operand, Tape
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.ir.traverse import key_of, leaves
+from stlc.compile.schedule.schedule import IndexRange
 from stlc.compile.semantics.switch import Hard, Switch
 
 ExternFunction: TypeAlias = Callable[..., Sequence[Array]]
@@ -306,3 +307,40 @@ def _strictness(cond: ir.Formula) -> set[bool]:
             return set().union(*map(_strictness, items))
         case _:
             return set()
+
+
+# ------------------------------------------------------------------------- inputs
+
+
+def inputs(program: Program, env: Mapping[str, Array], run: IndexRange, ops: Ops) -> dict[str, Array]:
+    """The inputs of `program` at the instants `run`, each `(count, batch)`; at least one column.
+
+    Args:
+        program: at these instants all samples that it reads exist.
+        env: whole columns, `(time, batch)`.
+        run: within the trace.
+        ops: the array library of `env`.
+    """
+
+    def read(name: str) -> Array:
+        if name == ir.ELAPSED:
+            return ops.counted(run.start, run.count, next(iter(env.values())))
+        if name in program.shifted:
+            return _beside(env[program.shifted[name].name], program.shifted[name], run, ops)
+        return _cut(env[name], run.start, run.count)
+
+    return {name: read(name) for name in program.columns or list(env)[:1]}
+
+
+def _cut(column: Array, start: int, count: int) -> Array:
+    return column if start == 0 and len(column) == count else column[start : start + count]
+
+
+def _beside(column: Array, at: ir.ShiftedSignal, run: IndexRange, ops: Ops) -> Array:
+    """The column some samples later; a clamped one repeats its first and last row beyond the ends."""
+    start, count, samples = run.start + at.steps, run.count, len(column)
+    before, after = min(max(-start, 0), count), min(max(start + count - samples, 0), count)
+    if not before and not after:
+        return _cut(column, start, count)
+    inside = [column[max(start, 0) : min(start + count, samples)]] if before + after < count else []
+    return ops.cat([*[column[:1]] * before, *inside, *[column[-1:]] * after])

@@ -1,7 +1,7 @@
 """Formulas -> arrays: robustness at the instants that are asked for, on any array library.
 
 Columns are `(time, batch)`. A schedule (`stlc.compile.schedule.schedule`) says what to compute,
-`stlc.compile.schedule.machine` how.
+`stlc.compile.backends.array.steps` how.
 """
 
 from __future__ import annotations
@@ -9,20 +9,18 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
 
-from stlc.compile.backends.array.inputs import inputs
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.array.steps import ArrayPlan, all_values, array_plan
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import defined
-from stlc.compile.schedule.frozen import Freezer
-from stlc.compile.schedule.machine import Machine
-from stlc.compile.schedule.schedule import End, Extent, Run, Runner, Schedule, schedule
+from stlc.compile.schedule.schedule import Boundary, IndexRange, TraceDomain, spanning
 from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.signature import Signature
@@ -42,7 +40,7 @@ def evaluate(
     semantics: Semantics | None = None,
     start: int = 0,
     count: int = 1,
-    end: End = "strict",
+    end: Boundary = "strict",
     stop: int | None = None,
 ) -> list[Array]:
     """Robustness of several formulas; common parts are computed once.
@@ -66,8 +64,8 @@ def evaluate(
         TraceError: E306, bounds over all continuations of the trace look too far beyond it.
     """
     windows = Windows(semantics or Exact(), ops)
-    extent = _extent(env, end, windows, stop)
-    return execute(planned(tuple(formulas), Run(start, count), extent), env, windows)
+    domain = _domain(env, end, windows, stop)
+    return execute(planned(tuple(formulas), spanning(start, count), domain), env, windows)
 
 
 def evaluate_parts(
@@ -76,7 +74,7 @@ def evaluate_parts(
     instants: range,
     *,
     ops: Ops,
-    end: End,
+    end: Boundary,
     stop: int | None = None,
 ) -> Iterator[tuple[ir.Formula, range, Array]]:
     """Exact robustness of a formula at consecutive instants, and of its parts where it needs them.
@@ -87,27 +85,29 @@ def evaluate_parts(
         Formulas, instants and values `(instants, batch)`, parts first; not what stands in a `Freeze`.
     """
     windows = Windows(Exact(), ops)
-    plan = planned((formula,), Run(instants.start, len(instants)), _extent(env, end, windows, stop))
-    for step, values in zip(plan.steps, _all_values(plan, env, windows), strict=True):
+    plan = planned((formula,), spanning(instants.start, len(instants)), _domain(env, end, windows, stop))
+    for step, values in zip(plan.schedule.steps, _checked(plan, env, windows), strict=True):
         yield step.node, range(step.run.start, step.run.last + 1), values
 
 
-def _extent(env: Mapping[str, Array], end: End, windows: Windows, stop: int | None = None) -> Extent:
+def _domain(
+    env: Mapping[str, Array], end: Boundary, windows: Windows, stop: int | None = None
+) -> TraceDomain:
     samples = len(next(iter(env.values())))
-    return Extent(samples, end, stop, counted=not windows.semantics.idempotent)
+    return TraceDomain(samples, end, stop, counted=not windows.semantics.idempotent)
 
 
 @lru_cache(maxsize=512)
-def planned(formulas: tuple[ir.Formula, ...], run: Run, extent: Extent) -> Schedule:
+def planned(formulas: tuple[ir.Formula, ...], run: IndexRange, domain: TraceDomain) -> ArrayPlan:
     """The schedule for a trace, remembered. Raises ValueError as `evaluate` does."""
-    samples = extent.samples
-    if run.start < 0 or (run.last >= samples and not extent.open):
+    samples = domain.samples
+    if run.start < 0 or (run.last >= samples and not domain.open):
         raise ValueError(f"instants {run.start}..{run.last} of a trace with {samples} samples")
-    if extent.end == "strict":
+    if domain.end == "strict":
         for formula in formulas:
             if not defined(formula, samples)[run.start : run.last + 1].all():
                 raise ValueError(f"the formula looks beyond the end of a trace of {samples} samples")
-    return schedule(formulas, run, extent)
+    return array_plan(formulas, run, domain)
 
 
 def robustness_signal(
@@ -116,109 +116,48 @@ def robustness_signal(
     *,
     ops: Ops,
     semantics: Semantics | None = None,
-    end: End = "strict",
+    end: Boundary = "strict",
 ) -> Array:
     """Robustness at every sample, `(time, batch)`; NaN where `end` "strict" leaves it undefined."""
     windows = Windows(semantics or Exact(), ops)
-    extent = _extent(env, "truncate" if end == "strict" else end, windows)
-    samples = extent.samples
-    (signal,) = execute(planned((formula,), Run(0, samples), extent), env, windows)
+    domain = _domain(env, "truncate" if end == "strict" else end, windows)
+    samples = domain.samples
+    (signal,) = execute(planned((formula,), spanning(0, samples), domain), env, windows)
     if end != "strict":
         return signal
     return ops.rows(defined(formula, samples), signal, math.nan)
 
 
-def execute(plan: Schedule, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """The values of the roots of a schedule, each `(count, batch)`.
+def execute(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
+    """The values of the roots of a plan, each `(count, batch)`.
 
     Raises:
         TraceError: E306, bounds over all continuations of the trace look too far beyond it.
     """
-    values = _all_values(plan, env, windows)
-    return [values[root] for root in plan.roots]
+    values = _checked(plan, env, windows)
+    return [values[root] for root in plan.schedule.roots]
 
 
-def _all_values(plan: Schedule, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """The values of all steps."""
-    ops, like = windows.ops, next(iter(env.values()))
-    if plan.beyond > MAX_BEYOND or (plan.beyond and plan.beyond * math.prod(like.shape[1:]) > MAX_VALUES):
+def _checked(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
+    """The values of all steps, where they are not too many."""
+    batch = math.prod(next(iter(env.values())).shape[1:])
+    if plan.beyond > MAX_BEYOND or (plan.beyond and plan.beyond * batch > MAX_VALUES):
         raise TraceError(_too_far(plan))
-    runners = plan.runners.get(windows)
-    if runners is None:
-        machine = Machine(plan.extent, windows)
-        runners = tuple(_runner(plan, index, machine) for index in range(len(plan.steps)))
-        plan.runners[windows] = runners
-    outputs = [batch.program(inputs(batch.program, env, batch.run, ops), ops) for batch in plan.batches]
-    values: list[Array] = []
-    for runner in runners:
-        values.append(runner(values, outputs, env, like))
-    return values
+    return all_values(plan, env, windows)
 
 
-def _too_far(plan: Schedule) -> Diagnostic:
+def _too_far(plan: ArrayPlan) -> Diagnostic:
     """E306 for a formula whose parts would be needed at too many instants beyond the trace."""
-    step = max(plan.steps, key=lambda step: step.run.last)
+    step = max(plan.schedule.steps, key=lambda step: step.run.last)
     return Diagnostic(
         "E306",
-        f"this looks {step.run.last - plan.extent.samples + 1:,} samples beyond the last one",
+        f"this looks {step.run.last - plan.schedule.domain.samples + 1:,} samples beyond the last one",
         step.node.span,
         help=(
             "record more, or shorten the intervals: a trace that ends so early says nothing certain here",
             "`--end truncate` evaluates on what there is",
         ),
     )
-
-
-def _runner(plan: Schedule, index: int, machine: Machine) -> Runner:
-    """What computes a step from those before it, the outputs of the programs, and the columns."""
-    step = plan.steps[index]
-    if isinstance(step.node, ir.Freeze):
-        return _frozen(step.node, step.run, plan.extent, machine.windows)
-    if isinstance(step.node, ir.Predicate):
-        return _predicate(plan, index, machine)
-    kernel, parts = machine.bind(step), [part for part in step.parts if part is not None]
-    if len(parts) == 1:
-        (only,) = parts
-        return lambda values, _, __, like: kernel((values[only],), like)
-    return lambda values, _, __, like: kernel([values[part] for part in parts], like)
-
-
-def _predicate(plan: Schedule, index: int, machine: Machine) -> Runner:
-    """Its rows come from a program, or are those of a column."""
-    step, place = plan.steps[index], plan.atoms.get(index)
-    assert isinstance(step.node, ir.Predicate)
-    if place is None:
-        kernel = machine.atom(step.node, step.run, Run(step.run.start, 0))
-        return lambda _, __, ___, like: kernel((), like)
-    number, name, inside = place
-    kernel = machine.atom(step.node, step.run, inside)
-    if number is None:
-        if inside.count == plan.extent.samples:
-            return lambda _, __, env, like: kernel((env[name],), like)
-        first, stop = inside.start, inside.start + inside.count
-        return lambda _, __, env, like: kernel((env[name][first:stop],), like)
-    offset = inside.start - plan.batches[number].run.start
-    if offset == 0 and plan.batches[number].run.count == inside.count:
-        return lambda _, outputs, __, like: kernel((outputs[number][name],), like)
-    rows = slice(offset, offset + inside.count)
-    return lambda _, outputs, __, like: kernel((outputs[number][name][rows],), like)
-
-
-def _frozen(node: ir.Freeze, run: Run, extent: Extent, windows: Windows) -> Runner:
-    judge = partial(_judge, windows=windows)
-    return lambda _, __, env, ___: Freezer(extent, env, windows.ops, judge).values(node, run)
-
-
-def _judge(
-    formula: ir.Formula, env: Mapping[str, Array], run: Run, extent: Extent, *, windows: Windows
-) -> Array:
-    """One formula at consecutive instants, on the trace or beyond it: `(count, batch)`."""
-    return execute(_scheduled(formula, run, extent), env, windows)[0]
-
-
-@lru_cache(maxsize=512)
-def _scheduled(formula: ir.Formula, run: Run, extent: Extent) -> Schedule:
-    return schedule((formula,), run, extent)
 
 
 class Weighed(Protocol):

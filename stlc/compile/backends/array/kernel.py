@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import NamedTuple, final
 
 from stlc import native
-from stlc.compile.backends.array.namespace import Pick, Sliding
+from stlc.compile.backends.array.namespace import Sliding
+from stlc.compile.schedule.schedule import Pick
 
 _SOURCE = Path(__file__).with_name("windows.c")
 _TYPES = {"float32": ("float", "int32_t", 4), "float64": ("double", "int64_t", 8)}

@@ -7,32 +7,21 @@ Operands named `x`, `a`, `b` are arrays; where a method says so a plain float ma
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, TypeAlias, final
+from typing import Any, Protocol, TypeAlias, final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from stlc.compile.schedule.schedule import Pick
 
 Array: TypeAlias = Any
 """A NumPy array or a torch tensor."""
 
 Mask: TypeAlias = Any
 """An array of booleans."""
-
-Pick: TypeAlias = Literal["min", "max"]
-
-
-def dual(pick: Pick) -> Pick:
-    """The other extremum."""
-    return "max" if pick == "min" else "min"
-
-
-def neutral(pick: Pick) -> float:
-    """The extremum of nothing."""
-    return math.inf if pick == "min" else -math.inf
 
 
 @final

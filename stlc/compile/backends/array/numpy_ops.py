@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.backends.array.kernel import Strided, window_kernel
-from stlc.compile.backends.array.namespace import Array, Mask, Ops, Pick, Sliding
+from stlc.compile.backends.array.namespace import Array, Mask, Ops, Sliding
 from stlc.compile.ir.functions import FUNCTIONS
+from stlc.compile.schedule.schedule import Pick
 
 _WIDE = 8
 """From so many columns on the kernel beats putting pairs together,"""

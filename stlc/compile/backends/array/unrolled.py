@@ -5,16 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.arith import Program, inputs
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.inputs import inputs
 from stlc.compile.backends.c.numbers import Untranslatable
 from stlc.compile.backends.onnx.ops import ONNX
 from stlc.compile.backends.onnx.sheet import Value
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import defined
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
-from stlc.compile.schedule.schedule import Run
+from stlc.compile.schedule.schedule import spanning
 
 Columns = dict[str, Value]
 
@@ -70,7 +69,7 @@ def _frozen(node: ir.Freeze, env: Columns) -> Value:
         if not known:
             rows.append(ONNX.full((1, 1), math.nan, like))
             continue
-        held = program(inputs(program, env, Run(instant, 1), ONNX), ONNX)
+        held = program(inputs(program, env, spanning(instant, 1), ONNX), ONNX)
         inner = env | {name: value.spread(samples, value.shape[1]) for name, value in held.items()}
         body = _thawed(node.body, inner)
         rows += evaluate([body], inner, ops=ONNX, start=instant, count=1)

@@ -10,10 +10,9 @@ import math
 from dataclasses import dataclass
 from typing import final
 
-from stlc.compile.backends.array.namespace import Array, Ops, Pick, Sliding, dual, neutral
+from stlc.compile.backends.array.namespace import Array, Ops, Sliding
+from stlc.compile.schedule.schedule import Pick, dual, neutral
 from stlc.compile.semantics.protocol import Parts, Semantics
-
-__all__ = ["Windows", "dual", "neutral"]
 
 _SCAN_BATCH = 64
 """From this batch size on a sequential scan beats the log-depth one."""

@@ -11,8 +11,8 @@ from collections.abc import Collection, Sequence
 from stlc.compile.backends.c.emit import HEAD, Motion, passes, place_in_step, roots_in, state_index
 from stlc.compile.backends.c.parts import Frame, declared, in_parts
 from stlc.compile.backends.c.plan import plan_of
+from stlc.compile.backends.c.printer import StepPrinter
 from stlc.compile.backends.c.slopes import SlopeWriter
-from stlc.compile.backends.c.unwind import Backward
 from stlc.compile.ir import nodes as ir
 
 _BUMP = """
@@ -49,9 +49,9 @@ def emit_adjoint(motion: Motion, formulas: Sequence[ir.Formula], *, fixed: Colle
         Untranslatable: the IR holds something that has no C form.
     """
     plan = plan_of(formulas, motion.steps + 1)
-    backward = Backward(plan, state_index(motion))
+    printer = StepPrinter(plan, state_index(motion))
     blocks = [roots_in(plan)]
-    blocks += [backward.lines([step]) for step in reversed(plan.steps)]
+    blocks += [printer.backward([step], {}) for step in reversed(plan.schedule.steps)]
     states, controls, steps = len(motion.states), len(motion.controls), motion.steps
     return "\n".join(
         [

@@ -9,11 +9,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from stlc.compile.backends.c.climb import CLIMB
-from stlc.compile.backends.c.formulas import Forward
 from stlc.compile.backends.c.numbers import Leaf, NumberWriter
 from stlc.compile.backends.c.parts import Frame, declared, in_parts
-from stlc.compile.backends.c.plan import plan_of
-from stlc.compile.backends.c.steps import Place, Plan
+from stlc.compile.backends.c.plan import Place, Plan, plan_of
+from stlc.compile.backends.c.printer import StepPrinter
 from stlc.compile.ir import nodes as ir
 
 LANES = 16
@@ -102,9 +101,7 @@ def state_index(motion: Motion) -> dict[str, int]:
 
 def passes(motion: Motion, plan: Plan) -> list[str]:
     """The two passes forward: `roll` fills the states, `check` gives the robustness of each requirement."""
-    forward = Forward(plan, state_index(motion))
-    blocks = [forward.lines([step]) for step in plan.steps]
-    blocks.append(roots_out(plan))
+    blocks = forward_blocks(plan, state_index(motion))
     return [
         "typedef double lane[LANES];",
         f"typedef double lanes[{motion.steps + 1}][LANES];",
@@ -118,7 +115,13 @@ def passes(motion: Motion, plan: Plan) -> list[str]:
     ]
 
 
-def roots_out(plan: Plan) -> list[str]:
+def forward_blocks(plan: Plan, index: Mapping[str, int]) -> list[list[str]]:
+    """Statements that fill the buffers of a plan and give the outcome of each formula."""
+    printer = StepPrinter(plan, index)
+    return [*(printer.forward([step], {}) for step in plan.schedule.steps), _roots_out(plan)]
+
+
+def _roots_out(plan: Plan) -> list[str]:
     """What the requirements come to, in their order."""
     return [_along(i, root, rows, "LANE out[{i}][j] = {value};") for i, root, rows in _side_by_side(plan)]
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from stlc.compile.backends.c.steps import Plan
+from stlc.compile.backends.c.plan import Plan
 
 LONG = 4_000
 """Characters from which on a function ends with the block that it has."""

@@ -1,44 +1,120 @@
-"""Formulas of the IR -> steps over buffers, which become C forwards and backwards.
+"""Formulas of the IR -> a schedule of steps with buffers, which becomes C forwards and backwards.
 
-Only instants that the roots need are computed, and equal sub-formulas at equal instants once. `freeze` is a
-loop over its instants; what does not read a frozen value is computed outside of it. Operands and requirements
-of equal shape are a loop over a table (`c_families`).
+`freeze` is a loop over its instants; what does not read a frozen value is computed outside of it. Operands
+and requirements of equal shape are a loop over a table (`families`). Functions of columns are computed once.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import islice
-from typing import assert_never
+from typing import TypeAlias
 
-from stlc.compile.backends.c.families import Family, families
-from stlc.compile.backends.c.index import Index, Stretch, at, between
+from stlc.compile.backends.c.families import Family, Table, families
 from stlc.compile.backends.c.numbers import Untranslatable
-from stlc.compile.backends.c.steps import (
-    PICKS,
-    Buffer,
-    Called,
-    CallKey,
-    Extremum,
-    Fill,
-    Frozen,
-    Joined,
-    Margin,
-    Meeting,
-    Moved,
-    Pick,
-    Place,
-    Plan,
-    Repeated,
-    Step,
-    Tabled,
-    call_of,
-)
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns_of, reach_of
 from stlc.compile.ir.traverse import frozen_in, operands, subexpressions
+from stlc.compile.schedule.schedule import (
+    PICKS,
+    IndexRange,
+    Instant,
+    Loop,
+    LoopIndex,
+    Pick,
+    Schedule,
+    Scheduler,
+    Scope,
+    Step,
+    TraceDomain,
+    earliest,
+    latest,
+)
+
+CallKey: TypeAlias = tuple[str, tuple[ir.Signal, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class Buffer:
+    """The values of a sub-formula at consecutive instants, `LANES` trajectories each.
+
+    Attributes:
+        name: of the C array.
+        origin: the instant of its first row.
+        rows: instants that there is room for.
+        place: doubles per lane that stand before it in the room.
+    """
+
+    name: str
+    origin: int
+    rows: int
+    place: int
+
+    def __getitem__(self, instant: Instant | str) -> str:
+        """C expression of the value at an instant, of lane `j`."""
+        offset = f" - {self.origin}" if self.origin > 0 else f" + {-self.origin}" if self.origin else ""
+        return f"{self.name}[{instant}{offset}][j]"
+
+
+@dataclass(frozen=True, slots=True)
+class Called:
+    """A step that gives all components of a function of columns, at all samples, numbered in turn."""
+
+    function: ir.Extern
+
+    @property
+    def components(self) -> list[ir.Extern]:
+        """The components as numbers."""
+        assert isinstance(self.function.function, ir.Body)
+        outputs = range(len(self.function.function.outputs))
+        return [replace(self.function, output=output) for output in outputs]
+
+
+@dataclass(frozen=True, slots=True)
+class Tabled:
+    """A step whose inside is run for every row of a table.
+
+    Attributes:
+        table: what differs from row to row.
+        pick: the extremum of all rows is the value, instant by instant; None: the first value of each row.
+    """
+
+    table: Table
+    pick: Pick | None
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where one value stands: a row of a buffer."""
+
+    buffer: Buffer
+    row: int
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A schedule, and where the values of its steps stand.
+
+    Attributes:
+        schedule: the steps; its roots are formulas at the first sample.
+        roots: where the robustness of each formula stands.
+        buffers: by number of the step, all of them.
+        size: doubles that they take per lane.
+        calls: functions of columns that are computed once -> number of the first component.
+    """
+
+    schedule: Schedule
+    roots: tuple[Place, ...]
+    buffers: tuple[Buffer, ...]
+    size: int
+    calls: Mapping[CallKey, int]
+
+    @property
+    def samples(self) -> int:
+        """Of a trajectory, T + 1."""
+        return self.schedule.domain.samples
 
 
 def plan_of(formulas: Sequence[ir.Formula], samples: int) -> Plan:
@@ -47,188 +123,148 @@ def plan_of(formulas: Sequence[ir.Formula], samples: int) -> Plan:
     Raises:
         Untranslatable: a window leaves the trajectory.
     """
-    planner = _Planner(samples)
-    roots = planner.roots(formulas)
-    return Plan(
-        samples, tuple(planner.scopes[0].steps), roots, tuple(planner.buffers), planner.size, planner.calls
-    )
+    planner = _Planner(TraceDomain(samples))
+    places = planner.roots(formulas)
+    numbers = tuple(number for number, _ in places)
+    schedule = Schedule(planner.domain, tuple(planner.scope.steps), numbers)
+    roots = tuple(Place(planner.buffers[number], row) for number, row in places)
+    return Plan(schedule, roots, tuple(planner.buffers), planner.size, planner.calls)
 
 
 @dataclass(slots=True)
-class _Scope:
-    """What is computed together: everything, or the inside of one `freeze`, or of the loop over a table."""
+class _Scope(Scope):
+    """Everything, the inside of one `freeze`, or that of the loop over a table."""
 
-    held: dict[str, Buffer] = field(default_factory=dict)
-    listed: frozenset[str] = frozenset()
-    steps: list[Step] = field(default_factory=list)
-    own: list[Buffer] = field(default_factory=list)
-    known: dict[tuple[ir.Formula, Stretch], Buffer] = field(default_factory=dict)
+    read: frozenset[str] = frozenset()
+    table: bool = False
+    own: list[int] = field(default_factory=list)
 
 
-@dataclass(slots=True)
-class _Planner:
-    samples: int
-    scopes: list[_Scope] = field(default_factory=lambda: [_Scope()])
-    buffers: list[Buffer] = field(default_factory=list)
-    size: int = 0
-    calls: dict[CallKey, tuple[Buffer, ...]] = field(default_factory=dict)
-    _loops: int = 0
+_FIRST = IndexRange(0, 0)
 
-    def value(self, formula: ir.Formula, run: Stretch) -> Buffer:
-        """The buffer with the robustness of a formula at the instants of `run`."""
-        formula = _split(formula)
-        depth = self._depth(formula)
-        if depth < len(self.scopes) - 1:
-            inner, self.scopes = self.scopes, self.scopes[: depth + 1]
-            frozen = any(not scope.listed for scope in inner[depth + 1 :])
-            found = self.value(formula, run.settled if frozen else run)
-            self.scopes = inner
-            return found
-        known = self.scopes[-1].known
-        key = (formula, run)
-        if key not in known:
-            known[key] = self._value(formula, run)
-        return known[key]
+
+class _Planner(Scheduler):
+    def __init__(self, domain: TraceDomain) -> None:
+        super().__init__(domain)
+        self.scope: _Scope = _Scope()
+        self.scopes = [self.scope]
+        self.buffers: list[Buffer] = []
+        self.size = 0
+        self.calls: dict[CallKey, int] = {}
+        self._loops = 0
+
+    def place(self, node: ir.Formula, run: IndexRange) -> int | None:
+        """The number of a formula, computed outside of the loops on which it does not depend."""
+        node = _split(node)
+        depth = self._depth(node)
+        around = self.scopes[depth + 1 :]
+        if not around:
+            return super().place(node, run)
+        frozen = any(not scope.table for scope in around)
+        with self._inside(self.scopes[: depth + 1]):
+            return self.place(node, run.settled if frozen else run)
+
+    def number(self, run: IndexRange) -> int:
+        """The next number, and a buffer for it."""
+        buffer = Buffer(f"b{len(self.buffers)}", earliest(run.start), run.count, self.size)
+        self.buffers.append(buffer)
+        self.size += buffer.rows
+        self.scope.own.append(number := super().number(run))
+        return number
+
+    @contextmanager
+    def _inside(self, scopes: list[_Scope]) -> Iterator[_Scope]:
+        """Other scopes for a while."""
+        before = self.scopes
+        self.scopes, self.scope = scopes, scopes[-1]
+        try:
+            yield self.scope
+        finally:
+            self.scopes, self.scope = before, before[-1]
 
     def _depth(self, formula: ir.Formula) -> int:
         """How many of the loops around a formula it depends on."""
         if len(self.scopes) == 1:
             return 0
         read = _frozen_names(formula)
-        known = (scope.held.keys() | scope.listed for scope in self.scopes)
-        return max((depth for depth, names in enumerate(known) if read & names), default=0)
+        return max((depth for depth, scope in enumerate(self.scopes) if read & scope.read), default=0)
 
-    def _value(self, formula: ir.Formula, run: Stretch) -> Buffer:
-        match formula:
-            case ir.Truth(value):
-                return self._add(Fill(self._buffer(run), run, math.inf if value else -math.inf))
-            case ir.Predicate():
-                self._check(formula.num, run)
-                return self._add(Margin(self._buffer(run), run, formula, self._held()))
+    def scheduled(self, node: ir.Formula, run: IndexRange) -> int:
+        """A new step; what would leave the plan is refused."""
+        match node:
+            case ir.Predicate(num):
+                self._check(num, run)
             case ir.BoolOp(op, items):
-                return self._join(PICKS[op], _operands(op, items), run)
-            case ir.Temporal() | ir.PastTemporal():
-                return self._window(formula, run)
-            case ir.Until() | ir.Since():
-                return self._meeting(formula, run)
-            case ir.Shift():
-                return self._shift(formula, run)
+                return self._join(node, PICKS[op], _operands(op, items), run)
+            case ir.Temporal(_, window) | ir.Until(_, window):
+                most = latest(run.last) + max(window.lo, window.hi or 0)
+                if most >= self.domain.samples:
+                    raise Untranslatable("a window that leaves the plan")
+            case ir.Shift(steps, _, None):
+                if earliest(run.start) + steps < 0 or latest(run.last) + steps >= self.domain.samples:
+                    raise Untranslatable("a sample outside of the plan")
             case ir.Freeze():
-                return self._freeze(formula, run)
-            case ir.AtStart(body):
-                first = self.value(body, between(0, 0))
-                return self._add(Repeated(self._buffer(run), run, first))
-            case _:
-                assert_never(formula)
+                return self._freeze(node, run)
+        return super().scheduled(node, run)
 
-    def roots(self, formulas: Sequence[ir.Formula]) -> tuple[Place, ...]:
-        """Where the robustness of formulas at the first sample stands; those of equal shape side by side."""
-        places: dict[int, Place] = {}
+    def roots(self, formulas: Sequence[ir.Formula]) -> list[tuple[int, int]]:
+        """Number and row of formulas at the first sample; those of equal shape stand side by side."""
+        places: dict[int, tuple[int, int]] = {}
         for family in self._families(list(map(_split, formulas))):
-            rows = self._tabled(family, between(0, 0), None)
-            places.update((member, Place(rows, row)) for row, member in enumerate(family.members))
+            number = self._tabled(family, _FIRST, None)
+            places.update((member, (number, row)) for row, member in enumerate(family.members))
         for i, formula in enumerate(formulas):
             if i not in places:
-                places[i] = Place(self.value(formula, between(0, 0)), 0)
-        return tuple(places[i] for i in range(len(formulas)))
+                places[i] = self._needed(formula, _FIRST), 0
+        return [places[i] for i in range(len(formulas))]
 
-    def _join(self, pick: Pick, items: Sequence[ir.Formula], run: Stretch) -> Buffer:
+    def _needed(self, formula: ir.Formula, run: IndexRange) -> int:
+        number = self.place(formula, run)
+        assert number is not None
+        return number
+
+    def _join(self, node: ir.BoolOp, pick: Pick, items: Sequence[ir.Formula], run: IndexRange) -> int:
         """The extremum of formulas, those of equal shape first made one."""
         found = self._families(items)
         loops = {family.members[0]: family for family in found}
         taken = {member for family in found for member in family.members[1:]}
-        parts = tuple(
-            self._tabled(loops[i], run, pick) if i in loops else self.value(item, run)
+        args = tuple(
+            self._tabled(loops[i], run, pick) if i in loops else self._needed(item, run)
             for i, item in enumerate(items)
             if i not in taken
         )
-        return parts[0] if len(parts) == 1 else self._add(Joined(self._buffer(run), run, pick, parts))
+        return args[0] if len(args) == 1 else self.add(Step(node, run, args, number=self.number(run)))
 
     def _families(self, formulas: Sequence[ir.Formula]) -> list[Family]:
         found = families(formulas, self._loops + 1)
         self._loops += len(found)
         return found
 
-    def _tabled(self, family: Family, run: Stretch, pick: Pick | None) -> Buffer:
+    def _tabled(self, family: Family, run: IndexRange, pick: Pick | None) -> int:
         table = family.table
-        out = self._buffer(run if pick else between(0, table.rows - 1))
-        inner = _Scope(listed=table.names)
-        self.scopes.append(inner)
-        body = self.value(family.shape, run)
-        self.scopes.pop()
+        number = self.number(run if pick else IndexRange(0, table.rows - 1))
+        with self._inside([*self.scopes, _Scope(read=table.names, table=True)]) as inner:
+            root = self._needed(family.shape, run)
         self._loops += 1
-        steps, own = tuple(inner.steps), tuple(inner.own)
-        return self._add(Tabled(out, run, pick, f"p{self._loops}", table, steps, own, body))
+        loop = Loop(f"p{self._loops}", (), tuple(inner.steps), tuple(inner.own), root)
+        return self.add(Step(Tabled(table, pick), run, (), loop, number))
 
-    def _window(self, node: ir.Temporal | ir.PastTemporal, run: Stretch) -> Buffer:
-        window, back = node.window, isinstance(node, ir.PastTemporal)
-        if back:
-            inner = Stretch(self._first(window, run), run.last.plus(-window.lo))
-        else:
-            inner = Stretch(run.first.plus(window.lo), self._last(window, run))
-        if inner.rows <= 0:
-            return self._nothing(node.op, run)
-        body = self.value(node.body, inner)
-        return self._add(Extremum(self._buffer(run), run, PICKS[node.op], window, body, back))
-
-    def _meeting(self, node: ir.Until | ir.Since, run: Stretch) -> Buffer:
-        window, back = node.window, isinstance(node, ir.Since)
-        if back:
-            first = self._first(window, run)
-            whole, inner = Stretch(first, run.last), Stretch(first, run.last.plus(-window.lo))
-        else:
-            last = self._last(window, run)
-            whole, inner = Stretch(run.first, last), Stretch(run.first.plus(window.lo), last)
-        if inner.rows <= 0:
-            return self._nothing(node.op, run)
-        left, right = self.value(node.left, whole), self.value(node.right, inner)
-        return self._add(Meeting(self._buffer(run), run, PICKS[node.op], window, left, right, back))
-
-    def _nothing(self, op: str, run: Stretch) -> Buffer:
-        """The extremum over no instants."""
-        return self._add(Fill(self._buffer(run), run, math.inf if PICKS[op] == "MIN" else -math.inf))
-
-    def _first(self, window: ir.Window, run: Stretch) -> Index:
-        """The first instant that a window of the past reads."""
-        return at(0) if window.hi is None else run.first.plus(-window.hi).at_least(0)
-
-    def _last(self, window: ir.Window, run: Stretch) -> Index:
-        """The last instant that a window of the future reads."""
-        last = at(self.samples - 1) if window.hi is None else run.last.plus(window.hi)
-        if max(run.last.high + window.lo, last.high) >= self.samples:
-            raise Untranslatable("a window that leaves the plan")
-        return last
-
-    def _shift(self, node: ir.Shift, run: Stretch) -> Buffer:
-        there = Stretch(run.first.plus(node.steps).at_least(0), run.last.plus(node.steps))
-        last = self.samples - 1
-        if there.last.high > last:
-            there = replace(there, last=at(last))
-        inside = run.first.low + node.steps >= 0 and run.last.high + node.steps <= last
-        if node.outside is None and not inside:
-            raise Untranslatable("a sample outside of the plan")
-        body = self.value(node.body, there) if there.rows > 0 else None
-        outside = math.inf if node.outside else -math.inf
-        return self._add(Moved(self._buffer(run), run, body, node.steps, outside))
-
-    def _freeze(self, node: ir.Freeze, run: Stretch) -> Buffer:
+    def _freeze(self, node: ir.Freeze, run: IndexRange) -> int:
         for _, num in node.bindings:
             self._check(num, run)
         self._loops += 1
-        index = f"f{self._loops}"
-        now = Index(index, run.first.low, run.last.high)
-        around, out, inner = self._held(), self._buffer(run), _Scope()
-        inner.held.update((name, self._buffer(between(0, 0), inner)) for name, _ in node.bindings)
-        self.scopes.append(inner)
-        body = self.value(node.body, Stretch(now, now))
-        self.scopes.pop()
-        numbers = tuple((inner.held[name], num) for name, num in node.bindings)
-        return self._add(Frozen(out, run, index, numbers, around, tuple(inner.steps), tuple(inner.own), body))
+        now = LoopIndex(f"f{self._loops}", earliest(run.start), latest(run.last))
+        number, read = self.number(run), frozenset(name for name, _ in node.bindings)
+        with self._inside([*self.scopes, _Scope(read=read)]) as inner:
+            bound = tuple(self.number(_FIRST) for _ in node.bindings)
+            root = self._needed(node.body, IndexRange(now, now))
+        loop = Loop(now.text, bound, tuple(inner.steps), tuple(inner.own), root)
+        return self.add(Step(node, run, (), loop, number))
 
-    def _check(self, num: ir.Num, run: Stretch) -> None:
+    def _check(self, num: ir.Num, run: IndexRange) -> None:
         """Refuse what reads beyond the plan; see to the functions that a number calls."""
         past, future = reach_of(num)
-        if run.first.low < past or run.last.high + future >= self.samples:
+        if earliest(run.start) < past or latest(run.last) + future >= self.domain.samples:
             raise Untranslatable("a sample outside of the plan")
         for part in subexpressions(num):
             key = call_of(part)
@@ -237,27 +273,24 @@ class _Planner:
 
     def _call(self, key: CallKey, num: ir.Num) -> None:
         assert isinstance(num, ir.Extern)
-        assert isinstance(num.function, ir.Body)
-        whole, first = between(0, self.samples - 1), self.scopes[0]
-        outs = tuple(self._buffer(whole, first) for _ in num.function.outputs)
-        first.steps.append(Called(outs, whole, replace(num, args=key[1], output=0)))
-        self.calls[key] = outs
+        whole, called = IndexRange(0, self.domain.samples - 1), Called(replace(num, args=key[1], output=0))
+        with self._inside(self.scopes[:1]):
+            first, *_ = [self.number(whole) for _ in called.components]
+            self.calls[key] = self.add(Step(called, whole, (), number=first))
 
-    def _held(self) -> dict[str, Buffer]:
-        return {name: buffer for scope in self.scopes for name, buffer in scope.held.items()}
 
-    def _buffer(self, run: Stretch, scope: _Scope | None = None) -> Buffer:
-        buffer = Buffer(f"b{len(self.buffers)}", run.first.low, run.rows, self.size)
-        self.buffers.append(buffer)
-        (scope or self.scopes[-1]).own.append(buffer)
-        self.size += buffer.rows
-        return buffer
+def call_of(num: ir.Num) -> CallKey | None:
+    """Under which key a number is a call whose components are computed once, at all samples."""
+    if not isinstance(num, ir.Extern) or not isinstance(num.function, ir.Body):
+        return None
+    leaves = [arg for arg in num.args if isinstance(arg, (ir.Signal, ir.ShiftedSignal))]
+    if len(leaves) < len(num.args) or len({_moved(leaf) for leaf in leaves}) > 1:
+        return None
+    return num.name, tuple(ir.Signal(leaf.name) for leaf in leaves)
 
-    def _add(
-        self, step: Fill | Margin | Joined | Extremum | Meeting | Moved | Repeated | Frozen | Tabled
-    ) -> Buffer:
-        self.scopes[-1].steps.append(step)
-        return step.out
+
+def _moved(leaf: ir.Signal | ir.ShiftedSignal) -> tuple[int, bool]:
+    return (leaf.steps, leaf.clamped) if isinstance(leaf, ir.ShiftedSignal) else (0, False)
 
 
 def _frozen_names(formula: ir.Formula) -> frozenset[str]:

@@ -1,4 +1,4 @@
-"""Extrema over windows, `until` and shifts as C, forwards and backwards.
+"""Extrema over windows and `until` as C, forwards and backwards.
 
 Backwards, the gradient of a value goes to the operand that gave it; of equal ones one gets it. `g` before the
 name of a buffer is that of its gradient. Windows that all end with the trace, or begin with it, are one pass.
@@ -7,91 +7,112 @@ name of a buffer is that of its gradient. Windows that all end with the trace, o
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import assert_never
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
-from stlc.compile.backends.c.index import Stretch
-from stlc.compile.backends.c.numbers import literal
-from stlc.compile.backends.c.steps import Extremum, Meeting, Moved, Pick
+from stlc.compile.backends.c.plan import Buffer
 from stlc.compile.ir import nodes as ir
+from stlc.compile.schedule.schedule import IndexRange, earliest
 
-_WORST: Mapping[Pick, str] = {"MIN": "INFINITY", "MAX": "(-INFINITY)"}
-_DUAL: Mapping[Pick, Pick] = {"MIN": "MAX", "MAX": "MIN"}
-_LESS: Mapping[Pick, str] = {"MIN": "<", "MAX": ">"}
+Macro: TypeAlias = Literal["MIN", "MAX"]
 
-
-def windowed(step: Extremum | Meeting | Moved, last: int) -> list[str]:
-    """Statements that give the values; `last` is the last sample."""
-    match step:
-        case Extremum():
-            return _extremum(step, last)
-        case Meeting():
-            return _meeting(step, last)
-        case Moved():
-            return _moved(step, last)
-        case _:
-            assert_never(step)
+_WORST: Mapping[Macro, str] = {"MIN": "INFINITY", "MAX": "(-INFINITY)"}
+_DUAL: Mapping[Macro, Macro] = {"MIN": "MAX", "MAX": "MIN"}
+_LESS: Mapping[Macro, str] = {"MIN": "<", "MAX": ">"}
 
 
-def windowed_back(step: Extremum | Meeting | Moved, last: int) -> list[str]:
+@dataclass(frozen=True, slots=True)
+class WindowStep:
+    """Extrema over windows of one operand; of two, `until` for MAX and `release` for MIN.
+
+    Attributes:
+        out: buffer of the values.
+        run: their instants.
+        pick: the extremum.
+        window: from each instant.
+        back: the window lies in the past: `since` and `trigger`.
+        args: buffers of the operands.
+        last: the last sample.
+    """
+
+    out: Buffer
+    run: IndexRange
+    pick: Macro
+    window: ir.Window
+    back: bool
+    args: tuple[Buffer, ...]
+    last: int
+
+    @property
+    def passes(self) -> bool:
+        """Whether every value follows from its neighbour."""
+        return self.window.hi is None and not self.run.single
+
+
+def windowed(step: WindowStep) -> list[str]:
+    """Statements that give the values."""
+    return _extremum(step) if len(step.args) == 1 else _meeting(step)
+
+
+def windowed_back(step: WindowStep) -> list[str]:
     """Statements that take the gradient by the values to what they came from."""
-    match step:
-        case Extremum():
-            return _extremum_back(step, last)
-        case Meeting():
-            return _meeting_back(step, last)
-        case Moved():
-            return _moved_back(step, last)
-        case _:
-            assert_never(step)
+    return _extremum_back(step) if len(step.args) == 1 else _meeting_back(step)
+
+
+def loop(run: IndexRange, *, back: bool = False) -> str:
+    """The head of a loop over instants `k`."""
+    if back:
+        return f"for (int k = {run.last}; k >= {run.start}; --k)"
+    return f"for (int k = {run.start}; k <= {run.last}; ++k)"
 
 
 # ---------------------------------------------------------------------- extrema
 
 
-def _extremum(step: Extremum, last: int) -> list[str]:
-    if _passes(step.window, step.run):
-        return _pass(step, last)
+def _extremum(step: WindowStep) -> list[str]:
+    if step.passes:
+        return _pass(step)
     return [
-        f"{step.run.loop()} {{",
-        *(f"  {line}" for line in _scan(step, last)),
+        f"{loop(step.run)} {{",
+        *(f"  {line}" for line in _scan(step)),
         "}",
     ]
 
 
-def _scan(step: Extremum, last: int) -> list[str]:
+def _scan(step: WindowStep) -> list[str]:
     """The value at `k` from all samples of its window."""
-    out, body, pick = step.out["k"], step.body, step.pick
-    first, stop = _ends(step.window, last, back=step.back)
+    out, body, pick = step.out["k"], step.args[0], step.pick
+    first, stop = _ends(step)
     return [
         f"LANE {out} = {_WORST[pick]};",
         f"for (int i = {first}; i <= {stop}; ++i) LANE {out} = {pick}({out}, {body['i']});",
     ]
 
 
-def _pass(step: Extremum, last: int) -> list[str]:
+def _pass(step: WindowStep) -> list[str]:
     """Every value from its neighbour."""
     out, pick, lo = step.out, step.pick, step.window.lo
     there, before = (f"k - {lo}", "k - 1") if step.back else (f"k + {lo}", "k + 1")
-    value = f"{pick}({out[before]}, {step.body[there]})"
-    if step.back and step.run.first.low < lo:
+    value = f"{pick}({out[before]}, {step.args[0][there]})"
+    if step.back and earliest(step.run.start) < lo:
         return [
-            *_begun(step, _scan(step, last)),
+            *_begun(step, _scan(step)),
             f"  else if (k < {lo}) LANE {out['k']} = {_WORST[pick]};",
             f"  else LANE {out['k']} = {value};",
             "}",
         ]
-    return [*_begun(step, _scan(step, last)), f"  else LANE {out['k']} = {value};", "}"]
+    return [*_begun(step, _scan(step)), f"  else LANE {out['k']} = {value};", "}"]
 
 
-def _extremum_back(step: Extremum, last: int) -> list[str]:
-    if _passes(step.window, step.run):
-        return _pass_back(step, last)
-    return [f"{step.run.loop()} {{", *(f"  {line}" for line in _scan_back(step, last)), "}"]
+def _extremum_back(step: WindowStep) -> list[str]:
+    if step.passes:
+        return _pass_back(step)
+    return [f"{loop(step.run)} {{", *(f"  {line}" for line in _scan_back(step)), "}"]
 
 
-def _scan_back(step: Extremum, last: int) -> list[str]:
-    out, body = step.out, step.body
-    first, stop = _ends(step.window, last, back=step.back)
+def _scan_back(step: WindowStep) -> list[str]:
+    out, body = step.out, step.args[0]
+    first, stop = _ends(step)
     return [
         f"double left[LANES]; LANE left[j] = g{out['k']};",
         f"for (int i = {first}; i <= {stop}; ++i) LANE {{",
@@ -101,16 +122,16 @@ def _scan_back(step: Extremum, last: int) -> list[str]:
     ]
 
 
-def _pass_back(step: Extremum, last: int) -> list[str]:
+def _pass_back(step: WindowStep) -> list[str]:
     out, lo = step.out, step.window.lo
     there, before = (f"k - {lo}", "k - 1") if step.back else (f"k + {lo}", "k + 1")
-    late = [f"  else if (k < {lo}) continue;"] if step.back and step.run.first.low < lo else []
+    late = [f"  else if (k < {lo}) continue;"] if step.back and earliest(step.run.start) < lo else []
     return [
-        *_begun(step, _scan_back(step, last), reverse=True),
+        *_begun(step, _scan_back(step), reverse=True),
         *late,
         "  else LANE {",
-        f"    const int hit = {step.body[there]} == {out['k']};",
-        f"    g{step.body[there]} += hit ? g{out['k']} : 0.0;",
+        f"    const int hit = {step.args[0][there]} == {out['k']};",
+        f"    g{step.args[0][there]} += hit ? g{out['k']} : 0.0;",
         f"    g{out[before]} += hit ? 0.0 : g{out['k']};",
         "  }",
         "}",
@@ -120,46 +141,46 @@ def _pass_back(step: Extremum, last: int) -> list[str]:
 # ------------------------------------------------------------------------ until
 
 
-def _meeting(step: Meeting, last: int) -> list[str]:
-    if step.window.lo == 0 and _passes(step.window, step.run):
-        return _meeting_pass(step, last)
-    return [f"{step.run.loop()} {{", *(f"  {line}" for line in _meeting_scan(step, last)), "}"]
+def _meeting(step: WindowStep) -> list[str]:
+    if step.passes and not step.window.lo:
+        return _meeting_pass(step)
+    return [f"{loop(step.run)} {{", *(f"  {line}" for line in _meeting_scan(step)), "}"]
 
 
-def _meeting_scan(step: Meeting, last: int) -> list[str]:
+def _meeting_scan(step: WindowStep) -> list[str]:
     out, pick, lo = step.out["k"], step.pick, step.window.lo
-    held = f"held[j] = {_DUAL[pick]}(held[j], {step.left['i']});"
-    near, far = _outwards(step, last)
+    held = f"held[j] = {_DUAL[pick]}(held[j], {step.args[0]['i']});"
+    near, far = _outwards(step)
     return [
         f"double held[LANES]; LANE {{ {out} = {_WORST[pick]}; held[j] = {_WORST[_DUAL[pick]]}; }}",
         *([f"{near} LANE {held}"] if lo else []),
         f"{far} LANE {{",
         f"  {held}",
-        f"  const double met = {_DUAL[pick]}({step.right['i']}, held[j]);",
+        f"  const double met = {_DUAL[pick]}({step.args[1]['i']}, held[j]);",
         f"  {out} = {pick}({out}, met);",
         "}",
     ]
 
 
-def _meeting_pass(step: Meeting, last: int) -> list[str]:
+def _meeting_pass(step: WindowStep) -> list[str]:
     """`u(k) = min(left(k), max(right(k), u(k + 1)))`, or its dual."""
     pick, before = step.pick, "k - 1" if step.back else "k + 1"
-    reached = f"{pick}({step.right['k']}, {step.out[before]})"
-    value = f"{_DUAL[pick]}({step.left['k']}, {reached})"
-    return [*_begun(step, _meeting_scan(step, last)), f"  else LANE {step.out['k']} = {value};", "}"]
+    reached = f"{pick}({step.args[1]['k']}, {step.out[before]})"
+    value = f"{_DUAL[pick]}({step.args[0]['k']}, {reached})"
+    return [*_begun(step, _meeting_scan(step)), f"  else LANE {step.out['k']} = {value};", "}"]
 
 
-def _meeting_back(step: Meeting, last: int) -> list[str]:
-    if step.window.lo == 0 and _passes(step.window, step.run):
-        return _meeting_pass_back(step, last)
-    lines = _meeting_scan_back(step, last)
-    return [f"{step.run.loop()} LANE {{", *(f"  {line}" for line in lines), "}"]
+def _meeting_back(step: WindowStep) -> list[str]:
+    if step.passes and not step.window.lo:
+        return _meeting_pass_back(step)
+    lines = _meeting_scan_back(step)
+    return [f"{loop(step.run)} LANE {{", *(f"  {line}" for line in lines), "}"]
 
 
-def _meeting_scan_back(step: Meeting, last: int) -> list[str]:
+def _meeting_scan_back(step: WindowStep) -> list[str]:
     """The first instant that gives the value: there the right side, or the worst of the left one so far."""
-    out, left, right, less = step.out["k"], step.left, step.right, _LESS[_DUAL[step.pick]]
-    near, far = _outwards(step, last)
+    out, left, right, less = step.out["k"], step.args[0], step.args[1], _LESS[_DUAL[step.pick]]
+    near, far = _outwards(step)
     worse = f"if ({left['i']} {less} {left['worst']}) worst = i;"
     return [
         f"if (g{out} == 0.0) continue;",
@@ -176,10 +197,10 @@ def _meeting_scan_back(step: Meeting, last: int) -> list[str]:
     ]
 
 
-def _meeting_pass_back(step: Meeting, last: int) -> list[str]:
-    out, left, right = step.out, step.left, step.right
+def _meeting_pass_back(step: WindowStep) -> list[str]:
+    out, left, right = step.out, step.args[0], step.args[1]
     before = "k - 1" if step.back else "k + 1"
-    lines = ["LANE {", *(f"  {line}" for line in _meeting_scan_back(step, last)), "}"]
+    lines = ["LANE {", *(f"  {line}" for line in _meeting_scan_back(step)), "}"]
     return [
         *_begun(step, lines, reverse=True),
         "  else LANE {",
@@ -193,56 +214,28 @@ def _meeting_pass_back(step: Meeting, last: int) -> list[str]:
     ]
 
 
-# ----------------------------------------------------------------------- shifts
-
-
-def _moved(step: Moved, last: int) -> list[str]:
-    out, outside = step.out["k"], literal(step.outside)
-    if step.body is None:
-        return [f"{step.run.loop()} LANE {out} = {outside};"]
-    there = f"k + ({step.steps})"
-    return [
-        f"{step.run.loop()}",
-        f"  if ({there} < 0 || {there} > {last}) LANE {out} = {outside};",
-        f"  else LANE {out} = {step.body[there]};",
-    ]
-
-
-def _moved_back(step: Moved, last: int) -> list[str]:
-    if step.body is None:
-        return []
-    there = f"k + ({step.steps})"
-    return [
-        f"{step.run.loop()}",
-        f"  if ({there} >= 0 && {there} <= {last}) LANE g{step.body[there]} += g{step.out['k']};",
-    ]
-
-
 # -------------------------------------------------------------------- in common
 
 
-def _ends(window: ir.Window, last: int, *, back: bool) -> tuple[str, str]:
+def _ends(step: WindowStep) -> tuple[str, str]:
     """First and last sample of the window of `k`."""
-    if back:
-        return "0" if window.hi is None else f"LATER(k - {window.hi}, 0)", f"k - {window.lo}"
-    return f"k + {window.lo}", f"{last}" if window.hi is None else f"k + {window.hi}"
+    lo, hi = step.window.lo, step.window.hi
+    if step.back:
+        return "0" if hi is None else f"LATER(k - {hi}, 0)", f"k - {lo}"
+    return f"k + {lo}", f"{step.last}" if hi is None else f"k + {hi}"
 
 
-def _outwards(step: Meeting, last: int) -> tuple[str, str]:
+def _outwards(step: WindowStep) -> tuple[str, str]:
     """Heads of loops from `k` to where the window begins, and on to its other end."""
-    first, stop = _ends(step.window, last, back=step.back)
+    first, stop = _ends(step)
     if step.back:
         return f"for (int i = k; i > LATER({stop}, -1); --i)", f"for (int i = {stop}; i >= {first}; --i)"
     return f"for (int i = k; i < {first}; ++i)", f"for (int i = {first}; i <= {stop}; ++i)"
 
 
-def _passes(window: ir.Window, run: Stretch) -> bool:
-    return window.hi is None and not run.single
-
-
-def _begun(step: Extremum | Meeting, lines: list[str], *, reverse: bool = False) -> list[str]:
+def _begun(step: WindowStep, lines: list[str], *, reverse: bool = False) -> list[str]:
     """The head of a pass, and what it begins with; `reverse`: in the other direction."""
     run = step.run
-    begin = run.first if step.back else run.last
-    head = run.loop(back=not step.back if not reverse else step.back)
-    return [f"{head} {{", f"  if (k == {begin.text}) {{", *(f"    {line}" for line in lines), "  }"]
+    begin = run.start if step.back else run.last
+    head = loop(run, back=not step.back if not reverse else step.back)
+    return [f"{head} {{", f"  if (k == {begin}) {{", *(f"    {line}" for line in lines), "  }"]

@@ -12,8 +12,9 @@ from collections.abc import Hashable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TypeAlias, cast, final
 
-from stlc.compile.backends.array.namespace import Ops, Pick, Sliding
+from stlc.compile.backends.array.namespace import Ops, Sliding
 from stlc.compile.backends.onnx.sheet import BATCH, Kind, Value, joined
+from stlc.compile.schedule.schedule import Pick
 
 Number: TypeAlias = Value | float
 

@@ -17,7 +17,8 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
 from stlc.compile.backends.array.kernel import Strided, WindowKernel, window_kernel
-from stlc.compile.backends.array.namespace import Pick, Sliding, dual, neutral
+from stlc.compile.backends.array.namespace import Sliding
+from stlc.compile.schedule.schedule import Pick, dual, neutral
 
 _LARGE = 1 << 12
 """From so many numbers on a gradient of our own is faster."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from stlc.compile.backends.array.namespace import Mask, Ops, Pick, Sliding
+from stlc.compile.backends.array.namespace import Mask, Ops, Sliding
 from stlc.compile.backends.torch.extrema import (
     by_kernel,
     choice,
@@ -25,6 +25,7 @@ from stlc.compile.backends.torch.extrema import (
     small_until,
 )
 from stlc.compile.ir.functions import FUNCTIONS
+from stlc.compile.schedule.schedule import Pick
 
 
 class _SafeSqrt(torch.autograd.Function):

@@ -15,16 +15,15 @@ from typing import TypeAlias, final
 
 import numpy as np
 
-from stlc.compile.backends.array.arith import Program
-from stlc.compile.backends.array.inputs import inputs
+from stlc.compile.backends.array.arith import Program, inputs
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import Reach, columns, looks_at_ends, reach, uses_end
 from stlc.compile.ir.traverse import frozen_in, map_children, nodes, numbers
-from stlc.compile.schedule.schedule import Extent, Run, reads, upto, within
+from stlc.compile.schedule.schedule import IndexRange, TraceDomain, reads, spanning, within
 
 Env: TypeAlias = Mapping[str, Array]
-Judge: TypeAlias = Callable[[ir.Formula, Env, Run, Extent], Array]
+Judge: TypeAlias = Callable[[ir.Formula, Env, IndexRange, TraceDomain], Array]
 """Values `(count, batch)` of a formula on columns `(time, batch)` at the instants of a run."""
 
 _MOST = 1 << 22
@@ -37,78 +36,80 @@ class Freezer:
     """Judges `Freeze` nodes on one trace.
 
     Attributes:
-        extent: of the trace.
+        domain: of the trace.
         env: its columns, and what is frozen around.
         ops: the array library.
         judge: the evaluator.
     """
 
-    extent: Extent
+    domain: TraceDomain
     env: Env
     ops: Ops
     judge: Judge
 
-    def values(self, node: ir.Freeze, run: Run) -> Array:
+    def values(self, node: ir.Freeze, run: IndexRange) -> Array:
         """The node at the instants `run`, `(count, batch)`."""
-        bound = within(_together(node, self.extent), run, self.extent)
+        bound = within(_together(node, self.domain), run, self.domain)
         if bound.count <= 0:
             parts = list(self._unbound(node, run))
         else:
             parts = [
-                *self._unbound(node, upto(run.start, bound.start - 1)),
+                *self._unbound(node, IndexRange(run.start, bound.start - 1)),
                 *self._bound(node, bound),
-                *self._unbound(node, upto(bound.last + 1, run.last)),
+                *self._unbound(node, IndexRange(bound.last + 1, run.last)),
             ]
         return self.ops.cat(parts) if len(parts) > 1 else parts[0]
 
-    def _unbound(self, node: ir.Freeze, run: Run) -> Iterator[Array]:
+    def _unbound(self, node: ir.Freeze, run: IndexRange) -> Iterator[Array]:
         """Where a value to freeze does not exist, what reads it is unknown, or false on a cut trace."""
         for missing, instants in groupby(range(run.start, run.start + run.count), partial(self._lost, node)):
             first, *more = instants
             kept = tuple((name, num) for name, num in node.bindings if name not in missing)
-            body = without(node.body, missing, self.extent)
+            body = without(node.body, missing, self.domain)
             if kept:
-                yield from self._bound(replace(node, bindings=kept, body=body), Run(first, 1 + len(more)))
+                yield from self._bound(
+                    replace(node, bindings=kept, body=body), spanning(first, 1 + len(more))
+                )
             else:
-                yield self.judge(body, self.env, Run(first, 1 + len(more)), self.extent)
+                yield self.judge(body, self.env, spanning(first, 1 + len(more)), self.domain)
 
     def _lost(self, node: ir.Freeze, instant: int) -> frozenset[str]:
         """Names of the values that do not exist at an instant."""
-        extent, run = self.extent, Run(instant, 1)
+        domain, run = self.domain, spanning(instant, 1)
         return frozenset(
-            name for name, num in node.bindings if within(reads(num, extent), run, extent).count <= 0
+            name for name, num in node.bindings if within(reads(num, domain), run, domain).count <= 0
         )
 
-    def _bound(self, node: ir.Freeze, run: Run) -> Iterator[Array]:
+    def _bound(self, node: ir.Freeze, run: IndexRange) -> Iterator[Array]:
         back, ahead = _neighbourhood(node.body)
         if run.count == 1 or math.isinf(back + ahead):
             yield from self._whole(node, run, back, ahead)
             return
         first = min(max(run.start, int(back)), run.last + 1)
-        last = max(min(run.last, self.extent.samples - 1 - int(ahead)), first - 1)
+        last = max(min(run.last, self.domain.samples - 1 - int(ahead)), first - 1)
         if first > run.start:
-            yield from self._whole(node, upto(run.start, first - 1), back, ahead)
-        yield from self._near(node, upto(first, last), int(back), int(ahead))
+            yield from self._whole(node, IndexRange(run.start, first - 1), back, ahead)
+        yield from self._near(node, IndexRange(first, last), int(back), int(ahead))
         if last < run.last:
-            yield from self._whole(node, upto(last + 1, run.last), back, ahead)
+            yield from self._whole(node, IndexRange(last + 1, run.last), back, ahead)
 
-    def _near(self, node: ir.Freeze, run: Run, back: int, ahead: int) -> Iterator[Array]:
+    def _near(self, node: ir.Freeze, run: IndexRange, back: int, ahead: int) -> Iterator[Array]:
         """Instants whose neighbourhood lies within the trace: it is all that is laid out."""
         length = back + ahead + 1
-        extent = replace(self.extent, samples=length, stop=None)
+        domain = replace(self.domain, samples=length, stop=None)
         for chunk in _chunks(run, max(_MOST // (length * self._batch), 1)):
             chosen = np.arange(chunk.start, chunk.last + 1)
             rows = np.arange(-back, ahead + 1)[:, None] + chosen
             env = {n: x[rows].reshape(length, -1) for n, x in self._read(node).items()}
             env |= self._held(node, chunk, length)
-            yield self.judge(node.body, env, Run(back, 1), extent).reshape(chunk.count, -1)
+            yield self.judge(node.body, env, spanning(back, 1), domain).reshape(chunk.count, -1)
 
-    def _whole(self, node: ir.Freeze, run: Run, back: float, ahead: float) -> Iterator[Array]:
+    def _whole(self, node: ir.Freeze, run: IndexRange, back: float, ahead: float) -> Iterator[Array]:
         """Any instants: the trace around them is repeated for each, and each judged in its own copy."""
         ops, batch = self.ops, self._batch
-        for chunk in _chunks(run, _edge(_MOST // batch, back + ahead, self.extent.samples)):
+        for chunk in _chunks(run, _edge(_MOST // batch, back + ahead, self.domain.samples)):
             start = max(chunk.start - back, 0)
-            stop = min(chunk.last + ahead + 1, self.extent.samples)
+            stop = min(chunk.last + ahead + 1, self.domain.samples)
             begin, length = int(start), int(stop) - int(start)
             blank = ops.full((1, chunk.count, 1), 0.0, self._like)
             env = {
@@ -116,13 +117,13 @@ class Freezer:
                 for name, x in self._read(node).items()
             }
             env |= self._held(node, chunk, length)
-            ends = self.extent.stop
-            extent = replace(self.extent, samples=length, stop=None if ends is None else ends - begin)
-            there = self.judge(node.body, env, Run(chunk.start - begin, chunk.count), extent)
+            ends = self.domain.stop
+            domain = replace(self.domain, samples=length, stop=None if ends is None else ends - begin)
+            there = self.judge(node.body, env, spanning(chunk.start - begin, chunk.count), domain)
             each = np.arange(chunk.count)
             yield there.reshape(chunk.count, chunk.count, batch)[each, each]
 
-    def _held(self, node: ir.Freeze, run: Run, length: int) -> dict[str, Array]:
+    def _held(self, node: ir.Freeze, run: IndexRange, length: int) -> dict[str, Array]:
         """The frozen values of every instant of `run`, the same at all times: `(length, count * batch)`."""
         program = Program(dict(node.bindings))
         found = program(inputs(program, self.env, run, self.ops), self.ops)
@@ -145,8 +146,8 @@ class Freezer:
         return int(self._like.shape[1])
 
 
-def _together(node: ir.Freeze, extent: Extent) -> Reach:
-    reaches = [reads(num, extent) for _, num in node.bindings]
+def _together(node: ir.Freeze, domain: TraceDomain) -> Reach:
+    reaches = [reads(num, domain) for _, num in node.bindings]
     return Reach(max(r.past for r in reaches), max(r.future for r in reaches))
 
 
@@ -169,22 +170,22 @@ def _edge(most: int, width: float, samples: int) -> int:
     return max(int((math.sqrt(width * width + 4.0 * most) - width) / 2.0), 1)
 
 
-def _chunks(run: Run, size: int) -> Iterator[Run]:
+def _chunks(run: IndexRange, size: int) -> Iterator[IndexRange]:
     for start in range(run.start, run.start + run.count, size):
-        yield upto(start, min(start + size - 1, run.last))
+        yield IndexRange(start, min(start + size - 1, run.last))
 
 
-def without(body: ir.Formula, names: frozenset[str], extent: Extent) -> ir.Formula:
+def without(body: ir.Formula, names: frozenset[str], domain: TraceDomain) -> ir.Formula:
     """The formula where nothing is known of the frozen values `names`."""
     match body:
         case ir.Predicate(num, sign):
             if not frozen_in(num) & names:
                 return body
-            return ir.Truth(extent.end == "upper" if extent.open else sign < 0, body.span)
+            return ir.Truth(domain.end == "upper" if domain.open else sign < 0, body.span)
         case ir.Freeze(bindings, inner):
             lost = {name for name, num in bindings if frozen_in(num) & names}
-            inner = without(inner, names - {name for name, _ in bindings} | lost, extent)
+            inner = without(inner, names - {name for name, _ in bindings} | lost, domain)
             kept = tuple((name, num) for name, num in bindings if name not in lost)
             return replace(body, bindings=kept, body=inner) if kept else inner
         case _:
-            return map_children(body, formulas=lambda part: without(part, names, extent))
+            return map_children(body, formulas=lambda part: without(part, names, domain))

@@ -1,0 +1,339 @@
+"""A schedule over arrays: predicates at the same instants are one program, every other step a function.
+
+Values are `(count, batch)`. What computes a step is made once for a semantics and an array library, and kept.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from typing import Any, TypeAlias, assert_never, final
+
+import numpy as np
+
+from stlc.compile.backends.array.arith import Program, inputs
+from stlc.compile.backends.array.frozen import Freezer
+from stlc.compile.backends.array.namespace import Array
+from stlc.compile.backends.array.windows import Windows
+from stlc.compile.ir import nodes as ir
+from stlc.compile.schedule.schedule import (
+    PICKS,
+    IndexRange,
+    Pick,
+    Schedule,
+    Step,
+    TraceDomain,
+    neutral,
+    reads,
+    schedule,
+    spanning,
+    within,
+)
+
+Kernel: TypeAlias = Callable[[Sequence[Array], Array], Array]
+"""The values of the operands that exist, and any column for shape, dtype and device -> `(count, batch)`."""
+
+Runner: TypeAlias = Callable[..., Array]
+"""Computes a step from those before it, the outputs of the programs, the columns, and any one of these."""
+
+_ENDLESS = 1 << 60
+"""Rows of a window to the end of the trace: more than there are."""
+
+
+# --------------------------------------------------------------------------- predicates
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Predicates that are computed together at the same instants, all of them within the trace."""
+
+    run: IndexRange
+    program: Program
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Rows of a predicate: an output of a program, or without one those of a column.
+
+    Attributes:
+        batch: number of the program; None for a column.
+        name: of the output, or of the column.
+        inside: the instants at which the predicate has a value.
+    """
+
+    batch: int | None
+    name: str
+    inside: IndexRange
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayPlan:
+    """A schedule, and how its steps are computed.
+
+    Attributes:
+        schedule: the steps.
+        batches: programs of the predicates.
+        predicates: number of a step -> where its rows come from; absent where it has no value.
+        beyond: how many values beyond the last sample there are in all.
+        runners: by semantics and array library; made when they are first needed.
+    """
+
+    schedule: Schedule
+    batches: tuple[Batch, ...]
+    predicates: dict[int, Source]
+    beyond: int = 0
+    runners: dict[Hashable, tuple[Runner, ...]] = field(default_factory=dict, compare=False, repr=False)
+
+
+def array_plan(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDomain) -> ArrayPlan:
+    """The plan for formulas at the instants `run`."""
+    found = schedule(formulas, run, domain)
+    batches, predicates = _batches(found.steps, domain)
+    stops = ((step.run.last - domain.samples + 1, step.run.count) for step in found.steps)
+    return ArrayPlan(found, batches, predicates, sum(max(min(stop), 0) for stop in stops))
+
+
+def _batches(steps: Sequence[Step], domain: TraceDomain) -> tuple[tuple[Batch, ...], dict[int, Source]]:
+    """One program for all predicates over the same stretch of the trace; bare columns need none."""
+    wanted: dict[ir.Num, list[tuple[IndexRange, int]]] = {}
+    predicates: dict[int, Source] = {}
+    for index, step in enumerate(steps):
+        if isinstance(step.node, ir.Predicate):
+            inside = within(reads(step.node.num, domain), step.run, domain)
+            if inside.count > 0 and isinstance(step.node.num, ir.Signal) and step.node.sign > 0:
+                predicates[index] = Source(None, step.node.num.name, inside)
+            elif inside.count > 0:
+                wanted.setdefault(_signed(step.node), []).append((inside, index))
+    grouped: dict[IndexRange, dict[ir.Num, list[tuple[IndexRange, int]]]] = {}
+    for num, asked in wanted.items():
+        for stretch, indices in _stretches(asked):
+            grouped.setdefault(stretch, {})[num] = indices
+    batches = []
+    for number, (stretch, nums) in enumerate(grouped.items()):
+        outputs = {str(i): num for i, num in enumerate(nums)}
+        batches.append(Batch(stretch, Program(outputs)))
+        for i, indices in enumerate(nums.values()):
+            predicates.update({index: Source(number, str(i), inside) for inside, index in indices})
+    return tuple(batches), predicates
+
+
+def _signed(atom: ir.Predicate) -> ir.Num:
+    return atom.num if atom.sign > 0 else ir.Op("neg", (atom.num,))
+
+
+def _stretches(asked: list[tuple[IndexRange, int]]) -> list[tuple[IndexRange, list[tuple[IndexRange, int]]]]:
+    """Runs that touch are put together."""
+    out: list[tuple[IndexRange, list[tuple[IndexRange, int]]]] = []
+    for run, index in sorted(asked, key=lambda item: (item[0].start, item[0].count)):
+        if out and run.start <= out[-1][0].last + 1:
+            whole, indices = out[-1]
+            out[-1] = (IndexRange(whole.start, max(whole.last, run.last)), [*indices, (run, index)])
+        else:
+            out.append((run, [(run, index)]))
+    return out
+
+
+# -------------------------------------------------------------------------------- steps
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """Makes functions of steps, for traces of one length.
+
+    Attributes:
+        domain: of the traces.
+        windows: the algorithms, with semantics and array library.
+    """
+
+    domain: TraceDomain
+    windows: Windows
+
+    @property
+    def unknown(self) -> float:
+        """What stands for what nobody knows yet; a number each where two traces are its two ends."""
+        if self.domain.end == "both":
+            both: Any = np.array([-math.inf, math.inf])
+            return both  # type: ignore[no-any-return]
+        return math.inf if self.domain.end == "upper" else -math.inf
+
+    def predicate(self, node: ir.Predicate, run: IndexRange, inside: IndexRange) -> Kernel:
+        """A predicate; its one part are the rows at the instants `inside`, signed, if there are any.
+
+        Beyond the trace a predicate is unknown, and false where windows are cut.
+        """
+        outside = self.unknown if self.domain.open else -node.sign * math.inf
+        if inside.count <= 0:
+            return self._constant(run.count, outside)
+        ops, padded = self.windows.ops, self.windows.padded
+        missing = inside.start - run.start
+        whole = inside.count == run.count
+
+        def kernel(parts: Sequence[Array], like: Array) -> Array:
+            known = parts[0]
+            if node.guard:
+                known = ops.infinite(ops.gt(known, 0.0) if node.strict else ops.ge(known, 0.0), known)
+            if whole:
+                return known
+            known = padded(known, run.count - missing, outside)
+            if not missing:
+                return known
+            return ops.cat([ops.full((missing, *like.shape[1:]), outside, like), known])
+
+        return kernel
+
+    def bind(self, step: Step) -> Kernel:
+        """Any other node."""
+        node, run = step.node, step.run
+        operands = len(step.operands)
+        match node:
+            case ir.Truth(value):
+                return self._constant(run.count, math.inf if value else -math.inf)
+            case ir.BoolOp(op):
+                pick, ops, join = PICKS[op], self.windows.ops, self.windows.semantics.join
+                return lambda parts, _: join(parts, pick, ops)
+            case ir.Temporal(op, window) | ir.Until(op, window):
+                return self._future(window, run, operands, PICKS[op])
+            case ir.PastTemporal(op, window) | ir.Since(op, window):
+                return self._past(window, run, operands, PICKS[op])
+            case ir.Shift():
+                return self._shift(node, run, operands)
+            case ir.AtStart():
+                return self._repeated(run.count)
+            case ir.Predicate() | ir.Freeze():
+                raise TypeError("predicates and frozen values come from programs")
+            case _:
+                assert_never(node)
+
+    def _constant(self, rows: int, value: float) -> Kernel:
+        full = self.windows.ops.full
+        return lambda _, like: full((rows, *like.shape[1:]), value, like)
+
+    def _repeated(self, rows: int) -> Kernel:
+        full = self.windows.ops.full
+        return lambda parts, like: parts[0] + full((rows, *like.shape[1:]), 0.0, like)
+
+    def _future(self, window: ir.Window, run: IndexRange, operands: int, pick: Pick) -> Kernel:
+        """Windows of the future; those "to the end" that start beyond it are unknown on an open trace."""
+        rows = run.count
+        beyond = neutral(pick)
+        if self.domain.open and window.hi is None:
+            rows = min(rows, self.domain.length - window.lo - run.start)
+            beyond = self.unknown
+        if rows <= 0 or not operands:
+            return self._constant(run.count, beyond)
+        inner, padded = self._windows(window, operands, pick, rows), self.windows.padded
+        if rows == run.count:
+            return inner
+        return lambda parts, like: padded(inner(parts, like), run.count, beyond)
+
+    def _past(self, window: ir.Window, run: IndexRange, operands: int, pick: Pick) -> Kernel:
+        """Windows of the past: the same, with time reversed."""
+        ops, reduce = self.windows.ops, self.windows.semantics.reduce
+        if not operands:
+            return self._constant(run.count, neutral(pick))
+        if run.count == 1 and operands == 1:
+            return lambda parts, _: reduce(parts[0], pick, ops)
+        inner, flip = self._windows(window, operands, pick, run.count), ops.flip
+        return lambda parts, like: flip(inner([flip(part) for part in parts], like))
+
+    def _windows(self, window: ir.Window, operands: int, pick: Pick, rows: int) -> Kernel:
+        """One operand: its extrema. Two: `until` from `window.lo` on, and the left one holds up to there."""
+        extrema, until, lo = self.windows.extrema, self.windows.until, window.lo
+        most = _ENDLESS if window.hi is None else window.hi - lo + 1
+        if operands == 1:
+            return lambda parts, _: extrema(parts[0], pick, count=rows, width=most)
+        return lambda parts, _: until(parts[0], parts[1], pick, count=rows, width=most, lo=lo)
+
+    def _shift(self, node: ir.Shift, run: IndexRange, operands: int) -> Kernel:
+        if node.outside is not None:
+            outside = math.inf if node.outside else -math.inf
+        elif self.domain.open:
+            outside = self.unknown
+        else:
+            outside = math.inf if node.weak else -math.inf
+        if not operands:
+            return self._constant(run.count, outside)
+        before = min(max(-(run.start + node.steps), 0), run.count)
+        ops = self.windows.ops
+
+        def kernel(parts: Sequence[Array], like: Array) -> Array:
+            body = parts[0]
+            after = run.count - before - body.shape[0]
+            rest = [ops.full((rows, *like.shape[1:]), outside, like) for rows in (before, after) if rows]
+            if not rest:
+                return body
+            return ops.cat([*rest[: bool(before)], body, *rest[bool(before) :]])
+
+        return kernel
+
+
+# ------------------------------------------------------------------------------ running
+
+
+def all_values(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
+    """The values of all steps over columns `(time, batch)`."""
+    ops, like = windows.ops, next(iter(env.values()))
+    runners = plan.runners.get(windows)
+    if runners is None:
+        machine = Machine(plan.schedule.domain, windows)
+        runners = tuple(_runner(plan, step, machine) for step in plan.schedule.steps)
+        plan.runners[windows] = runners
+    outputs = [batch.program(inputs(batch.program, env, batch.run, ops), ops) for batch in plan.batches]
+    values: list[Array] = []
+    for runner in runners:
+        values.append(runner(values, outputs, env, like))
+    return values
+
+
+def _runner(plan: ArrayPlan, step: Step, machine: Machine) -> Runner:
+    if isinstance(step.node, ir.Freeze):
+        return _frozen(step.node, step.run, machine)
+    if isinstance(step.node, ir.Predicate):
+        return _predicate(plan, step, machine)
+    kernel, parts = machine.bind(step), step.operands
+    if len(parts) == 1:
+        (only,) = parts
+        return lambda values, _, __, like: kernel((values[only],), like)
+    return lambda values, _, __, like: kernel([values[part] for part in parts], like)
+
+
+def _predicate(plan: ArrayPlan, step: Step, machine: Machine) -> Runner:
+    """Its rows come from a program, or are those of a column."""
+    source, domain = plan.predicates.get(step.number), plan.schedule.domain
+    if source is None:
+        kernel = machine.predicate(step.node, step.run, spanning(step.run.start, 0))
+        return lambda _, __, ___, like: kernel((), like)
+    number, name, inside = source.batch, source.name, source.inside
+    kernel = machine.predicate(step.node, step.run, inside)
+    if number is None:
+        if inside.count == domain.samples:
+            return lambda _, __, env, like: kernel((env[name],), like)
+        first, stop = inside.start, inside.last + 1
+        return lambda _, __, env, like: kernel((env[name][first:stop],), like)
+    offset = inside.start - plan.batches[number].run.start
+    if offset == 0 and plan.batches[number].run.count == inside.count:
+        return lambda _, outputs, __, like: kernel((outputs[number][name],), like)
+    rows = slice(offset, offset + inside.count)
+    return lambda _, outputs, __, like: kernel((outputs[number][name][rows],), like)
+
+
+def _frozen(node: ir.Freeze, run: IndexRange, machine: Machine) -> Runner:
+    domain, windows = machine.domain, machine.windows
+    judge = partial(_judge, windows=windows)
+    return lambda _, __, env, ___: Freezer(domain, env, windows.ops, judge).values(node, run)
+
+
+def _judge(
+    formula: ir.Formula, env: Mapping[str, Array], run: IndexRange, domain: TraceDomain, *, windows: Windows
+) -> Array:
+    """One formula at consecutive instants, on the trace or beyond it: `(count, batch)`."""
+    plan = _scheduled(formula, run, domain)
+    return all_values(plan, env, windows)[plan.schedule.roots[0]]
+
+
+@lru_cache(maxsize=512)
+def _scheduled(formula: ir.Formula, run: IndexRange, domain: TraceDomain) -> ArrayPlan:
+    return array_plan((formula,), run, domain)
