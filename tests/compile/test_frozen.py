@@ -11,6 +11,7 @@ from formula_strategies import GRID, SPAN, formulas, traces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stlc.compile.backends.array import frozen
 from stlc.compile.backends.array.graph import evaluate, robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
@@ -18,7 +19,6 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
-from stlc.compile.backends.array import frozen
 
 Env = dict[str, np.ndarray]
 

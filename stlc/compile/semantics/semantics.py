@@ -16,17 +16,11 @@ A semantics is one file of `stlc.compile.semantics.kinds`, called by its name.
 
 from __future__ import annotations
 
-<<<<<<< HEAD
-from stlc.compile.backends.array.namespace import Pick
+from stlc.compile.schedule.schedule import Pick
 from stlc.compile.semantics.kinds.agm import ArithmeticGeometricMean
 from stlc.compile.semantics.kinds.dgmsr import GeneralizedMean
 from stlc.compile.semantics.kinds.exact import Exact
 from stlc.compile.semantics.kinds.smooth import LogSumExp
-=======
-from stlc.compile.schedule.schedule import Pick
-from stlc.compile.semantics.extrema import Exact, LogSumExp
-from stlc.compile.semantics.means import ArithmeticGeometricMean, GeneralizedMean
->>>>>>> 3615333 (schedule: one for every back end)
 from stlc.compile.semantics.protocol import Parts, Semantics
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.registry import SEMANTICS
