@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from stlc.trace import Trace
 
     def compile(spec: ast.Spec, system: System) -> Task:
-        """What the package `stlc.compile` does when it is called."""
+        """Call of the package `stlc.compile` as a function."""
 
 else:
     import stlc.compile as compile

@@ -34,7 +34,7 @@ _OPEN_FOLDERS = Path("/proc/self/fd")
 
 
 class Unusable(Exception):  # noqa: N818 - an answer, caught by who asks
-    """Why a folder is not used.
+    """Reason for which a folder is not used.
 
     Attributes:
         why: said after the name of the folder.
@@ -110,7 +110,7 @@ class Cache:
             return []
 
     def size(self) -> tuple[int, int]:
-        """How many files there are, and how many bytes."""
+        """Number of files and of their bytes."""
         sizes = [found.st_size for _, found in _entries(self)]
         return len(sizes), sum(sizes)
 
@@ -135,7 +135,7 @@ def _tell(what: str, instead: str) -> None:
 
 
 def place() -> Path:
-    """Where the cache belongs: `$XDG_CACHE_HOME/stlc`, else `~/.cache/stlc`. Raises Unusable."""
+    """Folder of the cache: `$XDG_CACHE_HOME/stlc`, else `~/.cache/stlc`. Raises Unusable."""
     home = os.environ.get("XDG_CACHE_HOME", "")
     if home and Path(home).is_absolute():  # relative ones are to be ignored, says the XDG specification
         return Path(home) / "stlc"
@@ -164,7 +164,7 @@ def lasting() -> Cache | None:
 
 
 def why_not() -> str:
-    """Why there is no lasting cache; "" where there is one."""
+    """Reason for which there is no lasting cache; "" where there is one."""
     try:
         opened()
     except Unusable as refused:

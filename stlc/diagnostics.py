@@ -1,4 +1,4 @@
-"""What can be wrong, as data: codes, labels, help. Rendering is done in `stlc.cli.framework.render`."""
+"""Diagnostics as data: codes, labels, help. Rendering is done in `stlc.cli.framework.render`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Fix:
 
 @dataclass(frozen=True, slots=True)
 class Diagnostic:
-    """One finding.
+    """A finding about an input or about the machine.
 
     Attributes:
         code: an entry of `CODES`; codes that start with W are warnings.
@@ -54,11 +54,11 @@ class Diagnostic:
 
     @property
     def severity(self) -> Severity:
-        """Whether this is an error or a warning."""
+        """Error or warning, by the letter of the code."""
         return "warning" if self.code.startswith("W") else "error"
 
     def with_note(self, text: str) -> Diagnostic:
-        """The same finding with one more note."""
+        """Copy with one more note."""
         return replace(self, note=(*self.note, text))
 
 
@@ -92,7 +92,7 @@ def tell(sink: list[Diagnostic], finding: Diagnostic) -> None:
 
 
 class StlcError(Exception):
-    """Something is wrong with what the user gave; `exit_code` is that of the command line."""
+    """Base of errors in what the user gave; `exit_code` is that of the command line."""
 
     exit_code = 3
 
@@ -101,7 +101,7 @@ class StlcError(Exception):
         self.diagnostics = diagnostics
 
     def __reduce__(self) -> tuple[type[StlcError], tuple[Diagnostic, ...]]:
-        """From one process to another an error goes with its findings."""
+        """Pickled form: an error keeps its findings between processes."""
         return type(self), self.diagnostics
 
 
@@ -134,7 +134,7 @@ class MissingError(StlcError):
 
 
 class Notice(UserWarning):
-    """Something about the machine that changes no result; the command line shows the finding, once."""
+    """Warning about the machine that changes no result; the command line shows its finding once."""
 
     def __init__(self, finding: Diagnostic) -> None:
         super().__init__(": ".join((finding.code, "; ".join((finding.message, *finding.help)))))

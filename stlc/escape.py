@@ -93,7 +93,7 @@ def _ansi(char: str) -> str:
 
 
 def _raw(char: str) -> bool:
-    """Whether it stands for a byte of a file name that is not UTF-8."""
+    """True for a character that stands for a byte of a file name that is not UTF-8."""
     return "\udc80" <= char <= "\udcff"
 
 

@@ -217,14 +217,14 @@ def find_trace(name: str, runs: Path = Path("runs")) -> Path:
 
 
 def _is_bag(path: Path) -> bool:
-    """Whether a path is the folder of a bag of ROS 2."""
+    """True if a path is the folder of a ROS 2 bag."""
     with suppress(OSError):
         return path.is_dir() and ((path / "metadata.yaml").is_file() or any(map(is_stored, path.iterdir())))
     return False
 
 
 def is_stored(path: Path) -> bool:
-    """Whether a path is a file of a bag of ROS 2, packed or not."""
+    """True if a path is a file of a ROS 2 bag, packed or not."""
     return path.name.lower().removesuffix(".zstd").endswith((".db3", ".mcap")) and path.is_file()
 
 

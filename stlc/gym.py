@@ -44,7 +44,7 @@ MOST = 10.0
 
 
 class SpecEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
-    """One agent in the world of a system, rewarded by the robustness of a specification.
+    """Environment of one agent in the world of a system, rewarded by the robustness of a specification.
 
     An observation is what the system's policy observes, (k,) float32, then the share of the episode that is
     over where it is terminated at its end: what is left to earn depends on it. Its bounds are finite, what
@@ -113,7 +113,7 @@ class SpecEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._seen(), info
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One step of the world under `action`, (m,)."""
+        """Advance the world by one step under `action`, (m,)."""
         if self._worlds is None or len(self._driven) > self.steps:
             raise UsageError(Diagnostic("U101", "the episode is over", help=("call `reset` first",)))
         held = self._actuators.clipped(action, unit=self.normalised)
@@ -135,7 +135,7 @@ class SpecEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._observed.told(seen, unit=self.normalised)
 
     def _judged(self) -> dict[str, Any]:
-        """What the last horizon of the episode is worth, or as much of it as there is."""
+        """Robustness of the last horizon of the episode, or of as much of it as there is."""
         driven = torch.cat(self._driven[-self.task.horizon - 1 :]).numpy(force=True)
         columns = {name: driven[:, i, None] for i, name in enumerate(self.task.names)}
         margins = evaluate(self._formulas, columns, ops=NUMPY, end="truncate")

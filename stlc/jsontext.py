@@ -72,7 +72,7 @@ _ESCAPES = re.compile(r"(\\\\|\\u[dD][89abAB]..\\u[dD][c-fC-F]..)|\\u[dD][89a-fA
 
 
 def loads(text: str) -> Any:
-    """What a JSON text from elsewhere holds; half of a character, which no file can hold, becomes U+FFFD.
+    """Data of a JSON text from elsewhere; half of a character, which no file can hold, becomes U+FFFD.
 
     Raises:
         ValueError: it is no JSON.

@@ -67,7 +67,7 @@ Doubles = "NDArray[np.float64]"
 
 @dataclass(frozen=True, slots=True)
 class Climb:
-    """How plans are to be improved; all arrays contiguous float64.
+    """Parameters of a local search; all arrays contiguous float64.
 
     Attributes:
         bounds: lowest and highest value of each control, and 1 where it is an angle that turns round, (3, m).
@@ -163,7 +163,7 @@ class Kernel:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What is differentiated.
+    """Derivatives of an objective by robustness and states.
 
     Attributes:
         by_rho: its derivative by the robustness of each requirement, (B, R).
@@ -286,7 +286,7 @@ def load(text: str) -> ctypes.CDLL | None:
 
 
 def why_none(text: str) -> str:
-    """Why `load` gave None for a text, in words that follow "because"."""
+    """Reason for which `load` gave None for a text, in words that follow "because"."""
     using = compiler()
     if using is None:
         return "there is no C compiler"
@@ -333,7 +333,7 @@ _made: dict[str, Cache | None] = {}
 
 
 def _key(text: str, using: str) -> str:
-    """What a library is built from and by. Raises CompilerError."""
+    """Hash of everything that a library is built from and by. Raises CompilerError."""
     parts = (text, using, version(using), *FLAGS, *VECTOR_FLAGS, _processor())
     return hashlib.sha256("\0".join(parts).encode(errors="surrogateescape")).hexdigest()[:32]
 
@@ -400,7 +400,7 @@ def _attempted(using: str, source: Path, target: Path, level: str) -> str:
 
 
 def _processor() -> str:
-    """What `-march=native` depends on."""
+    """Features of the processor, on which `-march=native` depends."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""What a result depends on besides its inputs: versions, the state of the source tree, the machine."""
+"""Provenance of a result besides its inputs: versions, state of the source tree, machine."""
 
 from __future__ import annotations
 

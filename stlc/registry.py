@@ -86,14 +86,14 @@ class Registry(Generic[T]):
         return self._entries[name]
 
     def suggest(self, name: str) -> str:
-        """One line of help for somebody who wrote `name`."""
+        """Help in one line for a misspelt `name`."""
         known = f"{self.kind}s: {', '.join(self.names)}" if self.names else f"there is no {self.kind}"
         near = closest(name, self.names)
         return known if near is None else f"did you mean `{near}`?  {known}"
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All names, in the order in which they were entered."""
+        """Names in the order in which they were entered."""
         return tuple(self._entries)
 
     def __contains__(self, name: object) -> bool:

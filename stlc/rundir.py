@@ -1,4 +1,4 @@
-"""One folder = one run, self-describing: `runs/<spec>/<number>-<words>`.
+"""Folder of a run, self-describing: `runs/<spec>/<number>-<words>`.
 
 A run is never overwritten: a new one takes the next number. `runs/latest` and `runs/<spec>/latest` are links
 to the newest. Whole files are written beside and renamed; rows are appended so that a kill costs at most
@@ -24,7 +24,6 @@ from stlc.escape import file_part, shell
 from stlc.files import write_atomic
 from stlc.jsontext import dumps
 from stlc.registry import closest
-from stlc.words import draw_words
 
 Status = Literal["running", "finished", "interrupted", "failed"]
 
@@ -155,7 +154,7 @@ class RunDir:
             raise RunError(self._damaged(name, error)) from error
 
     def record(self) -> dict[str, Any]:
-        """What `run.json` says about the run. Raises RunError (R101) if it is missing or damaged."""
+        """Content of `run.json`. Raises RunError (R101) if it is missing or damaged."""
         record = self.read_json(RECORD)
         if not isinstance(record, dict):
             raise RunError(self._damaged(RECORD, ValueError("it is no JSON object")))
@@ -176,7 +175,7 @@ class RunDir:
 
     @property
     def status(self) -> Status:
-        """How far the run came. Raises RunError (R101) if `run.json` is damaged."""
+        """Status of the run. Raises RunError (R101) if `run.json` is damaged."""
         status: Status = self.record().get("status", "running")
         return status
 
@@ -233,7 +232,7 @@ class RunDir:
 
 
 def every_run(root: Path = RUNS) -> list[RunDir]:
-    """All runs below `root` that have a record, by spec and number."""
+    """Runs below `root` that have a record, by spec and number."""
     paths = (path for path in root.glob("*/*") if not path.is_symlink() and _NUMBERED.fullmatch(path.name))
     return [RunDir(path) for path in sorted(paths) if (path / RECORD).is_file()]
 
@@ -308,7 +307,7 @@ def _spec_path(run: RunDir) -> Path | None:
 
 
 def _names(run: RunDir) -> tuple[str, str, str, str]:
-    """Everything that names a run: all of it, its number twice, its words."""
+    """Names of a run: its folder, its number twice, its words."""
     number, _, words = run.name.partition("-")
     return run.name, number, str(int(number)), words
 
@@ -386,3 +385,31 @@ def _drop_torn_line(descriptor: int) -> None:
         return
     data = os.pread(descriptor, size, 0)
     os.ftruncate(descriptor, data.rfind(b"\n") + 1)
+
+
+# ---------------------------------------------------------------------- words
+
+
+_ADJECTIVES = """
+    able amber ample azure blunt bold brisk broad calm candid clear coral crisp deft dusky eager
+    early even fair fleet fresh gentle glad golden grand green hardy hazel honest humble jolly keen
+    kind level light lively lucid lunar mellow merry mild misty modest neat nimble noble open
+    patient plain polar prompt proud quick quiet rapid ready robust rosy rustic sandy serene sharp
+    silent silver sleek smooth solid sound spry steady still stout sunny supple swift tall tawny
+    tidy timely tranquil true upbeat vivid warm wary wise witty
+"""
+_ANIMALS = """
+    adder alpaca auk badger bat beaver bee bison boar bobcat bream bunting buzzard carp civet cod
+    condor coot crane cricket crow curlew deer dipper dolphin dove duck dunlin eagle egret eider elk
+    ermine falcon ferret finch fox gannet gecko goose goshawk grebe grouse gull hare harrier hawk
+    hedgehog heron hoopoe ibex ibis jackdaw jay kestrel kite lark lemur linnet lizard llama loon
+    lynx magpie marten merlin mole moose moth newt ocelot orca oriole osprey otter owl panda pika
+    pike plover puffin quail raven robin salmon seal shrew siskin skua snipe sparrow stoat stork
+    swallow swan swift tapir teal tern thrush toad trout turtle vole walrus warbler weasel whale
+    wigeon wolf wombat wren yak zebra
+"""
+
+
+def draw_words() -> str:
+    """Two words, such as `quiet-heron`. Independent of every seed of an experiment."""
+    return f"{secrets.choice(_ADJECTIVES.split())}-{secrets.choice(_ANIMALS.split())}"

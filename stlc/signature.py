@@ -1,4 +1,4 @@
-"""Which column is what: the ordered, named columns of a state tensor or a trace."""
+"""Signature of a state tensor or a trace: its ordered, named columns."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Role = Literal["input", "output", "state", "env", "timer"]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One scalar column.
+    """A scalar column.
 
     Attributes:
         name: as written in specifications and system files.
@@ -64,5 +64,5 @@ class Signature:
         return self.names.index(name)
 
     def extended(self, *columns: Column) -> Signature:
-        """The same columns with `columns` appended."""
+        """Signature with `columns` appended."""
         return Signature((*self.columns, *columns))

@@ -1,4 +1,4 @@
-"""Where text came from: a file's text, and spans of it."""
+"""Source texts and spans of them."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def leaving(undo: Callable[[int], object]) -> Iterator[None]:
 
 
 def undoing(undo: Callable[[int], object]) -> int:
-    """From now on a forced end calls `undo`, as in `leaving`; returns its number."""
+    """Register `undo` for a forced end, as in `leaving`; returns its number."""
     key = next(_numbers)
     _undone[key] = undo
     return key

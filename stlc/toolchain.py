@@ -67,7 +67,7 @@ class HangsError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What a program gave: its exit code, and what it wrote."""
+    """Result of a program: its exit code and its output."""
 
     code: int
     out: str
@@ -106,7 +106,7 @@ _versions: dict[str, str] = {}
 
 
 def version(using: str) -> str:
-    """What a compiler says of itself, with the date and size of its file. Raises CompilerError."""
+    """Version text of a compiler, with the date and size of its file. Raises CompilerError."""
     key = _identity(using)
     why = trouble(key)
     if why:
@@ -127,7 +127,7 @@ def _identity(using: str) -> str:
 
 
 def works(using: str) -> str:
-    """Why a compiler cannot build a library, "" where it can; what is remembered is forgotten."""
+    """Reason for which a compiler cannot build a library, "" where it can; earlier failures are forgotten."""
     forget()
     try:
         version(using)
@@ -143,7 +143,7 @@ def works(using: str) -> str:
 
 
 def failure(done: Done) -> str:
-    """What went wrong, in a line."""
+    """Error message of a compiler in one line."""
     lines = [line.strip() for line in (done.said or done.out).splitlines() if line.strip()]
     told = next((line for line in lines if "error" in line.lower()), lines[0] if lines else "")
     return f"fails with exit code {done.code}" + (f": {told[:160]}" if told else "")
@@ -156,7 +156,7 @@ _known: dict[str, str] = {}
 
 
 def trouble(key: str) -> str:
-    """Why something failed lately, in this process or another; "" where it did not."""
+    """Reason of a recent failure, in this process or another; "" where there was none."""
     if key in _known:
         return _known[key]
     kept = cache.lasting()
@@ -181,7 +181,7 @@ def remember(key: str, why: str, *, seconds: float | None = None) -> None:
 
 
 def remembered() -> list[str]:
-    """Why commands do without the compiler at present."""
+    """Reason for which commands do without the compiler at present."""
     kept = cache.lasting()
     found = [] if kept is None else [_recorded(kept, name) for name in kept.names(_TROUBLE)]
     return list(dict.fromkeys(filter(None, [*_known.values(), *found])))
@@ -296,14 +296,14 @@ def _await(process: subprocess.Popen[bytes]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Use:
-    """What the processes of a session use: seconds of the processor, and bytes of memory."""
+    """Resources used by the processes of a session: seconds of the processor, bytes of memory."""
 
     seconds: float
     memory: int
 
 
 def _use(session: int) -> _Use | None:
-    """What the processes of a session use, with the time of those that ended; None if unknown."""
+    """Resources used by the processes of a session, ended ones included; None if unknown."""
     ticks, pages, known = 0, 0, False
     for path in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError, ValueError, IndexError):

@@ -42,12 +42,12 @@ class Unit:
 
     @property
     def scale(self) -> float:
-        """How many SI units one of it is."""
+        """Size of the unit in SI units."""
         return float(self.ratio)
 
     @property
     def dimensionless(self) -> bool:
-        """Whether all exponents are 0."""
+        """True if all exponents are 0."""
         return self.dims == _NONE
 
     @property
@@ -195,7 +195,7 @@ _CELSIUS = re.compile(r"deg(?:ree)?s?[_. ]*C(?:elsius)?|°[_ ]*C|Cel(?:sius)?|ce
 
 
 def means_celsius(text: str) -> bool:
-    """Whether somebody means degrees Celsius, however written."""
+    """True for spellings of degrees Celsius."""
     return _CELSIUS.fullmatch(text.strip()) is not None
 
 
@@ -208,7 +208,7 @@ def nearest(value: Fraction | float) -> float:
 
 
 def same_dims(a: Unit, b: Unit) -> bool:
-    """Whether quantities of these units can be added and compared."""
+    """True if quantities of these units can be added and compared."""
     return a.dims == b.dims
 
 
@@ -231,7 +231,7 @@ def _factors(text: str) -> list[tuple[str, int]]:
 
 
 def _in_kelvin(factors: Iterable[tuple[str, int]]) -> str:
-    """What to write for a product with `degC`."""
+    """Advice for a product with `degC`."""
     powers: dict[str, int] = {}
     for symbol, power in factors:
         known = SYMBOLS.get(symbol)

@@ -19,7 +19,7 @@ ROOMS = (
     {"source", "version", "stopping"},
     {"diagnostics"},
     {"escape"},
-    {"registry", "units", "words", "jsontext"},
+    {"registry", "units", "jsontext"},
     {"signature"},
     {"rundir", "files", "provenance", "cache", "toolchain", "native", "trace"},
     {"grammar"},

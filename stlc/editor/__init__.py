@@ -1,1 +1,1 @@
-"""What an editor asks of a specification while it is written."""
+"""Answers to an editor about a specification while it is written."""

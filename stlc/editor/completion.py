@@ -1,4 +1,4 @@
-"""What can be written at a cursor: the words that the grammar takes there, and the names that it takes.
+"""Completion at a cursor: words that the grammar accepts there, and names of the kind that it accepts.
 
 The parser reads the declaration up to the cursor and says which terminals may follow; where it cannot read
 that far, everything is offered.
@@ -40,7 +40,7 @@ _FIRST_UNITS = ("s", "steps", "ms", "min", "m", "m/s", "m/s^2", "rad", "deg", "1
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """Something that may be written.
+    """A completion.
 
     Attributes:
         text: as it is inserted, in place of what is written already.
@@ -66,7 +66,7 @@ class Completion:
 
 
 def complete(document: Document, offset: int) -> Completion:
-    """What can be written at `offset`, whatever stands behind it."""
+    """Completions at `offset`; the text behind it is not looked at."""
     text = document.source.text[:offset]
     if _SILENT.fullmatch(text[text.rfind("\n") + 1 :]):
         return Completion(offset, ())
@@ -92,13 +92,13 @@ def complete(document: Document, offset: int) -> Completion:
 
 
 def _piece_start(text: str) -> int:
-    """Where the declaration begins that the end of a text stands in."""
+    """Start of the last declaration of a text."""
     starts = declaration_starts(text)
     return starts[bisect_right(starts, len(text)) - 1]
 
 
 def _units_at(piece: str, text: str) -> str | None:
-    """What is written of a unit in brackets, or None where no unit stands."""
+    """Beginning of a unit in brackets, or None where no unit stands."""
     head, bracket, tail = piece.rpartition("[")
     written = _UNIT_PREFIX.search(text)
     assert written is not None
@@ -112,7 +112,7 @@ def _units_at(piece: str, text: str) -> str | None:
 
 
 def _fitting(document: Document, offset: int, piece: str, accepted: frozenset[str]) -> Iterator[Offer]:
-    """What the parser would take."""
+    """Tokens that the parser accepts next."""
     yield from _keywords(accepted)
     if "UNIT" in accepted:
         yield from _units()
@@ -175,7 +175,7 @@ def _functions() -> Iterator[Offer]:
 
 
 def _new_names(document: Document, piece: str) -> Iterator[Offer]:
-    """Where only a name can stand: a type, or a state of the system that is not declared yet."""
+    """Completions where only a name can stand: types, or undeclared states of the system."""
     words = [lexeme.text for lexeme in lexemes(piece)]
     if words[-1:] in ([":"], [">"], ["->"]):
         yield from (Offer(name, "type", text) for name, text in TYPES.items())
@@ -190,7 +190,7 @@ def _new_names(document: Document, piece: str) -> Iterator[Offer]:
 
 
 def _shared(document: Document, alias: str) -> Iterator[Offer]:
-    """What a module offers."""
+    """Completions from a module."""
     for module in document.modules:
         if module.alias == alias:
             for item in shared(module):

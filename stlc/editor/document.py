@@ -43,7 +43,7 @@ _MAX_LABELS = 8
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What is to be shown at a place of the text.
+    """A diagnostic and its place in the text.
 
     Attributes:
         diagnostic: as the command line would show it.
@@ -58,7 +58,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Document:
-    """One text, looked at once. Everything that is asked of it comes from here.
+    """Analysis of one version of a text, from which all requests are answered.
 
     Attributes:
         source: the text, under the path of its file.
@@ -86,7 +86,7 @@ class Document:
 
     @cached_property
     def modules(self) -> tuple[Module, ...]:
-        """What it imports; nothing where a file cannot be read."""
+        """Imported modules; empty where a file cannot be read."""
         try:
             return load_modules(self.spec)
         except StlcError:
@@ -94,13 +94,13 @@ class Document:
 
     @cached_property
     def meaning(self) -> Meaning:
-        """What its names and intervals come to."""
+        """Meaning of its names and intervals."""
         interface = None if self.system is None else self.system.interface()
         return understand(self.spec, self.modules, interface=interface, grid=self.grid)
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
-        """Everything that `stlc lint` says of it, in the order of the text.
+        """Findings of `stlc lint`, in the order of the text.
 
         Where only training is in the way of it, errors are mild: a monitor takes such a specification.
         """
@@ -240,7 +240,7 @@ class Meaning:
     interface: Interface | None = field(default=None, repr=False)
 
     def value(self, name: str) -> Value | None:
-        """What a signal, constant, region or definition without arguments is; None where that fails."""
+        """Value of a signal, constant, region or definition without arguments; None where that fails."""
         entry = self.scope.entries.get(name)
         if isinstance(entry, Known):
             return entry.value
@@ -253,7 +253,7 @@ class Meaning:
             return None
 
     def steps(self, name: str) -> int | None:
-        """How many steps ahead a formula looks; None where the grid does not say."""
+        """Lookahead of a formula, steps; None where the grid does not say."""
         formula = self.formulas.get(name)
         if formula is None:
             return None
@@ -280,7 +280,7 @@ class Meaning:
 def understand(
     spec: ast.Spec, modules: tuple[Module, ...], *, interface: Interface | None, grid: Grid
 ) -> Meaning:
-    """What can be understood of a specification; findings are dropped, the compiler reports them."""
+    """Meaning of a specification as far as it resolves; findings are dropped, the compiler reports them."""
     scope = Scope(temporal=True, time_unit=spec.time_unit)
     file = declared(spec, modules, interface, {}, scope)
     columns = {decl.name: _ranged(decl, plain, unit, file.scope) for decl, plain, unit in file.found.columns}
@@ -298,7 +298,7 @@ def _ranged(
 
 
 def _formulas(spec: ast.Spec, meaning: Meaning) -> dict[str, typed.Formula]:
-    """By name; a requirement wins over a definition of the same name."""
+    """Formulas by name; a requirement precedes a definition of the same name."""
     found: dict[str, typed.Formula] = {}
     for item in spec.items:
         if isinstance(item, ast.Def):
@@ -346,7 +346,7 @@ class Borrowed:
 
 
 def shared(module: Module) -> tuple[ast.Item, ...]:
-    """What can be used of a module; its requirements are its own."""
+    """Declarations of a module that others can use: all but its requirements."""
     return tuple(item for item in module.spec.items if not isinstance(item, ast.Require | ast.Assume))
 
 
@@ -371,7 +371,7 @@ def borrowed_at(spec: ast.Spec, modules: tuple[Module, ...], offset: int) -> Bor
 
 
 def definition(document: Document, offset: int) -> tuple[Span, ...]:
-    """Where to go from a cursor.
+    """Places of the declaration of the name at a cursor.
 
     From a use to the declaration; from the declaration of a signal, a parameter or a constant to the system
     file that has it too; from `system "file"` into that file; from `module.name` into the module.
@@ -392,7 +392,7 @@ def definition(document: Document, offset: int) -> tuple[Span, ...]:
 
 
 def system_place(document: Document, symbol: Symbol) -> Span | None:
-    """Where the system file declares a symbol, if it does."""
+    """Place of a symbol in the system file, if it is declared there."""
     if document.system is None or symbol.kind not in ("signal", "param", "const", "extern"):
         return None
     item = symbol.item

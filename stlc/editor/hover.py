@@ -1,4 +1,4 @@
-"""What there is to say about the word under a cursor: sort, unit, range, value, time in seconds and steps."""
+"""Hover text of the word under a cursor: sort, unit, range, value, time in seconds and steps."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _is_temporal(lexeme: Lexeme) -> bool:
 
 
 def _place_of(document: Document, node: ast.Temporal | ast.Until, lexeme: Lexeme | None, offset: int) -> Span:
-    """From the word that a cursor touches to the end of the interval behind it."""
+    """Span from the word at a cursor to the end of the interval behind it."""
     word = (offset, offset) if lexeme is None else (lexeme.start, lexeme.end)
     if node.interval is None:
         return document.source.span(*word)
@@ -125,7 +125,7 @@ def about_shared(item: ast.Item, key: str) -> str:
 
 
 def summary(document: Document, symbol: Symbol) -> str:
-    """One line: sort, unit, range."""
+    """Sort, unit and range in one line."""
     return next(iter(_facts(document, symbol)), symbol.kind)
 
 

@@ -19,7 +19,7 @@ _NAME = re.compile(r"[^\W\d]\w*")
 
 
 class RenameError(Exception):
-    """Why a name cannot be changed to that."""
+    """Reason for which a name cannot be changed."""
 
 
 _FROM_ELSEWHERE = ("module", "extern", "param")
@@ -27,7 +27,7 @@ _FROM_ELSEWHERE = ("module", "extern", "param")
 
 
 def can_rename(document: Document, offset: int) -> Occurrence | None:
-    """What would be renamed, if that is possible."""
+    """Occurrence that would be renamed, if that is possible."""
     found = document.names.at(offset)
     return None if found is None or found.symbol.kind in _FROM_ELSEWHERE else found
 
@@ -61,7 +61,7 @@ def _line(document: Document) -> int:
 
 
 def _column(document: Document, item: ast.Item | None, name: str) -> list[Edit]:
-    """Where the data of a renamed signal comes from."""
+    """Edit that keeps the column of a renamed signal."""
     if not isinstance(item, ast.Signal) or item.column is not None:
         return []
     together = [other.name for other in document.spec.items if other.span == item.span]
@@ -96,5 +96,5 @@ def _bindings(names: Names) -> list[int]:
 
 
 def _declared(names: Names) -> tuple[int, int, int]:
-    """How many names there are: two declarations of one name count once."""
+    """Numbers of declared names; two declarations of one name count once."""
     return len(names.values), len(names.types), len(names.rules)

@@ -36,7 +36,7 @@ class Server(LanguageServer):
 
     @property
     def encoding(self) -> Encoding:
-        """How the client counts columns."""
+        """Unit in which the client counts columns."""
         chosen = str(getattr(self.workspace.position_encoding, "value", self.workspace.position_encoding))
         return "utf-8" if chosen == "utf-8" else "utf-32" if chosen == "utf-32" else "utf-16"
 
@@ -61,7 +61,7 @@ class Server(LanguageServer):
         self._documents.pop(uri, None)
 
     def offset(self, document: Document, position: lsp.Position) -> int:
-        """Where a position of the client is in a text."""
+        """Offset of a position of the client."""
         return Layout(document.source.text, self.encoding).offset(Place(position.line, position.character))
 
     def publish(self, uri: str) -> None:
@@ -370,7 +370,7 @@ class Layout:
         return tuple(zip(starts, ends, strict=True))
 
     def place(self, offset: int) -> Place:
-        """Where the character at `offset` stands."""
+        """Line and column of the character at `offset`."""
         offset = min(max(offset, 0), len(self.text))
         row = bisect_right(self._lines, offset, key=lambda line: line[0]) - 1
         start, end = self._lines[row]

@@ -1,4 +1,4 @@
-"""What the names of a specification are bound to: every place where a symbol is declared or used."""
+"""Symbols of a specification and their occurrences."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _KINDS: Mapping[type[ast.Item], Kind] = {
 
 @dataclass(frozen=True, slots=True)
 class Symbol:
-    """Something that a specification names.
+    """A named entity of a specification.
 
     Attributes:
         name: without backticks.
@@ -65,7 +65,7 @@ class Occurrence:
 
     @property
     def declares(self) -> bool:
-        """Whether the symbol is declared here."""
+        """True if the symbol is declared here."""
         return self.span == self.symbol.span
 
 
@@ -91,7 +91,7 @@ class Names:
         return max(touching, key=lambda one: one.span.start, default=None)
 
     def of(self, symbol: Symbol) -> tuple[Occurrence, ...]:
-        """All places of a symbol."""
+        """Occurrences of a symbol."""
         return tuple(one for one in self.occurrences if one.symbol == symbol)
 
 
@@ -99,7 +99,7 @@ Scope: TypeAlias = Mapping[str, Symbol]
 
 
 def names_of(spec: ast.Spec) -> Names:
-    """All names of a specification and where they are written. The first declaration of a name has it."""
+    """Names of a specification and their occurrences. The first declaration of a name has it."""
     values: dict[str, Symbol] = {}
     types: dict[str, Symbol] = {}
     rules: dict[str, Symbol] = {}
@@ -239,7 +239,7 @@ def _uses(node: object, scope: Scope, names: Names) -> Iterator[Occurrence]:
 
 
 def _sees(node: object, part: object) -> bool:
-    """Whether the variables that a node binds can be used in this part of it."""
+    """True if the variables that a node binds can be used in this part of it."""
     return isinstance(node, ast.Quantifier | ast.Freeze) and part is node.body
 
 
@@ -259,7 +259,7 @@ def _nodes(node: object) -> Iterator[ast.Node]:
 
 
 def _parts(node: object) -> Iterator[object]:
-    """What stands inside of a node."""
+    """Child nodes."""
     if isinstance(node, tuple):
         yield from node
     elif isinstance(node, ast.Node):

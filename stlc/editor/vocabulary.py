@@ -1,4 +1,4 @@
-"""What the words of the language mean, in one sentence each."""
+"""Meaning of the words of the language, in one sentence each."""
 
 from __future__ import annotations
 

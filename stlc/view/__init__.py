@@ -14,7 +14,7 @@ _PACKAGES = {"matplotlib": "matplotlib", "PIL": "pillow"}
 
 
 def available() -> bool:
-    """Whether pictures can be drawn here."""
+    """True if matplotlib and Pillow are installed."""
     return not _missing()
 
 

@@ -46,7 +46,7 @@ class Animation:
 
 
 def film_of(run: RunDir, *, title: str | None = None) -> Film | None:
-    """What there is to see of the run's deployment; None where nothing was recorded.
+    """Film of the run's deployment; None where nothing was recorded.
 
     Its title names specification, scenario and run where no other is given.
 
@@ -90,7 +90,7 @@ def animate(run: RunDir, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_B
 
 
 def current(run: RunDir) -> bool:
-    """Whether the animation in the folder is that of the newest deployment."""
+    """True if the animation in the folder is that of the newest deployment."""
     gif = run.path / f"{film_name(run)}.gif"
     recorded = [run.path / name for name in (SCENE, TRACE) if (run.path / name).exists()]
     return gif.exists() and all(gif.stat().st_mtime >= record.stat().st_mtime for record in recorded)
@@ -121,17 +121,17 @@ class Seen:
 
     @property
     def own_keys(self) -> Mapping[str, str]:
-        """What the world adds to the legend."""
+        """Entries of the legend that the world adds."""
         return getattr(self.world, "KEYS", {})
 
     @property
     def frames(self) -> int:
-        """How many instants there are."""
+        """Number of instants."""
         return frames_of(self.scene)
 
     @property
     def strip(self) -> Strip | None:
-        """What is shown over time; None where it is not known."""
+        """Strip charts; None where margins or decisions are not known."""
         decisions = self.scene.get("decision")
         if self.judged is None or decisions is None:
             return None
@@ -169,7 +169,7 @@ def seen_in(run: RunDir, *, guarded: bool = True) -> Seen | None:
 
 
 def _judged(run: RunDir, trace_name: str, scene: Scene) -> Judged | None:
-    """What the agents of a scene drove; None for a trace of another deployment, or one without a verdict."""
+    """Judged drives of a scene's agents; None for another deployment's trace, or one without a verdict."""
     decisions = scene.get("decision")
     if decisions is None:
         return None
@@ -199,7 +199,7 @@ def _scene_film(run: RunDir, title: str) -> Film | None:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One drive as a page shows it.
+    """A drive as a page shows it.
 
     Attributes:
         title: under which guard; nothing where there is only one drive.
@@ -228,7 +228,7 @@ class Shot:
     taped: Callable[[range], Taped]
 
     def time(self, sample: int) -> float:
-        """Of a sample, in seconds."""
+        """Time of a sample, seconds."""
         return self.t0 + sample * self.dt
 
 
@@ -236,7 +236,7 @@ WITHOUT, WITH = "without the guard", "with the guard"
 
 
 def shots_of(run: RunDir) -> list[Shot]:
-    """What a page shows of the newest deployment: the first seed without and with the guard.
+    """Drives of the newest deployment for a page: the first seed without and with the guard.
 
     One shot where there is nothing to compare; the signals of a trace where no world draws; none where
     nothing was recorded.

@@ -39,12 +39,12 @@ _WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
 
 
 def available() -> bool:
-    """Whether PyBullet is installed."""
+    """True if PyBullet is installed."""
     return find_spec("pybullet") is not None and find_spec("pybullet_data") is not None
 
 
 def stage_drawing(stage: Stage) -> Draw:
-    """What draws frame `index` of a scene as a rendered picture of all robots, side by side."""
+    """Function that draws frame `index` of a scene: a rendered picture of all robots, side by side."""
     theatre = Theatre(stage, "picture")
 
     def draw(axes: Any, scene: Scene, index: int) -> None:
@@ -91,7 +91,7 @@ def require_window() -> None:
 
 
 class Theatre:
-    """All robots of a stage and the balls around them, side by side along x."""
+    """The robots of a stage and the balls around them, side by side along x."""
 
     def __init__(self, stage: Stage, mode: Mode) -> None:
         with _silenced():
@@ -112,7 +112,7 @@ class Theatre:
 
     @property
     def open(self) -> bool:
-        """Whether the window has not been closed."""
+        """True until the window is closed."""
         return bool(self.client.isConnected())
 
     def close(self) -> None:
@@ -155,7 +155,7 @@ class Theatre:
         return robots
 
     def _disc(self, place: NDArray[np.float64]) -> int:
-        """What a robot stands on."""
+        """Disc on which a robot stands."""
         radius = 0.28 * self.stage.reach
         shape = self.client.createVisualShape(self.client.GEOM_CYLINDER, radius=radius, length=0.01)
         return int(self.client.createMultiBody(0, -1, shape, (place - (0, 0, 0.006)).tolist()))

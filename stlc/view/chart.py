@@ -59,7 +59,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """What a map shows.
+    """Data of a map.
 
     Attributes:
         trace: what was recorded.
@@ -78,14 +78,14 @@ class Chart:
         return self.trace.data[across], self.trace.data[up]
 
     def color(self, place: Place) -> str:
-        """Of a place: red where it must not be entered, else its own."""
+        """Colour of a place: red where it must not be entered, else its own."""
         if place.role == "avoid":
             return RED
         others = [other for other in self.plane.places if other.role != "avoid"]
         return _TINTS[others.index(place) % len(_TINTS)]
 
     def inside(self, place: Place) -> Mask:
-        """Who is in a place when, (traces, samples)."""
+        """Mask of the traces in a place over time, (traces, samples)."""
         return place.depth(self.trace) >= 0.0
 
     def first(self, most: int) -> NDArray[np.int64]:
@@ -103,7 +103,7 @@ def chart_of(spec: ast.Spec, verdict: Verdict, trace: Trace) -> Chart | None:
 
 
 def draw_chart(chart: Chart) -> Picture:
-    """All paths over the places, and beside it for every place the share of traces in it over time."""
+    """Map of all paths over the places; beside it, for every place, the share of traces in it over time."""
     with look():
         figure = new_figure(9, 4.4)
         plot, rows = _layout(figure, chart)
@@ -115,7 +115,7 @@ def draw_chart(chart: Chart) -> Picture:
 
 
 def chart_film(chart: Chart, *, title: str = "") -> Film:
-    """The same in motion: places fill while they matter, paths fade behind the agents."""
+    """Film of the map: places fill while they matter, paths fade behind the agents."""
 
     def begin(figure: Figure) -> Callable[[int], None]:
         plot, rows = _layout(figure, chart)
@@ -207,7 +207,7 @@ def _tint(color: str, strength: float) -> tuple[float, float, float, float]:
 
 
 def _clearest(depth: NDArray[np.float64], others: Sequence[NDArray[np.float64]]) -> tuple[int, int]:
-    """Where a name stands: deep in its place and, if that can be, out of the others; (row, column)."""
+    """Position of a label: deep in its place and, if possible, outside the others; (row, column)."""
     free = np.minimum.reduce([depth, *(-other for other in others)])
     best = int(np.argmax(free if (free >= 0).any() else depth))
     return best // depth.shape[1], best % depth.shape[1]
@@ -272,7 +272,7 @@ def _draw_presence(axes: Axes, chart: Chart, place: Place) -> None:
 
 
 def _matters(place: Place, trace: Trace) -> Mask:
-    """When a place matters, (samples,)."""
+    """Mask of the samples at which a place matters, (samples,)."""
     return np.array([place.active(float(seconds) - trace.t0) for seconds in trace.times])
 
 
@@ -314,7 +314,7 @@ TITLE = 26
 
 @dataclass(frozen=True, slots=True)
 class Use:
-    """One occurrence of a place in a requirement.
+    """An occurrence of a place in a requirement.
 
     Attributes:
         requirement: its name.
@@ -350,23 +350,23 @@ class Place:
 
     @property
     def role(self) -> Role:
-        """To be in, to stay out of, or both."""
+        """Requirement on the place: reach, avoid, or both."""
         kinds = {use.negative for use in self.uses}
         return "mixed" if len(kinds) != 1 else "avoid" if kinds.pop() else "reach"
 
     @property
     def visited(self) -> bool:
-        """Whether it is enough to have been there."""
+        """True if having been there once is enough."""
         return self.role == "reach" and all(use.visit for use in self.uses)
 
     @property
     def windows(self) -> tuple[Window, ...]:
-        """When it matters; empty where it always does."""
+        """Times at which it matters; empty for always."""
         found = [use.window for use in self.uses]
         return tuple(dict.fromkeys(window for window in found if window)) if all(found) else ()
 
     def active(self, seconds: float) -> bool:
-        """Whether it matters at this time."""
+        """True if it matters at this time."""
         return not self.windows or any(low <= seconds <= high for low, high in self.windows)
 
     def depth(self, points: Trace) -> NDArray[np.float64]:
@@ -388,7 +388,7 @@ class Plane:
     places: tuple[Place, ...]
 
     def window(self, trace: Trace) -> tuple[Window, Window]:
-        """What of the plane is worth seeing: paths, and places that are not cut off by twice their room."""
+        """Part of the plane to show: all paths, and places as far as they lie near them."""
         ends = []
         for name in self.axes:
             values = trace.data[name][np.isfinite(trace.data[name])]
@@ -535,7 +535,7 @@ def _point(node: ast.Member) -> ast.Expr:
 
 
 def _texts(node: ast.Member) -> tuple[str, str]:
-    """What tells a place from others: its point and its region."""
+    """Key of a place: text of its point and of its region."""
     return _text(_point(node)), _text(node.region)
 
 
@@ -544,7 +544,7 @@ def _text(node: ast.Node) -> str:
 
 
 def uses_text(uses: Sequence[Use]) -> str:
-    """What the specification asks of a place, in a few words."""
+    """Requirements on a place, in a few words."""
     parts = []
     for use in uses:
         when = "" if use.window is None else f" {use.window[0]:g} to {use.window[1]:g} s"

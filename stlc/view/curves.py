@@ -1,4 +1,4 @@
-"""How training went: accuracy, requirements, loss and learning rate over time."""
+"""Learning curves: accuracy, requirements, loss and learning rate over time."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _column(rows: Rows, key: str) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 def _even(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What `values` are without their noise: means over a window, which the ends cut."""
+    """Running mean of `values`, over a shorter window at the ends."""
     reach, count = len(values) // 60, len(values)
     sums = np.concatenate([[0.0], np.cumsum(values)])
     first = np.maximum(np.arange(count) - reach, 0)
@@ -56,7 +56,7 @@ def _even(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _set_share_axis(axes: Axes, values: Sequence[NDArray[np.float64]]) -> None:
-    """Down to the bulk of the lowest curve, up to the highest: first measurements may fall below the axis."""
+    """Set limits from the bulk of the lowest curve to the highest; first measurements may be cut off."""
     low = min((float(np.quantile(curve, 0.08)) for curve in values if len(curve)), default=0.0)
     high = max((float(curve.max()) for curve in values if len(curve)), default=1.0)
     low = max(0.0, np.floor(20 * (low - 0.02)) / 20)
@@ -65,7 +65,7 @@ def _set_share_axis(axes: Axes, values: Sequence[NDArray[np.float64]]) -> None:
 
 
 def _draw_share(axes: Axes, seconds: NDArray[np.float64], shares: NDArray[np.float64], **style: Any) -> None:
-    """What was measured, faintly, and above it what it is without noise."""
+    """Draw measurements faintly, and their running mean above them."""
     axes.plot(seconds, shares, **{**style, "label": None, "alpha": 0.28, "lw": 0.8})
     axes.plot(seconds, _even(shares), **style)
 

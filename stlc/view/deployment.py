@@ -1,4 +1,4 @@
-"""What the policy did in its world: with and without the backup, over all deployment seeds."""
+"""The report's sections on a deployment: drives, metrics and decisions with and without a guard."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _setting(simulation: Record) -> str:
 
 
 def _unforeseen(guards: Mapping[str, Record]) -> Html | None:
-    """Why plans can do better than what was driven."""
+    """Explanation of a gap between plans and drives."""
     foreseen = _mean(list(guards.values())[-1].get("metrics") or {}, "foreseen")
     if foreseen is None or foreseen >= 1.0:
         return None
@@ -121,7 +121,7 @@ def _of(some: int, all_: int) -> str:
 
 
 def _broken(simulation: Record | None) -> Html | None:
-    """Who broke which rule with the guard, and when."""
+    """Table of the drives that broke a rule with the guard."""
     each = list(drives_of(simulation).values())
     broken = each[-1]["broken"] if each else []
     if not broken:
@@ -138,7 +138,7 @@ def _broken(simulation: Record | None) -> Html | None:
 
 
 def _names(guards: Mapping[str, Record]) -> list[str]:
-    """All metrics, in the order of the first guard that has them."""
+    """Names of all metrics, in the order of the first guard that has them."""
     return list(dict.fromkeys(name for guard in guards.values() for name in guard.get("metrics") or {}))
 
 
@@ -151,7 +151,7 @@ def _share_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
 
 
 def _ever(guards: Mapping[str, Record], name: str) -> bool:
-    """Whether a share is more than nothing with any guard."""
+    """True if a share is above zero with any guard."""
     return any(_mean(guard.get("metrics") or {}, name) for guard in guards.values())
 
 

@@ -1,4 +1,4 @@
-"""What was driven, judged: signals over robustness, and why a requirement was violated."""
+"""The report's sections on the recorded trace: verdicts, signals with robustness, causes, map."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def _key(word: str, color: str) -> Html:
 
 
 def causes_of(causes: Mapping[str, Cause], names: list[str], spec: ast.Spec) -> Html | None:
-    """Of each violated requirement its worst violation: which part, when, with which values."""
+    """Worst violation of each violated requirement: part, instant and values."""
     if not causes:
         return None
     declared = {item.name: item for item in spec.items if isinstance(item, ast.Require)}
@@ -204,7 +204,7 @@ def _cause_html(cause: Cause, names: list[str], declared: ast.Require | None) ->
 
 
 def _code(text: str) -> Html:
-    """What stands in backticks, as code."""
+    """Text with its parts in backticks as code."""
     return join([el("code", part) if i % 2 else part for i, part in enumerate(text.split("`"))])
 
 

@@ -39,7 +39,7 @@ QUALITY = 86
 
 @dataclass(frozen=True, slots=True)
 class Film:
-    """Something that can be drawn frame by frame.
+    """A drawing for each of a number of instants.
 
     Attributes:
         frames: how many instants there are.
@@ -61,7 +61,7 @@ class Film:
 
     @property
     def speed(self) -> int:
-        """How many times as fast as the truth it is shown."""
+        """Speed of the film as a multiple of real time."""
         return speed_of(self.frames, self.dt)
 
 
@@ -86,17 +86,17 @@ class Taped:
 
     @property
     def colors(self) -> set[str]:
-        """All that are used, as `#rrggbb`."""
+        """Colours in use, as `#rrggbb`."""
         found = {str(color)[:7] for c in self.commands if c[0] == "p" for color in c[2:4] if color}
         return found | {str(c[5])[:7] for c in self.commands if c[0] == "t"}
 
     @property
     def pictured(self) -> bool:
-        """Whether there are pictures among the commands."""
+        """True if there are pictures among the commands."""
         return any(command[0] == "i" for command in self.commands)
 
     def as_json(self) -> dict[str, Any]:
-        """The same as plain data."""
+        """Plain data for JSON."""
         return {
             "width": self.width,
             "height": self.height,
@@ -167,7 +167,7 @@ def save_still(film: Film, path: Path, *, at: int | None = None, dpi: int = FINE
 def still_bytes(
     film: Film, kind: Literal["png", "webp"] = "webp", *, at: int | None = None, dpi: int = DPI
 ) -> bytes:
-    """One instant of `film`, by default the one that tells most, as the content of a file."""
+    """File content of one instant of `film`, by default of its most telling one."""
     index = min(film.frames - 1, film.moment if at is None else at)
     (picture,) = frames_in(film, range(index, index + 1), dpi)
     buffer = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Where in the initial set a policy fails, as one sentence: numbers only, nothing is drawn here.
+"""Failures on held-out starts: the region of the initial set that has most of them, in words and drawn.
 
 The sentence is a conjunction of simple conditions that covers many failing starts and few others: subgroup
 discovery by beam search, with the F-score as its measure.
@@ -85,7 +85,7 @@ class Condition:
     value: float
 
     def holds(self, x0: Array) -> Mask:
-        """Which starts (starts, columns) meet it."""
+        """Mask of the starts (starts, columns) that meet it."""
         compare = {"<=": np.less_equal, ">=": np.greater_equal, "=": np.equal}[self.op]
         meets: Mask = compare(x0[:, self.column], self.value)
         return meets
@@ -93,7 +93,7 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class Weakness:
-    """Where one requirement fails.
+    """Region of the initial set in which one requirement fails.
 
     Attributes:
         requirement: index of the requirement.
@@ -132,7 +132,7 @@ def load_held_out(path: Path) -> HeldOut | None:
 
 
 def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | None:
-    """Where in the initial set `requirement` (by default the worst) fails; None if it never does."""
+    """Region in which `requirement` (by default the worst) fails; None if it never fails."""
     index = held.worst if requirement is None else requirement
     failing = held.each[:, index] < -TOLERANCE
     if not failing.any():
@@ -183,7 +183,7 @@ def _f_score(region: Mask, failing: Mask) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Values:
-    """What a column takes: single values that many starts share, and whether there are others.
+    """Values of a column: single values that many starts share, and whether there are others.
 
     A continuous column may have such values too: a timer that starts at 0, a sentinel for "nothing there".
     """
@@ -271,7 +271,7 @@ def _column_text(conditions: list[Condition], name: str, signature: Signature | 
 
 
 def weakness_text(weakness: Weakness, held: HeldOut, signature: Signature | None = None) -> str:
-    """One sentence: where the requirement fails, how often there, and how much of its failing that is."""
+    """Sentence on a region: failure rate inside, and its share of all failures."""
     if not weakness.conditions:
         failing = round(weakness.failing * len(held.x0))
         return f"fails in {failing:,} of {len(held.x0):,} starts, in no region of their own"
@@ -283,7 +283,7 @@ def weakness_text(weakness: Weakness, held: HeldOut, signature: Signature | None
 
 
 def unsolved_text(held: HeldOut) -> str:
-    """How many starts are left, and for how many of them it is known that something can be done."""
+    """Number of unsolved starts, and of those among them with a known satisfying plan."""
     failing, known = held.unsolved
     text = f"{failing:,} of {len(held.x0):,} starts"
     if held.known is None or not failing:

@@ -168,7 +168,7 @@ def _known(margins: Mapping[str, Floats]) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One violation by one agent.
+    """A violation by one agent.
 
     Attributes:
         requirement: its name.

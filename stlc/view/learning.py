@@ -40,7 +40,7 @@ ROUND_TIMES = (10.0, 20.0, 30.0, 60.0, 120.0, 180.0, 300.0, 600.0, 900.0, 1200.0
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """What a learning curve foretells.
+    """Extrapolation of a learning curve.
 
     Attributes:
         state: `short`: too few rounds to say; `flat`: twice the steps would change little; `rising`.
@@ -55,7 +55,7 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Learning:
-    """How far a training came.
+    """Verdict on a training.
 
     Attributes:
         level: in a word.
@@ -101,7 +101,7 @@ class Commands:
 
     @classmethod
     def of(cls, run: str, *, newest: bool = False, start: str = "stlc", guard: str = "paper") -> Commands:
-        """Those of the run that is found by the name `run`; `newest` need not be named to be driven.
+        """Commands of the run with the name `run`; `newest` need not be named to be driven.
 
         `guard` is the one that is recommended: `none`, `paper` or `full`.
         """
@@ -120,7 +120,7 @@ def recommended(record: Mapping[str, Any]) -> str:
 
 
 def driven_lines(result: Mapping[str, Any]) -> list[str]:
-    """What a run's result says of its drives, best first: a line for each guard, and what is recommended.
+    """Closed-loop results of a run, best first: a line for each guard, and the recommendation.
 
     Empty where nothing is on record; a reason where nothing could be driven.
     """
@@ -159,7 +159,7 @@ def _driven_line(each: Mapping[str, Any]) -> str:
 
 
 def _changed_line(each: Mapping[str, Any]) -> str:
-    """What a guard changes on the starts that were driven without it, too."""
+    """Drives that a guard gains and loses on the starts that were also driven without it."""
     if not each.get("compared"):
         return ""
     name = {"paper": "the paper's guard", "full": "the full guard"}.get(str(each["guard"]), "")
@@ -194,7 +194,7 @@ def learning_on_record(
 
 
 def clause(held: HeldOut | None, signature: Signature | None) -> str:
-    """Where the worst requirement fails, or ""."""
+    """Region in which the worst requirement fails, or ""."""
     weakness = None if held is None else find_weakness(held)
     return "" if held is None or weakness is None else weakness_text(weakness, held, signature)
 
@@ -248,7 +248,7 @@ def learning_of(
 
 
 def forecast(rows: Sequence[Mapping[str, Any]], accuracy: float, feasible: float) -> Curve:
-    """What the curve of plan accuracy foretells of a policy of `accuracy` where `feasible` is possible.
+    """Extrapolation of plan accuracy towards `feasible`, from rows and the final `accuracy`.
 
     The logarithm of the odds of success is fitted by a line over the logarithm of the step, from a quarter
     of the steps on, and goes on from where the policy is. The learning rate falls at the end of every
@@ -280,7 +280,7 @@ def _log_odds(value: float) -> float:
 
 
 def _longer(curve: Curve, seconds: float, commands: Commands) -> tuple[str, str]:
-    """What a longer training would bring, and the command; "" where it is not what helps."""
+    """Advice on a longer training, and its command; "" where that would not help."""
     twice = f"{commands.train_on} --budget {budget_text(max(seconds, 10.0))}"
     match curve.state, curve.times:
         case "rising", float(times):

@@ -1,4 +1,4 @@
-"""What a run's folder offers to a report; every part may be missing."""
+"""Contents of a run's folder for a report; every part may be missing."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ class Material:
 
     @property
     def result(self) -> Record:
-        """What training ended with; empty while it has not."""
+        """Result of the training; empty until it is finished."""
         result = self.record.get("result")
         return result if isinstance(result, Mapping) else {}
 
     @property
     def outside(self) -> bool:
-        """Whether the specification takes functions from outside, which its system provides."""
+        """True if the specification takes external functions, which its system provides."""
         return any(isinstance(item, ast.Extern) for item in _items(self.texts.get("spec.stl", "")))
 
     @property

@@ -39,7 +39,7 @@ _WIDE, _HIGH = 1000, 40  # of a track
 
 @dataclass(frozen=True, slots=True)
 class _Track:
-    """What is known over time: its name, its curve, and what it is at every frame."""
+    """A strip chart of the page: its name, its curve, and its value at every frame."""
 
     name: str
     curve: Html
@@ -68,7 +68,7 @@ def player_section(material: Material) -> Section | None:
 
 
 def script() -> Html:
-    """What runs in the page; it reads nothing but the page."""
+    """Script of the page; it reads nothing but the page."""
     return Html((files("stlc.view") / SCRIPT).read_text(encoding="utf-8"))
 
 
@@ -272,7 +272,7 @@ def _line(times: NDArray[np.float64], heights: NDArray[np.float64]) -> str:
 
 
 def _area(times: NDArray[np.float64], base: NDArray[np.float64], heights: NDArray[np.float64]) -> str:
-    """What lies between two staircases."""
+    """Outline of the area between two staircases."""
     x = np.append(_across(times), _WIDE)
     words, begin = list[str](), 0
     same = (heights[1:] == heights[:-1]) & (base[1:] == base[:-1])
@@ -289,7 +289,7 @@ def _area(times: NDArray[np.float64], base: NDArray[np.float64], heights: NDArra
 
 
 def _events(shots: Sequence[Shot]) -> Html | None:
-    """What was violated, requirement by requirement; each line leads to its instant."""
+    """Violations by requirement; each line leads to its instant."""
     names = list(dict.fromkeys(name for shot in shots for name in shot.requirements))
     if not names:
         return None
@@ -332,7 +332,7 @@ def _event_table(rows: list[tuple[Shot, Event]], count_: int) -> Html:
 def _data(
     shots: Sequence[Shot], tapes: Sequence[Taped], tracks: Sequence[Sequence[_Track]], shown: range
 ) -> Html:
-    """Everything that is replayed, as JSON that no text in it can end."""
+    """Replayed data as JSON that no text in it can end."""
     dt = shots[0].dt
     document: dict[str, Any] = {
         "times": [round(index * dt, 9) for index in shown],

@@ -62,7 +62,7 @@ def write_report(run: RunDir) -> Path:
 
 
 def sections_of(material: Material) -> list[Section]:
-    """What there is to say, in order."""
+    """Sections of the report, in order."""
     parts = (
         requirements_section(material),
         deployment_section(material),
@@ -97,7 +97,7 @@ def render_report(material: Material, sections: list[Section]) -> str:
 
 
 def headline(material: Material) -> Html:
-    """What came out, in one sentence.
+    """Result of the run in one sentence, with the advice that follows from it.
 
     A run that was deployed is judged by its drives, one that was not by its plans.
     """
@@ -119,7 +119,7 @@ def headline(material: Material) -> Html:
 
 
 def numbers(material: Material, tiles: list[tuple[str, str]]) -> Html | None:
-    """The same in a few numbers; `tiles` adds those of the deployment."""
+    """Key figures of the training; `tiles` adds those of the deployment."""
     return _tiles([*_training_tiles(material.result), *tiles])
 
 
@@ -144,7 +144,7 @@ def _beside(result: Mapping[str, Any]) -> str:
 
 
 def _sampled(result: Mapping[str, Any]) -> str:
-    """That not all starts were searched, where it is so."""
+    """Remark that the share is an estimate, where not all starts were searched."""
     searched, held_out = result.get("searched"), result.get("held_out")
     if not searched or not held_out or searched >= held_out:
         return ""
@@ -152,7 +152,7 @@ def _sampled(result: Mapping[str, Any]) -> str:
 
 
 def _advice(material: Material) -> Html | None:
-    """How far the training came, and what would help, where the policy falls short."""
+    """Level of the training and advice, where the policy falls short."""
     where = clause(material.held_out, material.signature)
     commands = Commands.of(shlex.quote(material.run.shown), guard=recommended(material.record))
     learning = learning_on_record(material.record, material.rows, commands, where)
@@ -279,12 +279,12 @@ def _facts(material: Material) -> list[tuple[str, Child]]:
 
 
 def _clock(record: Mapping[str, Any]) -> str:
-    """What a budget was counted in, where that is not the clock on the wall."""
+    """Clock of a budget, where that is not the wall clock."""
     return " of processor time" if (record.get("options") or {}).get("clock") == "processor" else ""
 
 
 def _options(record: Mapping[str, Any]) -> str:
-    """What the engine decided, as far as the run says it."""
+    """Resolved options, as far as the run records them."""
     engine = record.get("engine") or record.get("options") or {}
     shown = [f"{name} {engine[name]}" for name in _OPTIONS if engine.get(name) is not None]
     if record.get("margin") is not None:
@@ -321,7 +321,7 @@ _TITLES = {
 
 
 def failures_section(material: Material) -> Section | None:
-    """Where in the initial set the policy's plans fail."""
+    """Region of the initial set in which the policy's plans fail."""
     if material.held_out is None:
         return None
     picture = draw_failures(material.held_out, material.signature, material.units)
@@ -395,13 +395,13 @@ def _simulate(material: Material) -> list[str]:
 
 
 def _seeds(seeds: Sequence[int]) -> str:
-    """As `--seeds` takes them: `0..9`, or `0,3`."""
+    """Seeds in the notation of `--seeds`: `0..9`, or `0,3`."""
     whole = len(seeds) > 1 and list(seeds) == list(range(seeds[0], seeds[-1] + 1))
     return f"{seeds[0]}..{seeds[-1]}" if whole else ",".join(map(str, seeds))
 
 
 def _limits(done: Mapping[str, Any]) -> list[str]:
-    """What a guard was told, where that is not the usual."""
+    """Options of the guard that differ from the defaults."""
     words = []
     hurried = done.get("paper_time_limit") is not None
     if hurried or ("time_limit" in done and done["time_limit"] != USUAL_LIMIT):

@@ -48,7 +48,7 @@ class Key:
 
 @dataclass(frozen=True, slots=True)
 class Staging:
-    """How a scene is shown.
+    """Parameters of a scene's film.
 
     Attributes:
         draw: what draws one frame of it.
@@ -67,7 +67,7 @@ class Staging:
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """Where things stand, in inches from the lower left: (left, bottom, width, height)."""
+    """Layout in inches from the lower left: (left, bottom, width, height)."""
 
     size: tuple[float, float]
     scene: tuple[float, float, float, float]
@@ -75,7 +75,7 @@ class _Plan:
 
 
 def frames_of(scene: Scene) -> int:
-    """How many instants there are."""
+    """Number of instants."""
     return min(len(values) for values in scene.values())
 
 
@@ -116,7 +116,7 @@ def scene_film(scene: Scene, staging: Staging) -> Film:
 
 
 def _moment(scene: Scene, frames: int) -> int:
-    """When most agents were guarded, the ends left out; the middle where none was."""
+    """Frame with most interventions, the ends left out; the middle where there was none."""
     middle = frames // 2
     if "decision" not in scene:
         return middle
@@ -171,7 +171,7 @@ def _panel(figure: Figure, plan: _Plan, box: tuple[float, float, float, float]) 
 
 
 def keys_of(scene: Scene, own: Mapping[str, str]) -> list[Key]:
-    """Who decided, as far as it was recorded, what was rejected and violated, and what the world adds."""
+    """Legend: recorded sources of decisions, rejected plans, violations, and what the world adds."""
     sources = {0, *np.unique(scene["decision"]).tolist()} if "decision" in scene else set()
     keys = [Key(DECIDERS[source], DECIDED[source]) for source in sorted(sources)]
     if "rejected" in scene and np.isfinite(scene["rejected"]).any():

@@ -118,7 +118,7 @@ def _plot_margin(axes: Axes, times: Floats, rho: Floats) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """One trace to show and why it was chosen."""
+    """A trace to show and the reason for it."""
 
     index: int
     title: str
@@ -146,7 +146,7 @@ def choose_traces(
 
 @dataclass(frozen=True, slots=True)
 class _Agent:
-    """One trace of a recording."""
+    """A trace of a recording."""
 
     trace: Trace
     margins: Margins
@@ -237,7 +237,7 @@ def _wrapped(title: str) -> str:
 
 
 def _draw_row(axes: Axes, kind: str, name: str, agent: _Agent) -> None:
-    """One panel; interventions of the guard are shaded behind numbers and margins."""
+    """Draw a panel; interventions of the guard are shaded behind numbers and margins."""
     trace = agent.trace
     match kind:
         case "line":
@@ -459,7 +459,7 @@ def signal_film(trace: Trace, *, title: str = "") -> Film:
 
 
 def _panel(axes: Axes, trace: Trace, name: str) -> Callable[[int], None]:
-    """One signal of at most `MOST_AGENTS` agents; all curves are one line with gaps."""
+    """A signal of at most `MOST_AGENTS` agents; all curves are one line with gaps."""
     values = trace.data[name][:MOST_AGENTS]
     gap = np.full((len(values), 1), np.nan)
     axes.set_ylabel(labelled(name, trace.signature[name].unit.text).replace(" [", "\n[", 1))

@@ -1,4 +1,4 @@
-"""One look for every picture: few inks, colour-blind safe, legible on light and on dark paper.
+"""Style of all pictures: few inks, colour-blind safe, legible on light and on dark paper.
 
 Figures are built without pyplot and inside `look`, so no picture leaves a trace in matplotlib's settings.
 """

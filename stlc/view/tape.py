@@ -50,7 +50,7 @@ def taped(draw: Callable[[Any, int], None], frames: Sequence[int], size: tuple[f
 
 
 def taped_film(film: Film, frames: Sequence[int]) -> Taped:
-    """The same of a whole picture, as `film` draws it."""
+    """Record a whole picture as `film` draws it."""
     with look():
         figure = new_figure(*film.size)
         figure.set_dpi(DPI)
@@ -64,7 +64,7 @@ def taped_film(film: Film, frames: Sequence[int]) -> Taped:
 
 
 class Tape(RendererBase):
-    """What matplotlib draws on: whatever comes is entered into the present frame."""
+    """Matplotlib renderer that records drawing commands frame by frame."""
 
     def __init__(self, width: int, height: int) -> None:
         super().__init__()
@@ -74,11 +74,11 @@ class Tape(RendererBase):
         self._letters: Any = _measuring(width, height, DPI)
 
     def begin(self) -> None:
-        """Another frame."""
+        """Begin another frame."""
         self._frames.append([])
 
     def taped(self) -> Taped:
-        """All that was drawn."""
+        """The recording."""
         frames = tuple(tuple(frame) for frame in self._frames)
         return Taped(self.width, self.height, tuple(self._known), frames)
 
@@ -133,12 +133,12 @@ class Tape(RendererBase):
         self._enter(("t", *at, s, size, _color(gc.get_rgb(), gc), align, round(-angle), int(bold)))
 
     def get_text_width_height_descent(self, s: str, prop: Any, ismath: Any) -> tuple[float, float, float]:
-        """As letters are on a canvas."""
+        """Size of a text in dots, as on a canvas."""
         wide, high, deep = self._letters.get_text_width_height_descent(s, prop, ismath)
         return float(wide), float(high), float(deep)
 
     def get_canvas_width_height(self) -> tuple[float, float]:
-        """In dots."""
+        """Size of the canvas in dots."""
         return self.width, self.height
 
     def points_to_pixels(self, points: Any) -> Any:

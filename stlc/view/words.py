@@ -96,7 +96,7 @@ CAUSES = {
 
 
 def viable_sentence(simulation: Mapping[str, Any]) -> str:
-    """How many drives were lost, when, and how many of the others obeyed; "" where none was."""
+    """Number and time of lost drives, and share of the others that obeyed; "" where none was lost."""
     each = list(drives_of(simulation).values())
     if not each:
         return ""
