@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +17,6 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import typed
 from stlc.compile.lowering.lower import lower
-from stlc.compile.semantics import kinds
 from stlc.compile.semantics.semantics import (
     SEMANTICS,
     TOLERANCE,
@@ -32,7 +29,6 @@ from stlc.compile.semantics.semantics import (
     semantics_of,
 )
 from stlc.diagnostics import UsageError
-from stlc.monitor.verdict import Monitor
 
 ALL = [SEMANTICS.get(name)() for name in SEMANTICS.names]
 SOUND = [semantics for semantics in ALL if semantics.sound]
@@ -186,18 +182,3 @@ def test_semantics_by_what_somebody_asks_for() -> None:
     with pytest.raises(UsageError, match="no `smoothing`"):
         semantics_of("agm", 20)
     assert TOLERANCE == 1e-6
-
-
-def test_a_semantics_is_one_file(tmp_path: Path) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "extending.md").read_text()
-    (text,) = re.findall(r"```python\n(\"\"\"`softened`.*?)```", page, re.S)
-    (tmp_path / "softened.py").write_text(text)
-    kinds.__path__.append(str(tmp_path))
-    try:
-        assert "softened" in SEMANTICS.names
-        verdict = Monitor("signal x\nrequire r: always[0, 1 s] x > 0", dt=1.0)
-        rho = verdict.robustness({"x": np.array([1.0, 3.0])}, semantics="softened", at=0)
-        assert rho == pytest.approx(0.9 * 1.0 + 0.05 * 4.0)
-    finally:
-        kinds.__path__.remove(str(tmp_path))
-        SEMANTICS._entries.pop("softened", None)

@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stlc.compile.augment.timers import Timer, clock_of
-from stlc.compile.backends.array.arith import Program
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.switch import Hard, StraightThrough, Switch, Tanh
-from stlc.dynamics.model import integrators
-from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.model.system import System
 
 Make = Callable[..., System]
@@ -278,27 +272,3 @@ def test_any_net_of_dependencies_is_scheduled_right(
         moved[reset] = torch.where(env[guard] > 0.3, target, moved[reset])
         x = torch.stack([moved[name] for name in names], 1)
         assert torch.allclose(got[:, t + 1], x, atol=1e-12)
-
-
-def test_an_integrator_is_one_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "extending.md").read_text()
-    text = page.split("This is all\nof `midpoint.py`:\n\n```python\n")[1].partition("```")[0]
-    (tmp_path / "midpoint.py").write_text(text)
-    integrators.__path__.append(str(tmp_path))
-    monkeypatch.setattr(INTEGRATORS, "_entries", {})
-    assert "midpoint" in INTEGRATORS.names
-
-    try:
-        midpoint = INTEGRATORS.get("midpoint")
-    finally:
-        integrators.__path__.remove(str(tmp_path))
-
-    def error(steps: int) -> float:
-        state: dict[str, ir.Num] = {"x": ir.Signal("x")}
-        step = midpoint(lambda at: at, state, 1 / steps)["x"]
-        x = np.ones(1)
-        for _ in range(steps):
-            x = Program({"x": step})({"x": x}, NUMPY)["x"]
-        return float(abs(x[0] - math.e))
-
-    assert math.log2(error(16) / error(32)) == pytest.approx(2, abs=0.15)

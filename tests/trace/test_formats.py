@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from stlc.diagnostics import StlcError, TraceError
-from stlc.trace import Reading, formats, load_trace, save_trace
-from stlc.trace.formats import registry
+from stlc.trace import Reading, load_trace, save_trace
 
 pa = pytest.importorskip("pyarrow")
 parquet = pytest.importorskip("pyarrow.parquet")
@@ -424,18 +423,3 @@ def test_writing_stays_with_npz_and_csv(tmp_path: Path) -> None:
     trace = load_trace(a_csv(tmp_path / "a.csv"))
     save_trace(tmp_path / "b.npz", trace)
     np.testing.assert_array_equal(load_trace(tmp_path / "b.npz").data["x"], trace.data["x"])
-
-
-def test_a_format_is_one_file_and_one_line(monkeypatch, tmp_path):
-    page = (Path(__file__).parents[2] / "docs" / "extending.md").read_text()
-    text = page.split("`jsonl.py`, an object a sample:\n\n```python\n")[1].partition("```")[0]
-    (tmp_path / "jsonl.py").write_text(text)
-    line = page.split("drive.jsonl` works:\n\n```python\n")[1].partition("```")[0]
-    assert line.strip() == 'Format("jsonl", (".jsonl",)),'
-    monkeypatch.setattr(formats, "__path__", [*formats.__path__, str(tmp_path)])
-    monkeypatch.setattr(registry, "FORMATS", (*registry.FORMATS, registry.Format("jsonl", (".jsonl",))))
-    monkeypatch.setattr(registry, "SUFFIXES", (*registry.SUFFIXES, ".jsonl"))
-    (tmp_path / "drive.jsonl").write_text('{"t": 0, "x": 1.5}\n{"t": 0.1, "x": 2}\n')
-    trace = load_trace(tmp_path / "drive.jsonl")
-    assert trace.dt == pytest.approx(0.1)
-    assert trace.data["x"].tolist() == [[1.5, 2.0]]

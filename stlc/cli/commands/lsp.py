@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-from stlc.cli.framework.output import PULSE
 from stlc.cli.framework.program import command
 
 
@@ -23,5 +22,4 @@ def lsp(
     """
     from stlc.editor.server import make_server
 
-    with PULSE.doing(""):  # waits for the editor
-        make_server().start_io()
+    make_server().start_io()

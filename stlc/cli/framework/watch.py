@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from stlc.cli.framework.output import PULSE, say
+from stlc.cli.framework.output import say
 
 PERIOD = 0.3
 
@@ -30,8 +30,7 @@ def watch(files: Iterable[str], action: Callable[[], object], *, rounds: int | N
         if rounds is not None:
             rounds -= 1
         if rounds is None or rounds > 0:
-            with PULSE.doing(""):
-                time.sleep(PERIOD)
+            time.sleep(PERIOD)
 
 
 def _stamp(path: Path) -> tuple[int, int]:

@@ -1,0 +1,91 @@
+"""The examples of docs/extending.md: written into a copy of the source, changed as shown, and run."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+TEXT = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
+BLOCK = re.compile(r"^<!-- (file|change|check): (.+?) -->\n```\w+\n(.*?)^```", re.MULTILINE | re.DOTALL)
+BLOCKS = BLOCK.findall(TEXT)
+CHECKS = [(name, body) for kind, name, body in BLOCKS if kind == "check"]
+
+RUNNER = """
+import json, sys, traceback
+failures = {}
+for name, body in json.load(sys.stdin):
+    try:
+        exec(compile(body, name, "exec"), {"__name__": name})
+    except BaseException:
+        failures[name] = traceback.format_exc()
+json.dump(failures, open("failures.json", "w"))
+"""
+
+
+def change(path: Path, diff: str) -> None:
+    """Replace the lines of a diff that are there now by those that should be."""
+    lines = diff.splitlines()
+    before = "".join(f"{line[1:]}\n" for line in lines if line[0] != "+")
+    after = "".join(f"{line[1:]}\n" for line in lines if line[0] != "-")
+    text = path.read_text(encoding="utf-8")
+    assert text.count(before) == 1, f"{path.name} has changed: docs/extending.md shows\n{before}"
+    path.write_text(text.replace(before, after), encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def failures(tmp_path_factory) -> dict[str, str]:
+    """Check -> traceback, of those that fail in the extended copy."""
+    tree = tmp_path_factory.mktemp("extended")
+    skipped = shutil.ignore_patterns("__pycache__", "results")
+    for folder in ("stlc", "benchmarks", "specs", "examples"):
+        shutil.copytree(ROOT / folder, tree / folder, ignore=skipped)
+    for kind, name, body in BLOCKS:
+        if kind == "file":
+            assert not (tree / name).exists(), f"{name} is there already"
+            (tree / name).write_text(body, encoding="utf-8")
+        elif kind == "change":
+            change(tree / name, body)
+    environment = {**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", RUNNER],
+        input=json.dumps(CHECKS),
+        cwd=tree,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    found: dict[str, str] = json.loads((tree / "failures.json").read_text(encoding="utf-8"))
+    return found
+
+
+def test_the_page_has_an_example_of_each_extension():
+    assert len(CHECKS) == 11
+    assert len([kind for kind, *_ in BLOCKS if kind == "file"]) == 10
+    operator = [name for kind, name, _ in BLOCKS if kind == "change" and name.endswith(".py")]
+    assert len(operator) == 8  # six of the operator, one line each of a format and of a function
+
+
+@pytest.mark.parametrize("name", [name for name, _ in CHECKS])
+def test_an_example_works(name, failures):
+    assert name not in failures, failures.get(name)
+
+
+def test_the_examples_are_laid_out_like_the_source(tmp_path):
+    for kind, name, body in BLOCKS:
+        if kind == "file" and name.endswith(".py"):
+            (tmp_path / Path(name).name).write_text(body, encoding="utf-8")
+    config = ["--config", str(ROOT / "pyproject.toml")]
+    for action in (["check", "--ignore", "INP001"], ["format", "--check"]):
+        command = [sys.executable, "-m", "ruff", *action, "-q", *config, str(tmp_path)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
