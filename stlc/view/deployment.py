@@ -8,11 +8,10 @@ from typing import Any
 from stlc.controller.evaluation.metrics import HOLDS, METRICS, is_progress
 from stlc.view.html import Child, Html, Section, classed, el, join, table
 from stlc.view.material import Material
-from stlc.view.words import cause_words, count, drives_of, seconds, share, spread
+from stlc.view.words import cause_words, count, drives_of, guard_words, seconds, share, spread
 
 Record = Mapping[str, Any]
 
-GUARDS = {"none": "no guard", "paper": "with the backup", "full": "with the full guard"}
 MOST_BROKEN = 12
 """Drives that broke rules and are listed."""
 SOURCES = ("policy", "polished", "backup", "safest", "")
@@ -25,9 +24,9 @@ def deployment_tiles(material: Material) -> list[tuple[str, str]]:
         return []
     name, guard = list(guards.items())[-1]
     metrics = guard.get("metrics") or {}
-    beside = GUARDS.get(name, name)
+    beside = guard_words(name).beside
     each = {
-        GUARDS.get(name, name): f"{drives['obeyed']:,} of {drives['count']:,}"
+        guard_words(name).beside: f"{drives['obeyed']:,} of {drives['count']:,}"
         for name, drives in drives_of(material.simulation).items()
     }
     tiles = [
@@ -59,7 +58,7 @@ def _compared(title: str, guards: Mapping[str, Record], rows: list[tuple[Child, 
     """A table with a column per guard; nothing where there are no rows."""
     if not rows:
         return None
-    header = ["", *(GUARDS.get(name, name) for name in guards)]
+    header = ["", *(guard_words(name).title for name in guards)]
     compared = table(header, rows, numeric=range(1, len(header)), kind="compare")
     return join(el("h3", title), compared) if title else compared
 

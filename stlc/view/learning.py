@@ -19,8 +19,8 @@ from stlc.escape import operand, shell
 from stlc.rundir import RunDir
 from stlc.signature import Signature
 from stlc.view.held_out import HeldOut, find_weakness, load_held_out, weakness_text
+from stlc.view.words import GUARDS, guard_words, share
 from stlc.view.words import seconds as duration
-from stlc.view.words import share
 
 Level: TypeAlias = Literal["infeasible", "no plan known", "undertrained", "partly trained", "trained"]
 
@@ -106,8 +106,7 @@ class Commands:
         `guard` is the one that is recommended: `none`, `paper` or `full`.
         """
         run = shell((operand(run),))
-        words = {"none": "", "paper": " --backup", "full": " --guard full"}[guard]
-        simulate = f"stlc simulate{words}" if newest else f"stlc simulate {run}{words}"
+        simulate = " ".join(filter(None, ("stlc simulate", "" if newest else run, GUARDS[guard].option)))
         return cls(f"{start} train --resume {run}", simulate, f"stlc report {run}")
 
 
@@ -116,7 +115,7 @@ def recommended(record: Mapping[str, Any]) -> str:
     result = record.get("result")
     driven = result.get("closed_loop") if isinstance(result, Mapping) else None
     guard = driven.get("recommended") if isinstance(driven, Mapping) else None
-    return guard if guard in ("none", "paper", "full") else "paper"
+    return str(guard) if guard in GUARDS else "paper"
 
 
 def driven_lines(result: Mapping[str, Any]) -> list[str]:
@@ -136,17 +135,14 @@ def driven_lines(result: Mapping[str, Any]) -> list[str]:
         first = sorted(guards, key=lambda each: each.get("guard") != best)
         lines = [_driven_line(each) for each in first]
         lines += [line for each in first if (line := _changed_line(each))]
-        return [*lines, f"recommended: {ADVISED[best]}"] if best in ADVISED else lines
+        if best in GUARDS:
+            words = GUARDS[str(best)]
+            lines.append(
+                f"recommended: {words.noun} (`{words.option or 'stlc simulate'}`), by what was driven"
+            )
+        return lines
     except (KeyError, TypeError, ValueError):  # what somebody else has written
         return []
-
-
-GUARDED = {"none": "without a guard", "paper": "with the paper's guard", "full": "with the full guard"}
-ADVISED = {
-    "none": "no guard (`stlc simulate`), by what was driven",
-    "paper": "the paper's guard (`--backup`), by what was driven",
-    "full": "the full guard (`--guard full`), by what was driven",
-}
 
 
 def _driven_line(each: Mapping[str, Any]) -> str:
@@ -154,7 +150,7 @@ def _driven_line(each: Mapping[str, Any]) -> str:
     low, high = each["interval"]
     safe = "" if each.get("safe") is None else f", {share(each['safe'])} safe"
     part = f"{share(each['share'])}, 95 % interval {100 * low:.1f} to {share(high)}"
-    guard = GUARDED.get(str(each["guard"]), "")
+    guard = guard_words(each["guard"]).beside
     return f"{each['satisfied']:,} of {each['drives']:,} drives satisfied ({part}) {guard}{safe}"
 
 
@@ -162,10 +158,10 @@ def _changed_line(each: Mapping[str, Any]) -> str:
     """Drives that a guard gains and loses on the starts that were also driven without it."""
     if not each.get("compared"):
         return ""
-    name = {"paper": "the paper's guard", "full": "the full guard"}.get(str(each["guard"]), "")
     return (
-        f"{name} changes {each['gained'] + each['lost']:,} of {each['compared']:,} drives: "
-        f"{each['gained']:,} are satisfied only with it, {each['lost']:,} only without"
+        f"{guard_words(each['guard']).noun} changes {each['gained'] + each['lost']:,} of "
+        f"{each['compared']:,} drives: {each['gained']:,} are satisfied only with it, "
+        f"{each['lost']:,} only without"
     )
 
 

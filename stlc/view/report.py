@@ -38,7 +38,16 @@ from stlc.view.html import (
 from stlc.view.learning import Commands, clause, driven_lines, learning_on_record, recommended
 from stlc.view.material import Material, gather, untagged
 from stlc.view.player import player_section, script
-from stlc.view.words import count, interval, number, obeyed_sentence, seconds, share, viable_sentence
+from stlc.view.words import (
+    count,
+    guard_words,
+    interval,
+    number,
+    obeyed_sentence,
+    seconds,
+    share,
+    viable_sentence,
+)
 
 REPORT = "report.html"
 
@@ -382,7 +391,7 @@ def _simulate(material: Material) -> list[str]:
     """The command of the newest deployment; with the backup where there was none."""
     done = material.simulation or {}
     guard = list(done.get("guards") or {"paper": {}})[-1]
-    words = ["stlc", "simulate", material.run.shown, *_GUARDS.get(str(guard), ("--guard", str(guard)))]
+    words = ["stlc", "simulate", material.run.shown, *guard_words(guard).option.split()]
     if done.get("scenario"):
         words += ["--scenario", str(done["scenario"])]
     seeds = done.get("seeds") or range(10)
@@ -410,9 +419,6 @@ def _limits(done: Mapping[str, Any]) -> list[str]:
     words += ["--ceiling", str(done["ceiling"])] if done.get("ceiling") else []
     asked = done.get("margin") or {}
     return words + [word for name in asked for word in ("--margin", f"{name}={asked[name]:.6g}")]
-
-
-_GUARDS = {"none": (), "paper": ("--backup",)}
 
 
 def texts_section(material: Material) -> Section | None:

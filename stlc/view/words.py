@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 
@@ -47,6 +48,41 @@ def seconds(value: float | None) -> str:
         return f"{value:.3g} s"
     minutes, rest = divmod(round(value), 60)
     return f"{minutes} min {rest} s" if rest else f"{minutes} min"
+
+
+@dataclass(frozen=True, slots=True)
+class GuardWords:
+    """Names of a guard.
+
+    Attributes:
+        title: heading of its column.
+        option: of `stlc simulate`; "" where it needs none.
+    """
+
+    title: str
+    option: str
+
+    @property
+    def noun(self) -> str:
+        """With its article: `the full guard`, `no guard`."""
+        return f"the {self.title}" if self.option else self.title
+
+    @property
+    def beside(self) -> str:
+        """With its preposition: `with the full guard`, `without a guard`."""
+        return f"with {self.noun}" if self.option else "without a guard"
+
+
+GUARDS = {
+    "none": GuardWords("no guard", ""),
+    "paper": GuardWords("paper's guard", "--backup"),
+    "full": GuardWords("full guard", "--guard full"),
+}
+
+
+def guard_words(name: object) -> GuardWords:
+    """Names of a guard; those of an unknown one are made from its name."""
+    return GUARDS.get(str(name)) or GuardWords(f"guard {name}", f"--guard {name}")
 
 
 def labelled(name: str, unit: str) -> str:

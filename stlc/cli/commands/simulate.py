@@ -194,10 +194,10 @@ class _Order:
 def _driven(order: _Order, name: str | None, *, kept: bool = True) -> Record:
     """Deploy without and with the guard under a scenario; margins are written where it is `kept`."""
     from stlc.cli.framework.output import show_diagnostics
-    from stlc.cli.simulate.text import TITLES
     from stlc.cli.simulate.watch import Watching
     from stlc.controller.evaluation.rules import rules_of
     from stlc.controller.training.run import Run
+    from stlc.view.words import guard_words
 
     run, found = order.run, {}
     if name is not None:
@@ -206,7 +206,7 @@ def _driven(order: _Order, name: str | None, *, kept: bool = True) -> Record:
     margin = order.asked.of(run.task, run.policy, order.guard, order.setting.replan)
     setting = replace(order.setting, margin=margin)
     for mode in GUARDS[order.guard]:
-        title = " · ".join((run.task.compiled.name, TITLES[mode], *([name] if name else [])))
+        title = " · ".join((run.task.compiled.name, guard_words(mode).title, *([name] if name else [])))
         last = kept and mode == order.guard
         watching = Watching(title, order.live, order.margins if last else None)
         try:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from stlc.escape import operand, shell, visible
+from stlc.view.words import guard_words
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +23,6 @@ ERRORS = {
     "sensor_noise": "noise: what agents see",
 }
 """Errors of a scenario, in words."""
-TITLES = {"none": "no guard", "paper": "paper's guard", "full": "full guard"}
 COMPARED = ("obeyed every rule", "plan accuracy")
 """Columns by which scenarios are compared; drives that are lost are not counted."""
 
@@ -48,7 +48,7 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
         yield f"  the guard asks for a margin: {spared}"
     yield ""
     yield from _drives(document)
-    header = ("", *(TITLES[name] for name in guards))
+    header = ("", *(guard_words(name).title for name in guards))
     shares = _shares(guards, safe=bool(document.get("safety", True))) if windows else ()
     yield table([*_rules(document), *shares, *_progress(guards), *_times(guards)], header=header)
     for name, guard in guards.items():
@@ -130,7 +130,7 @@ def compared(document: Record) -> Iterator[str]:
     from stlc.cli.framework.output import table
 
     guards = list(document["guards"])
-    header = ("scenario", *(f"{TITLES[name]}: {label}" for name in guards for label in COMPARED))
+    header = ("scenario", *(f"{guard_words(name).title}: {label}" for name in guards for label in COMPARED))
     rows = []
     for name, each in {"as it is": document, **document["scenarios"]}.items():
         cells: list[str] = []
