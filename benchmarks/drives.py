@@ -17,13 +17,13 @@ from benchmarks.training import Place, benchmark_order
 from stlc.cli.framework.options import SeedsOption
 from stlc.cli.framework.output import say
 from stlc.cli.framework.ranges import parse_limit, parse_seeds
-from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, drive
 from stlc.controller.evaluation.deployment import decided, feasible_states
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.metrics import METRICS, is_progress, measure
-from stlc.controller.guard.candidates import Limits
+from stlc.controller.guard.candidates import Limits, Mode
 from stlc.controller.guard.feasibility import viable
-from stlc.controller.guard.guard import GUARD_VERSION, Guard, Mode
+from stlc.controller.guard.guard import GUARD_VERSION, Guard
 from stlc.controller.guard.margins import MarginRequest, parse_margins
 from stlc.controller.training.run import SPEC, SYSTEM, Run
 from stlc.controller.world import world_type
@@ -86,7 +86,7 @@ class Drives:
         return found
 
 
-def recorded(guard: Guard, setting: Setting) -> Recording:
+def recorded(guard: Guard, setting: Setting) -> DeploymentRecording:
     """A deployment under a guard in the world of its system."""
     recorder = Recorder(setting.agents)
     drive(guard, world_type(guard.task.system.decl), setting, recorder)

@@ -14,12 +14,12 @@ from stlc.controller.parallel import executor
 from stlc.controller.parallel.bundle import input_files
 from stlc.controller.parallel.jobs import Job, JobResult
 from stlc.controller.problem.task import satisfied
+from stlc.controller.training.budget import Clock
 from stlc.controller.training.checkpoint import load_checkpoint
 from stlc.controller.training.config import (
     ENGINE_VERSION,
     HELD_OUT,
     HELD_OUT_SEED,
-    Clock,
     TrainConfig,
 )
 from stlc.controller.training.run import Run, spec_hash, system_hash

@@ -84,7 +84,7 @@ def with_margin(task: Task) -> Limits:
 
 def kernels(task: Task) -> Mapping[str, str]:
     """The C texts of a task: verdicts of plans with the search for better ones, and the gradient."""
-    motion, formulas = motion_of(task), [rule.formula for rule in task.rules]
+    motion, formulas = motion_of(task.system), [rule.formula for rule in task.rules]
     return {"kernel": emit(motion, formulas), "adjoint": emit_adjoint(motion, formulas)}
 
 

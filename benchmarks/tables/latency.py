@@ -23,7 +23,7 @@ from benchmarks.timing import WARM, Times, one_thread
 from stlc.cli.framework.options import SeedsOption
 from stlc.cli.framework.program import command
 from stlc.cli.framework.ranges import parse_seeds
-from stlc.controller.deployment.simulator import Recording, Setting
+from stlc.controller.deployment.simulator import DeploymentRecording, Setting
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
 from stlc.controller.training.run import Run
@@ -120,7 +120,7 @@ def rows_of(run: Run, samples: int, seeds: tuple[int, ...]) -> Iterator[Row]:
         yield Row(task.compiled.name, run.dir.name, mode, times, Times.of(acting))
 
 
-def picked(recording: Recording, samples: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def picked(recording: DeploymentRecording, samples: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Places (row, step), half of them spread evenly, (k, 2), and half where the guard acted, (l, 2)."""
     half = max(samples // 2, 1)
     every = np.argwhere(np.ones_like(recording.source, dtype=bool))
@@ -132,7 +132,7 @@ def _spread(places: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     return found
 
 
-def _alone(run: Run, recording: Recording, places: NDArray[np.int64]) -> list[float]:
+def _alone(run: Run, recording: DeploymentRecording, places: NDArray[np.int64]) -> list[float]:
     """Seconds of a plan of the policy, its rollout and its verdict."""
     found = []
     for row, step in (*places[:WARM], *places):
@@ -143,7 +143,9 @@ def _alone(run: Run, recording: Recording, places: NDArray[np.int64]) -> list[fl
     return found[min(WARM, len(places)) :]
 
 
-def _timed(guard: Guard, recording: Recording, places: NDArray[np.int64]) -> list[tuple[float, int]]:
+def _timed(
+    guard: Guard, recording: DeploymentRecording, places: NDArray[np.int64]
+) -> list[tuple[float, int]]:
     """Seconds of each decision, and who took it. The first few are taken twice: they warm the caches."""
     found = []
     for row, step in (*places[:WARM], *places):

@@ -13,7 +13,7 @@ from stlc.dynamics.declaration.learning import START
 from stlc.dynamics.model.step import commands
 
 if TYPE_CHECKING:
-    from stlc.controller.problem.pending_goals import Promise
+    from stlc.controller.problem.pending_goals import PendingGoal
     from stlc.dynamics.model.mirror import Mirror
 
 
@@ -121,7 +121,7 @@ def _mean(number: ir.Num, places: Mapping[str, str], count: int) -> list[str]:
     return [f"{{ double sum = 0.0; for (int k = 0; k < {count}; ++k) {{ {body} }} cost += sum / {count}; }}"]
 
 
-def _promise(promise: Promise, task: Task, places: Mapping[str, str]) -> list[str]:
+def _promise(promise: PendingGoal, task: Task, places: Mapping[str, str]) -> list[str]:
     """What is lacked of gamma where a promise is open."""
     writer = NumberWriter(_columns(places))
     margin = writer.number(margin_of(promise.body))

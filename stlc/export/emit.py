@@ -37,7 +37,7 @@ def header(task: Task, network: PlanNetwork) -> str:
     Raises:
         Untranslatable: the task holds something that has no C form.
     """
-    motion = motion_of(task)
+    motion = motion_of(task.system)
     judged = plan_of([rule.formula for rule in task.rules], task.horizon + 1)
     falling = plan_of([open_ended(anchored(rule.formula)) for rule in task.compiled.safety], task.horizon + 1)
     parts = _numbers(task, network) | {

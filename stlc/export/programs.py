@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.controller.problem.task import Judged, Task, rank
+from stlc.controller.problem.task import PlanVerdicts, Task, rank
 
 if TYPE_CHECKING:
     from torch.export import ExportedProgram
@@ -46,7 +46,7 @@ class Deciding(nn.Module):
         )
 
 
-def judged_openly(task: Task, x: Tensor, plans: Tensor) -> Judged:
+def judged_openly(task: Task, x: Tensor, plans: Tensor) -> PlanVerdicts:
     """`Task.judge` in torch's operations alone, which can be recorded."""
     columns = task.system.rollout_columns(x, plans)
     each = task.graph.per_requirement_columns(columns, ops=TORCH)
@@ -55,7 +55,7 @@ def judged_openly(task: Task, x: Tensor, plans: Tensor) -> Judged:
     safe = task.safety.overall(each[:, [names.index(rule.name) for rule in task.compiled.safety]])
     broken = ~torch.isfinite(plans).all(2).all(1) | torch.isnan(rho)
     rho, safe = rho.masked_fill(broken, -torch.inf), safe.masked_fill(broken, -torch.inf)
-    return Judged(rho, safe, each.masked_fill(broken[:, None], -torch.inf), plans, columns)
+    return PlanVerdicts(rho, safe, each.masked_fill(broken[:, None], -torch.inf), plans, columns)
 
 
 @contextmanager

@@ -13,18 +13,18 @@ from benchmarks.drives import GUARDS
 from benchmarks.tables.latency import picked
 from benchmarks.timing import Times
 from stlc.cli.framework.app import main
-from stlc.controller.deployment.simulator import Recording
+from stlc.controller.deployment.simulator import DeploymentRecording
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
 
-def recording(acted: list[tuple[int, int]]) -> Recording:
+def recording(acted: list[tuple[int, int]]) -> DeploymentRecording:
     rows, steps = 4, 50
     source = np.zeros((rows, steps), dtype=np.int64)
     for place in acted:
         source[place] = 1
     zero = np.zeros((rows, steps))
-    return Recording(
+    return DeploymentRecording(
         4, np.zeros((rows, steps + 1, 1)), zero[..., None], source, source, zero, zero, zero > 0, (), {}, {}
     )
 

@@ -14,7 +14,8 @@ from torch import Tensor
 from stlc.cli.simulate.live import LiveView, _fitting, _shown, _signed
 from stlc.controller.deployment.live import LiveMonitor
 from stlc.controller.deployment.simulator import Recorder, Setting, drive
-from stlc.controller.guard.guard import Guard, Mode
+from stlc.controller.guard.candidates import Mode
+from stlc.controller.guard.guard import Guard
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.dynamics.declaration.load import parse_system

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from traffic_drivers import careful
 
-from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, drive
 from stlc.controller.evaluation.archive import save_scene, save_trace_of
 from stlc.controller.evaluation.deployment import (
     InterruptedDeploymentError,
@@ -22,9 +22,9 @@ from stlc.controller.evaluation.deployment import (
 )
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.metrics import METRICS, measure
-from stlc.controller.evaluation.stats import Interval, student
+from stlc.controller.evaluation.stats import MeanInterval, student
 from stlc.controller.guard.feasibility import solvable
-from stlc.controller.guard.guard import Decision, Guard
+from stlc.controller.guard.guard import Guard, GuardDecision
 from stlc.controller.policies.policy import BestOfKPolicy
 from stlc.controller.problem.task import Task
 from stlc.controller.training.run import Run
@@ -49,7 +49,7 @@ class Careful:
 
 
 @pytest.fixture(scope="module")
-def recorded(car_task: Task) -> Recording:
+def recorded(car_task: Task) -> DeploymentRecording:
     from stlc.controller.world import world_type
 
     recorder = Recorder(SETTING.agents)
@@ -62,7 +62,7 @@ def recorded(car_task: Task) -> Recording:
 # ---------------------------------------------------------------------- closed loop
 
 
-def test_shapes_of_a_recording(recorded: Recording) -> None:
+def test_shapes_of_a_recording(recorded: DeploymentRecording) -> None:
     assert recorded.states.shape == (12, 41, 7)
     assert recorded.actions.shape == (12, 40, 1)
     assert {recorded.source.shape, recorded.t0.shape, recorded.rho.shape, recorded.safe.shape} == {(12, 40)}
@@ -71,7 +71,7 @@ def test_shapes_of_a_recording(recorded: Recording) -> None:
     assert np.array_equal(recorded.scene["decision"][:-1].T, recorded.source[:6])
 
 
-def test_seeds_are_independent_of_each_other(car_task: Task, recorded: Recording) -> None:
+def test_seeds_are_independent_of_each_other(car_task: Task, recorded: DeploymentRecording) -> None:
     alone = deploy(car_task, Careful(car_task), Setting((1,), 6, 40), "paper").recording
     assert np.array_equal(alone.states, recorded.states[6:])
 
@@ -121,7 +121,7 @@ def test_who_is_told_something_plans_at_once(car_task: Task) -> None:
     asked: list[int] = []
 
     class Counting(Guard):
-        def decide(self, x: Tensor, begun: Decision | None = None) -> Decision:
+        def decide(self, x: Tensor, begun: GuardDecision | None = None) -> GuardDecision:
             asked.append(len(x))
             return super().decide(x, begun)
 
@@ -219,7 +219,7 @@ def test_a_policy_that_gives_no_number_is_told(car_task: Task) -> None:
 # ------------------------------------------------------------------------- verdicts
 
 
-def test_executed_verdicts_are_those_of_the_monitor(car_task: Task, recorded: Recording) -> None:
+def test_executed_verdicts_are_those_of_the_monitor(car_task: Task, recorded: DeploymentRecording) -> None:
     executed = judge_executed(car_task, recorded)
     signals = {name: recorded.states[..., i] for i, name in enumerate(car_task.names)}
     monitor = Monitor(car_task.compiled.spec, dt=car_task.dt, horizon=car_task.horizon * car_task.dt)
@@ -232,7 +232,7 @@ def test_executed_verdicts_are_those_of_the_monitor(car_task: Task, recorded: Re
     assert float(executed.starts(everything).mean()) == pytest.approx(verdict.share)
 
 
-def test_what_was_foreseen_went_as_the_model_says(car_task: Task, recorded: Recording) -> None:
+def test_what_was_foreseen_went_as_the_model_says(car_task: Task, recorded: DeploymentRecording) -> None:
     executed = judge_executed(car_task, recorded)
     assert 0 < executed.foreseen.mean() < 1
     for start, row in np.argwhere(executed.foreseen)[::17]:
@@ -243,7 +243,7 @@ def test_what_was_foreseen_went_as_the_model_says(car_task: Task, recorded: Reco
         assert predicted.numpy() == pytest.approx(happened, abs=1e-4)
 
 
-def test_metrics_are_means_over_seeds(car_task: Task, recorded: Recording) -> None:
+def test_metrics_are_means_over_seeds(car_task: Task, recorded: DeploymentRecording) -> None:
     metrics = measure(recorded, judge_executed(car_task, recorded))
     assert set(METRICS) - set(metrics) == {"feasible", "feasible_followed"}
     assert len(metrics["plan_accuracy"].values) == 2
@@ -254,7 +254,7 @@ def test_metrics_are_means_over_seeds(car_task: Task, recorded: Recording) -> No
     assert sum(shares[name] for name in ("policy", "backup", "safest")) == pytest.approx(1.0)
 
 
-def test_the_ceiling_is_searched_for_in_visited_states(car_task: Task, recorded: Recording) -> None:
+def test_the_ceiling_is_searched_for_in_visited_states(car_task: Task, recorded: DeploymentRecording) -> None:
     assert np.isnan(feasible_states(car_task, recorded, 0)).all()
     some = feasible_states(car_task, recorded, 60)
     looked, good = np.isfinite(some), recorded.rho >= -1e-6
@@ -289,23 +289,23 @@ def test_quantiles_of_student(freedom: int, t: float) -> None:
 
 def test_an_interval_covers_the_mean_as_often_as_it_says() -> None:
     rng = np.random.default_rng(0)
-    found = [Interval.of(sample.tolist()) for sample in rng.normal(3.0, 2.0, (4000, 10))]
+    found = [MeanInterval.of(sample.tolist()) for sample in rng.normal(3.0, 2.0, (4000, 10))]
     covered = np.mean([interval.low <= 3.0 <= interval.high for interval in found])  # type: ignore[operator]
     assert covered == pytest.approx(0.95, abs=0.012)
 
 
 def test_one_seed_has_no_interval() -> None:
-    single = Interval.of([0.5])
+    single = MeanInterval.of([0.5])
     assert (single.mean, single.low, single.high, single.half) == (0.5, None, None, None)
-    assert Interval.of([1.0, math.inf]).half is None
-    assert Interval.of([2.0, 2.0, 2.0]).half == 0.0
+    assert MeanInterval.of([1.0, math.inf]).half is None
+    assert MeanInterval.of([2.0, 2.0, 2.0]).half == 0.0
 
 
 # -------------------------------------------------------------------------- on disk
 
 
 def test_a_trace_carries_its_decisions_and_where_it_is_from(
-    car_task: Task, car_run: RunDir, recorded: Recording, tmp_path: Path
+    car_task: Task, car_run: RunDir, recorded: DeploymentRecording, tmp_path: Path
 ) -> None:
     run = Run(car_run, car_task, BestOfKPolicy(car_task, None))  # type: ignore[arg-type]
     paths = save_trace_of(run, recorded, SETTING, tmp_path / "also.npz")
@@ -322,7 +322,7 @@ def test_a_trace_carries_its_decisions_and_where_it_is_from(
         assert trace.extras["agent"].tolist() == [*range(6)] * 2
 
 
-def test_a_scene_is_read_back_without_pickle(recorded: Recording, tmp_path: Path) -> None:
+def test_a_scene_is_read_back_without_pickle(recorded: DeploymentRecording, tmp_path: Path) -> None:
     save_scene(tmp_path / "scene.npz", recorded.scene)
     with np.load(tmp_path / "scene.npz", allow_pickle=False) as scene:
         assert np.array_equal(scene["pose"], recorded.scene["pose"])

@@ -7,7 +7,7 @@ import torch
 
 from stlc import native
 from stlc.controller.problem.native import NativeJudge
-from stlc.controller.problem.task import Judged, Task
+from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.dynamics.model.system import System
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
@@ -15,11 +15,11 @@ pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C
 
 def _both(
     task: Task, x0: torch.Tensor, u: torch.Tensor, monkeypatch: pytest.MonkeyPatch
-) -> tuple[Judged, Judged]:
+) -> tuple[PlanVerdicts, PlanVerdicts]:
     fast = task.judge(x0, u)
     monkeypatch.setattr(native, "compiler", lambda: None)
     other = Task(task.compiled, System(task.system.decl))
-    assert NativeJudge.of(other) is None
+    assert NativeJudge.of(other.system, other.rules) is None
     return fast, other.judge(x0, u)
 
 
@@ -27,7 +27,7 @@ def _both(
 def test_kernel_and_torch_agree(
     car_task: Task, monkeypatch: pytest.MonkeyPatch, dtype: torch.dtype, tolerance: float
 ) -> None:
-    assert NativeJudge.of(car_task) is not None
+    assert NativeJudge.of(car_task.system, car_task.rules) is not None
     x0 = car_task.sample(3000, seed=1, dtype=dtype)
     u = (
         20.0 * torch.rand(3000, car_task.horizon, 1, generator=torch.Generator().manual_seed(2), dtype=dtype)

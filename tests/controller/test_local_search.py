@@ -9,7 +9,7 @@ from stlc import native
 from stlc.controller.problem.native import Effort
 from stlc.controller.problem.task import Task
 from stlc.controller.training.local_search import Searcher
-from stlc.controller.training.samplers import CAPACITY, Buffer
+from stlc.controller.training.samplers import CAPACITY, ReplayBuffer
 from stlc.dynamics.model.system import System
 
 
@@ -86,7 +86,7 @@ def test_a_native_climb_does_not_depend_on_how_it_is_shared(car_task: Task) -> N
 
 
 def test_the_buffer_forgets_the_oldest() -> None:
-    buffer = Buffer.empty(2, 3, 1, torch.device("cpu"))
+    buffer = ReplayBuffer.empty(2, 3, 1, torch.device("cpu"))
     for start in range(0, CAPACITY + 10, 10):
         rows = torch.arange(start, start + 10, dtype=torch.float32)
         buffer.add(rows[:, None].expand(-1, 2), rows[:, None, None].expand(-1, 3, 1))

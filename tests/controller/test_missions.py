@@ -11,11 +11,11 @@ from mission_strategies import augmented
 from torch import Tensor
 
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, drive
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
-from stlc.controller.problem.task import Judged, Task
+from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import Trainer
 from stlc.controller.training.samplers import GLIMPSES, POOL, ROUNDS, Draws, Missions, mission_steps, visited
@@ -92,7 +92,7 @@ class Steered:
     def plan(self, x: Tensor) -> Tensor:
         return steered(self.task, x)
 
-    def judged(self, x: Tensor) -> Judged:
+    def judged(self, x: Tensor) -> PlanVerdicts:
         return self.task.judge(x, self.plan(x))
 
 
@@ -200,7 +200,7 @@ def test_kernel_and_torch_agree_on_memory(task: Task) -> None:
 # ----------------------------------------------------------------- deployment, verdicts
 
 
-def deployed(task: Task, seeds: int = 6) -> Recording:
+def deployed(task: Task, seeds: int = 6) -> DeploymentRecording:
     recorder = Recorder(4)
     guard = Guard(task, Steered(task), "none")
     drive(guard, ModelWorld, Setting(tuple(range(seeds)), 4, 32), recorder)  # type: ignore[arg-type]

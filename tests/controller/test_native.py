@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from stlc import native
-from stlc.controller.problem.native import torch_reasons
 from stlc.controller.problem.task import Task
 from stlc.controller.training.objective import guided_objective, loss
 from stlc.diagnostics import Notice
@@ -38,8 +37,8 @@ def _task(extern: str, body: str) -> Task:
 def test_a_function_in_python_leaves_the_work_to_torch_with_the_same_results() -> None:
     outside, inside = _task(OUTSIDE, ""), _task("", INSIDE)
     why = "the function `hand` has no C form"
-    assert torch_reasons(outside, "cpu", **EXACT) == dict.fromkeys(("verdicts", "search", "gradient"), why)
-    assert not any(torch_reasons(inside, "cpu", **EXACT).values())
+    assert outside.torch_reasons("cpu", **EXACT) == dict.fromkeys(("verdicts", "search", "gradient"), why)
+    assert not any(inside.torch_reasons("cpu", **EXACT).values())
     x0 = outside.sample(50, seed=1, dtype=torch.float64)
     results = []
     for task in (outside, inside):
@@ -54,14 +53,14 @@ def test_a_function_in_python_leaves_the_work_to_torch_with_the_same_results() -
 def test_the_paper_s_objective_a_device_and_a_missing_compiler(
     car_task: Task, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    assert torch_reasons(car_task, "cpu", **EXACT) == {"verdicts": "", "search": "", "gradient": ""}
-    smooth = torch_reasons(car_task, "cpu", searches=False, smooth=True)
+    assert car_task.torch_reasons("cpu", **EXACT) == {"verdicts": "", "search": "", "gradient": ""}
+    smooth = car_task.torch_reasons("cpu", searches=False, smooth=True)
     assert smooth == {"verdicts": "", "gradient": "the paper's objective is smooth"}
-    assert set(torch_reasons(car_task, "cuda", **EXACT).values()) == {"the device is cuda"}
+    assert set(car_task.torch_reasons("cuda", **EXACT).values()) == {"the device is cuda"}
     fresh = Task(car_task.compiled, System(car_task.system.decl))
     monkeypatch.setattr(native, "compiler", lambda: None)
     monkeypatch.setattr("stlc.controller.problem.native.compiler", lambda: None)
-    assert set(torch_reasons(fresh, "cpu", **EXACT).values()) == {"there is no C compiler"}
+    assert set(fresh.torch_reasons("cpu", **EXACT).values()) == {"there is no C compiler"}
     monkeypatch.undo()
     fresh = Task(car_task.compiled, System(car_task.system.decl))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -70,5 +69,5 @@ def test_the_paper_s_objective_a_device_and_a_missing_compiler(
     compiler.chmod(0o755)
     monkeypatch.setenv("CC", str(compiler))
     with pytest.warns(Notice, match="W702: the C compiler `.*/cc` fails with exit code 4"):
-        reasons = torch_reasons(fresh, "cpu", **EXACT)
+        reasons = fresh.torch_reasons("cpu", **EXACT)
     assert set(reasons.values()) == {"the C compiler fails with exit code 4: fatal error: no room"}

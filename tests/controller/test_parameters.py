@@ -103,7 +103,7 @@ def test_they_decide_what_is_asked(task: Task) -> None:
 @pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
 @given(seed=st.integers(0, 10_000))
 def test_kernel_and_torch_agree(task: Task, seed: int) -> None:
-    assert NativeJudge.of(task) is not None
+    assert NativeJudge.of(task.system, task.rules) is not None
     generator = torch.Generator().manual_seed(seed)
     x0 = task.sample(64, generator=generator, dtype=torch.float64)
     u = 6 * torch.rand(64, 10, 2, generator=generator, dtype=torch.float64) - 3

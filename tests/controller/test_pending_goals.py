@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from stlc.controller.guard.guard import Guard
-from stlc.controller.problem.pending_goals import Promises
+from stlc.controller.problem.pending_goals import PendingGoals
 from stlc.controller.problem.task import KEPT, Task
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse
@@ -131,5 +131,5 @@ def test_without_a_mission_there_are_no_promises(tmp_path: Path) -> None:
     path.write_text(LINE)
     spec = parse(Source("line.stl", "spec line\nstate signal x [m]\nrequire low: always[0, T] x < 3 m\n"))
     task = Task.of(spec, System.load(path))
-    assert isinstance(task.promises, Promises)
+    assert isinstance(task.promises, PendingGoals)
     assert task.promises.items == ()

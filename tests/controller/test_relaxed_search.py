@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from stlc.controller.guard.candidates import REPAIRED, Limits
-from stlc.controller.guard.guard import Decision, Guard
+from stlc.controller.guard.guard import Guard, GuardDecision
 from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.search import RelaxedSearch, StagedSearch
 from stlc.controller.problem.task import Task
@@ -50,7 +50,7 @@ class Onward:
         return torch.ones((len(x0), 6, 1), dtype=x0.dtype)
 
 
-def decided(task: Task, x: Tensor) -> Decision:
+def decided(task: Task, x: Tensor) -> GuardDecision:
     return Guard(task, Onward(), "full", limits=LIMITS).decide(x)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from stlc.controller.deployment.simulator import Recording
+from stlc.controller.deployment.simulator import DeploymentRecording
 from stlc.controller.evaluation.rules import Lost, Rules, drives_json, drives_of_plans, judge_drives, rules_of
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig
@@ -80,7 +80,7 @@ def found(run: Run) -> Rules:
     return rules
 
 
-def driven(xs: list[list[float]], *, good: bool = True) -> Recording:
+def driven(xs: list[list[float]], *, good: bool = True) -> DeploymentRecording:
     """Drives along these x, by plans that were good or not."""
     states = np.array(xs, dtype=float)[..., None]
     rows, steps = states.shape[0], states.shape[1] - 1
@@ -88,7 +88,7 @@ def driven(xs: list[list[float]], *, good: bool = True) -> Recording:
     none = whole.astype(np.int64)
     actions = np.zeros((rows, steps, 1))
     rho, safe = whole - (not good), np.full(whole.shape, good)
-    return Recording(rows, states, actions, none, none, rho, whole, safe, ({},), {}, {})
+    return DeploymentRecording(rows, states, actions, none, none, rho, whole, safe, ({},), {}, {})
 
 
 # ------------------------------------------------------------------------ where they are

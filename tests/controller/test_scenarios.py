@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from stlc.controller.deployment.disturbance import Disturbance, errors_of
-from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, drive
 from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.guard import Guard
 from stlc.controller.problem.task import Task
@@ -71,8 +71,8 @@ def task_of(scenario: str) -> Task:
 
 
 @pytest.fixture
-def driven() -> Callable[[str], tuple[Recording, Still]]:
-    def drive_in(scenario: str) -> tuple[Recording, Still]:
+def driven() -> Callable[[str], tuple[DeploymentRecording, Still]]:
+    def drive_in(scenario: str) -> tuple[DeploymentRecording, Still]:
         task = task_of(scenario)
         policy, recorder = Still(task), Recorder(3)
         drive(Guard(task, policy), world_type(task.system.decl), Setting((0, 1), 3, 4), recorder)
@@ -83,7 +83,7 @@ def driven() -> Callable[[str], tuple[Recording, Still]]:
     return drive_in
 
 
-Driven = Callable[[str], tuple[Recording, Still]]
+Driven = Callable[[str], tuple[DeploymentRecording, Still]]
 
 
 def test_nothing_is_different_in_the_nominal_one(driven: Driven) -> None:
@@ -157,7 +157,7 @@ class Steady(Still):
         return super().plan(x0) + 0.5
 
 
-def steady(scenario: str, agents: int = 40) -> tuple[Recording, Steady]:
+def steady(scenario: str, agents: int = 40) -> tuple[DeploymentRecording, Steady]:
     task = task_of(scenario)
     policy, recorder = Steady(task), Recorder(agents)
     drive(Guard(task, policy), world_type(task.system.decl), Setting((0, 1), agents, 2), recorder)

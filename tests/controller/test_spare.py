@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from stlc.compile.ir.nodes import Predicate, Signal
-from stlc.controller.deployment.simulator import Recorder, Recording, Setting, drive
-from stlc.controller.guard.candidates import Limits
-from stlc.controller.guard.guard import Guard, Mode
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, drive
+from stlc.controller.guard.candidates import Limits, Mode
+from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.margins import tightened, with_margins
 from stlc.controller.guard.safe_prefix import prefix_robustness, robustness_until
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
@@ -59,7 +59,7 @@ class Onward:
         return plan
 
 
-def driven(mode: Mode, margin: float, scenario: str = "") -> Recording:
+def driven(mode: Mode, margin: float, scenario: str = "") -> DeploymentRecording:
     task = task_of(scenario)
     guard = Guard(task, Onward(task.horizon), mode, limits=Limits(margin={"clear": margin}, seconds=None))
     recorder = Recorder(8)

@@ -23,10 +23,10 @@ BRAKING = '''"""Full braking, before anything else is tried."""
 
 import torch
 from stlc.controller.guard.candidates import REPAIRED, Candidates
-from stlc.controller.guard.stages import Stage
+from stlc.controller.guard.stages import GuardStage
 
 
-class Braking(Stage):
+class Braking(GuardStage):
     turns = {"paper": 5}
 
     def __init__(self, setup):

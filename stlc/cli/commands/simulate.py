@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from stlc.controller.deployment.simulator import Setting
     from stlc.controller.evaluation.deployment import Deployment
     from stlc.controller.evaluation.rules import Rules
-    from stlc.controller.guard.guard import Mode
+    from stlc.controller.guard.candidates import Mode
     from stlc.controller.guard.margins import MarginRequest
     from stlc.controller.training.run import Run
     from stlc.dynamics.declaration.deployment import ScenarioDecl

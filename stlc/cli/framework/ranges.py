@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from stlc.diagnostics import Diagnostic, UsageError
 
 if TYPE_CHECKING:
-    from stlc.controller.training.config import Clock
+    from stlc.controller.training.budget import Clock
 
 MOST_SEEDS = 1000
 _RANGE = re.compile(r"\s*(\d{1,18})\s*(?:\.\.\s*(\d{1,18})\s*)?")

@@ -14,7 +14,7 @@ from stlc.escape import visible
 
 if TYPE_CHECKING:
     from stlc.controller.deployment.live import LiveMonitor
-    from stlc.controller.deployment.simulator import Moment, Setting, Watch
+    from stlc.controller.deployment.simulator import Setting, SimulationStep, Watch
     from stlc.controller.problem.task import Task
 
 STANDARD_OUTPUT = "-"
@@ -61,7 +61,7 @@ class Watching:
                 told = stack.enter_context(_bar(self.title))
                 listeners.append(lambda: told(_present(oversight)))
 
-            def watch(moment: Moment) -> None:
+            def watch(moment: SimulationStep) -> None:
                 oversight.push(moment)
                 for listener in listeners:
                     listener()
@@ -69,7 +69,7 @@ class Watching:
             yield watch
 
 
-def _present(oversight: LiveMonitor) -> Moment:
+def _present(oversight: LiveMonitor) -> SimulationStep:
     assert oversight.moment is not None
     return oversight.moment
 

@@ -14,7 +14,7 @@ import typer
 from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
 from stlc.cli.framework.output import console, emit_json, say, show_diagnostics
 from stlc.cli.train.progress import Progress, RunInfo, Summary
-from stlc.controller.training.final_evaluation import Outcome
+from stlc.controller.training.final_evaluation import TrainingOutcome
 from stlc.controller.training.loop import Watch
 from stlc.diagnostics import StlcError
 from stlc.rundir import LATEST, RUNS
@@ -50,7 +50,7 @@ class Sitting:
     """
 
     folder: RunDir
-    outcome: Outcome | None = None
+    outcome: TrainingOutcome | None = None
     progress: Progress = field(default_factory=Progress)
     logbook: Opener | None = None
     keeps: bool = True
@@ -186,7 +186,7 @@ def _commands(folder: RunDir, ranks: int = 1) -> Commands:
     return Commands.of(spoken(folder), newest=newest, start=started(ranks), guard=guard)
 
 
-def _learning(outcome: Outcome) -> Learning | None:
+def _learning(outcome: TrainingOutcome) -> Learning | None:
     """The verdict on the training, as its record has it."""
     return learning_of_run(outcome.run.dir, _commands(outcome.run.dir, outcome.ranks))
 
@@ -206,7 +206,7 @@ def _info(folder: RunDir) -> RunInfo:
     )
 
 
-def _summary(outcome: Outcome, *, pictures: bool) -> Summary:
+def _summary(outcome: TrainingOutcome, *, pictures: bool) -> Summary:
     from stlc.view.held_out import find_weakness, load_held_out, unsolved_text, weakness_text
 
     learning = _learning(outcome)

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from stlc.controller.deployment.disturbance import Disturbance
 from stlc.controller.deployment.world_errors import blamed, require_numbers, scene_of, states_of, wrong
+from stlc.controller.guard.candidates import RobustnessMargins
 from stlc.controller.guard.feasibility import solvable, viable
-from stlc.controller.guard.margins import RobustnessMargins
 from stlc.controller.world import Charting, Choosing, Redrawing
 from stlc.diagnostics import Diagnostic, RunError, SystemFileError
 
@@ -110,7 +110,7 @@ class Worlds:
             self.redrawn += len(left)
             with blamed(world, "redraw", "draw starts again"):
                 given = states_of(world, "redraw", world.redraw(left), self.size)
-            require_numbers(world, "redraw", given, (self.names, f"at step 0 (seed {seed})"))
+            require_numbers(world, "redraw", given, self.names, f"at step 0 (seed {seed})")
             again = torch.cat((given, x[:, self.size[1] :]), 1)
             good &= (again == x).all(1)
             x, left = again, torch.nonzero(~good).squeeze(1)
@@ -171,7 +171,7 @@ class Worlds:
         for world, seed, each in zip(self.worlds, self.seeds, given, strict=True):
             x = states_of(world, method, each, self.size)
             when = "" if step is None else f"at step {step} "
-            require_numbers(world, method, x, (self.names, f"{when}(seed {seed})"))
+            require_numbers(world, method, x, self.names, f"{when}(seed {seed})")
             found.append(x)
         return torch.cat(found)
 

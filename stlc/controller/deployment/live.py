@@ -14,7 +14,7 @@ from stlc.monitor.online.margins import Margin, Margins
 
 if TYPE_CHECKING:
     from stlc.controller.deployment.batched import Setting
-    from stlc.controller.deployment.simulator import Moment
+    from stlc.controller.deployment.simulator import SimulationStep
     from stlc.controller.problem.task import Task
 
 
@@ -30,11 +30,11 @@ class LiveMonitor:
 
     def __init__(self, task: Task, setting: Setting) -> None:
         self.task, self.setting = task, setting
-        self.moment: Moment | None = None
+        self.moment: SimulationStep | None = None
         self.counts: NDArray[np.int64] = np.zeros(len(SOURCES), dtype=np.int64)
         self._margins = Margins([as_driven(rule, task) for rule in task.rules], task.horizon)
 
-    def push(self, moment: Moment) -> None:
+    def push(self, moment: SimulationStep) -> None:
         """Take the next moment in."""
         self.moment = moment
         states = moment.x.numpy(force=True)

@@ -17,16 +17,16 @@ from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.diagnostics import Diagnostic, RunError
 
 if TYPE_CHECKING:
-    from stlc.controller.guard.guard import Decision, Guard
+    from stlc.controller.guard.guard import Guard, GuardDecision
     from stlc.controller.world import WorldType
 
-__all__ = ["Moment", "Recorder", "Recording", "Setting", "Watch", "drive"]
+__all__ = ["DeploymentRecording", "Recorder", "Setting", "SimulationStep", "Watch", "drive"]
 
 Frame = Mapping[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class DeploymentRecording:
     """What happened to `agents` agents of each seed; rows are the agents of the first seed, then of the next.
 
     Attributes:
@@ -82,7 +82,7 @@ class Recorder:
     pictured: bool = True
     states: list[Tensor] = field(default_factory=list)
     actions: list[Tensor] = field(default_factory=list)
-    decisions: list[Decision] = field(default_factory=list)
+    decisions: list[GuardDecision] = field(default_factory=list)
     frames: list[Frame] = field(default_factory=list)
     options: list[Tensor] = field(default_factory=list)
     quiet: list[Tensor] = field(default_factory=list)
@@ -96,7 +96,7 @@ class Recorder:
         self.states.append(x)
         self.frames.append(frame)
 
-    def step(self, decision: Decision, action: Tensor, x: Tensor, frame: Frame) -> None:
+    def step(self, decision: GuardDecision, action: Tensor, x: Tensor, frame: Frame) -> None:
         """One more step with `action` (rows, m), and the sample `x` (rows, n) behind it."""
         self.decisions.append(decision)
         self.actions.append(action)
@@ -107,7 +107,7 @@ class Recorder:
         self.states[-1] = x
         self.options.append(options)
 
-    def recording(self) -> Recording | None:
+    def recording(self) -> DeploymentRecording | None:
         """What there is so far, whole steps only; None before the first one."""
         steps = min(len(self.actions), len(self.frames) - 1)
         if steps < 1:
@@ -123,7 +123,7 @@ class Recorder:
         for name in self.replaced[0] if len(self.replaced) >= steps else ():
             plans = np.stack([frame[name] for frame in self.replaced[:steps]])
             scene[name] = np.concatenate((plans, np.full_like(plans[:1], np.nan)))
-        return Recording(
+        return DeploymentRecording(
             self.agents,
             torch.stack(self.states[: steps + 1], 1).numpy(force=True),
             torch.stack(self.actions[:steps], 1).numpy(force=True),
@@ -138,7 +138,7 @@ class Recorder:
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class SimulationStep:
     """A step of a deployment, as it has been decided.
 
     Attributes:
@@ -153,12 +153,12 @@ class Moment:
     step: int
     steps: int
     x: Tensor
-    decision: Decision | None
+    decision: GuardDecision | None
     planned: int = 0
     seconds: float = 0.0
 
 
-Watch = Callable[[Moment], None]
+Watch = Callable[[SimulationStep], None]
 
 
 class _Pilot:
@@ -168,7 +168,7 @@ class _Pilot:
         self.guard, self.replan = guard, setting.replan
         columns = guard.task.plain.signature.columns
         self.told = [index for index, column in enumerate(columns) if column.role == "env"]
-        self.decision: Decision | None = None
+        self.decision: GuardDecision | None = None
         self.age = torch.zeros(0, dtype=torch.int64)
 
     def due(self, x: Tensor, seen: Tensor, step: int) -> Tensor:
@@ -191,7 +191,7 @@ class _Pilot:
             pick[due] = self.guard.prefer(options[due], self._begun(due, options[:, 0]))
         return pick
 
-    def decide(self, x: Tensor, seen: Tensor, due: Tensor) -> tuple[Decision, Tensor]:
+    def decide(self, x: Tensor, seen: Tensor, due: Tensor) -> tuple[GuardDecision, Tensor]:
         """Decisions, and actions (rows, m), where those in rows `due` plan for what they see of `x`."""
         if len(due):
             new = self.guard.decide(seen[due], self._begun(due, seen))
@@ -203,7 +203,7 @@ class _Pilot:
         self.age, self.before = self.age + 1, x
         return self.decision, action
 
-    def _begun(self, due: Tensor, seen: Tensor) -> Decision | None:
+    def _begun(self, due: Tensor, seen: Tensor) -> GuardDecision | None:
         """What is left of the plans of those in rows `due`, who see `seen` (rows, n).
 
         Where several steps of a plan are taken before the next is made, the policy goes on from its end: the
@@ -245,17 +245,17 @@ def drive(
             recorder.replaced.append(replaced)
         _require_numbers(action, x, step, guard)
         if watch is not None:
-            watch(Moment(step, setting.steps, x, decision, len(due), seconds))
+            watch(SimulationStep(step, setting.steps, x, decision, len(due), seconds))
         x = worlds.advance(x, action, step + 1)
         recorder.step(decision, action, x, worlds.snapshot())
         recorder.quiet.append(worlds.quiet)
         recorder.progress = worlds.progress()
     if watch is not None:
-        watch(Moment(setting.steps, setting.steps, x, None))
+        watch(SimulationStep(setting.steps, setting.steps, x, None))
 
 
 def _replaced(
-    worlds: Worlds, guard: Guard, decision: Decision, seen: Tensor, due: Tensor
+    worlds: Worlds, guard: Guard, decision: GuardDecision, seen: Tensor, due: Tensor
 ) -> dict[str, NDArray[np.float32]] | None:
     """Where the plans of the first seed lead that a guard has just replaced, and those in their place.
 

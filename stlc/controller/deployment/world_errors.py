@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from traceback import extract_tb
@@ -49,15 +49,14 @@ def states_of(world: object, method: str, given: object, size: tuple[int, int]) 
         return given.detach().to("cpu", torch.float64)
 
 
-def require_numbers(world: object, method: str, x: Tensor, where: tuple[tuple[str, ...], str]) -> None:
+def require_numbers(world: object, method: str, x: Tensor, names: Sequence[str], when: str) -> None:
     """Raise SystemFileError (S302) where states (agents, n) hold NaN or infinity.
 
-    `where`: the names of the columns, and when it happened.
+    `names`: of the columns. `when`: of the deployment, for the message.
     """
     bad = ~torch.isfinite(x)
     if not bool(bad.any()):
         return
-    names, when = where
     agent, column = torch.nonzero(bad)[0].tolist()
     message = f"the world gives {x[agent, column]:g} for `{names[column]}` of agent {agent} {when}"
     raise SystemFileError(Diagnostic("S302", message, _defined_at(world, method), "by this"))

@@ -24,7 +24,7 @@ from stlc.version import __version__
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from stlc.controller.deployment.simulator import Recording, Setting
+    from stlc.controller.deployment.simulator import DeploymentRecording, Setting
     from stlc.controller.evaluation.rules import Rules
     from stlc.controller.training.run import Run
     from stlc.dynamics.model.system import System
@@ -36,7 +36,7 @@ UNGUARDED = ("eval/unguarded_trace.npz", "eval/unguarded_scene.npz")
 RESULT = "eval/simulate.json"
 
 
-def trace_of(run: Run, recording: Recording, setting: Setting, rules: Rules | None = None) -> Trace:
+def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: Rules | None = None) -> Trace:
     """All agents of all seeds as traces, decisions beside them.
 
     Extras, each (traces, steps): `action.NAME` for every control, `decision` (0 policy, 1 backup, 2 safest,
@@ -65,7 +65,7 @@ def trace_of(run: Run, recording: Recording, setting: Setting, rules: Rules | No
     )
 
 
-def _commanded(system: System, recording: Recording) -> NDArray[np.float64]:
+def _commanded(system: System, recording: DeploymentRecording) -> NDArray[np.float64]:
     """What actuators got, (rows, steps, m)."""
     states = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
     planned = torch.from_numpy(recording.actions)
@@ -74,7 +74,7 @@ def _commanded(system: System, recording: Recording) -> NDArray[np.float64]:
 
 def save_trace_of(
     run: Run,
-    recording: Recording,
+    recording: DeploymentRecording,
     setting: Setting,
     also: Path | None = None,
     *,
@@ -92,7 +92,7 @@ def save_trace_of(
 
 
 def save_unguarded(
-    run: Run, recording: Recording | None, setting: Setting, rules: Rules | None = None
+    run: Run, recording: DeploymentRecording | None, setting: Setting, rules: Rules | None = None
 ) -> None:
     """Write what the first seed drove without a guard, or remove what an older deployment left of it.
 

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stlc.controller.deployment.simulator import Moment, Recorder, Recording, Setting, drive
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, SimulationStep, drive
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.evaluation.rules import Rules, drives_of_plans, obeying, rules_of, verdict_on_drives
-from stlc.controller.guard.candidates import Limits
-from stlc.controller.guard.guard import Guard, Mode
+from stlc.controller.guard.candidates import Limits, Mode
+from stlc.controller.guard.guard import Guard
 from stlc.controller.training.config import DRIVES
 from stlc.controller.world import world_type
 from stlc.diagnostics import StlcError
@@ -277,13 +277,13 @@ class _Trial:
         known.cost = (whole - self.left()) / count
         known.seeds += count
 
-    def _driven(self, mode: Mode, seeds: Sequence[int], agents: int, share: float) -> Recording:
+    def _driven(self, mode: Mode, seeds: Sequence[int], agents: int, share: float) -> DeploymentRecording:
         """Drives to their end. Raises _LateError where that would take more than a share of what is left."""
         setting = Setting(tuple(seeds), agents, self.test.steps, self.test.replan)
         guard = Guard(self.task, self.policy, mode, limits=Limits(seconds=setting.limit))
         begun, recorder = self.left(), Recorder(agents, pictured=False)
 
-        def watch(moment: Moment) -> None:
+        def watch(moment: SimulationStep) -> None:
             spent = begun - self.left()
             hopeless = moment.step >= 3 and spent * moment.steps / moment.step > 1.5 * max(begun, 0.0)
             if self.left() <= 0.0 or spent > share * begun or hopeless:
@@ -294,7 +294,7 @@ class _Trial:
         assert recording is not None
         return recording
 
-    def _judged(self, recording: Recording) -> tuple[NDArray[np.bool_], NDArray[np.bool_] | None]:
+    def _judged(self, recording: DeploymentRecording) -> tuple[NDArray[np.bool_], NDArray[np.bool_] | None]:
         """Which drives satisfy the mission, and which what is tagged `@safety` in it."""
         rows = len(recording.states)
         if self.rules is None:

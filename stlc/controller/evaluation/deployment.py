@@ -13,14 +13,14 @@ import torch
 from numpy.typing import NDArray
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.deployment.simulator import Recorder, Recording, Setting, Watch, drive
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, Watch, drive
 from stlc.controller.evaluation.executed import Executed, judge_executed
 from stlc.controller.evaluation.metrics import measure
 from stlc.controller.evaluation.rules import Drives, Rules, drives_json, drives_of_plans, judge_drives
-from stlc.controller.evaluation.stats import Interval
-from stlc.controller.guard.candidates import SOURCES, Limits
+from stlc.controller.evaluation.stats import MeanInterval
+from stlc.controller.guard.candidates import SOURCES, Limits, Mode
 from stlc.controller.guard.feasibility import solvable
-from stlc.controller.guard.guard import Guard, Mode
+from stlc.controller.guard.guard import Guard
 from stlc.controller.world import world_type
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ LATENCY_SECONDS = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Latency:
+class DecisionLatency:
     """Seconds a decision for one agent alone, over states that were visited."""
 
     median: float
@@ -66,10 +66,10 @@ class Deployment:
     """
 
     guard: Mode
-    recording: Recording
-    metrics: Mapping[str, Interval]
+    recording: DeploymentRecording
+    metrics: Mapping[str, MeanInterval]
     decisions: Mapping[str, float]
-    latency: Latency
+    latency: DecisionLatency
     unsafe: tuple[Unsafe, ...]
     drives: Drives
 
@@ -77,7 +77,7 @@ class Deployment:
 class InterruptedDeploymentError(Exception):
     """A deployment ended early; carries what happened until then."""
 
-    def __init__(self, recording: Recording | None) -> None:
+    def __init__(self, recording: DeploymentRecording | None) -> None:
         super().__init__("the deployment ended early")
         self.recording = recording
 
@@ -111,7 +111,9 @@ def deploy(
         raise InterruptedDeploymentError(recorder.recording()) from error
 
 
-def judged(guard: Guard, recording: Recording, ceiling: int = 0, rules: Rules | None = None) -> Deployment:
+def judged(
+    guard: Guard, recording: DeploymentRecording, ceiling: int = 0, rules: Rules | None = None
+) -> Deployment:
     """What is to be known of a recorded deployment under a guard; see `feasible_states` for `ceiling`.
 
     Without `rules` a drive obeys where it satisfies the specification of plans from every start.
@@ -139,7 +141,7 @@ def unsafe_agents(executed: Executed, agents: int) -> tuple[Unsafe, ...]:
     return tuple(Unsafe(*divmod(row, agents), bool(executed.savable[row])) for row in rows)
 
 
-def feasible_states(task: Task, recording: Recording, count: int) -> NDArray[np.float64]:
+def feasible_states(task: Task, recording: DeploymentRecording, count: int) -> NDArray[np.float64]:
     """Whether some plan satisfies the specification, in `count` visited states, evenly spread: (rows, steps).
 
     1: the plan that was followed does, or a search has found one; 0: neither; NaN: nobody has looked.
@@ -152,7 +154,7 @@ def feasible_states(task: Task, recording: Recording, count: int) -> NDArray[np.
     return known
 
 
-def decided(recording: Recording) -> dict[str, float]:
+def decided(recording: DeploymentRecording) -> dict[str, float]:
     """Who decided, as shares of all decisions."""
     found = {name: float((recording.source == index).mean()) for index, name in enumerate(SOURCES)}
     backup = recording.source == SOURCES.index("backup")
@@ -161,7 +163,7 @@ def decided(recording: Recording) -> dict[str, float]:
     return found
 
 
-def latency(guard: Guard, recording: Recording, samples: int = LATENCY_SAMPLES) -> Latency:
+def latency(guard: Guard, recording: DeploymentRecording, samples: int = LATENCY_SAMPLES) -> DecisionLatency:
     """Time decisions for one agent alone in states drawn evenly from those visited, some seconds at most.
 
     Each goes on from a decision in the state before, as in the deployment; that one is not timed.
@@ -179,7 +181,7 @@ def latency(guard: Guard, recording: Recording, samples: int = LATENCY_SAMPLES) 
         seconds.append(perf_counter() - begin)
         if perf_counter() > stop:
             break
-    return Latency(float(np.median(seconds)), float(np.quantile(seconds, 0.99)), len(seconds))
+    return DecisionLatency(float(np.median(seconds)), float(np.quantile(seconds, 0.99)), len(seconds))
 
 
 def as_json(

@@ -22,7 +22,7 @@ from stlc.controller.guard.feasibility import viable as search_safe
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
-    from stlc.controller.deployment.simulator import Recording
+    from stlc.controller.deployment.simulator import DeploymentRecording
     from stlc.controller.problem.task import Task
 
 Mask = NDArray[np.bool_]
@@ -60,7 +60,7 @@ class Executed:
         return held
 
 
-def judge_executed(task: Task, recording: Recording, *, savable: Mask | None = None) -> Executed:
+def judge_executed(task: Task, recording: DeploymentRecording, *, savable: Mask | None = None) -> Executed:
     """Judge what happened. Without a window that fits, there are no starts.
 
     `savable`: (rows,) from whose first states a safe plan is known; a search finds them if not given.
@@ -106,7 +106,7 @@ def _margin(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], coun
     return np.broadcast_to(margin, (count, next(iter(columns.values())).shape[1]))
 
 
-def as_foreseen(task: Task, recording: Recording) -> Mask:
+def as_foreseen(task: Task, recording: DeploymentRecording) -> Mask:
     """Whether the world did at a step what the model says, (rows, steps)."""
     before = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
     action = torch.from_numpy(recording.actions).flatten(0, 1)

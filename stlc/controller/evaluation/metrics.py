@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.evaluation.stats import Interval
+from stlc.controller.evaluation.stats import MeanInterval
 
 if TYPE_CHECKING:
-    from stlc.controller.deployment.simulator import Recording
+    from stlc.controller.deployment.simulator import DeploymentRecording
     from stlc.controller.evaluation.executed import Executed
 
 Mask: TypeAlias = NDArray[np.bool_]
@@ -229,8 +229,8 @@ def is_progress(key: str) -> bool:
 
 
 def measure(
-    recording: Recording, executed: Executed, feasible: NDArray[np.float64] | None = None
-) -> dict[str, Interval]:
+    recording: DeploymentRecording, executed: Executed, feasible: NDArray[np.float64] | None = None
+) -> dict[str, MeanInterval]:
     """All metrics over the seeds that have them, the requirements one by one, and the progress of the world.
 
     Args:
@@ -243,11 +243,11 @@ def measure(
     for found, progress in zip(each, recording.progress, strict=True):
         found |= {name: float(value) for name, value in progress.items()}
     values = {key: [one[key] for one in each if math.isfinite(one.get(key, math.nan))] for key in each[0]}
-    return {key: Interval.of(some) for key, some in values.items() if some}
+    return {key: MeanInterval.of(some) for key, some in values.items() if some}
 
 
 def _of_seed(
-    recording: Recording, executed: Executed, feasible: NDArray[np.float64] | None, own: slice
+    recording: DeploymentRecording, executed: Executed, feasible: NDArray[np.float64] | None, own: slice
 ) -> Iterator[tuple[str, float]]:
     names, safety = tuple(executed.rules), executed.safety
     seed = Seed(

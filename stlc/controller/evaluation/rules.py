@@ -30,7 +30,7 @@ from stlc.monitor.verdict import Monitor
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from stlc.controller.deployment.simulator import Recording
+    from stlc.controller.deployment.simulator import DeploymentRecording
     from stlc.controller.problem.task import Task
     from stlc.controller.training.run import Run
     from stlc.dynamics.declaration.decl import SystemDecl
@@ -255,7 +255,9 @@ def _requirements(spec: ast.Spec) -> Iterator[ast.Require]:
 # ----------------------------------------------------------------------- who obeyed
 
 
-def judge_drives(rules: Rules, task: Task, recording: Recording, savable: NDArray[np.bool_]) -> Drives:
+def judge_drives(
+    rules: Rules, task: Task, recording: DeploymentRecording, savable: NDArray[np.bool_]
+) -> Drives:
     """Judge every drive from its first sample to its last.
 
     Args:
@@ -280,7 +282,7 @@ def judge_drives(rules: Rules, task: Task, recording: Recording, savable: NDArra
     return Drives(found, broken, viable | obeying(found, len(savable)))
 
 
-def verdict_on_drives(rules: Rules, task: Task, recording: Recording) -> Verdict:
+def verdict_on_drives(rules: Rules, task: Task, recording: DeploymentRecording) -> Verdict:
     """The verdict on every drive from its first sample to its last; raises SpecError as `judge_drives`."""
     outside = any(isinstance(item, ast.Extern) for item in rules.spec.items)
     decl = task.system.decl
@@ -296,7 +298,7 @@ def verdict_on_drives(rules: Rules, task: Task, recording: Recording) -> Verdict
 
 
 def _lost(
-    broken: Broken, safety: frozenset[str], task: Task, recording: Recording, savable: bool
+    broken: Broken, safety: frozenset[str], task: Task, recording: DeploymentRecording, savable: bool
 ) -> Lost | None:
     """When a drive was lost that broke rules, by the first of those tagged `@safety`, else by the first."""
     row, unsafe = broken.row, not safety.isdisjoint(broken.rules)

@@ -12,7 +12,7 @@ _Z = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2)
 
 
 @dataclass(frozen=True, slots=True)
-class Interval:
+class MeanInterval:
     """A mean over seeds and where it lies with 95 % confidence; no `low` and `high` for a single seed."""
 
     mean: float
@@ -21,7 +21,7 @@ class Interval:
     values: tuple[float, ...]
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> Interval:
+    def of(cls, values: Sequence[float]) -> MeanInterval:
         """Of at least one value; values that are not finite leave the interval open."""
         mean = fmean(values)
         if len(values) < 2 or not all(map(math.isfinite, values)):

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from math import inf
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import torch
 from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.guard.margins import RobustnessMargins
 from stlc.runtime.prefixes import Grid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from stlc.controller.problem.task import Task
+
+Mode: TypeAlias = Literal["none", "paper", "full"]
+RobustnessMargins: TypeAlias = Mapping[str, float]
+"""Safety requirement -> robustness that plans must keep, in its own unit; none if left out."""
 
 SOURCES = ("policy", "backup", "safest", "polished")
 TO_SPARE = 0.05

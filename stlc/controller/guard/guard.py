@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.guard.candidates import Candidates, Limits, finite
+from stlc.controller.guard.candidates import Candidates, Limits, Mode, finite
 from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.safe_prefix import robustness_until
 from stlc.controller.guard.search import RelaxedSearch, StagedSearch
@@ -19,15 +19,14 @@ from stlc.runtime.prefixes import Grid
 
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import Policy
-    from stlc.controller.problem.task import Judged, Task
+    from stlc.controller.problem.task import PlanVerdicts, Task
 
-Mode: TypeAlias = Literal["none", "paper", "full"]
 GUARD_VERSION = 1
 """Raised with every change of a guard's decisions; benchmarks drive anew what older guards drove."""
 
 
 @dataclass(frozen=True, slots=True)
-class Decision:
+class GuardDecision:
     """What agents do now, and why.
 
     Attributes:
@@ -50,7 +49,7 @@ class Decision:
     policy_rho: Tensor
     proposed: Tensor
 
-    def later(self, steps: int | Tensor = 1) -> Decision:
+    def later(self, steps: int | Tensor = 1) -> GuardDecision:
         """The same decision so many steps later, (agents,) or one number: what is left of the plans.
 
         Their last actions are held on.
@@ -61,17 +60,17 @@ class Decision:
         plan = self.plan.gather(1, index.to(self.plan.device))
         return replace(self, plan=plan, action=plan[:, 0])
 
-    def of(self, rows: Tensor) -> Decision:
+    def of(self, rows: Tensor) -> GuardDecision:
         """Those of some agents, (k,) indices."""
-        return Decision(*(getattr(self, name)[rows] for name in _FIELDS))
+        return GuardDecision(*(getattr(self, name)[rows] for name in _FIELDS))
 
-    def with_new(self, rows: Tensor, new: Decision) -> Decision:
+    def with_new(self, rows: Tensor, new: GuardDecision) -> GuardDecision:
         """These decisions, but for some agents, (k,) indices, which have decided anew."""
         pairs = ((getattr(self, name), getattr(new, name)) for name in _FIELDS)
-        return Decision(*(old.index_copy(0, rows, fresh) for old, fresh in pairs))
+        return GuardDecision(*(old.index_copy(0, rows, fresh) for old, fresh in pairs))
 
 
-_FIELDS = tuple(each.name for each in fields(Decision))
+_FIELDS = tuple(each.name for each in fields(GuardDecision))
 
 
 class Guard:
@@ -108,7 +107,7 @@ class Guard:
             self.backup = StagedSearch(self.strict, self.policy, mode, grid=grid, limits=limits)
 
     @torch.no_grad()
-    def decide(self, x: Tensor, begun: Decision | None = None) -> Decision:
+    def decide(self, x: Tensor, begun: GuardDecision | None = None) -> GuardDecision:
         """Decide for (agents, n) states; verdicts are taken in float64.
 
         A plan that was begun and still satisfies the specification is gone on with where the new one is no
@@ -117,7 +116,7 @@ class Guard:
 
         Args:
             x: (agents, n) states.
-            begun: what is left of the decision before; see `Decision.later`.
+            begun: what is left of the decision before; see `GuardDecision.later`.
 
         Returns:
             The decision. Without a guard a plan that is no number is handed on, with robustness -inf.
@@ -129,7 +128,7 @@ class Guard:
         if self.backup is not None and len(failing):
             previous = None if begun is None else begun.plan[failing]
             found.put(failing, self.backup.search(x[failing], fresh[failing], previous))
-        decision = Decision(
+        decision = GuardDecision(
             found.plans[:, 0],
             found.plans,
             found.source,
@@ -141,14 +140,14 @@ class Guard:
         )
         return decision if self.strict is self.task else self._plainly(decision, x, fresh)
 
-    def _plainly(self, decision: Decision, x: Tensor, fresh: Tensor) -> Decision:
+    def _plainly(self, decision: GuardDecision, x: Tensor, fresh: Tensor) -> GuardDecision:
         """The decision with the verdicts of the task itself."""
         taken = self.task.judge(x, decision.plan, states=False)
         policy_rho = self.task.judge(x, fresh, states=False).rho
         return replace(decision, rho=taken.rho, safe=taken.safe >= -TOLERANCE, policy_rho=policy_rho)
 
     @torch.no_grad()
-    def endangered(self, x: Tensor, begun: Decision, steps: int | Tensor) -> Tensor:
+    def endangered(self, x: Tensor, begun: GuardDecision, steps: int | Tensor) -> Tensor:
         """Who would, by the model, violate the safety requirements with the next steps of a begun plan.
 
         Args:
@@ -166,7 +165,7 @@ class Guard:
         return ~(robustness_until(formulas, columns, steps) >= -TOLERANCE)
 
     @torch.no_grad()
-    def prefer(self, options: Tensor, begun: Decision | None = None) -> Tensor:
+    def prefer(self, options: Tensor, begun: GuardDecision | None = None) -> Tensor:
         """Which of its options each agent plans best for; of equals the first.
 
         Args:
@@ -185,11 +184,11 @@ class Guard:
             score[:, 0] = torch.maximum(score[:, 0], rest)
         return (score >= score.amax(1, keepdim=True)).to(torch.uint8).argmax(1)
 
-    def _score(self, judged: Judged) -> Tensor:
+    def _score(self, judged: PlanVerdicts) -> Tensor:
         return rank(judged.rho, self.strict.cost(judged), judged.safe)
 
     @torch.no_grad()
-    def carried_on(self, x: Tensor, begun: Decision, taken: Tensor) -> Decision:
+    def carried_on(self, x: Tensor, begun: GuardDecision, taken: Tensor) -> GuardDecision:
         """What is left of plans for (agents, n) states, the policy's own from their end on.
 
         `taken`: how many steps of each are behind it, (agents,); so many of its last actions are replaced.
@@ -206,7 +205,9 @@ class Guard:
             plan[rows] = torch.cat((plan[rows, :left], tail[:, : length - left]), 1)
         return replace(begun, plan=plan, action=plan[:, 0])
 
-    def _kept(self, x: Tensor, begun: Decision | None, fresh: Tensor, judged: Judged) -> Candidates:
+    def _kept(
+        self, x: Tensor, begun: GuardDecision | None, fresh: Tensor, judged: PlanVerdicts
+    ) -> Candidates:
         """The policy's plans, or what is left of those that were begun."""
         zero, free = torch.zeros(len(x), dtype=torch.int64, device=x.device), torch.zeros_like(judged.rho)
         found = Candidates(fresh.clone(), judged.rho.clone(), judged.safe.clone(), free, zero, zero.clone())
@@ -219,7 +220,7 @@ class Guard:
         found.put(keep, before.of(keep))
         return found
 
-    def _deepened(self, rest: Judged) -> Tensor:
+    def _deepened(self, rest: PlanVerdicts) -> Tensor:
         """Whether what is left of a plan satisfies an open goal of the mission more and more, (agents,)."""
         if not self.task.promises.items:
             return torch.zeros_like(rest.rho, dtype=torch.bool)

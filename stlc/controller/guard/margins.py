@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -28,12 +28,9 @@ from stlc.registry import closest
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
-    from stlc.controller.guard.guard import Mode
+    from stlc.controller.guard.candidates import Mode, RobustnessMargins
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
-
-RobustnessMargins: TypeAlias = Mapping[str, float]
-"""Safety requirement -> robustness that plans must keep, in its own unit; none if left out."""
 
 
 def with_margins(task: Task, margin: RobustnessMargins) -> Task:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from stlc.controller.methods._network import NetworkMethod
 from stlc.controller.training.config import base_config
+from stlc.controller.training.learner import NetworkMethod
 from stlc.controller.training.objective import paper_objective
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import torch
 from torch import Tensor, nn
 
-from stlc.controller.problem.task import Judged, rank
+from stlc.controller.problem.task import PlanVerdicts, rank
 from stlc.dynamics.model.controls import raw_width, squash
 
 if TYPE_CHECKING:
@@ -35,11 +35,11 @@ class SelfJudging(Protocol):
 
     task: Task
 
-    def plan_judged(self, x0: Tensor) -> tuple[Tensor, Judged]:
+    def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
         """The plan to follow and its verdict: (B, n) -> (B, T, m), verdicts over (B,)."""
 
 
-def plan_judged(task: Task, policy: Policy, x0: Tensor) -> tuple[Tensor, Judged]:
+def plan_judged(task: Task, policy: Policy, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
     """The plans of a policy from states (B, n) in their dtype, (B, T, m), and their verdicts."""
     if isinstance(policy, SelfJudging) and policy.task is task:
         plans, judged = policy.plan_judged(x0)
@@ -158,7 +158,7 @@ class BestOfKPolicy:
 
     __call__ = plan
 
-    def plan_judged(self, x0: Tensor) -> tuple[Tensor, Judged]:
+    def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
         """The plan to follow and its verdict: (B, n) -> (B, T, m), verdicts over (B,)."""
         plans = self.candidates(x0)
         batch, count, steps, controls = plans.shape
@@ -169,9 +169,9 @@ class BestOfKPolicy:
         return plans[rows, best], select(judged, index)
 
 
-def select(judged: Judged, index: Tensor) -> Judged:
+def select(judged: PlanVerdicts, index: Tensor) -> PlanVerdicts:
     """The verdicts at `index`, (k,) positions along the batch."""
-    return Judged(
+    return PlanVerdicts(
         rho=judged.rho[index],
         safe=judged.safe[index],
         requirements=judged.requirements[index],

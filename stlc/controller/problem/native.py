@@ -7,7 +7,7 @@ no C form, torch does the same work, and `torch_reasons` says why.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -22,12 +22,13 @@ from stlc.native import Adjoint, Climb, Kernel, Outcome, Stop, load, never, why_
 from stlc.toolchain import compiler
 
 if TYPE_CHECKING:
-    from stlc.controller.problem.task import Task
+    from stlc.compile.pipeline import CompiledRequirement
+    from stlc.dynamics.model.system import System
 
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How much a native climb tries.
+    """Effort of a native local search.
 
     Attributes:
         generations: of changed plans per row.
@@ -44,10 +45,10 @@ class Effort:
     stop: Stop = never
 
 
-def motion_of(task: Task) -> Motion:
-    """One exact step of a task's system, as the C emitters read it."""
-    step = task.system.exact_step
-    return Motion(task.names, task.system.control_names, step.lets, step.next, task.horizon, task.dt)
+def motion_of(system: System) -> Motion:
+    """One exact step of a system, as the C emitters read it."""
+    step = system.exact_step
+    return Motion(system.names, system.control_names, step.lets, step.next, system.horizon, system.dt)
 
 
 class NativeJudge:
@@ -58,26 +59,27 @@ class NativeJudge:
         names: of the state columns.
     """
 
-    def __init__(self, kernel: Kernel, task: Task) -> None:
+    def __init__(self, kernel: Kernel, system: System, rules: Sequence[CompiledRequirement]) -> None:
         self.kernel = kernel
-        self.names = task.names
-        self.rules = len(task.rules)
-        controls = task.system.controls
+        self.names = system.names
+        self.rules = len(rules)
+        controls = system.controls
         turns = torch.tensor([control.squash == "angle" for control in controls])
-        low, high = task.system.control_low, task.system.control_high
+        low, high = system.control_low, system.control_high
         self._bounds = torch.stack((low, high, turns.to(low.dtype))).double().numpy()
-        self._factors = np.array([rule.weight / rule.scale for rule in task.rules])
+        self._factors = np.array([rule.weight / rule.scale for rule in rules])
 
     @classmethod
-    def of(cls, task: Task) -> NativeJudge | None:
-        """The kernel of a task, built if need be; None where torch has to do its work."""
+    def of(cls, system: System, rules: Sequence[CompiledRequirement]) -> NativeJudge | None:
+        """The kernel of a system and its requirements; None where torch has to do its work."""
         try:
-            library = load(emit(motion_of(task), [rule.formula for rule in task.rules]))
+            library = load(emit(motion_of(system), [rule.formula for rule in rules]))
         except Untranslatable:
             return None
         if library is None:
             return None
-        return cls(Kernel(library, states=len(task.names), rules=len(task.rules), steps=task.horizon), task)
+        kernel = Kernel(library, states=len(system.names), rules=len(rules), steps=system.horizon)
+        return cls(kernel, system, rules)
 
     def judge(self, x0: Tensor, u: Tensor, *, columns: bool) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Robustness per requirement (B, R), and the states (T+1, B) by name where they are wanted.
@@ -143,16 +145,18 @@ class NativeGradient:
         self.adjoint = adjoint
 
     @classmethod
-    def of(cls, task: Task) -> NativeGradient | None:
-        """For a task; None where torch has to differentiate."""
-        if task.native is None:
+    def of(
+        cls, system: System, rules: Sequence[CompiledRequirement], judge: NativeJudge | None
+    ) -> NativeGradient | None:
+        """For a system and its requirements; None where torch has to differentiate."""
+        if judge is None:
             return None
-        fixed = [timer.name for timer in task.system.timers]
+        fixed = [timer.name for timer in system.timers]
         try:
-            library = load(emit_adjoint(motion_of(task), [rule.formula for rule in task.rules], fixed=fixed))
+            library = load(emit_adjoint(motion_of(system), [rule.formula for rule in rules], fixed=fixed))
         except Untranslatable:
             return None
-        return None if library is None else cls(task.native, Adjoint(library))
+        return None if library is None else cls(judge, Adjoint(library))
 
     def __call__(self, x0: Tensor, u: Tensor, *, slope: float) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Robustness per requirement (B, R) and states (T+1, B) by name, differentiable by `u`.
@@ -198,33 +202,8 @@ class _Judged(torch.autograd.Function):
         return None, None, torch.from_numpy(gradient).to(u.dtype), None
 
 
-def torch_reasons(task: Task, device: str, *, searches: bool, smooth: bool) -> Mapping[str, str]:
-    """Why torch does the work: for each part of a training a reason, or "" where it runs as C.
-
-    The parts are `verdicts` of plans, `search` for better ones and the `gradient` of robustness.
-
-    Args:
-        task: specification and system.
-        device: of torch, by its type.
-        searches: whether the training searches for plans.
-        smooth: whether its objective is smooth, for which there is no native gradient.
-    """
-    if device != "cpu":
-        return dict.fromkeys(("verdicts", "search", "gradient"), f"the device is {device}")
-    rules = [rule.formula for rule in task.rules]
-    judged = "" if task.native is not None else _reason(lambda: emit(motion_of(task), rules))
-    if smooth:
-        gradient = "the paper's objective is smooth"
-    elif judged or task.gradient is not None:
-        gradient = judged
-    else:
-        gradient = _reason(lambda: emit_adjoint(motion_of(task), rules))
-    searched = {"search": judged} if searches else {}
-    return {"verdicts": judged, **searched, "gradient": gradient}
-
-
-def _reason(text: Callable[[], str]) -> str:
-    """Why there is no library of a text."""
+def reason(text: Callable[[], str]) -> str:
+    """Cause why there is no library of a C text."""
     if compiler() is None:
         return "there is no C compiler"
     try:

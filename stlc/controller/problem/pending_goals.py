@@ -31,7 +31,7 @@ HELD = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Promise:
+class PendingGoal:
     """An `eventually@` of a state formula.
 
     Attributes:
@@ -47,7 +47,7 @@ class Promise:
     last: float
 
 
-class Promises:
+class PendingGoals:
     """The promises of a mission.
 
     Attributes:
@@ -101,7 +101,7 @@ class Promises:
         return found
 
 
-def _promise(name: str, formula: typed.Formula, grid: Grid) -> Promise | None:
+def _promise(name: str, formula: typed.Formula, grid: Grid) -> PendingGoal | None:
     match formula:
         case typed.Temporal(
             op="eventually",
@@ -110,7 +110,7 @@ def _promise(name: str, formula: typed.Formula, grid: Grid) -> Promise | None:
         ):
             lowered = lower(body, grid, [])
             if reach(lowered) == Reach(0, 0):
-                return Promise(name, lowered, _steps(lo, grid), _steps(hi, grid))
+                return PendingGoal(name, lowered, _steps(lo, grid), _steps(hi, grid))
         case _:
             pass
     return None

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from stlc.compile.backends.array.arith import Program
 from stlc.compile.backends.array.graph import RobustnessGraph, evaluate
+from stlc.compile.backends.c.adjoint import emit_adjoint
+from stlc.compile.backends.c.emit import emit
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.frontend.parameters import fixed
 from stlc.compile.ir.discretize import Grid
@@ -18,8 +20,8 @@ from stlc.compile.ir.traverse import nodes
 from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.compile.semantics.switch import Hard, Switch
-from stlc.controller.problem.native import NativeGradient, NativeJudge
-from stlc.controller.problem.pending_goals import Promises
+from stlc.controller.problem.native import NativeGradient, NativeJudge, motion_of, reason
+from stlc.controller.problem.pending_goals import PendingGoals
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -44,7 +46,7 @@ SHORT = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class PlanVerdicts:
     """What became of a batch of plans, exact semantics, no gradient.
 
     Attributes:
@@ -186,14 +188,36 @@ class Task:
     @cached_property
     def native(self) -> NativeJudge | None:
         """The kernel that does what needs no gradient; None where torch has to."""
-        return NativeJudge.of(self)
+        return NativeJudge.of(self.system, self.rules)
 
     @cached_property
     def gradient(self) -> NativeGradient | None:
         """Robustness and states differentiable by plans, natively; None where torch has to differentiate."""
-        return NativeGradient.of(self)
+        return NativeGradient.of(self.system, self.rules, self.native)
 
-    def judge(self, x0: Tensor, u: Tensor, *, states: bool = True) -> Judged:
+    def torch_reasons(self, device: str, *, searches: bool, smooth: bool) -> Mapping[str, str]:
+        """Why torch does the work: for each part of a training a reason, or "" where it runs as C.
+
+        The parts are `verdicts` of plans, `search` for better ones and the `gradient` of robustness.
+
+        Args:
+            device: of torch, by its type.
+            searches: whether the training searches for plans.
+            smooth: whether its objective is smooth, for which there is no native gradient.
+        """
+        if device != "cpu":
+            return dict.fromkeys(("verdicts", "search", "gradient"), f"the device is {device}")
+        motion, formulas = motion_of(self.system), [rule.formula for rule in self.rules]
+        judged = "" if self.native is not None else reason(lambda: emit(motion, formulas))
+        if smooth:
+            gradient = "the paper's objective is smooth"
+        elif judged or self.gradient is not None:
+            gradient = judged
+        else:
+            gradient = reason(lambda: emit_adjoint(motion, formulas))
+        return {"verdicts": judged, **({"search": judged} if searches else {}), "gradient": gradient}
+
+    def judge(self, x0: Tensor, u: Tensor, *, states: bool = True) -> PlanVerdicts:
         """Roll plans out exactly and judge them, without gradient.
 
         Args:
@@ -214,7 +238,7 @@ class Task:
             lost = torch.full_like(rho, -torch.inf)
             rho, safe = torch.where(broken, lost, rho), torch.where(broken, lost, safe)
             each = torch.where(broken[:, None], lost[:, None], each)
-        return Judged(rho, safe, each, u, columns)
+        return PlanVerdicts(rho, safe, each, u, columns)
 
     def _judged(self, x0: Tensor, u: Tensor, *, states: bool) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Robustness per requirement and states, by the native kernel where it can."""
@@ -242,7 +266,7 @@ class Task:
         parts = sum(1 for rule in self.rules for _ in nodes(rule.formula))
         return (self.horizon + 1) * (2 * len(self.names) + 2 * len(self.system.control_names) + 4 * parts)
 
-    def cost(self, judged: Judged) -> Tensor:
+    def cost(self, judged: PlanVerdicts) -> Tensor:
         """What plans are chosen by where they satisfy the specification, without gradient: (batch,).
 
         These are the performance terms as if every plan were satisfying. On a mission the pull of the next
@@ -272,9 +296,9 @@ class Task:
         return cost + PULL * gap.mean(0)
 
     @cached_property
-    def promises(self) -> Promises:
+    def promises(self) -> PendingGoals:
         """What a mission promises, and how much it is to be kept with."""
-        return Promises(self.compiled, self.system.decl.objective.gamma)
+        return PendingGoals(self.compiled, self.system.decl.objective.gamma)
 
     @cached_property
     def _pull(self) -> Program | None:

@@ -15,14 +15,14 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
-
-from stlc.controller.training.config import cores
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from stlc.controller.training.config import Clock
+
+Clock = Literal["wall", "processor"]
+"""Quantity that a budget counts: time that passes, or processor time as on an idle machine."""
 
 PROVISIONAL = 10_000
 """Steps that are planned until the first of them have been timed."""
@@ -40,6 +40,12 @@ ROUNDS = 3
 """Search rounds over which the time that is spent on them is averaged."""
 FIRST_SEARCH = 1.0
 """Intervals between search rounds that the first search is expected to take."""
+
+
+def cores() -> int:
+    """Cores that this process may use: its share, where several of this machine train together."""
+    found = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, found // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
 
 def processor() -> float:

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, get_args
 
 import torch
 
+from stlc.controller.training.budget import Clock, StepSchedule, cores
 from stlc.registry import METHODS
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.budget import StepSchedule
-
-Clock = Literal["wall", "processor"]
-"""What a budget counts: time that passes, or processor time as it would pass on an idle machine."""
 
 ENGINE_VERSION = 2
 """Raised with every change of what the engine reaches; figures that another one made are taken anew."""
@@ -197,12 +193,6 @@ def base_config(
         clock=config.clock,
         drives=config.drives,
     )
-
-
-def cores() -> int:
-    """Cores that this process may use: its share, where several of this machine train together."""
-    found = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, found // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
 
 def _threads(*, searching: bool) -> int:

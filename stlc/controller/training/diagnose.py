@@ -46,7 +46,7 @@ SHOWN = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class TrainingStep:
     """What a training step was made with.
 
     Attributes:
@@ -64,14 +64,16 @@ class Step:
     number: int
 
     @classmethod
-    def of(cls, network: PlanNetwork, objective: Objective, x0: Tensor, number: int, task: Task) -> Step:
+    def of(
+        cls, network: PlanNetwork, objective: Objective, x0: Tensor, number: int, task: Task
+    ) -> TrainingStep:
         """The step with all plans of the network for states (B, n)."""
         with torch.no_grad():
             plans = network(x0)
         return cls(task, objective, x0.repeat_interleave(plans.shape[1], 0), plans.flatten(0, 1), number)
 
 
-def diagnose(step: Step) -> StlcError:
+def diagnose(step: TrainingStep) -> StlcError:
     """The first of what a training step needs that is no number, and where."""
     for look in (_plans, _motion, _robustness, _cost):
         found = look(step)
@@ -86,7 +88,7 @@ def diagnose(step: Step) -> StlcError:
     )
 
 
-def _plans(step: Step) -> StlcError | None:
+def _plans(step: TrainingStep) -> StlcError | None:
     row = _first(~torch.isfinite(step.u).flatten(1).all(1))
     if row is None:
         return None
@@ -100,7 +102,7 @@ def _plans(step: Step) -> StlcError | None:
     )
 
 
-def _motion(step: Step) -> StlcError | None:
+def _motion(step: TrainingStep) -> StlcError | None:
     with torch.no_grad():
         states = step.task.system.rollout(step.x0, step.u, HARD)
     bad = ~torch.isfinite(states)
@@ -123,7 +125,7 @@ def _motion(step: Step) -> StlcError | None:
     )
 
 
-def _robustness(step: Step) -> StlcError | None:
+def _robustness(step: TrainingStep) -> StlcError | None:
     """A requirement whose value, or else whose gradient, is no finite number on states that are.
 
     A value that is infinite spoils the gradients of all requirements, so values come first.
@@ -149,7 +151,7 @@ def _robustness(step: Step) -> StlcError | None:
     return None
 
 
-def _cost(step: Step) -> StlcError | None:
+def _cost(step: TrainingStep) -> StlcError | None:
     """A performance term whose value or gradient is no number."""
     declared = step.task.system.decl
     for term in declared.objective.terms:
@@ -176,7 +178,7 @@ def _cost(step: Step) -> StlcError | None:
     return None
 
 
-def _each(step: Step, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
+def _each(step: TrainingStep, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
     """Robustness per requirement (B, R) and states (T+1, B), differentiable as training has them."""
     native = native_rolled(step.task, step.objective, step.x0, u)
     if native is not None:
@@ -186,7 +188,7 @@ def _each(step: Step, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
     return step.task.graph.per_requirement_columns(columns, ops=TORCH, smoothing=smoothing), columns
 
 
-def _differentiated(step: Step, value_of: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+def _differentiated(step: TrainingStep, value_of: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
     """A value per plan (B,) and its gradient by the plan, (B, T, m)."""
     u = step.u.detach().requires_grad_()
     value = value_of(u)
@@ -215,21 +217,21 @@ def _first(marks: Tensor) -> int | None:
     return int(rows[0]) if len(rows) else None
 
 
-def _state(step: Step, row: int) -> str:
+def _state(step: TrainingStep, row: int) -> str:
     columns = zip(step.task.system.signature.columns, step.x0[row].tolist(), strict=True)
     return ", ".join(
         f"{column.name} = {value:.4g} {column.unit}".removesuffix(" 1") for column, value in columns
     )
 
 
-def _plan(step: Step, row: int, steps: int | None = None) -> str:
+def _plan(step: TrainingStep, row: int, steps: int | None = None) -> str:
     shown = min(SHOWN, step.u.shape[1] if steps is None else max(steps, 1))
     values = zip(step.task.system.control_names, step.u[row, :shown].t().tolist(), strict=True)
     more = ", …" if shown < step.u.shape[1] else ""
     return "; ".join(f"{name} = {', '.join(f'{value:.4g}' for value in line)}{more}" for name, line in values)
 
 
-def _at(step: Step) -> str:
+def _at(step: TrainingStep) -> str:
     return f"at training step {step.number}"
 
 

@@ -106,7 +106,7 @@ class Layer:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class ExplorationResult:
     """What one start came to.
 
     Attributes:
@@ -150,7 +150,7 @@ class Exploration:
         sweeps: int,
         generator: torch.Generator,
         enough: Callable[[], bool] = lambda: False,
-    ) -> Found:
+    ) -> ExplorationResult:
         """A satisfying plan from the state (n,), as far as one was found.
 
         Args:
@@ -165,17 +165,17 @@ class Exploration:
         layers += [layers[0].rows(np.empty(0, dtype=np.int64))] * self.task.horizon
         for sweep in range(sweeps):
             if sweep and enough():
-                return Found(None, sweep)
+                return ExplorationResult(None, sweep)
             for layer in range(self.task.horizon):
                 if not len(layers[layer]):
                     continue
                 grown = self._grown(layers[layer], random)
                 length = grown.plans.shape[1]
                 if length == self.task.horizon and len(grown):
-                    return Found(self._best(x, grown), sweep + 1)
+                    return ExplorationResult(self._best(x, grown), sweep + 1)
                 before = layers[length]
                 layers[length] = self._thinned(before.joined(grown) if len(before) else grown, random)
-        return Found(None, sweeps)
+        return ExplorationResult(None, sweeps)
 
     def solved(
         self,

@@ -28,7 +28,7 @@ VERDICT_LEAST, VERDICT_SHARE = 20.0, 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class TrainingOutcome:
     """Result of a training.
 
     Attributes:
@@ -79,7 +79,7 @@ class FinalEvaluation:
     def _for_simulations(self) -> float:
         return simulation_reserve(self.time.seconds) if self.config.drives else 0.0
 
-    def of(self, policy: Policy, steps: int) -> Outcome:
+    def of(self, policy: Policy, steps: int) -> TrainingOutcome:
         """Judge a policy after so many steps, keep the verdict in the run, and close its record."""
         self.trained = self.time.now()
         result = score(self.task, policy, n=self.config.held_out, enough=self._out_of_time)
@@ -93,7 +93,7 @@ class FinalEvaluation:
         found |= {} if driven is None else {"closed_loop": driven.summary()}
         self.writer.close("finished", {**result.summary(), **found})
         seconds, ranks = self.time.spent, self.config.ranks
-        return Outcome(run, result, seconds, False, ranks, why=why, steps=steps, driven=driven)
+        return TrainingOutcome(run, result, seconds, False, ranks, why=why, steps=steps, driven=driven)
 
     def _simulated(self, run: Run) -> ClosedLoop | None:
         """The policy in closed loop, for as long as there is time."""

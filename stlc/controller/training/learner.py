@@ -9,6 +9,7 @@ gradient step mixes fresh states with such hard ones. Of the network's plans the
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -18,24 +19,27 @@ from torch import Tensor
 
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
-from stlc.controller.problem.native import torch_reasons
 from stlc.controller.problem.task import rank, satisfied
-from stlc.controller.training.diagnose import Step, diagnose
+from stlc.controller.training.checkpoint import load_checkpoint, weights
+from stlc.controller.training.diagnose import TrainingStep, diagnose
 from stlc.controller.training.exploration import EFFORTS, Exploration
 from stlc.controller.training.local_search import THOROUGH, Search, Searcher, SearchResult
 from stlc.controller.training.objective import loss
-from stlc.controller.training.samplers import Buffer, Draws, Fixed, Missions, Supply
+from stlc.controller.training.run import spec_hash, trained_on
+from stlc.controller.training.samplers import Draws, FixedSet, Missions, ReplayBuffer, Supply
+from stlc.diagnostics import Diagnostic, RunError
 from stlc.native import never
 from stlc.registry import METHODS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from stlc.controller.methods._network import NetworkMethod
     from stlc.controller.problem.task import Task
     from stlc.controller.training.config import ResolvedConfig
+    from stlc.controller.training.objective import Objective
     from stlc.diagnostics import StlcError
     from stlc.native import Stop
+    from stlc.rundir import RunDir
 
 MARGIN_STATES = 128
 MARGIN_SHARE = 0.2
@@ -93,10 +97,14 @@ class Trainer:
         self.average = self._network()
         self.network.normalise(self.supply.take(4096))
         ranks.agree_on(self.network)
-        self.training = Fixed(self.supply, config.samples, self.generator) if config.samples else self.supply
+        self.training = (
+            FixedSet(self.supply, config.samples, self.generator) if config.samples else self.supply
+        )
         self.average.load_state_dict(self.network.state_dict())
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=config.lr, fused=True)
-        self.buffer = Buffer.empty(len(task.names), task.horizon, len(task.system.control_names), device)
+        self.buffer = ReplayBuffer.empty(
+            len(task.names), task.horizon, len(task.system.control_names), device
+        )
         self.margin = task.system.decl.objective.gamma
         if self.searches:
             self.margin = ranks.agree(self._feasible_margin())
@@ -163,7 +171,7 @@ class Trainer:
     def torch_reasons(self) -> Mapping[str, str]:
         """Part of the training -> why torch does its work, or "" where it runs as C."""
         smooth = self.objective.smoothing is not None
-        return torch_reasons(self.task, self.device.type, searches=self.searches, smooth=smooth)
+        return self.task.torch_reasons(self.device.type, searches=self.searches, smooth=smooth)
 
     def wait(self, stop: Stop = never) -> bool:
         """Let the repair come to its end; False where `stop` came first."""
@@ -173,7 +181,7 @@ class Trainer:
         """Cause of a step that was not finite, of whichever rank, and whether the weights before it are."""
         theirs = [part["x0"].to(self.device) for part in self.ranks.gather({"x0": self.learnt})]
         x0 = torch.cat((self.learnt, *theirs))
-        step = Step.of(self.network, self.objective, x0, self.step, self.task)
+        step = TrainingStep.of(self.network, self.objective, x0, self.step, self.task)
         good = not self.ranks.any(not bool(torch.isfinite(step.u).all()))
         return diagnose(step), good
 
@@ -375,7 +383,7 @@ class Trainer:
             counts = [self.accuracy, self.buffer.count, self.barren, self.effort]
             found["counts"] = torch.tensor(counts, dtype=torch.float64)
         kept = len(self.buffer)
-        if isinstance(self.training, Fixed):
+        if isinstance(self.training, FixedSet):
             found.update({f"training.{name}": value for name, value in self.training.tensors().items()})
         found.update({f"supply.{name}": value for name, value in self.supply.tensors().items()})
         known = self.repairing.result(stop=lambda: True) if self.repairing is not None else None
@@ -425,7 +433,7 @@ class Trainer:
         self.buffer.plans[:kept] = tensors["buffer.plans"]
         self.buffer.count = int(facts["solved"])
         self.supply.restore(_below(tensors, "supply"))
-        if isinstance(self.training, Fixed):
+        if isinstance(self.training, FixedSet):
             self.training.restore(_below(tensors, "training"))
         self.generator.set_state(tensors["generator"].cpu())
         if known := _below(tensors, "repairing"):
@@ -453,3 +461,43 @@ def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {
         name[len(prefix) + 1 :]: value for name, value in tensors.items() if name.startswith(prefix + ".")
     }
+
+
+# ------------------------------------------------------------------ the methods that train it
+
+
+class NetworkMethod(ABC):
+    """Training and loading of a network that proposes `config.plans` plans.
+
+    Attributes:
+        searches: whether failing states are repaired by local search beside the steps.
+        mirrored: whether the network uses the mirror of the system.
+    """
+
+    searches = False
+    mirrored = False
+
+    @abstractmethod
+    def objective(self, learner: Trainer) -> Objective:
+        """The loss of plans, at the margin of a training."""
+
+    def learner(
+        self, task: Task, config: ResolvedConfig, *, steps: int, device: torch.device, ranks: Ranks
+    ) -> Trainer:
+        """A training before its first step."""
+        return Trainer(task, config, steps=steps, device=device, ranks=ranks)
+
+    def network(self, task: Task, config: ResolvedConfig) -> PlanNetwork:
+        """The network of a run, its weights drawn from torch's own generator."""
+        return PlanNetwork(task, hidden=config.hidden, plans=config.plans, mirrored=self.mirrored)
+
+    def load(self, task: Task, run: RunDir, config: ResolvedConfig, device: str = "cpu") -> BestOfKPolicy:
+        """The policy of a run: the averaged weights. Raises RunError: R101 or R102, see `Method.load`."""
+        saved = load_checkpoint(run, spec_hash=spec_hash(run), system_hash=trained_on(run))
+        network = self.network(task, config)
+        try:
+            network.load_state_dict(weights(saved, "average"))
+        except RuntimeError as error:
+            message = f"the checkpoint of `{run.shown}` does not fit its network"
+            raise RunError(Diagnostic("R101", message, note=(str(error),))) from error
+        return BestOfKPolicy(task, network.to(torch.device(device)).eval())

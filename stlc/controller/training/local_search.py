@@ -20,7 +20,7 @@ from torch import Tensor
 from stlc.compile.backends.c.emit import LANES
 from stlc.controller.problem.native import Effort
 from stlc.controller.problem.task import FLOAT32_SLACK
-from stlc.controller.training.config import cores
+from stlc.controller.training.budget import cores
 from stlc.native import never
 
 if TYPE_CHECKING:

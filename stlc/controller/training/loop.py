@@ -15,7 +15,7 @@ from stlc.controller.training.budget import PROVISIONAL, Pace, StepSchedule, Tim
 from stlc.controller.training.checkpoint import load_checkpoint, never_saved, restoring
 from stlc.controller.training.config import ResolvedConfig, TrainConfig, resolve_config
 from stlc.controller.training.diagnose import check_mirror, refuted
-from stlc.controller.training.final_evaluation import FinalEvaluation, Outcome
+from stlc.controller.training.final_evaluation import FinalEvaluation, TrainingOutcome
 from stlc.controller.training.run import Run, RunWriter, load_config, load_task, spec_hash, system_hash
 from stlc.diagnostics import Diagnostic, MissingError, RunError, StlcError, UsageError
 from stlc.dynamics.model.memory import keep_freed_memory
@@ -71,7 +71,7 @@ def train(
     watch: Watch | None = None,
     *,
     ranks: Ranks = ALONE,
-) -> Outcome:
+) -> TrainingOutcome:
     """Train a policy in a new run folder that already holds its specification and system.
 
     Args:
@@ -122,7 +122,7 @@ def resume(
     device: str = "cpu",
     watch: Watch | None = None,
     ranks: Ranks = ALONE,
-) -> Outcome:
+) -> TrainingOutcome:
     """Go on with a run that was interrupted; the weights become those of an uninterrupted run, bit for bit.
 
     Args:
@@ -189,7 +189,7 @@ def resume(
 
 def _without_steps(
     method: Method, task: Task, config: ResolvedConfig, writer: RunWriter, time: TimeBudget, watch: Watch
-) -> Outcome:
+) -> TrainingOutcome:
     """The outcome of a planner, which is judged as it is."""
     margin = task.system.decl.objective.gamma
     writer.note({"margin": margin, "steps": 0, "schedule": None})
@@ -250,7 +250,7 @@ class _Session:
         self.refuted: bool | None = None
         self.exhausted = False
 
-    def finish(self) -> Outcome:
+    def finish(self) -> TrainingOutcome:
         """Train to the end, judge, and close the record.
 
         Whatever interrupts it leaves the last checkpoint, from which `resume` goes on.
@@ -358,11 +358,13 @@ class _Session:
             return False
         return bool(self.refuted) or (self.exhausted and learner.step >= enough)
 
-    def _unjudged(self, *, interrupted: bool) -> Outcome:
+    def _unjudged(self, *, interrupted: bool) -> TrainingOutcome:
         """The outcome of a session that does not judge its policy."""
         learner = self.learner
         run = Run(self.writer.folder, learner.task, learner.policy)
-        return Outcome(run, None, self.time.spent, interrupted, learner.ranks.size, steps=learner.step)
+        return TrainingOutcome(
+            run, None, self.time.spent, interrupted, learner.ranks.size, steps=learner.step
+        )
 
     def _save(self) -> None:
         """Write a checkpoint; of a search that goes on beside the steps it keeps what that begins with."""

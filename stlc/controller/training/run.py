@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from stlc.controller.evaluation.held_out import Score
     from stlc.controller.policies.policy import PlanNetwork, Policy
-    from stlc.controller.problem.task import Judged
+    from stlc.controller.problem.task import PlanVerdicts
     from stlc.rundir import Status
 
 SPEC = "spec.stl"
@@ -93,7 +93,7 @@ class Run:
         """The network of the policy. Raises RunError (R101) where the run's method trains none."""
         return self.network_policy.network
 
-    def plan_judged(self, x0: Tensor) -> tuple[Tensor, Judged]:
+    def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
         """The policy's plans from states (B, n) and their verdicts."""
         return plan_judged(self.task, self.policy, x0)
 

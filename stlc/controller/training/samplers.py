@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from stlc.controller.policies.policy import Policy
-    from stlc.controller.problem.task import Judged, Task
+    from stlc.controller.problem.task import PlanVerdicts, Task
     from stlc.native import Stop
 
 BLOCK = 8192
@@ -81,7 +81,7 @@ class Draws:
         self.block = tensors["block"].to(self._device)
 
 
-class Fixed:
+class FixedSet:
     """A training set: states of another supply, handed out in a new order each time it has been used up.
 
     Attributes:
@@ -115,7 +115,7 @@ class Fixed:
         self.states, self.queue = (tensors[name].to(self.states.device) for name in ("states", "queue"))
 
 
-Planner: TypeAlias = Callable[[Tensor], "Judged"]
+Planner: TypeAlias = Callable[[Tensor], "PlanVerdicts"]
 """States (B, n) -> the plans that are followed from there, judged."""
 
 POOL = 2048
@@ -203,7 +203,7 @@ class Missions:
         most = max(self._task.horizon // 2, 1)
         return torch.randint(1, most + 1, (n,), generator=self._generator).to(self._device)
 
-    def _at(self, judged: Judged, steps: Tensor) -> Tensor:
+    def _at(self, judged: PlanVerdicts, steps: Tensor) -> Tensor:
         """Predicted states after so many steps, one number a row: (n, dim)."""
         return torch.stack([judged.columns[name].gather(0, steps[None])[0] for name in self._task.names], 1)
 
@@ -256,7 +256,7 @@ CAPACITY = 20_000
 
 
 @dataclass(slots=True)
-class Buffer:
+class ReplayBuffer:
     """A ring of solved hard states.
 
     Attributes:
@@ -270,7 +270,7 @@ class Buffer:
     count: int = 0
 
     @classmethod
-    def empty(cls, state: int, steps: int, controls: int, device: torch.device) -> Buffer:
+    def empty(cls, state: int, steps: int, controls: int, device: torch.device) -> ReplayBuffer:
         """A buffer without entries for states of `state` columns and plans of `steps` x `controls`."""
         return cls(
             torch.zeros(CAPACITY, state, device=device), torch.zeros(CAPACITY, steps, controls, device=device)

@@ -323,7 +323,7 @@ class TrainDecl:
     lr: float | None = key(number(1e-12), "learning rate")
     batch: int | None = key(integer(), "fresh initial states a step")
     samples: int | None = key(integer(), "size of the training set of `method: gradient`")
-    method: str | None = key(word(METHODS.names), "training method")
+    method: str | None = key(word(METHODS), "training method")
 
 
 def _float(value: Any) -> float | None:

@@ -164,9 +164,10 @@ def number(low: float = 0.0) -> Kind:
 
 
 def word(options: Iterable[str]) -> Kind:
-    """One of a few words."""
-    known = tuple(options)
-    return Kind(lambda cx, node, label: cx.reader.option(node, label, known), {"enum": list(known)})
+    """One of a few words, or of the names of a registry, which are looked up whenever one is read."""
+    return Kind(
+        lambda cx, node, label: cx.reader.option(node, label, tuple(options)), {"enum": list(options)}
+    )
 
 
 def _share(cx: Context, node: Node, label: str) -> float | None:

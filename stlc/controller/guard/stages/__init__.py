@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
     from stlc.runtime.prefixes import Grid
 
-STAGES: PackageRegistry[type[Stage]] = PackageRegistry(
+STAGES: PackageRegistry[type[GuardStage]] = PackageRegistry(
     "stage", "stlc.controller.guard.stages", "STAGE", default=""
 )
 
@@ -81,7 +81,7 @@ class Tried:
     candidates: Candidates
 
 
-class Stage(ABC):
+class GuardStage(ABC):
     """A way to find a better plan.
 
     Attributes:
@@ -106,7 +106,7 @@ class Stage(ABC):
         """
 
 
-def stages_of(guard: str) -> tuple[type[Stage], ...]:
+def stages_of(guard: str) -> tuple[type[GuardStage], ...]:
     """The stages of a guard in their order."""
     found = [stage for stage in map(STAGES.get, STAGES) if guard in stage.turns]
     return tuple(sorted(found, key=lambda stage: stage.turns[guard]))

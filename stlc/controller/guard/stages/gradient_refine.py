@@ -24,7 +24,7 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.compile.semantics.switch import StraightThrough
 from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline
 from stlc.controller.guard.feasibility import extremes
-from stlc.controller.guard.stages import Rejected, Setup, Stage, Tried
+from stlc.controller.guard.stages import GuardStage, Rejected, Setup, Tried
 from stlc.native import Outcome
 
 if TYPE_CHECKING:
@@ -231,7 +231,7 @@ class GradientAscent:
         return bounded
 
 
-class GradientRefine(Stage):
+class GradientRefine(GuardStage):
     """Gradient steps from the policy's plan and from the one before, in half of the time."""
 
     turns: ClassVar[Mapping[str, int]] = {"full": 10}

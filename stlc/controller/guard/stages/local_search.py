@@ -9,7 +9,7 @@ from torch import Tensor
 
 from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline, rank
 from stlc.controller.guard.feasibility import safety_task
-from stlc.controller.guard.stages import Rejected, Setup, Stage
+from stlc.controller.guard.stages import GuardStage, Rejected, Setup
 from stlc.controller.training.local_search import Searcher
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
 
-class LocalSearch(Stage):
+class LocalSearch(GuardStage):
     """A search for phi, and for phi_safe alone where that finds nothing safe."""
 
     turns: ClassVar[Mapping[str, int]] = {"full": 20}

@@ -11,14 +11,14 @@ from torch import Tensor
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.candidates import SAFEST, Candidates, Deadline, best
 from stlc.controller.guard.safe_prefix import prefix_robustness
-from stlc.controller.guard.stages import Rejected, Setup, Stage, Tried
+from stlc.controller.guard.stages import GuardStage, Rejected, Setup, Tried
 from stlc.controller.guard.stages.prefix_shooting import PrefixShooting
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
 
-class LongestSafePrefix(Stage):
+class LongestSafePrefix(GuardStage):
     """The plan with the longest safe prefix; of several the most robust, then the latest to fail."""
 
     turns: ClassVar[Mapping[str, int]] = {"paper": 20, "full": 60}

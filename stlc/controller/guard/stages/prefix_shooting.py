@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from stlc.controller.guard.candidates import BACKUP, Candidates, Deadline, best, finite
-from stlc.controller.guard.stages import Rejected, Setup, Stage, Tried
+from stlc.controller.guard.stages import GuardStage, Rejected, Setup, Tried
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -25,7 +25,7 @@ HANDED_ON = 65_536
 """Trajectories that are kept for the stage behind, at most; it makes the others again."""
 
 
-class PrefixShooting(Stage):
+class PrefixShooting(GuardStage):
     """The shortest prefix with a satisfying plan, or else a safe one.
 
     Among plans of the same rank robustness decides, then the performance terms of the objective, because

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline
 from stlc.controller.guard.feasibility import safety_task, solve
-from stlc.controller.guard.stages import Rejected, Setup, Stage
+from stlc.controller.guard.stages import GuardStage, Rejected, Setup
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-class Restarts(Stage):
+class Restarts(GuardStage):
     """What `feasibility.solve` finds until the deadline."""
 
     turns: ClassVar[Mapping[str, int]] = {"full": 30}

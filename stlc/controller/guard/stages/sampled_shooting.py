@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from stlc.controller.guard.candidates import BACKUP, Candidates, Deadline, finite, rank
-from stlc.controller.guard.stages import Rejected, Setup, Stage
+from stlc.controller.guard.stages import GuardStage, Rejected, Setup
 from stlc.controller.guard.stages.local_search import climbed_from
 from stlc.controller.training.local_search import Searcher
 
@@ -69,7 +69,7 @@ class SampledPrefixes:
         return replace(found, prefix_length=lengths.view(shape))
 
 
-class SampledShooting(Stage):
+class SampledShooting(GuardStage):
     """The best of sampled prefixes, and of searches from some of them, for agents whose plan is only safe."""
 
     turns: ClassVar[Mapping[str, int]] = {"full": 40}
