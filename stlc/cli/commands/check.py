@@ -13,7 +13,7 @@ import typer
 from stlc.cli.check import options as given
 from stlc.cli.check.judge import Question, names_of, time_step, usage
 from stlc.cli.framework.options import FailUnderOption, JsonOption, SetOption, SystemOption, parse_overrides
-from stlc.cli.framework.output import COLOR, QUIET, emit, emit_json, say, show_diagnostics, wants_color
+from stlc.cli.framework.output import COLOR, PULSE, QUIET, emit, emit_json, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
 
 if TYPE_CHECKING:
@@ -104,7 +104,8 @@ def _stream(traces: Sequence[str], question: Question, *, talk: bool) -> Outcome
 
     if len(traces) > 1:
         raise usage("the standard input is judged alone", "stlc check SPEC -")
-    return outcome_of_stream(question, talk=talk)
+    with PULSE.doing(""):  # waits for samples
+        return outcome_of_stream(question, talk=talk)
 
 
 # -------------------------------------------------------------------------- results

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from stlc.cli.framework.output import PULSE
 from stlc.cli.framework.program import command
 
 
@@ -22,4 +23,5 @@ def lsp(
     """
     from stlc.editor.server import make_server
 
-    make_server().start_io()
+    with PULSE.doing(""):  # waits for the editor
+        make_server().start_io()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from stlc.cli.framework.options import JsonOption, RunArgument, RunsOption
-from stlc.cli.framework.output import emit, emit_json, say
+from stlc.cli.framework.output import PULSE, emit, emit_json, say
 from stlc.cli.framework.program import command
 from stlc.escape import visible
 
@@ -26,7 +26,8 @@ def report(
     from stlc.view.report import write_report
 
     folder = RunDir.open(run, runs)
-    write_report(folder)
+    with PULSE.doing("drawing the report"):
+        write_report(folder)
     path = f"{folder.shown}/report.html"
     record = folder.record()
     learning = learning_of_run(folder, Commands.of(folder.shown, guard=recommended(record)))

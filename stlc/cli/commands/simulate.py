@@ -306,12 +306,12 @@ def _guard(backup: bool | None, guard: str | None) -> Mode:
 
 def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rules | None) -> Deployment:
     """One deployment that is watched; what was driven before a failure or Ctrl-C is saved."""
-    from stlc.cli.framework.output import say
+    from stlc.cli.framework.output import PULSE, say
     from stlc.controller.evaluation.archive import save_trace_of
     from stlc.controller.evaluation.deployment import InterruptedDeploymentError, deploy
 
     try:
-        with watching.of(run.task, order.setting) as watch:
+        with PULSE.doing(f"simulating, {mode}"), watching.of(run.task, order.setting) as watch:
             return deploy(run.task, run.policy, order.setting, mode, watch=watch, rules=rules)
     except InterruptedDeploymentError as error:
         if error.recording is not None:

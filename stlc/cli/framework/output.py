@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
+import time
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any, Literal, TextIO
+from typing import TYPE_CHECKING, Any, Literal, TextIO, cast
 
 from stlc.diagnostics import Diagnostic, Notice
 from stlc.escape import screen, visible
@@ -127,7 +129,7 @@ def console(*, stderr: bool = False, width: int | None = None) -> Console:
     if width is None and not stream.isatty():
         width = 120
     return Console(
-        file=stream,
+        file=cast(TextIO, _Noted(stream)),
         force_terminal=colored or None,
         no_color=not colored,
         highlight=False,
@@ -159,9 +161,100 @@ def _cell(text: str, width: int) -> str:
     return text.rjust(width) if digits.isdigit() else text.ljust(width)
 
 
+# ------------------------------------------------------------------------- sign of life
+
+
+class Pulse:
+    """Sign of life of a command that is at work and says nothing: what it does, and for how long.
+
+    In a terminal a line that is redrawn after `IN_TERMINAL` seconds without output, and removed before the
+    next; elsewhere a line every `IN_LOG` seconds.
+    """
+
+    IN_TERMINAL, IN_LOG = 1.5, 28.0
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._doing: list[tuple[str, float]] = []
+        self._last = 0.0
+        self._shown = False
+
+    @contextmanager
+    def beating(self) -> Iterator[None]:
+        """Show the sign while a command runs; not within another one, and not where remarks are left out."""
+        stream = sys.stderr
+        if self._doing or QUIET.get() or stream is None:
+            yield
+            return
+        ended = threading.Event()
+        self._last = time.monotonic()
+        thread = threading.Thread(target=self._beat, args=(stream, ended), daemon=True)
+        with self.doing("at work"):
+            thread.start()
+            try:
+                yield
+            finally:
+                ended.set()
+                self.note()
+
+    @contextmanager
+    def doing(self, what: str) -> Iterator[None]:
+        """Name what is done for a while; "" for waiting, of which no sign is shown."""
+        self._doing.append((what, time.monotonic()))
+        self.note()
+        try:
+            yield
+        finally:
+            self._doing.pop()
+
+    def note(self) -> None:
+        """Take in that something is written now: the line in the terminal makes room for it."""
+        with self._lock:
+            self._last = time.monotonic()
+            if self._shown:
+                self._shown = False
+                with suppress(OSError, ValueError):
+                    sys.stderr.write("\r\x1b[K")
+
+    def _beat(self, stream: TextIO, ended: threading.Event) -> None:
+        terminal = stream.isatty() and os.environ.get("TERM") != "dumb"
+        silence = self.IN_TERMINAL if terminal else self.IN_LOG
+        while not ended.wait(min(0.5, silence)):
+            with self._lock, suppress(OSError, ValueError, IndexError):
+                what, begun = self._doing[-1]
+                now = time.monotonic()
+                if not what or now - self._last < silence:
+                    continue
+                text = f"{what}, {now - begun:.0f} s"
+                stream.write(f"\r\x1b[K{text}" if terminal else f"{text}\n")
+                stream.flush()
+                self._shown = terminal
+                self._last = self._last if terminal else now
+
+
+PULSE = Pulse()
+"""That of the command that runs."""
+
+
+class _Noted:
+    """A stream of which it is noted when something is written."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write to the stream."""
+        PULSE.note()
+        return self._stream.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
 def _write(stream: TextIO | None, text: str) -> None:
     if stream is None:  # closed by the caller: stlc … >&-
         return
+    PULSE.note()
     with tolerate_closed(stream):
         try:
             stream.write(text + "\n")

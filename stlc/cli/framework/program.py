@@ -24,7 +24,7 @@ import typer
 
 from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
 from stlc.cli.framework.errors import report as report_error
-from stlc.cli.framework.output import COLOR, QUIET, ColorMode, emit, noticing, silence
+from stlc.cli.framework.output import COLOR, PULSE, QUIET, ColorMode, emit, noticing, silence
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.version import __version__
 
@@ -186,6 +186,7 @@ class Program:
             argv: the arguments without the program's name; by default those of the process.
         """
         front, rest = _split(sys.argv[1:] if argv is None else argv)
+        QUIET.set(bool({"-q", "--quiet"} & {*front}))
         stopped: list[int] = []
         try:
             with _stoppable() as stopped, noticing():
@@ -193,9 +194,9 @@ class Program:
                 if name in self.moved:
                     finding = Diagnostic("U101", f"there is no command `{name}`", help=(self.moved[name],))
                     raise UsageError(finding)
-                code = self.parser(name).main(
-                    args=[*front, *rest], prog_name=self.name, standalone_mode=False
-                )
+                words = [*front, *rest]
+                with PULSE.beating():
+                    code = self.parser(name).main(args=words, prog_name=self.name, standalone_mode=False)
         except BaseException as error:  # the boundary
             code = report_error(SystemExit(stopped[0]) if stopped else error, rest)
         _flush()
@@ -215,7 +216,7 @@ def _show_version(wanted: bool) -> None:
 def _global_options(
     context: typer.Context,
     color: Annotated[ColorMode, typer.Option("--color", help="Whether the output may be coloured.")] = "auto",
-    quiet: Annotated[
+    _quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="Print results, warnings and errors only.")
     ] = False,
     version: Annotated[
@@ -224,7 +225,6 @@ def _global_options(
     ] = False,
 ) -> None:
     COLOR.set(color)
-    QUIET.set(quiet)
     if not version:
         only_help(context)
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from stlc.cli.framework.output import say
+from stlc.cli.framework.output import PULSE, say
 
 PERIOD = 0.3
 
@@ -30,7 +30,8 @@ def watch(files: Iterable[str], action: Callable[[], object], *, rounds: int | N
         if rounds is not None:
             rounds -= 1
         if rounds is None or rounds > 0:
-            time.sleep(PERIOD)
+            with PULSE.doing(""):
+                time.sleep(PERIOD)
 
 
 def _stamp(path: Path) -> tuple[int, int]:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 def draw(run: Run) -> dict[str, str]:
     """The animation and the report, where matplotlib is there; what was drawn, by kind."""
-    from stlc.cli.framework.output import say
+    from stlc.cli.framework.output import PULSE, say
     from stlc.view import available
 
     if not available():
@@ -27,8 +27,10 @@ def draw(run: Run) -> dict[str, str]:
     seen = seen_in(run.dir)
     if seen is not None and seen.stage is not None and not in_space():
         say(f"robots are drawn as lines: bodies need pybullet ({BODIES})")
-    film = animate(run.dir)
-    write_report(run.dir)
+    with PULSE.doing("drawing the animation"):
+        film = animate(run.dir)
+    with PULSE.doing("drawing the report"):
+        write_report(run.dir)
     drawn = {"report": f"{run.dir.shown}/report.html"}
     if film is None:
         return drawn
@@ -58,10 +60,12 @@ def require_robots(run: Run) -> None:
 
 def show(run: Run) -> None:
     """Play the newest deployment in PyBullet's window."""
+    from stlc.cli.framework.output import PULSE
     from stlc.view import bullet
     from stlc.view.animate import seen_in
 
     seen = seen_in(run.dir)
     stage = None if seen is None else seen.stage
     if seen is not None and stage is not None:
-        bullet.show(stage, seen.scene, seen.dt)
+        with PULSE.doing(""):
+            bullet.show(stage, seen.scene, seen.dt)

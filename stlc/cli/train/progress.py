@@ -17,7 +17,7 @@ from stlc.cli.framework.output import console as open_console
 if TYPE_CHECKING:
     from stlc.view.learning import Learning
 
-LINE_EVERY = 30.0  # seconds between lines where there is no terminal to redraw
+LINE_EVERY = 25.0  # seconds between lines where there is no terminal to redraw
 BLOCKS = "▁▂▃▄▅▆▇█"
 ASCII_BLOCKS = "_.-:=+*#"
 SPARK_WIDTH = 16
@@ -117,7 +117,7 @@ def percent(value: float) -> str:
 
 
 class Progress:
-    """Shows a training run: in place on a terminal, one line every 30 s elsewhere.
+    """Shows a training run: in place on a terminal, one line every 25 s elsewhere.
 
     Rows are those of `train.jsonl`; a row may carry only some of its keys (a bare `step` moves the counter),
     what it leaves out keeps its last value. In use: `start`, `update`…, `finish`; `stop` alone leaves

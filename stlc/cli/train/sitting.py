@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, Self
 import typer
 
 from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
-from stlc.cli.framework.output import console, emit_json, say, show_diagnostics
+from stlc.cli.framework.output import PULSE, console, emit_json, say, show_diagnostics
 from stlc.cli.train.progress import Progress, RunInfo, Summary
 from stlc.controller.training.final_evaluation import TrainingOutcome
 from stlc.controller.training.loop import Watch
@@ -95,6 +95,7 @@ class Sitting:
             self._before[number] = signal.signal(number, self._ask)
         if self.keeps:
             self._forced.enter_context(leaving(self._ended))
+            self._forced.enter_context(PULSE.doing("training and evaluation"))
             self._log = None if self.logbook is None else self.logbook(self.folder.path)
             self.progress.start(_info(self.folder))
         return self
@@ -247,4 +248,5 @@ def draw_report(folder: RunDir) -> None:
         return
     from stlc.view.report import write_report
 
-    write_report(folder)
+    with PULSE.doing("drawing the report"):
+        write_report(folder)
