@@ -10,7 +10,7 @@ from stlc.compile.frontend.declare import MAX_COMPONENTS
 from stlc.compile.frontend.scope import column_entries, member_entries
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.motion import Assign, shared_draws, state_assigns
-from stlc.dynamics.schema.names import UNIT, Context, Names, base_name, component_names
+from stlc.dynamics.schema.names import Context, Names, base_name, component_names, unit_text
 from stlc.dynamics.schema.reader import Reader
 from stlc.dynamics.schema.record import (
     EXPRESSION,
@@ -18,6 +18,7 @@ from stlc.dynamics.schema.record import (
     OF,
     VECTOR,
     integer,
+    items_of,
     key,
     raw,
     read,
@@ -62,7 +63,7 @@ class ControlDecl:
 class StateKeys:
     """The keys of a state."""
 
-    unit: Unit = key(UNIT, "unit of the stored numbers", Unit())
+    unit: Unit = key(unit_text, "unit of the stored numbers", Unit())
     ends: Node | None = key(_RANGE, "lower and upper end, numbers or vectors", name="range")
     clamp: bool = key(FLAG, "kept within `range` after every step", False)
     role: str = key(word(("state", "env")), "`env`: changed by events alone", "state")
@@ -79,7 +80,7 @@ class StateKeys:
 class ParamKeys:
     """The keys of a parameter."""
 
-    unit: Unit = key(UNIT, "unit of the stored numbers", Unit())
+    unit: Unit = key(unit_text, "unit of the stored numbers", Unit())
     ends: Node | None = key(_RANGE, "drawn uniformly from it unless `draw` is given", name="range")
     draw: Node | None = key(raw(VECTOR), "distribution of the value")
     size: int | None = key(_SIZE, "components of a vector")
@@ -91,14 +92,12 @@ class ParamKeys:
 class ControlKeys:
     """The keys of a control."""
 
-    unit: Unit = key(UNIT, "unit of the stored numbers", Unit())
+    unit: Unit = key(unit_text, "unit of the stored numbers", Unit())
     ends: Node | None = key(_RANGE, "lower and upper end, numbers or vectors", name="range")
     squash: Squash = key(
         word(get_args(Squash)), "map from a network output to the range; `angle`: a direction", "tanh"
     )
-    levels: Node | None = key(
-        raw({"type": ["array", "null"], "items": EXPRESSION}), "values that a search may try"
-    )
+    levels: Node | None = key(raw(items_of(EXPRESSION)), "values that a search may try")
     size: int | None = key(_SIZE, "components of a vector")
 
 

@@ -11,8 +11,8 @@ from typing import Any, Literal, get_args
 
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.columns import read_levels
-from stlc.dynamics.declaration.learning import INTEGERS, TERMS, Term
-from stlc.dynamics.declaration.motion import SETS, Assign, rate_unit, states_of
+from stlc.dynamics.declaration.learning import INTEGERS, Term, term_list
+from stlc.dynamics.declaration.motion import SETS, Assign, rate_unit, read_sets, states_of
 from stlc.dynamics.schema.expressions import written
 from stlc.dynamics.schema.names import Context, base_name
 from stlc.dynamics.schema.reader import first_line
@@ -21,17 +21,19 @@ from stlc.dynamics.schema.record import (
     LINE,
     NAME,
     OF,
-    SHARE,
     STEPS,
     VECTOR,
     Kind,
+    fraction,
     integer,
+    items_of,
     json_schema,
     key,
     list_of,
     mapping_of,
     part,
     read,
+    reads,
     values_of,
     word,
 )
@@ -52,6 +54,7 @@ that satisfies everything."""
 # ------------------------------------------------------------------------------------ backup
 
 
+@reads(mapping_of({"type": "array", "items": EXPRESSION}))
 def _levels(cx: Context, node: Node, label: str) -> Mapping[str, tuple[float, ...]]:
     """Values of controls, in the place of what those declare themselves."""
     found = {}
@@ -72,11 +75,7 @@ class BackupDecl:
     """The prefixes that the backup policy tries."""
 
     bins: int = key(integer(2), "values of a control, evenly over its range", 5)
-    levels: Mapping[str, tuple[float, ...]] = key(
-        Kind(_levels, mapping_of({"type": "array", "items": EXPRESSION})),
-        "values by control, in place of `bins`",
-        {},
-    )
+    levels: Mapping[str, tuple[float, ...]] = key(_levels, "values by control, in place of `bins`", {})
     lengths: tuple[int, ...] = key(INTEGERS, "lengths of prefixes, in steps", (1, 2, 3), name="T0")
     batch: int = key(integer(), "trajectories at a time", 8192)
     samples: int = key(integer(high=1 << 20), "largest number of prefixes of one length", SAMPLES)
@@ -98,6 +97,7 @@ _BACKUP = Kind(read_backup, json_schema(BackupDecl), BackupDecl)
 # ------------------------------------------------------------------------------------ events
 
 
+@reads(EXPRESSION)
 def _trigger(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
     """A state formula, or `rise(…)`, `fall(…)` of one."""
     expr = cx.here.parse(node, label)
@@ -110,6 +110,7 @@ def _trigger(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
             return {"when": cx.here.formula_of(expr)}
 
 
+@reads(EXPRESSION)
 def _instant(cx: Context, node: Node, label: str) -> int | None:
     """A step of the deployment; 0 is its start."""
     return 0 if written(node) in {"0", "0 s", "0 steps"} else STEPS.read(cx, node, label)
@@ -123,16 +124,15 @@ class EventDecl:
     """
 
     name: str = key(NAME, "for messages", "", label=OF)
-    when: ir.Formula | None = key(
-        Kind(_trigger, EXPRESSION), "condition, or `rise(…)`, `fall(…)` of one", spread=True
-    )
+    when: ir.Formula | None = key(_trigger, "condition, or `rise(…)`, `fall(…)` of one", spread=True)
     edge: Edge | None = None
-    at: int | None = key(Kind(_instant, EXPRESSION), "time or step at which it happens once")
+    at: int | None = key(_instant, "time or step at which it happens once")
     every: int | None = key(STEPS, "period, as a time or in steps")
     sets: tuple[Assign, ...] = key(SETS, "new values, in order", (), name="set", required=True)
 
 
-def read_events(cx: Context, node: Node, label: str) -> tuple[EventDecl, ...]:
+@reads(items_of(json_schema(EventDecl)), EventDecl)
+def _events(cx: Context, node: Node, label: str) -> tuple[EventDecl, ...]:
     """Events, each with exactly one of `when`, `at` and `every`."""
     found = []
     for index, item in enumerate(cx.reader.items(node, label)):
@@ -144,9 +144,6 @@ def read_events(cx: Context, node: Node, label: str) -> tuple[EventDecl, ...]:
             cx.reader.report("S102", message, first_line(item.span))
         found.append(event)
     return tuple(found)
-
-
-_EVENTS = Kind(read_events, {"type": ["array", "null"], "items": json_schema(EventDecl)}, EventDecl)
 
 
 # -------------------------------------------------------------------------------------- test
@@ -176,6 +173,7 @@ class JudgeRef:
     span: Span = field(compare=False, repr=False)
 
 
+@reads({"type": ["string", "null"]})
 def _world(cx: Context, node: Node, _label: str) -> WorldRef | None:
     """`file.py:Class`, relative to the system file."""
     text = None if isinstance(node, Scalar) and node.is_null else cx.reader.text(node, "`world`")
@@ -188,6 +186,7 @@ def _world(cx: Context, node: Node, _label: str) -> WorldRef | None:
     return WorldRef(Path(node.span.source.name).parent / file, name, node.span)
 
 
+@reads({"type": ["string", "null"]})
 def _judge(cx: Context, node: Node, _label: str) -> JudgeRef | None:
     """A specification, relative to the file that names it."""
     text = None if isinstance(node, Scalar) and node.is_null else cx.reader.text(node, "`judge`")
@@ -200,6 +199,7 @@ def _judge(cx: Context, node: Node, _label: str) -> JudgeRef | None:
     return JudgeRef(Path(os.path.normpath(folder / text)), text, node.span)
 
 
+@reads(items_of({"type": "string"}))
 def _uncertain(cx: Context, node: Node, label: str) -> tuple[str, ...]:
     """Constants, by name; a vector has one."""
     known = tuple(dict.fromkeys(map(base_name, cx.names.constants)))
@@ -208,10 +208,6 @@ def _uncertain(cx: Context, node: Node, label: str) -> tuple[str, ...]:
         if item.text not in known:
             cx.reader.unknown(item, label, known)
     return tuple(item.text for item in items)
-
-
-_WORLD = Kind(_world, {"type": ["string", "null"]})
-_JUDGE = Kind(_judge, {"type": ["string", "null"]})
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,14 +219,13 @@ class TestDecl:
     steps: int = key(STEPS, "length, as a time or in steps", 200)
     agents: int = key(integer(high=100_000), "agents", 20)
     replan: int = key(integer(), "steps between plans", 1)
-    events: tuple[EventDecl, ...] = key(_EVENTS, "exogenous events, in order", ())
+    events: tuple[EventDecl, ...] = key(_events, "exogenous events, in order", ())
     metrics: tuple[str, ...] = key(list_of(word(METRICS), "a metric"), "metrics to report", ())
-    world: WorldRef | None = key(_WORLD, "`file.py:Class`: a world in Python, in place of events")
+    world: WorldRef | None = key(_world, "`file.py:Class`: a world in Python, in place of events")
     uncertain: tuple[str, ...] | None = key(
-        Kind(_uncertain, {"type": ["array", "null"], "items": {"type": "string"}}),
-        "constants that `errors: {parameters: …}` perturbs; those of the dynamics unless given",
+        _uncertain, "constants that `parameters` perturbs; all of the dynamics unless given"
     )
-    judge: JudgeRef | None = key(_JUDGE, "specification that closed-loop runs are judged by")
+    judge: JudgeRef | None = key(_judge, "specification that closed-loop runs are judged by")
     starts: Starts = key(word(get_args(Starts)), "initial states of agents", "any")
 
 
@@ -245,12 +240,13 @@ class ErrorsDecl:
     dynamics (`stlc.dynamics.scenarios.perturbed`). Clocks, which are states in seconds, are known exactly.
     """
 
-    actuator_gain: float = key(SHARE, "constant relative error of every control of an agent", 0.0)
-    parameters: float = key(SHARE, "constant relative error of every number in the dynamics", 0.0)
-    actuator_noise: float = key(SHARE, "standard deviation of noise on controls, of half their range", 0.0)
-    sensor_noise: float = key(SHARE, "standard deviation of noise on observed states, of their range", 0.0)
+    actuator_gain: float = key(fraction, "constant relative error of every control of an agent", 0.0)
+    parameters: float = key(fraction, "constant relative error of every number in the dynamics", 0.0)
+    actuator_noise: float = key(fraction, "standard deviation of noise on controls, of half their range", 0.0)
+    sensor_noise: float = key(fraction, "standard deviation of noise on observed states, of their range", 0.0)
 
 
+@reads(mapping_of(VECTOR))
 def _constants(cx: Context, node: Node, label: str) -> Mapping[str, str]:
     """Constants and their other values, as text."""
     found: dict[str, str] = {}
@@ -263,6 +259,12 @@ def _constants(cx: Context, node: Node, label: str) -> Mapping[str, str]:
     return MappingProxyType(found)
 
 
+@reads(mapping_of(VECTOR))
+def _noise(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
+    return read_sets(cx.amounts(), node, label)
+
+
+@reads(mapping_of(VECTOR))
 def _rates(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
     """Additions to derivatives (or next values), in the unit of the state per second."""
     found: list[Assign] = []
@@ -278,9 +280,6 @@ def _rates(cx: Context, node: Node, label: str) -> tuple[Assign, ...]:
     return tuple(found)
 
 
-_CONSTANTS = Kind(_constants, mapping_of(VECTOR))
-
-
 @dataclass(frozen=True, slots=True)
 class ScenarioDecl:
     """A named overlay of a deployment."""
@@ -289,28 +288,22 @@ class ScenarioDecl:
     doc: str = key(LINE, "one line for people", "")
     expect: str = key(word(("nominal", "ood")), "`ood`: states that training never drew", "nominal")
     constants: Mapping[str, str] = key(
-        _CONSTANTS, "other values of constants, in model and truth", {}, name="const"
+        _constants, "other values of constants, in model and truth", {}, name="const"
     )
     override: tuple[Assign, ...] = key(SETS, "initial values, drawn after all others", ())
-    events: tuple[EventDecl, ...] = key(_EVENTS, "events beside those of `test`", ())
-    disturb: tuple[Assign, ...] = key(
-        Kind(_rates, mapping_of(VECTOR)), "additions to derivatives of the truth, not of the model", ()
-    )
-    noise: tuple[Assign, ...] = key(
-        Kind(lambda cx, node, label: SETS.read(cx.amounts(), node, label), mapping_of(VECTOR)),
-        "additions to the states that agents observe",
-        (),
-    )
+    events: tuple[EventDecl, ...] = key(_events, "events beside those of `test`", ())
+    disturb: tuple[Assign, ...] = key(_rates, "additions to derivatives of the truth, not of the model", ())
+    noise: tuple[Assign, ...] = key(_noise, "additions to the states that agents observe", ())
     mismatch: Mapping[str, str] = key(
-        _CONSTANTS, "constants of the truth that the model does not know", {}, name="model_mismatch"
+        _constants, "constants of the truth that the model does not know", {}, name="model_mismatch"
     )
     errors: ErrorsDecl = key(part(ErrorsDecl), "errors, as shares", ErrorsDecl())
-    world: WorldRef | None = key(_WORLD, "world in place of that of `test`")
+    world: WorldRef | None = key(_world, "world in place of that of `test`")
     prefer: tuple[Term, ...] = key(
-        TERMS, "performance terms that plans are ranked by, beside those of `objective`", ()
+        term_list, "performance terms that plans are ranked by, beside those of `objective`", ()
     )
     backup: BackupDecl | None = key(_BACKUP, "backup in place of that of the system")
-    judge: JudgeRef | None = key(_JUDGE, "specification in place of that of `test`")
+    judge: JudgeRef | None = key(_judge, "specification in place of that of `test`")
 
 
 def read_scenarios(node: Node | None, cx: Context) -> tuple[ScenarioDecl, ...]:

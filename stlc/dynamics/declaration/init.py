@@ -20,6 +20,7 @@ from stlc.dynamics.schema.record import (
     OF,
     VECTOR,
     integer,
+    items_of,
     key,
     list_of,
     mapping_of,
@@ -112,9 +113,7 @@ class InitKeys:
     """The section `init`."""
 
     mixture: tuple[Node, ...] = key(list_of(section(SituationKeys), ""), "situations", ())
-    where: Node | None = key(
-        raw({"type": ["array", "null"], "items": EXPRESSION}), "conditions on every initial state"
-    )
+    where: Node | None = key(raw(items_of(EXPRESSION)), "conditions on every initial state")
     grid: Node | None = key(raw({"type": "object"}), "values of states; every combination equally often")
     from_: Node | None = key(raw({"type": "string"}), "a file of states, relative to this one", name="from")
     draw: Node | None = key(_DRAWS, "values of the states that `grid` or `from` leave out")

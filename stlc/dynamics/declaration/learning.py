@@ -22,11 +22,13 @@ from stlc.dynamics.schema.record import (
     VECTOR,
     Kind,
     integer,
+    items_of,
     json_schema,
     key,
     mapping_of,
     number,
     read,
+    reads,
     word,
 )
 from stlc.dynamics.schema.yaml_nodes import Node, Scalar, Sequence, as_int
@@ -47,6 +49,7 @@ OUTCOME = {
 # ------------------------------------------------------------------------------- objective
 
 
+@reads(EXPRESSION)
 def _absolute(cx: Context, node: Node, label: str) -> ir.Num | None:
     value = cx.here.number(node, label)
     return None if value is None else absolute(value).num
@@ -64,12 +67,11 @@ class Term:
 
     name: str = key(NAME, "for tables; the expression unless given", "", label=OF)
     weight: float = key(number(), "factor of the mean over a plan", 1.0)
-    value: ir.Num = key(
-        Kind(_absolute, EXPRESSION), "the cost", name="expr", label=_term_label, required=True
-    )
+    value: ir.Num = key(_absolute, "the cost", name="expr", label=_term_label, required=True)
 
 
-def read_terms(cx: Context, node: Node | None, label: str) -> tuple[Term, ...]:
+@reads(items_of(json_schema(Term)), Term)
+def term_list(cx: Context, node: Node | None, label: str) -> tuple[Term, ...]:
     """A list of performance terms; they read `sat`, `rho`, `k`, `t`, and `x_start` for each state `x`."""
     names = cx.names
     entries = {name: Known(Number(ir.Signal(name), flexible=True), about) for name, about in OUTCOME.items()}
@@ -85,9 +87,6 @@ def read_terms(cx: Context, node: Node | None, label: str) -> tuple[Term, ...]:
         if term.value is not None:
             terms.append(replace(term, name=term.name or _term_label_of(item)))
     return tuple(terms)
-
-
-TERMS = Kind(read_terms, {"type": ["array", "null"], "items": json_schema(Term)}, Term)
 
 
 def _term_label_of(node: Node) -> str:
@@ -119,7 +118,7 @@ class ObjectiveDecl:
     gamma: float = key(number(), "robustness at which the hinge ends", 0.5)
     smoothing: float = key(number(1e-9), "scale of the smooth robustness", 500.0)
     stl_weight: float = key(number(), "weight of the hinge", 1.0, name="lambda")
-    terms: tuple[Term, ...] = key(TERMS, "performance terms", ())
+    terms: tuple[Term, ...] = key(term_list, "performance terms", ())
 
 
 # ------------------------------------------------------------------------------------ policy
@@ -165,6 +164,7 @@ def _units(cx: Context) -> dict[str, Unit]:
     return states | {each.name: each.unit for each in cx.names.controls}
 
 
+@reads(mapping_of(EXPRESSION))
 def _around(cx: Context, node: Node, label: str) -> dict[str, float]:
     units = _units(cx)
     points = {
@@ -174,6 +174,7 @@ def _around(cx: Context, node: Node, label: str) -> dict[str, float]:
     return {name: value for name, value in points.items() if value is not None}
 
 
+@reads(mapping_of({"type": "number", "minimum": 0}))
 def _weights(cx: Context, node: Node, label: str) -> dict[str, float]:
     costs = {
         name: cx.reader.number(each, f"the weight of `{name}`")
@@ -182,6 +183,7 @@ def _weights(cx: Context, node: Node, label: str) -> dict[str, float]:
     return {name: value for name, value in costs.items() if value is not None}
 
 
+@reads(mapping_of(mapping_of(EXPRESSION)))
 def _gain(cx: Context, node: Node, label: str) -> dict[str, dict[str, float]]:
     states = {each.name: each.unit for each in cx.names.columns}
     controls = {each.name: each.unit for each in cx.names.controls}
@@ -199,22 +201,15 @@ def _gain(cx: Context, node: Node, label: str) -> dict[str, dict[str, float]]:
 class FeedbackDecl:
     """The entry `feedback` of the policy; `stlc.dynamics.model.feedback` computes the gain."""
 
-    around: Mapping[str, float] = key(
-        Kind(_around, mapping_of(EXPRESSION)), "point of operation: states and controls", {}
-    )
-    weights: Mapping[str, float] = key(
-        Kind(_weights, mapping_of({"type": "number", "minimum": 0})),
-        "weights of the regulator's cost, by state or control",
-        {},
-    )
+    around: Mapping[str, float] = key(_around, "point of operation: states and controls", {})
+    weights: Mapping[str, float] = key(_weights, "weights of the regulator's cost, by state or control", {})
     gain: Mapping[str, Mapping[str, float]] = key(
-        Kind(_gain, mapping_of(mapping_of(EXPRESSION))),
-        "the gain, by control and state, in place of the regulator's",
-        {},
+        _gain, "the gain, by control and state, in place of the regulator's", {}
     )
     authority: float = key(number(), "largest share of half an actuator's range that the feedback adds", 1.0)
 
 
+@reads({"anyOf": [{"enum": ["lqr"]}, json_schema(FeedbackDecl)]}, FeedbackDecl)
 def _feedback(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
     """The feedback asked for: `lqr`, or a mapping."""
     if isinstance(node, Scalar) and node.is_null:
@@ -227,6 +222,7 @@ def _feedback(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
     return None
 
 
+@reads(items_of(VECTOR))
 def _observed(cx: Context, node: Node, label: str) -> dict[str, Any]:
     seen = [each for item in cx.reader.items(node, label) for each in _seen(item, cx)]
     return {"observe": tuple(num for num, _ in seen), "observe_text": tuple(text for _, text in seen)}
@@ -245,6 +241,7 @@ def _seen(node: Node, cx: Context) -> tuple[tuple[ir.Num, str], ...]:
     return tuple(zip((number.num for number in numbers), texts, strict=True))
 
 
+@reads(mapping_of(VECTOR))
 def _mirror(cx: Context, node: Node, label: str) -> dict[str, Any]:
     """The images of states and controls under a symmetry; those that are not listed stay as they are.
 
@@ -287,24 +284,14 @@ class PolicyDecl:
     type: str = key(word(("mlp",)), "kind of network", "mlp", label="`{name}` of the policy")
     hidden: tuple[int, ...] = key(INTEGERS, "widths of the hidden layers", (256, 256, 256))
     observe: tuple[ir.Num, ...] = key(
-        Kind(_observed, {"type": ["array", "null"], "items": VECTOR}),
-        "inputs of the network; every state unless given",
-        (),
-        spread=True,
+        _observed, "inputs of the network; every state unless given", (), spread=True
     )
     observe_text: tuple[str, ...] = field(default=(), compare=False)
     mirror: tuple[Assign, ...] = key(
-        Kind(_mirror, mapping_of(VECTOR)),
-        "images of states and controls under a symmetry of system and specification",
-        (),
-        spread=True,
+        _mirror, "images of states and controls under a symmetry of system and specification", (), spread=True
     )
     mirror_span: Span | None = field(default=None, compare=False, repr=False)
-    feedback: FeedbackDecl | None = key(
-        Kind(_feedback, {"anyOf": [{"enum": ["lqr"]}, json_schema(FeedbackDecl)]}, FeedbackDecl),
-        "a stabilising feedback beneath the plans",
-        spread=True,
-    )
+    feedback: FeedbackDecl | None = key(_feedback, "a stabilising feedback beneath the plans", spread=True)
     feedback_span: Span | None = field(default=None, compare=False, repr=False)
 
 

@@ -55,6 +55,7 @@ from stlc.dynamics.schema.record import (
     EXPRESSION,
     VECTOR,
     Json,
+    items_of,
     json_schema,
     key,
     mapping_of,
@@ -93,9 +94,7 @@ class SystemKeys:
     control: Node | None = key(section(ControlKeys, free=True), "controls")
     def_: Node | None = key(raw(mapping_of(EXPRESSION)), "named sub-expressions", name="def")
     flow: Node | None = key(raw(mapping_of(VECTOR)), "derivatives, or next values of a discrete system")
-    jump: Node | None = key(
-        raw({"type": ["array", "null"], "items": json_schema(JumpDecl)}, JumpDecl), "guarded resets"
-    )
+    jump: Node | None = key(raw(items_of(json_schema(JumpDecl)), JumpDecl), "guarded resets")
     init: Node | None = key(section(InitKeys), "initial states")
     objective: Node | None = key(section(ObjectiveDecl), "loss that training minimises")
     policy: Node | None = key(section(PolicyDecl), "network and its inputs")

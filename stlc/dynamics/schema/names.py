@@ -16,7 +16,7 @@ from stlc.diagnostics import Label, SystemFileError
 from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.schema.expressions import SECOND, Expressions
 from stlc.dynamics.schema.reader import Reader
-from stlc.dynamics.schema.record import FLAG, SECONDS, STEPS, Kind, integer, key, read, word
+from stlc.dynamics.schema.record import FLAG, SECONDS, STEPS, integer, key, read, reads, word
 from stlc.dynamics.schema.yaml_nodes import Mapping, Node, Scalar, Sequence
 from stlc.grammar import ast
 from stlc.signature import Column, Signature
@@ -193,7 +193,9 @@ def read_constants(node: Node | None, reader: Reader, names: Names) -> None:
         names.entries[name] = Known(value, "constant", entry.key.span)
 
 
-def _unit(cx: Context, node: Node, _label: str) -> Unit | None:
+@reads({"type": "string"})
+def unit_text(cx: Context, node: Node, _label: str) -> Unit | None:
+    """A unit."""
     text = cx.reader.text(node, "`unit`")
     try:
         return None if text is None else parse_unit(text)
@@ -203,9 +205,6 @@ def _unit(cx: Context, node: Node, _label: str) -> Unit | None:
         )
         cx.reader.report("S103", str(error), node.span, advice)
         return None
-
-
-UNIT = Kind(_unit, {"type": "string"})
 
 
 def read_definitions(node: Node | None, reader: Reader, names: Names) -> None:

@@ -16,7 +16,7 @@ import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from stlc.dynamics.schema.reader import MAX_NAME
 from stlc.units import DIMENSIONLESS
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from stlc.dynamics.schema.yaml_nodes import Node
 
 R = TypeVar("R")
+_Read: TypeAlias = "Callable[[Context, Node, str], Any]"
 Json = dict[str, Any]
 _KEY = "key"
 OF = "`{name}` of {of}"
@@ -42,7 +43,7 @@ class Kind:
         record: the record that the value, or each of its items, is read into.
     """
 
-    read: Callable[[Context, Node, str], Any]
+    read: _Read
     schema: Mapping[str, Any]
     record: type | None = None
 
@@ -148,6 +149,11 @@ STEPS = Kind(lambda cx, node, label: cx.here.steps(node, label, cx.clock.dt), EX
 FORMULA = Kind(lambda cx, node, label: cx.here.formula(node, label), EXPRESSION)
 
 
+def reads(schema: Mapping[str, Any], record: type | None = None) -> Callable[[_Read], Kind]:
+    """A decorator that makes a kind of a reader."""
+    return lambda read: Kind(read, schema, record)
+
+
 def integer(low: int = 1, high: int = 10**9) -> Kind:
     """A whole number between `low` and `high`."""
     return Kind(
@@ -170,15 +176,13 @@ def word(options: Iterable[str]) -> Kind:
     )
 
 
-def _share(cx: Context, node: Node, label: str) -> float | None:
+@reads(EXPRESSION)
+def fraction(cx: Context, node: Node, label: str) -> float | None:
+    """A number between 0 and 1, or a percentage."""
     share = cx.here.constant(node, label, DIMENSIONLESS)
     if share is not None and not 0.0 <= share <= 1.0:
         cx.reader.wrong(node, label, "a share between 0 and 1", "write `10 %`")
     return share
-
-
-SHARE = Kind(_share, EXPRESSION)
-"""A number between 0 and 1, or a percentage."""
 
 
 def raw(schema: Mapping[str, Any], record: type | None = None) -> Kind:
@@ -194,6 +198,11 @@ def mapping_of(schema: Mapping[str, Any]) -> Json:
     }
 
 
+def items_of(schema: Mapping[str, Any]) -> Json:
+    """JSON Schema of a list; nothing is an empty one."""
+    return {"type": ["array", "null"], "items": dict(schema)}
+
+
 def list_of(kind: Kind, label: str) -> Kind:
     """A list, as a tuple of the items that can be read; `label` names an item in messages."""
 
@@ -201,7 +210,7 @@ def list_of(kind: Kind, label: str) -> Kind:
         each = [kind.read(cx, item, label) for item in cx.reader.items(node, where)]
         return tuple(item for item in each if item is not None)
 
-    return Kind(items, {"type": ["array", "null"], "items": dict(kind.schema)}, kind.record)
+    return Kind(items, items_of(kind.schema), kind.record)
 
 
 def part(record: type) -> Kind:
