@@ -61,16 +61,16 @@ def bounds(num: ir.Num, facts: KnownRanges) -> Bounds | None:
     match num:
         case ir.Const(value):
             return (value, value)
-        case ir.Signal(name) | ir.ShiftedSignal(name) | ir.FrozenVar(name):
-            return facts.get(name)
-        case ir.Indicator():
-            return (0.0, 1.0)
-        case ir.Where(_, yes, no):
-            return _hull(bounds(yes, facts), bounds(no, facts))
         case ir.Op(name, args):
             return _op(name, [bounds(arg, facts) for arg in args])
+        case ir.Where(_, yes, no):
+            return _hull(bounds(yes, facts), bounds(no, facts))
+        case ir.Indicator():
+            return (0.0, 1.0)
         case ir.Extern():
             return None
+        case leaf:
+            return facts.get(leaf.name)
 
 
 def _hull(left: Bounds | None, right: Bounds | None) -> Bounds | None:

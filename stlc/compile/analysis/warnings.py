@@ -167,14 +167,14 @@ def vacuous(formula: typed.Formula, signature: Signature, facts: KnownRanges) ->
 
 
 def truth(formula: typed.Formula, facts: KnownRanges) -> bool | None:
-    """What enforced ranges say: True or False at every instant of every trace, or None."""
+    """The truth that enforced ranges decide, at every instant of every trace; None: they do not."""
     return _truth(normal(formula), facts)
 
 
 def _truth(formula: typed.Formula, facts: KnownRanges) -> bool | None:
+    if isinstance(formula, typed.Truth):
+        return formula.value
     match formula:
-        case typed.Truth(_, value):
-            return value
         case typed.Predicate(_, num):
             reach = bounds(num, facts)
             if reach is None or isinstance(num, ir.Const):
@@ -243,9 +243,9 @@ def safety_never_violated(requirement: typed.Requirement, tag: ast.Tag | None) -
 
 def _constrains(formula: typed.Formula) -> bool:
     """Whether some finite prefix, shorter than the horizon, can violate a formula in negation normal form."""
+    if isinstance(formula, typed.Truth):
+        return False
     match formula:
-        case typed.Truth():
-            return False
         case typed.Logic(_, op, items):
             return (all if op == "or" else any)(map(_constrains, items))
         case typed.Temporal(_, op, window, body):

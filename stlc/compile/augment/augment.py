@@ -89,16 +89,16 @@ class _Goals:
         What is not absolute is asked of the start of the mission: there now and the mission clock agree.
         """
         if is_state(node, augmented=True):
-            return self._leaf(node, ("always", ir.Window(0, 0)), (typed.Truth(node.span, True), node))
+            return self._leaf(node, "always", ir.Window(0, 0), (typed.Truth(node.span, True), node))
         match node:
             case typed.Logic(span, "and" | "or" as op, items):
                 return GoalBranch(op, tuple(map(self.of, items)), span)
             case typed.Temporal(_, "always" | "eventually" as op, interval, body):
                 window = to_window(interval, self.grid, self.sink, outward=op == "always")
-                return self._leaf(node, (op, window), (typed.Truth(node.span, True), body))
+                return self._leaf(node, op, window, (typed.Truth(node.span, True), body))
             case typed.Until(_, "until" | "release" as op, interval, left, right):
                 window = to_window(interval, self.grid, self.sink, outward=op == "release")
-                return self._leaf(node, (op, window), (left, right))
+                return self._leaf(node, op, window, (left, right))
             case _:
                 report(self.sink, _looks_ahead(node.span))
                 return self.of(typed.Truth(node.span, True))
@@ -106,10 +106,10 @@ class _Goals:
     def _leaf(
         self,
         node: typed.Formula,
-        how: tuple[AbsoluteOp, ir.Window],
+        op: AbsoluteOp,
+        window: ir.Window,
         operands: tuple[typed.Formula, typed.Formula],
     ) -> Goal:
-        op, window = how
         for body in operands:
             if not is_state(body, augmented=True):
                 report(self.sink, _looks_ahead(body.span))

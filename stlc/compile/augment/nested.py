@@ -144,14 +144,14 @@ def _sum(window: ir.Window, lo: int, hi: int | None) -> ir.Window:
 
 def _ahead(formula: typed.Formula) -> int:
     """The samples that a formula looks ahead. Raises TooFarError where it has no end."""
+    if isinstance(formula, _OPAQUE):
+        return 0
     inner = max(map(_ahead, operands(formula)), default=0)
-    match formula:
-        case typed.Temporal(_, "always" | "eventually") | typed.Until(_, "until" | "release" | "unless"):
-            return inner + _end(formula)
-        case typed.Shift() | typed.Edge() | typed.Freeze() | typed.Recalled():
-            return 0
-        case _:
-            return inner
+    return inner + _end(formula) if _forwards(formula) else inner  # type: ignore[arg-type]
+
+
+_OPAQUE = (typed.Shift, typed.Edge, typed.Freeze, typed.Recalled)
+"""Formulas whose operands are not looked into: the past tells nothing of them."""
 
 
 def _end(node: typed.Temporal | typed.Until) -> int:
@@ -192,9 +192,9 @@ class _Writer:
                 return self.met(later, (self._once(inner, self._begun(window, when)),) if when else (), body)
             case typed.Temporal(_, "always", _, body):
                 _end(what)
-                return self._kept(window, when, (_window(what), body))
+                return self._kept(window, when, _window(what), body)
             case typed.Until(_, "until", _, left, right):
-                return self._reached(window, when, (_window(what), left, right))
+                return self._reached(window, when, _window(what), left, right)
             case typed.Until(_, "release", _, left, right):
                 return self.met(window, when, self._freed(what, left, right))
             case _:
@@ -216,11 +216,9 @@ class _Writer:
         late = _ahead(whole)
         return self._on_clock("eventually", _sum(window, late, late), self.delayed(whole, late))
 
-    def _kept(
-        self, window: ir.Window, when: Formulas, what: tuple[ir.Window, typed.Formula]
-    ) -> typed.Formula:
+    def _kept(self, window: ir.Window, when: Formulas, what: ir.Window, body: typed.Formula) -> typed.Formula:
         """`always[l, u] body` from a sample of `window` on."""
-        (lo, hi), body = (what[0].lo, what[0].hi or 0), what[1]
+        lo, hi = what.lo, what.hi or 0
         late = _ahead(body)
         body = self.delayed(body, late)
         lo, hi = lo + late, hi + late
@@ -240,10 +238,9 @@ class _Writer:
         return self._on_clock_until(there, self._or(latest, pending), lasting)
 
     def _reached(
-        self, window: ir.Window, when: Formulas, what: tuple[ir.Window, typed.Formula, typed.Formula]
+        self, window: ir.Window, when: Formulas, inner: ir.Window, left: typed.Formula, right: typed.Formula
     ) -> typed.Formula:
         """`left until[l, u] right` from a sample of `window` on."""
-        inner, left, right = what
         late = max(_ahead(left), _ahead(right))
         left, right = self.delayed(left, late), self.delayed(right, late)
         begun = self._ago(self._begun(window, when), late) if when else None

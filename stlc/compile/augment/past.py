@@ -132,7 +132,7 @@ class Past:
         if window.lo:
             recent = ir.Window(0, None if window.hi is None else window.hi - window.lo)
             inner = self._window(replace(node, interval=_back(recent, node.span)))
-            return self._delayed(node, inner, (window.lo, not once))
+            return self._delayed(node, inner, window.lo, before=not once)
         if window.hi == 0:
             return body
         memory = self._seen(node, body, window.hi) if once else self._held(node, body, window.hi)
@@ -178,13 +178,15 @@ class Past:
             return typed.Truth(node.span, True)
         window = to_window(node.interval, self.grid, self.sink, outward=not positive)
         if window.lo and window.hi is None:
-            return self._lasting(node, left, right, (window.lo, positive))
+            return self._lasting(node, left, right, window.lo, positive=positive)
         if window.lo and window.hi is not None:
             return self._since_before(node, window, positive=positive)
         ops: tuple[_Op, _Op] = ("and", "or") if positive else ("or", "and")
         if window.hi == 0:
             return typed.Logic(node.span, ops[0], (left, right))
-        recent = self._recent(node, self._condition(left), self._condition(right), (window.hi, positive))
+        recent = self._recent(
+            node, self._condition(left), self._condition(right), window.hi, positive=positive
+        )
         met = typed.Logic(node.span, ops[1], (right, recent.now))
         whole = typed.Temporal(
             node.span, "historically" if positive else "once", _back(ir.Window(0, None), node.span), left
@@ -199,10 +201,9 @@ class Past:
         )
 
     def _recent(
-        self, node: typed.Until, left: ir.Formula, right: ir.Formula, how: tuple[int | None, bool]
+        self, node: typed.Until, left: ir.Formula, right: ir.Formula, most: int | None, *, positive: bool
     ) -> typed.Recalled:
         """Whether q held at one of the samples before, and p from there on up to now; or its contrary."""
-        most, positive = how
         held, met = (left, right) if positive else (negate(left), negate(right))
         about = f"{_short(node.right)}, and {_short(node.left)} from there on"
         if most is None:
@@ -228,15 +229,19 @@ class Past:
         if body is None or before is None:
             return typed.Truth(node.span, True)
         op: _Op = "and" if positive else "or"
-        return typed.Logic(node.span, op, (body, self._delayed(node, before, (1, not positive))))
+        return typed.Logic(node.span, op, (body, self._delayed(node, before, 1, before=not positive)))
 
     # --------------------------------------------------------------------- some time ago
 
     def _delayed(
-        self, node: typed.Temporal | typed.Until | typed.Edge, body: typed.Formula, how: tuple[int, bool]
+        self,
+        node: typed.Temporal | typed.Until | typed.Edge,
+        body: typed.Formula,
+        steps: int,
+        *,
+        before: bool,
     ) -> typed.Formula:
-        """What `body` said so many samples ago, in a register; second: what it said before the start."""
-        steps, before = how
+        """What `body` said so many samples ago, in a register; `before`: what it said before the start."""
         if steps > REGISTER:
             return self._refused(node.span, f"that asks what was more than {REGISTER} samples ago")
         condition = self._condition(body)
@@ -262,7 +267,7 @@ class Past:
         """`p since[a, b] q`: p for the last a, and a ago `p since[0, b - a] q`; or its dual."""
         lo, hi = window.lo, window.hi or 0
         recent = replace(node, interval=_back(ir.Window(0, hi - lo), node.span))
-        ago = self._delayed(node, self._since(recent, positive=positive), (lo, not positive))
+        ago = self._delayed(node, self._since(recent, positive=positive), lo, before=not positive)
         held = typed.Temporal(
             node.span,
             "historically" if positive else "once",
@@ -272,10 +277,9 @@ class Past:
         return typed.Logic(node.span, "and" if positive else "or", (self._window(held), ago))
 
     def _lasting(
-        self, node: typed.Until, left: typed.Formula, right: typed.Formula, how: tuple[int, bool]
+        self, node: typed.Until, left: typed.Formula, right: typed.Formula, least: int, *, positive: bool
     ) -> typed.Formula:
         """`p since[a, end] q`: how long ago the first q was from which on p has held; or its dual."""
-        least, positive = how
         p, q = self._condition(left), self._condition(right)
         held, met = (p, q) if positive else (negate(p), negate(q))
         from_there = f"{_short(node.right)} with {_short(node.left)} from there on"

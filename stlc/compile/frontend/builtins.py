@@ -191,14 +191,11 @@ def stepping(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -
     delay = typed.Time(steps=Fraction({"next": 1, "prev": -1}.get(name, 0)))
     if name == "shift":
         delay = _delay(values[1], call.args[1].value, scope)
-    return _shifted(value, delay, (expr, call.span), f"`{name}`", scope)
+    return _shifted(value, delay, expr, call.span, f"`{name}`", scope)
 
 
-def _shifted(
-    value: Value, delay: typed.Time, places: tuple[ast.Expr, Span], name: str, scope: Scope
-) -> Value:
+def _shifted(value: Value, delay: typed.Time, expr: ast.Expr, span: Span, name: str, scope: Scope) -> Value:
     """A number, a vector or a formula some time later."""
-    expr, span = places
     match value:
         case Number() if value.kind != "bool":
             return replace(value, num=_delayed_number(value.num, delay), origin=None)
@@ -233,7 +230,7 @@ def _delta(value: Value, expr: ast.Expr, span: Span, scope: Scope) -> Value:
         if isinstance(value, Vector)
         else as_number(value, expr, Expectation("`delta` takes numbers"), scope)
     )
-    before = _shifted(now, typed.Time(steps=Fraction(-1)), (expr, span), "`delta`", scope)
+    before = _shifted(now, typed.Time(steps=Fraction(-1)), expr, span, "`delta`", scope)
     assert isinstance(before, Number | Vector)
     return broadcast("sub", (now, before), span, scope)
 
@@ -317,12 +314,12 @@ def builtin(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) ->
         return _indicator(call, values, scope)
     _positional(name, call, scope)
     if name in STEPPING:
-        count_arguments(name, call, STEPPING[name], scope)
+        count_arguments(name, call, *STEPPING[name], scope)
         if not scope.temporal:
             scope.fail(unsupported(f"`{name}`", call.span, scope))
         return stepping(name, call, values, scope)
     if name in REWRITTEN:
-        count_arguments(name, call, REWRITTEN[name], scope)
+        count_arguments(name, call, *REWRITTEN[name], scope)
         return _rewritten(name, call, values, scope)
     function = FUNCTIONS.get(name)
     if function is None or function.kind == "operator":
@@ -340,9 +337,8 @@ def unsupported(what: str, span: Span, scope: Scope) -> Diagnostic:
     return Diagnostic("E015", f"{what} is not compiled by this version", span)
 
 
-def count_arguments(name: str, call: ast.Call, arity: tuple[int, int | None], scope: Scope) -> None:
+def count_arguments(name: str, call: ast.Call, least: int, most: int | None, scope: Scope) -> None:
     """Refuse a wrong number of arguments (E105)."""
-    least, most = arity
     given = len(call.args)
     if least <= given and (most is None or given <= most):
         return
@@ -382,7 +378,7 @@ def _function(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) 
     if function.most is None and function.kind == "function" and items:
         flat = [n for item in items for n in (item.items if isinstance(item, Vector) else (item,))]
         return apply(name, flat, call.span, scope) if flat else Number(ir.Const(0.0), span=call.span)
-    count_arguments(name, call, (function.least, function.most), scope)
+    count_arguments(name, call, function.least, function.most, scope)
     return broadcast(name, items, call.span, scope)
 
 

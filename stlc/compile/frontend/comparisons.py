@@ -15,6 +15,7 @@ from stlc.compile.frontend.values import (
     Box,
     Complement,
     Number,
+    Operand,
     Region,
     Swept,
     Value,
@@ -38,7 +39,9 @@ def comparison(expr: ast.Compare, values: Sequence[Value], scope: Scope) -> type
         left, right = expr.operands[index], expr.operands[index + 1]
         whole = expr.span if len(expr.ops) == 1 else left.span.to(right.span)
         place = sign_span(op, left.span, right.span)
-        pairs.append(_pair(op, (left, values[index]), (right, values[index + 1]), (whole, place), scope))
+        pairs.append(
+            _pair(op, Operand(left, values[index]), Operand(right, values[index + 1]), whole, place, scope)
+        )
     return pairs[0] if len(pairs) == 1 else typed.Logic(expr.span, "and", tuple(pairs))
 
 
@@ -53,19 +56,19 @@ def sign_span(sign: str, left: Span, right: Span) -> Span:
 
 def _pair(
     op: str,
-    left: tuple[ast.Expr, Value],
-    right: tuple[ast.Expr, Value],
-    spans: tuple[Span, Span],
+    left: Operand,
+    right: Operand,
+    whole: Span,
+    place: Span,
     scope: Scope,
 ) -> typed.Formula:
-    whole, place = spans
     if op in ("==", "!="):
-        equal = _equality(left, right, spans, scope)
+        equal = _equality(left, right, whole, place, scope)
         return equal if op == "==" else typed.Not(whole, equal)
     _refuse_vectors(left, right, op, scope)
     need = f"`{op}` compares numbers"
-    a = as_number(left[1], left[0], Expectation(need, "the left side"), scope)
-    b = as_number(right[1], right[0], Expectation(need, "the right side"), scope)
+    a = as_number(left.value, left.expr, Expectation(need, "the left side"), scope)
+    b = as_number(right.value, right.expr, Expectation(need, "the right side"), scope)
     if "enum" in (a.kind, b.kind):
         help_ = ("use `==`, `!=` or `in {…}`",)
         scope.fail(
@@ -108,9 +111,7 @@ def _compared(*sides: Number) -> Unit:
     return next((side.unit for side in told if side.constant is None), told[0].unit)
 
 
-def _refuse_vectors(
-    left: tuple[ast.Expr, Value], right: tuple[ast.Expr, Value], op: str, scope: Scope
-) -> None:
+def _refuse_vectors(left: Operand, right: Operand, op: str, scope: Scope) -> None:
     for expr, value in (left, right):
         if isinstance(value, Vector):
             help_ = (f"`norm({expr.span.text})`, one component, or `in` with a region",)
@@ -119,11 +120,8 @@ def _refuse_vectors(
             )
 
 
-def _equality(
-    left: tuple[ast.Expr, Value], right: tuple[ast.Expr, Value], spans: tuple[Span, Span], scope: Scope
-) -> typed.Formula:
+def _equality(left: Operand, right: Operand, whole: Span, place: Span, scope: Scope) -> typed.Formula:
     """`==` on whole numbers, truth values and enums; its margin is 1/2 - |a - b|."""
-    whole, place = spans
     _refuse_vectors(left, right, "==", scope)
     if any(is_formula(value) for _, value in (left, right)):
         need = Expectation("`==` between truth values", "the other side")
@@ -131,21 +129,21 @@ def _equality(
         return typed.Logic(whole, "<->", (sides[0], sides[1]))
     a, b = _meet(left, right, scope), _meet(right, left, scope)
     if a.kind == "real" or b.kind == "real":
-        scope.fail(_real_equality(a, b, left[0], right[0], place))
+        scope.fail(_real_equality(a, b, left.expr, right.expr, place))
     _check_labels(a, b, place, scope)
     plain = [replace(side, kind="real", labels=()) for side in (a, b)]
     apart = apply("abs", (gap(plain[0], plain[1], whole, scope),), whole, scope)
     return typed.Predicate(whole, apply("sub", (half(whole), apart), whole, scope).num, strict=False)
 
 
-def _meet(side: tuple[ast.Expr, Value], other: tuple[ast.Expr, Value], scope: Scope) -> Number:
+def _meet(side: Operand, other: Operand, scope: Scope) -> Number:
     """A side as a number; a member of an enum is read in the enum of the other side."""
     expr, value = side
-    labels = other[1].labels if isinstance(other[1], Number) else ()
+    labels = other.value.labels if isinstance(other.value, Number) else ()
     if isinstance(value, Member) and labels:
         if value.name not in dict(labels):
             names = ", ".join(f"`{name}`" for name, _ in labels)
-            message = f"`{value.name}` is not a member of the enum of `{other[0].span.text}`"
+            message = f"`{value.name}` is not a member of the enum of `{other.expr.span.text}`"
             scope.fail(Diagnostic("E205", message, expr.span, help=(f"its members are {names}",)))
         return Number(ir.Const(dict(labels)[value.name]), kind="enum", labels=labels, span=expr.span)
     return loose_number(value, expr, Expectation("`==` compares numbers", "one side"), scope)
@@ -188,20 +186,16 @@ def _check_labels(a: Number, b: Number, place: Span, scope: Scope) -> None:
         )
 
 
-def in_set(
-    item: tuple[ast.Expr, Value], members: Sequence[tuple[ast.Expr, Value]], span: Span, scope: Scope
-) -> typed.Formula:
+def in_set(item: Operand, members: Sequence[Operand], span: Span, scope: Scope) -> typed.Formula:
     """`s in {1, 2}`: equal to one of them."""
-    equals = tuple(_equality(item, member, (span, span), scope) for member in members)
+    equals = tuple(_equality(item, member, span, span, scope) for member in members)
     return equals[0] if len(equals) == 1 else typed.Logic(span, "or", equals)
 
 
-def in_range(
-    item: tuple[ast.Expr, Value], ends: Sequence[tuple[ast.Expr, Value]], span: Span, scope: Scope
-) -> typed.Formula:
+def in_range(item: Operand, ends: Sequence[Operand], span: Span, scope: Scope) -> typed.Formula:
     """`x in [lo, hi]`: min(x - lo, hi - x), or under `@product` the paper's (x - lo) (hi - x)."""
     need = "`in [lo, hi]` compares numbers"
-    x = as_number(item[1], item[0], Expectation(need, "the left side"), scope)
+    x = as_number(item.value, item.expr, Expectation(need, "the left side"), scope)
     low, high = (as_number(value, expr, Expectation(need, "a bound"), scope) for expr, value in ends)
     (x, low, high), _ = agree((x, low, high), "compare", span, scope)
     if low.constant is not None and high.constant is not None and low.constant > high.constant:
@@ -209,7 +203,7 @@ def in_range(
             Diagnostic(
                 "E205",
                 "this range is empty: its lower end is above its upper end",
-                ends[0][0].span.to(ends[1][0].span),
+                ends[0].expr.span.to(ends[1].expr.span),
             )
         )
     if scope.product and x.kind != "int":
@@ -220,9 +214,7 @@ def in_range(
     return typed.Logic(span, "and", (above, below))
 
 
-def sweeps(
-    expr: ast.Member, segment: Swept, region: Sequence[tuple[ast.Expr, Value]], scope: Scope
-) -> typed.Formula:
+def sweeps(expr: ast.Member, segment: Swept, region: Sequence[Operand], scope: Scope) -> typed.Formula:
     """`sweep(p) in R`: all of the segment; `not in`: none of it, which is no negation."""
     if isinstance(expr.region, ast.SetLiteral):
         help_ = ("write a range `[lo, hi]`, or a region like `circle(center, radius)`",)
@@ -235,18 +227,16 @@ def sweeps(
             for end, value in region
         ]
         place: Region = Box(Vector((ends[0],)), Vector((ends[1],)), expr.region.span)
-    elif isinstance(region[0][1], REGION_TYPES):
-        place = region[0][1]
+    elif isinstance(region[0].value, REGION_TYPES):
+        place = region[0].value
     else:
-        message = f"`in` needs a region, this is {noun(region[0][1])}"
-        scope.fail(Diagnostic("E205", message, region[0][0].span))
+        message = f"`in` needs a region, this is {noun(region[0].value)}"
+        scope.fail(Diagnostic("E205", message, region[0].expr.span))
     place = Complement(place) if expr.negated else place
     return _pred(expr.span, swept_distance(segment.point, place, expr.span, scope))
 
 
-def in_region(
-    item: tuple[ast.Expr, Value], region: tuple[ast.Expr, Value], span: Span, scope: Scope
-) -> typed.Formula:
+def in_region(item: Operand, region: Operand, span: Span, scope: Scope) -> typed.Formula:
     """`p in R`: the signed distance is not negative."""
     (point_expr, point), (region_expr, place) = item, region
     if not isinstance(place, REGION_TYPES):

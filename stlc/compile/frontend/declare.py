@@ -253,7 +253,7 @@ def ranged(
     Raises:
         Failed: an end that is not a constant number (E205), of another unit (E203), or an empty range (E205).
     """
-    ends = None if decl.domain is None else _ends(decl.domain, (columns[0], unit), scope)
+    ends = None if decl.domain is None else _ends(decl.domain, columns[0], unit, scope)
     found = []
     for column in columns:
         if column.labels:
@@ -268,32 +268,31 @@ def ranged(
 
 
 def _ends(
-    domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral | ast.Expr, target: tuple[Column, Unit], scope: Scope
+    domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral | ast.Expr, column: Column, unit: Unit, scope: Scope
 ) -> tuple[float | None, float | None] | None:
     """Least and largest value that a domain allows; None for a distribution, and for an end that is `inf`."""
     if isinstance(domain, tuple):
-        low, high = _stored(domain, target, scope)
+        low, high = _stored(domain, column, unit, scope)
         if low is not None and high is not None and low > high:
             message = "this range is empty: its lower end is above its upper end"
             scope.fail(Diagnostic("E205", message, domain[0].span.to(domain[1].span)))
         return (low, high)
     if isinstance(domain, ast.SetLiteral):
-        values = [value for value in _stored(domain.items, target, scope) if value is not None]
+        values = [value for value in _stored(domain.items, column, unit, scope) if value is not None]
         return (min(values), max(values)) if values else None
     evaluate_all((domain,), scope.extended({}, samplers=True))
     return None
 
 
 def ends_of(
-    domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral, target: tuple[Column, Unit], scope: Scope
+    domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral, column: Column, unit: Unit, scope: Scope
 ) -> Iterator[float | None]:
     """The ends of a range or the members of a set, in the unit of the column; None for `inf`."""
-    return _stored(domain if isinstance(domain, tuple) else domain.items, target, scope)
+    return _stored(domain if isinstance(domain, tuple) else domain.items, column, unit, scope)
 
 
-def _stored(exprs: Sequence[ast.Expr], target: tuple[Column, Unit], scope: Scope) -> Iterator[float | None]:
+def _stored(exprs: Sequence[ast.Expr], column: Column, unit: Unit, scope: Scope) -> Iterator[float | None]:
     """Constants in the unit of the column; bare numbers are read in the unit that was declared."""
-    column, unit = target
     for expr, value in zip(exprs, evaluate_all(exprs, scope), strict=True):
         if isinstance(value, TimeExpr) and value.end:
             yield None

@@ -24,6 +24,7 @@ from stlc.compile.frontend.macros import arguments, cycle, finished, outgrown
 from stlc.compile.frontend.scope import TIME_WORDS, Cost, Definition, External, Failed, Scope, reserved
 from stlc.compile.frontend.values import (
     Number,
+    Operand,
     Origin,
     Swept,
     TimeExpr,
@@ -216,7 +217,9 @@ def _neg(expr: ast.Neg, values: Sequence[Value], scope: Scope) -> Value:
 def _binary(expr: ast.Binary, values: Sequence[Value], scope: Scope) -> Value:
     left, right = values
     if isinstance(left, TimeExpr) or isinstance(right, TimeExpr):
-        return moments.combine(expr.op, (expr.left, left), (expr.right, right), expr.span, scope)
+        return moments.combine(
+            expr.op, Operand(expr.left, left), Operand(expr.right, right), expr.span, scope
+        )
     who = f"`{expr.op}` {_VERBS[expr.op]} numbers"
     sides: list[Number | Vector] = []
     for value, side, which in ((left, expr.left, "left"), (right, expr.right, "right")):
@@ -248,17 +251,15 @@ def _compare(expr: ast.Compare, values: Sequence[Value], scope: Scope) -> Value:
 
 def _membership(expr: ast.Member, values: Sequence[Value], scope: Scope) -> Value:
     region = expr.region
-    item, rest = (expr.item, values[0]), values[1:]
+    item, rest = Operand(expr.item, values[0]), values[1:]
     if isinstance(values[0], Swept):
-        return comparisons.sweeps(
-            expr, values[0], list(zip(_member_parts(expr)[1:], rest, strict=True)), scope
-        )
+        return comparisons.sweeps(expr, values[0], list(map(Operand, _member_parts(expr)[1:], rest)), scope)
     if isinstance(region, ast.SetLiteral):
-        inside = comparisons.in_set(item, list(zip(region.items, rest, strict=True)), expr.span, scope)
+        inside = comparisons.in_set(item, list(map(Operand, region.items, rest)), expr.span, scope)
     elif isinstance(region, ast.Vector) and len(region.items) == 2:
-        inside = comparisons.in_range(item, list(zip(region.items, rest, strict=True)), expr.span, scope)
+        inside = comparisons.in_range(item, list(map(Operand, region.items, rest)), expr.span, scope)
     else:
-        inside = comparisons.in_region(item, (region, rest[0]), expr.span, scope)
+        inside = comparisons.in_region(item, Operand(region, rest[0]), expr.span, scope)
     return typed.Not(expr.span, inside) if expr.negated else inside
 
 
@@ -562,7 +563,7 @@ def _timed(
         bounds = (
             evaluate_all((expr.interval.lo, expr.interval.hi), scope) if expr.interval is not None else ()
         )
-        window = moments.interval(expr.interval, bounds, (expr.op, place), body, scope)
+        window = moments.interval(expr.interval, bounds, expr.op, place, body, scope)
     finally:
         inner = formulas(operands, scope)
     if isinstance(expr, ast.Temporal):

@@ -7,7 +7,7 @@ from dataclasses import replace
 from fractions import Fraction
 
 from stlc.compile.frontend.scope import Scope
-from stlc.compile.frontend.values import Number, TimeExpr, Value, noun
+from stlc.compile.frontend.values import Number, Operand, TimeExpr, Value, noun
 from stlc.compile.ir import typed
 from stlc.diagnostics import Diagnostic, Fix, Label
 from stlc.grammar import ast
@@ -30,9 +30,7 @@ def time_word(name: str, span: Span) -> TimeExpr:
             return TimeExpr(end=True, span=span)
 
 
-def combine(
-    op: str, left: tuple[ast.Expr, Value], right: tuple[ast.Expr, Value], span: Span, scope: Scope
-) -> TimeExpr:
+def combine(op: str, left: Operand, right: Operand, span: Span, scope: Scope) -> TimeExpr:
     """Arithmetic where at least one side is a time on the grid: sums, and multiples by plain numbers."""
     if op in ("+", "-"):
         a, b = moment(*left, scope), moment(*right, scope)
@@ -44,19 +42,19 @@ def combine(
                 a.horizons + sign * b.horizons,
                 span=span,
             )
-    times, factor = (left, right) if isinstance(left[1], TimeExpr) else (right, left)
-    if isinstance(factor[1], Number) and factor[1].constant is None:
-        scope.fail(out_of_place(times[0].span))
+    times, factor = (left, right) if isinstance(left.value, TimeExpr) else (right, left)
+    if isinstance(factor.value, Number) and factor.value.constant is None:
+        scope.fail(out_of_place(times.expr.span))
     if (
         op in ("*", "/")
-        and isinstance(times[1], TimeExpr)
-        and not times[1].end
+        and isinstance(times.value, TimeExpr)
+        and not times.value.end
         and not (op == "/" and times is right)
     ):
         share = _factor(*factor, scope)
         if op == "/" and share == 0:
-            scope.fail(Diagnostic("E401", "division by zero", factor[0].span, "is 0"))
-        return _scaled(times[1], 1 / share if op == "/" else share, span)
+            scope.fail(Diagnostic("E401", "division by zero", factor.expr.span, "is 0"))
+        return _scaled(times.value, 1 / share if op == "/" else share, span)
     help_ = ("a bound is a sum of times, each times a plain number: `T / 2 - 1 s`",)
     return scope.fail(Diagnostic("E205", f"`{op}` does not apply to these times", span, help=help_))
 
@@ -149,7 +147,8 @@ def _not_constant(expr: ast.Expr, value: Number, scope: Scope) -> Diagnostic:
 def interval(
     node: ast.Interval | None,
     bounds: Sequence[Value],
-    operator: tuple[str, Span],
+    op: str,
+    place: Span,
     body: ast.Expr,
     scope: Scope,
 ) -> typed.Interval:
@@ -158,21 +157,21 @@ def interval(
     Args:
         node: as written; None where nothing is written: from now to the end.
         bounds: values of its two bounds.
-        operator: its name, and where it stands.
+        op: name of the operator.
+        place: where it stands.
         body: what it applies to, for the help.
         scope: where findings go.
 
     Raises:
         Failed: E301 reversed, E302 negative, E303 not constant, E203 not a time.
     """
-    name, place = operator
     if node is None:
         return typed.Interval(typed.Time(), None, span=place)
     low, high = moment(node.lo, bounds[0], scope), moment(node.hi, bounds[1], scope)
     if low.end:
         scope.fail(Diagnostic("E303", "an interval cannot start at the end of the trace", node.lo.span))
     if _sign(low) < 0 or (not high.end and _sign(high) < 0):
-        scope.fail(_negative(name, node, (low, high), body))
+        scope.fail(_negative(op, node, (low, high), body))
     if not high.end and _sign(_difference(high, low)) < 0:
         scope.fail(_reversed(node))
     lo, hi = _time(low), None if high.end else _time(high)

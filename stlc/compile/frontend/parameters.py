@@ -88,7 +88,7 @@ def parameters(
         _agree(decl, columns, interface, scope)
     domain = decl.domain
     if isinstance(domain, tuple | ast.SetLiteral):
-        draws = _even(decl, list(ends_of(domain, (columns[0], unit), scope)), columns, scope)
+        draws = _even(decl, list(ends_of(domain, columns[0], unit, scope)), columns, scope)
     else:
         draws = distribution(domain, columns, unit, scope)
     found = []
@@ -141,14 +141,12 @@ def distribution(expr: ast.Expr, columns: Sequence[Column], unit: Unit, scope: S
     need = Expectation("a parameter is a number")
     numbers = [loose_number(value, expr, need, scope) for value in values]
     return tuple(
-        _in_column(number, expr, (column, unit), scope)
-        for number, column in zip(numbers, columns, strict=True)
+        _in_column(number, expr, column, unit, scope) for number, column in zip(numbers, columns, strict=True)
     )
 
 
-def _in_column(number: Number, expr: ast.Expr, target: tuple[Column, Unit], scope: Scope) -> ir.Num:
+def _in_column(number: Number, expr: ast.Expr, column: Column, unit: Unit, scope: Scope) -> ir.Num:
     """A drawn number as its column stores it."""
-    column, unit = target
     if columns_of(number.num):
         message = "a parameter is drawn before anything moves: its distribution reads constants alone"
         scope.fail(Diagnostic("E205", message, expr.span))

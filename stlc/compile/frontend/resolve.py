@@ -95,7 +95,7 @@ def signature_of(file: File, interface: Interface | None) -> tuple[Signature, tu
                 if column.name not in columns:
                     columns[column.name] = (column, decl.name_span)
                 elif where is not file:
-                    _check_same(column, decl.name_span, columns[column.name], file.scope)
+                    _check_same(column, decl.name_span, *columns[column.name], file.scope)
     order = [column for column, _ in columns.values()]
     return Signature(tuple(order)), tuple(drawn[column.name] for column in order if column.name in drawn)
 
@@ -106,8 +106,7 @@ def _every_file(file: File) -> Iterator[File]:
         yield from _every_file(part)
 
 
-def _check_same(column: Column, place: Span, first: tuple[Column, Span], scope: Scope) -> None:
-    known, span = first
+def _check_same(column: Column, place: Span, known: Column, span: Span, scope: Scope) -> None:
     units = (
         not column.unit.text
         or not known.unit.text

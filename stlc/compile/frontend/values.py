@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.grammar import ast
 from stlc.signature import Kind
 from stlc.source import Span
 from stlc.units import DIMENSIONLESS, Unit
@@ -87,6 +88,13 @@ class TimeExpr:
     horizons: Fraction = Fraction(0)
     end: bool = False
     span: Span | None = field(default=None, compare=False, repr=False)
+
+
+class Operand(NamedTuple):
+    """An operand as it is written, with its value."""
+
+    expr: ast.Expr
+    value: Value
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,10 @@ both, `G[a,b] G[c,d] p` is `G[a+c, b+d] p`, and so for `F`, `H` and `O`.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.normal_form import joined
@@ -27,21 +30,8 @@ def simplify(formula: ir.Formula, semantics: Semantics = _EXACT) -> ir.Formula:
         semantics: under which it has the same robustness; the exact one allows all laws.
     """
     whole = map_children(formula, formulas=lambda part: simplify(part, semantics))
-    match whole:
-        case ir.BoolOp():
-            return _join(whole, semantics)
-        case ir.Temporal() | ir.PastTemporal():
-            return _window(whole, semantics)
-        case ir.Until() | ir.Since():
-            return _binary(whole, semantics)
-        case ir.Shift(0, body):
-            return body
-        case ir.Freeze():
-            return _freeze(whole)
-        case ir.AtStart(ir.Truth() as body):
-            return body
-        case _:
-            return whole
+    law = _LAWS.get(type(whole))
+    return whole if law is None else law(whole, semantics)
 
 
 def _join(whole: ir.BoolOp, semantics: Semantics) -> ir.Formula:
@@ -68,7 +58,15 @@ def _window(node: ir.Temporal | ir.PastTemporal, semantics: Semantics) -> ir.For
     return node
 
 
-def _freeze(node: ir.Freeze) -> ir.Formula:
+def _shift(node: ir.Shift, _semantics: Semantics) -> ir.Formula:
+    return node.body if node.steps == 0 else node
+
+
+def _at_start(node: ir.AtStart, _semantics: Semantics) -> ir.Formula:
+    return node.body if isinstance(node.body, ir.Truth) else node
+
+
+def _freeze(node: ir.Freeze, _semantics: Semantics) -> ir.Formula:
     """Without what nobody reads; a predicate of this very instant reads the number itself."""
     read = frozenset().union(*map(frozen_in, numbers(node.body)))
     kept = tuple((name, num) for name, num in node.bindings if name in read)
@@ -104,3 +102,16 @@ def _binary(node: ir.Until | ir.Since, semantics: Semantics) -> ir.Formula:
     return simplify(
         ir.PastTemporal("once" if strong else "historically", node.window, node.right, node.span), semantics
     )
+
+
+_LAWS: Mapping[type, Callable[[Any, Semantics], ir.Formula]] = MappingProxyType(
+    {
+        ir.BoolOp: _join,
+        **dict.fromkeys((ir.Temporal, ir.PastTemporal), _window),
+        **dict.fromkeys((ir.Until, ir.Since), _binary),
+        ir.Shift: _shift,
+        ir.Freeze: _freeze,
+        ir.AtStart: _at_start,
+    }
+)
+"""Class of nodes -> what becomes of it, its operands simplified."""

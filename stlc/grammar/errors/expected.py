@@ -188,10 +188,10 @@ def _repair(failure: ParseFailure) -> Diagnostic | None:
         inserted = sign if glued else f" {sign}"
         sure = terminal not in _CLOSING or not _open_interval(failure)
         if failure.piece.repaired_by(previous.end, previous.end, inserted):
-            return _missing(failure, sign, (previous.end, previous.end, inserted), sure=sure)
+            return _missing(failure, sign, previous.end, previous.end, inserted, sure=sure)
         if found is not None and failure.piece.repaired_by(found.start, found.end, sign):
             start = previous.end if glued else found.start
-            return _missing(failure, sign, (start, found.end, sign), sure=sure)
+            return _missing(failure, sign, start, found.end, sign, sure=sure)
     return None
 
 
@@ -215,14 +215,13 @@ def _definition_colon(failure: ParseFailure) -> Diagnostic | None:
         return None
     if not failure.piece.repaired_by(sign.start, sign.end, " ="):
         return None
-    return _missing(ParseFailure(failure.piece, sign.start), "=", (sign.start, sign.end, " ="))
+    return _missing(ParseFailure(failure.piece, sign.start), "=", sign.start, sign.end, " =")
 
 
 def _missing(
-    failure: ParseFailure, sign: str, edit: tuple[int, int, str], *, sure: bool = True
+    failure: ParseFailure, sign: str, low: int, high: int, text: str, *, sure: bool = True
 ) -> Diagnostic:
     """That a sign is missing; where it is not `sure` that no other one was meant, nothing is repaired."""
-    low, high, text = edit
     label = f"expected `{sign}` before this" if low == high and failure.found is not None else ""
     return Diagnostic(
         "E010",
@@ -230,7 +229,7 @@ def _missing(
         failure.span,
         label,
         _labels(failure),
-        help=(failure.line_with(edit),),
+        help=(failure.line_with((low, high, text)),),
         fix=Fix(((failure.piece.source.span(low, high), text),)) if sure else None,
     )
 

@@ -7,9 +7,11 @@ names that the language prefers. Names of one's own get backticks where they wou
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping
 from enum import IntEnum
 from fractions import Fraction
-from typing import assert_never
+from types import MappingProxyType
+from typing import Any, assert_never
 
 from stlc.grammar import ast
 from stlc.grammar.words import BUILT_IN, RESERVED
@@ -44,25 +46,11 @@ _ARITHMETIC = {
 
 
 def _level(expr: ast.Expr) -> Level:
-    match expr:
-        case ast.Logic(op=op):
-            return _LOGIC[op]
-        case ast.Until():
-            return Level.UNTIL
-        case ast.Not() | ast.Temporal() | ast.Quantifier() | ast.Freeze() | ast.IfThenElse():
-            return Level.PREFIX
-        case ast.Compare() | ast.Member():
-            return Level.COMPARE
-        case ast.Binary(op=op):
-            return _ARITHMETIC[op]
-        case ast.Neg():
-            return Level.SIGN
-        case ast.Quantity(value=value) if value < 0:
-            return Level.SIGN
-        case ast.Index() | ast.Attr() | ast.Call():
-            return Level.POSTFIX
-        case _:
-            return Level.ATOM
+    if isinstance(expr, ast.Quantity) and expr.value < 0:
+        return Level.SIGN
+    if isinstance(expr, (ast.Logic, ast.Binary)):
+        return (_LOGIC | _ARITHMETIC)[expr.op]
+    return _LEVELS.get(type(expr), Level.ATOM)
 
 
 def show_at(expr: ast.Expr, least: Level) -> str:
@@ -73,23 +61,7 @@ def show_at(expr: ast.Expr, least: Level) -> str:
 
 def show_expr(expr: ast.Expr) -> str:
     """The text of an expression."""
-    match expr:
-        case ast.Quantity() | ast.String() | ast.Bool() | ast.Inf() | ast.Name():
-            return _atom(expr)
-        case ast.Vector(items=items):
-            return f"[{show_list(items)}]"
-        case ast.Index() | ast.Attr() | ast.Call():
-            return _postfix(expr)
-        case ast.Neg() | ast.Binary() | ast.Compare() | ast.Member():
-            return _arithmetic(expr)
-        case ast.Not() | ast.Logic():
-            return _logic(expr)
-        case ast.Temporal() | ast.Until():
-            return _temporal(expr)
-        case ast.Quantifier() | ast.Freeze() | ast.IfThenElse():
-            return _binder(expr)
-        case _:
-            assert_never(expr)
+    return _SHOWN[type(expr)](expr)
 
 
 def _atom(expr: ast.Quantity | ast.String | ast.Bool | ast.Inf | ast.Name) -> str:
@@ -223,6 +195,31 @@ def show_list(items: tuple[ast.Expr, ...]) -> str:
     return ", ".join(map(show_expr, items))
 
 
+_LEVELS: Mapping[type, Level] = MappingProxyType(
+    {
+        ast.Until: Level.UNTIL,
+        **dict.fromkeys((ast.Not, ast.Temporal, ast.Quantifier, ast.Freeze, ast.IfThenElse), Level.PREFIX),
+        **dict.fromkeys((ast.Compare, ast.Member), Level.COMPARE),
+        ast.Neg: Level.SIGN,
+        **dict.fromkeys((ast.Index, ast.Attr, ast.Call), Level.POSTFIX),
+    }
+)
+"""Class of expressions -> how tightly it binds, where all of it bind alike; others are atoms."""
+
+_SHOWN: Mapping[type, Callable[[Any], str]] = MappingProxyType(
+    {
+        **dict.fromkeys((ast.Quantity, ast.String, ast.Bool, ast.Inf, ast.Name), _atom),
+        ast.Vector: lambda expr: f"[{show_list(expr.items)}]",
+        **dict.fromkeys((ast.Index, ast.Attr, ast.Call), _postfix),
+        **dict.fromkeys((ast.Neg, ast.Binary, ast.Compare, ast.Member), _arithmetic),
+        **dict.fromkeys((ast.Not, ast.Logic), _logic),
+        **dict.fromkeys((ast.Temporal, ast.Until), _temporal),
+        **dict.fromkeys((ast.Quantifier, ast.Freeze, ast.IfThenElse), _binder),
+    }
+)
+"""Class of expressions -> its text."""
+
+
 # ------------------------------------------------------------------ names, numbers
 
 
@@ -264,26 +261,9 @@ def _decimal(digits: str, places: int) -> str:
 
 def show(node: ast.Node) -> str:
     """The text of a node: an expression, a declaration or a whole specification."""
-    match node:
-        case ast.Spec():
-            return _spec(node)
-        case ast.Import():
-            return _import_line(node)
-        case ast.Declaration():
-            return _declaration(node)
-        case ast.Tag(name=name, args=args):
-            return f"@{show_name(name)}" + (f"({show_args(args)})" if args else "")
-        case ast.TypeRef():
-            return _type(node)
-        case ast.Formal(name=name, type=written):
-            return own_name(name) + ("" if written is None else f": {_type(written)}")
-        case ast.Arg():
-            return show_args((node,))
-        case ast.Interval():
-            return show_interval(node)
-        case ast.SetLiteral():
-            return show_set(node)
-    return show_expr(node)  # type: ignore[arg-type]
+    if isinstance(node, ast.Declaration):
+        return _declaration(node)
+    return (_PARTS.get(type(node)) or show_expr)(node)  # type: ignore[arg-type]
 
 
 # ------------------------------------------------------------------- declarations
@@ -292,25 +272,20 @@ def show(node: ast.Node) -> str:
 def _declaration(item: ast.Declaration) -> str:
     doc = "".join(f"## {line}".rstrip() + "\n" for line in item.doc.split("\n")) if item.doc else ""
     tags = "".join(f"{show(tag)}\n" for tag in item.tags)
-    match item:
-        case ast.Signal() | ast.Const() | ast.Param() | ast.Extern():
-            text = _typed(item)
-        case ast.Enum(members=members):
-            listed = ", ".join(f"{own_name(name)} = {value}" for name, value in members)
-            text = f"enum {own_name(item.name)} {{ {listed} }}"
-        case ast.Region(value=value):
-            text = f"region {own_name(item.name)} = {show_expr(value)}"
-        case ast.Def(formals=formals, type=written, value=value):
-            arguments = f"({', '.join(map(show, formals))})" if formals else ""
-            sort = "" if written is None else f": {_type(written)}"
-            text = f"def {own_name(item.name)}{arguments}{sort} = {show_expr(value)}"
-        case ast.Require(formula=formula):
-            text = f"require {own_name(item.name)}: {show_expr(formula)}"
-        case ast.Assume(formula=formula):
-            text = f"assume {own_name(item.name)}: {show_expr(formula)}"
-        case _:
-            raise TypeError(f"{type(item).__name__} is no declaration of the language")
-    return f"{doc}{tags}{text}"
+    if type(item) not in _DECLARED:
+        raise TypeError(f"{type(item).__name__} is no declaration of the language")
+    return f"{doc}{tags}{_DECLARED[type(item)](item)}"
+
+
+def _enum(item: ast.Enum) -> str:
+    listed = ", ".join(f"{own_name(name)} = {value}" for name, value in item.members)
+    return f"enum {own_name(item.name)} {{ {listed} }}"
+
+
+def _def(item: ast.Def) -> str:
+    arguments = f"({', '.join(map(show, item.formals))})" if item.formals else ""
+    sort = "" if item.type is None else f": {_type(item.type)}"
+    return f"def {own_name(item.name)}{arguments}{sort} = {show_expr(item.value)}"
 
 
 def _typed(item: ast.Signal | ast.Const | ast.Param | ast.Extern) -> str:
@@ -360,3 +335,38 @@ def _spec(spec: ast.Spec) -> str:
         text += "" if alike or not text else "\n"
         text += f"{_declaration(item)}\n"
     return text
+
+
+def _tag(tag: ast.Tag) -> str:
+    return f"@{show_name(tag.name)}" + (f"({show_args(tag.args)})" if tag.args else "")
+
+
+def _formal(formal: ast.Formal) -> str:
+    return own_name(formal.name) + ("" if formal.type is None else f": {_type(formal.type)}")
+
+
+_DECLARED: Mapping[type, Callable[[Any], str]] = MappingProxyType(
+    {
+        **dict.fromkeys((ast.Signal, ast.Const, ast.Param, ast.Extern), _typed),
+        ast.Enum: _enum,
+        ast.Region: lambda item: f"region {own_name(item.name)} = {show_expr(item.value)}",
+        ast.Def: _def,
+        ast.Require: lambda item: f"require {own_name(item.name)}: {show_expr(item.formula)}",
+        ast.Assume: lambda item: f"assume {own_name(item.name)}: {show_expr(item.formula)}",
+    }
+)
+"""Class of declarations -> its text, without tags and comment."""
+
+_PARTS: Mapping[type, Callable[[Any], str]] = MappingProxyType(
+    {
+        ast.Spec: _spec,
+        ast.Import: _import_line,
+        ast.Tag: _tag,
+        ast.TypeRef: _type,
+        ast.Formal: _formal,
+        ast.Arg: lambda arg: show_args((arg,)),
+        ast.Interval: show_interval,
+        ast.SetLiteral: show_set,
+    }
+)
+"""Class of other nodes -> its text."""
