@@ -15,8 +15,8 @@ from stlc.compile.ir.traverse import margin_unit
 from stlc.escape import visible
 
 if TYPE_CHECKING:
-    from stlc.cli.check.checked import Checked
     from stlc.cli.check.judge import Question
+    from stlc.cli.check.outcome import Checked
     from stlc.monitor.explain.causes import Blame
     from stlc.monitor.explain.report import Cause
 
@@ -25,11 +25,11 @@ _WIDTH = 72
 
 def explain_trace(name: str, question: Question, runs: Path, *, as_json: bool) -> None:
     """Judge a trace, print the tree of causes of every violated requirement, exit with the answer."""
-    from stlc.cli.check.checked import exit_code
     from stlc.cli.check.judge import judge
+    from stlc.cli.check.outcome import EXIT_CODES, SATISFIED
 
     result = judge(name, question, runs, talk=not as_json)
-    code = exit_code([result], None)
+    code = EXIT_CODES.get(result.verdict.overall, SATISFIED)
     if as_json:
         causes = [_values(cause, result) for cause in result.causes.values()]
         found = {"trace": result.trace.name, "verdict": result.verdict.overall, "causes": causes}

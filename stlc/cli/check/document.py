@@ -1,19 +1,24 @@
-"""The document `check/1`."""
+"""Results of `stlc check` for other programs: JSON, JUnit XML, and robustness as a trace of its own."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.cli.check.checked import Checked
-from stlc.cli.check.outcome import Outcome, overall
+from stlc.cli.check.outcome import Checked, Outcome, Row, overall
+from stlc.escape import xml
 from stlc.monitor.explain.report import Cause
 from stlc.monitor.judgement import Judgement
 from stlc.monitor.signals import Gap
+
+if TYPE_CHECKING:
+    from stlc.cli.check.judge import Question
+    from stlc.cli.check.outcome import Checked
 
 
 def document(outcomes: Sequence[Outcome]) -> dict[str, Any]:
@@ -103,3 +108,84 @@ def cause_entry(cause: Cause) -> dict[str, Any]:
         "requirement": {"line": cause.place.span.line, "column": cause.place.span.column},
         "because": cause.because,
     }
+
+
+def junit(outcomes: Sequence[Outcome]) -> str:
+    """The document."""
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', f"<testsuites{_counts(outcomes)}>"]
+    for outcome in outcomes:
+        lines += _suite(outcome)
+    return "\n".join([*lines, "</testsuites>", ""])
+
+
+def _counts(outcomes: Sequence[Outcome]) -> str:
+    rows = [row for outcome in outcomes for row in outcome.rows]
+    errors = sum(bool(outcome.errors) for outcome in outcomes)
+    failures = sum(row.status == "violated" for row in rows)
+    skipped = sum(row.status in ("inconclusive", "out of scope") for row in rows)
+    seconds = sum(outcome.seconds for outcome in outcomes)
+    return (
+        f' tests="{len(rows) + errors}" failures="{failures}" errors="{errors}" skipped="{skipped}"'
+        f' time="{seconds:.3f}"'
+    )
+
+
+def _suite(outcome: Outcome) -> Iterator[str]:
+    yield f"  <testsuite name={_attribute(outcome.name)}{_counts([outcome])}>"
+    for error in outcome.errors[:1]:
+        yield f'    <testcase classname={_attribute(outcome.name)} name="trace">'
+        detail = xml("\n".join(f"{e.code}: {e.message}" for e in outcome.errors))
+        told = f"type={_attribute(error.code)} message={_attribute(error.message)}"
+        yield f"      <error {told}>{detail}</error>"
+        yield "    </testcase>"
+    for row in outcome.rows:
+        yield from _case(outcome, row)
+    yield "  </testsuite>"
+
+
+def _case(outcome: Outcome, row: Row) -> Iterator[str]:
+    head = f"    <testcase classname={_attribute(outcome.name)} name={_attribute(row.name)}"
+    if row.status == "satisfied":
+        yield f"{head}/>"
+        return
+    yield f"{head}>"
+    if row.status == "violated":
+        message = f"robustness {row.robustness}{', ' + row.where if row.where else ''}"
+        yield f'      <failure type="violated" message={_attribute(message)}>{xml(row.why)}</failure>'
+    else:
+        yield f"      <skipped message={_attribute(row.why or row.status)}/>"
+    yield "    </testcase>"
+
+
+def _attribute(text: str) -> str:
+    return f'"{xml(text)}"'
+
+
+def write_robustness(path: Path, result: Checked, question: Question) -> None:
+    """Write one signal per requirement, (traces, samples); NaN where it has no value.
+
+    Raises:
+        MissingError: R201, no room or no permission.
+    """
+    from dataclasses import replace
+
+    from stlc.cli.check.judge import monitor_of
+    from stlc.signature import Column, Signature
+    from stlc.trace import Trace, save_trace
+    from stlc.units import written_unit
+
+    trace = result.trace
+    monitor = monitor_of(result.source, question, result.trace.meta.carried)
+    end: Literal["strict", "truncate"] = "truncate" if question.end == "truncate" else "strict"
+    values = monitor.requirement_robustness(trace, end=end, semantics=question.semantics)
+    chosen = {judgement.name for judgement in result.verdict}
+    data = {
+        name: np.asarray(rows, dtype=np.float64).reshape(trace.traces, trace.samples)
+        for name, rows in values.items()
+        if name in chosen
+    }
+    units = {judged.name: written_unit(judged.unit) for judged in result.verdict}
+    signature = Signature(tuple(Column(name, units[name]) for name in data))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    meta = replace(trace.meta, spec_text="", spec_path="", judge_text="", judge_path="")
+    save_trace(path, Trace(signature, trace.dt, data, trace.t0, meta=meta, name=str(path)))

@@ -17,7 +17,7 @@ from stlc.files import find_spec, read_source
 from stlc.source import Source
 
 if TYPE_CHECKING:
-    from stlc.cli.check.checked import Checked
+    from stlc.cli.check.outcome import Checked
     from stlc.monitor.instants import At
     from stlc.monitor.verdict import Monitor
     from stlc.trace import Reading, Trace
@@ -111,7 +111,7 @@ def taken(name: str, runs: Path) -> list[str]:
 
 def judged(path: Path, question: Question) -> tuple[Checked, list[str]]:
     """The result for one file, and what is to be said about it."""
-    from stlc.cli.check.checked import Checked
+    from stlc.cli.check.outcome import Checked
     from stlc.monitor.explain.report import explain_all
     from stlc.trace import read_recording
 

@@ -86,12 +86,12 @@ def outcome_of(work: Work) -> Outcome:
     begun = time.perf_counter()
     path = found(work.name, work.runs)
     if work.chunk or _too_large(path):
-        from stlc.cli.check.chunks import outcome_in_chunks
+        from stlc.cli.check.online import outcome_in_chunks
 
         return outcome_in_chunks(path, work)
     result, said = judged(path, work.question)
     if work.out is not None:
-        from stlc.cli.check.out import write_robustness
+        from stlc.cli.check.document import write_robustness
 
         write_robustness(work.out, result, work.question)
     return Outcome(

@@ -1,14 +1,15 @@
-"""The options of `stlc check`."""
+"""Options of `stlc check`, and those about traces that `explain` and `plot` share with it."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from stlc.cli.check.judge import End
-from stlc.cli.framework.completion import requirement_names
+from stlc.cli.check.judge import End, Question, names_of, time_step
+from stlc.cli.framework.options import RequireOption, RunsOption, SetOption, SystemOption, parse_overrides
 from stlc.registry import SEMANTICS
 
 Files = Annotated[
@@ -16,15 +17,6 @@ Files = Annotated[
     typer.Argument(
         metavar="[SPEC] TRACE…",
         help="Traces (.npz, .csv, .parquet, .mat, .mcap, bags of ROS, or -), after a spec.",
-    ),
-]
-Spec = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="The specification, instead of the trace's own.")
-]
-Require = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME", help="Judge this requirement only; repeatable.", autocompletion=requirement_names
     ),
 ]
 When = Annotated[
@@ -40,24 +32,6 @@ Robustness = Annotated[
 Tolerance = Annotated[
     float, typer.Option(help="Robustness from minus this on is satisfied; 0: `>` is not `>=`.")
 ]
-Names = Annotated[
-    list[str] | None,
-    typer.Option("--map", metavar="SIGNAL=NAME", help="A signal's name in the trace; t is the clock."),
-]
-Resample = Annotated[
-    str | None,
-    typer.Option(metavar="TIME", help="Put the signals on a grid: bool, int, enum held, real linear."),
-]
-Step = Annotated[
-    str | None, typer.Option(metavar="TIME", help="Time between samples that have no clock, as 10ms.")
-]
-MaxGap = Annotated[
-    str | None,
-    typer.Option(
-        metavar="TIME",
-        help="In longer gaps signals are unknown; three steps with --resample, else no gap may be.",
-    ),
-]
 Out = Annotated[
     Path | None,
     typer.Option(
@@ -70,4 +44,51 @@ Jobs = Annotated[int, typer.Option("--jobs", "-j", min=0, help="Processes; 0: on
 Chunk = Annotated[
     int, typer.Option(min=0, metavar="SAMPLES", help="Read in pieces of this size; 0: if it has to be.")
 ]
-Runs = Annotated[Path, typer.Option(help="Folder of all runs.")]
+
+
+@dataclass(frozen=True, slots=True)
+class Traces:
+    """How traces are read, and by what they are judged."""
+
+    spec: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The specification, instead of the trace's own.")
+    ] = None
+    system: SystemOption = None
+    set_: SetOption = None
+    require: RequireOption = None
+    map_: Annotated[
+        list[str] | None,
+        typer.Option("--map", metavar="SIGNAL=NAME", help="A signal's name in the trace; t is the clock."),
+    ] = None
+    resample: Annotated[
+        str | None,
+        typer.Option(metavar="TIME", help="Put the signals on a grid: bool, int, enum held, real linear."),
+    ] = None
+    max_gap: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIME",
+            help="In longer gaps signals are unknown; three steps with --resample, else no gap may be.",
+        ),
+    ] = None
+    dt: Annotated[
+        str | None, typer.Option(metavar="TIME", help="Time between samples that have no clock, as 10ms.")
+    ] = None
+    runs: RunsOption = Path("runs")
+
+    def question(self, **more: Any) -> Question:
+        """What is asked of every trace; `more` are further fields of it. Raises UsageError (U101)."""
+        asked = {
+            "spec": self.spec,
+            "system": self.system,
+            "names": names_of(self.map_),
+            "require": tuple(self.require or ()),
+            "resample": time_step("--resample", self.resample),
+            "overrides": parse_overrides(self.set_),
+            "dt": time_step("--dt", self.dt),
+            "max_gap": time_step("--max-gap", self.max_gap),
+        }
+        return Question(**{**asked, **more})
+
+
+TRACES = Traces()

@@ -1,12 +1,16 @@
-"""What is left of a trace once it is judged: texts and numbers, small enough to travel between processes."""
+"""Results of `stlc check`: a trace that was judged, what is told of it, and the exit code."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from stlc.diagnostics import Diagnostic
+from stlc.monitor.explain.report import Cause
+from stlc.monitor.judgement import Judgement, Verdict
+from stlc.source import Source
+from stlc.trace import Trace
 
 if TYPE_CHECKING:
     from stlc.monitor.judgement import Status
@@ -19,6 +23,11 @@ WORDS: dict[Status, str] = {
 }
 
 SATISFIED, VIOLATED, INVALID, INCONCLUSIVE = 0, 1, 3, 4
+EXIT_CODES: dict[Status, int] = {
+    "satisfied": SATISFIED,
+    "violated": VIOLATED,
+    "inconclusive": INCONCLUSIVE,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +94,7 @@ def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None) -> i
         return max(broken)
     if fail_under is not None:
         return _by_share(outcomes, fail_under)
-    return {"violated": VIOLATED, "satisfied": SATISFIED}.get(overall(outcomes), INCONCLUSIVE)
+    return EXIT_CODES.get(overall(outcomes), INCONCLUSIVE)
 
 
 def overall(outcomes: Sequence[Outcome]) -> Status:
@@ -105,3 +114,32 @@ def _by_share(outcomes: Sequence[Outcome], least: float) -> int:
     if holds >= least:
         return SATISFIED
     return VIOLATED if 1.0 - fails < least else INCONCLUSIVE
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """A trace, by what it was judged, and the result.
+
+    Attributes:
+        trace: as read, signals renamed.
+        source: text of the specification.
+        verdict: per requirement.
+        causes: violated requirement -> why.
+        asked: the words of the command line that say how it was read and judged.
+    """
+
+    trace: Trace
+    source: Source
+    verdict: Verdict
+    causes: Mapping[str, Cause]
+    asked: tuple[str, ...] = ()
+
+    @property
+    def warnings(self) -> tuple[Diagnostic, ...]:
+        """Of the compiler."""
+        return self.verdict.subject.compiled.warnings
+
+    def needs(self, judged: Judgement) -> tuple[float, float]:
+        """Seconds of signal that the judged instants of a requirement need, and seconds that there are."""
+        last = judged.start + judged.instants - 1 + judged.rule.reach
+        return last * self.trace.dt, (self.trace.samples - 1) * self.trace.dt

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stlc.cli.check.checked import Checked
-from stlc.cli.check.outcome import WORDS, Row
+from stlc.cli.check.outcome import WORDS, Checked, Row
 from stlc.cli.framework.output import table
 from stlc.cli.framework.render import render_place
 from stlc.compile.ir.support import columns

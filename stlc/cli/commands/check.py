@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import typer
 
 from stlc.cli.check import options as given
-from stlc.cli.check.judge import Question, names_of, time_step, usage
-from stlc.cli.framework.options import FailUnderOption, JsonOption, SetOption, SystemOption, parse_overrides
+from stlc.cli.check.judge import Question, usage
+from stlc.cli.framework.options import FailUnderOption, JsonOption
 from stlc.cli.framework.output import COLOR, PULSE, QUIET, emit, emit_json, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
 
@@ -31,24 +31,16 @@ _STREAM = "-"
 )
 def check(
     files: given.Files,
-    spec: given.Spec = None,
-    system: SystemOption = None,
-    set_: SetOption = None,
-    require: given.Require = None,
     at: given.When = None,
     end: given.Ending = "open",
     semantics: given.Robustness = "exact",
     tolerance: given.Tolerance = 1e-6,
-    map_: given.Names = None,
-    resample: given.Resample = None,
-    max_gap: given.MaxGap = None,
-    dt: given.Step = None,
     fail_under: FailUnderOption = None,
     out: given.Out = None,
     junit: given.Junit = None,
     jobs: given.Jobs = 1,
     chunk: given.Chunk = 0,
-    runs: given.Runs = Path("runs"),
+    reading: given.Traces = given.TRACES,
     json: JsonOption = False,
 ) -> None:
     """Judge recorded traces: verdicts, and the reasons of violations.
@@ -62,20 +54,9 @@ def check(
     from stlc.cli.check.many import Work, all_outcomes, out_paths
     from stlc.cli.check.outcome import exit_code
 
-    spec, traces = _split_files(files, spec)
-    question = Question(
-        spec,
-        system,
-        names_of(map_),
-        tuple(require or ()),
-        at,
-        end,
-        _tolerance(tolerance),
-        time_step("--resample", resample),
-        parse_overrides(set_),
-        semantics,
-        time_step("--dt", dt),
-        time_step("--max-gap", max_gap),
+    spec, traces = _split_files(files, reading.spec)
+    question = reading.question(
+        spec=spec, at=at, end=end, tolerance=_tolerance(tolerance), semantics=semantics
     )
     talk = not (QUIET.get() or json)
     if _STREAM in traces:
@@ -85,7 +66,7 @@ def check(
     else:
         color, paths = wants_color(sys.stdout), out_paths(out, traces)
         works = [
-            Work(name, question, runs, path, chunk, color, COLOR.get())
+            Work(name, question, reading.runs, path, chunk, color, COLOR.get())
             for name, path in zip(traces, paths, strict=True)
         ]
         outcomes = list(all_outcomes(works, jobs))
@@ -100,7 +81,7 @@ def check(
 
 
 def _stream(traces: Sequence[str], question: Question, *, talk: bool) -> Outcome:
-    from stlc.cli.check.stream import outcome_of_stream
+    from stlc.cli.check.online import outcome_of_stream
 
     if len(traces) > 1:
         raise usage("the standard input is judged alone", "stlc check SPEC -")
@@ -144,7 +125,7 @@ def _print_document(outcomes: Sequence[Outcome], code: int) -> None:
 
 
 def _write_junit(path: Path, outcomes: Sequence[Outcome]) -> None:
-    from stlc.cli.check.junit import junit
+    from stlc.cli.check.document import junit
     from stlc.files import write_atomic
 
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -14,9 +14,6 @@ import typer
 from stlc.cli.check import options as given
 from stlc.cli.framework.options import (
     JsonOption,
-    RequireOption,
-    SetOption,
-    SystemOption,
     parse_overrides,
 )
 from stlc.cli.framework.output import emit, emit_json, table
@@ -43,24 +40,14 @@ def explain(
         str | None,
         typer.Argument(metavar="CODE|SPEC|TRACE|RUN", help="A code, precedence, .stl file, trace or run."),
     ] = None,
-    require: RequireOption = None,
     at: Annotated[
         str | None, typer.Option(metavar="K|TIME", help="Of a trace: judge at this sample or time.")
     ] = None,
-    spec: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Of a trace: instead of its own specification.")
-    ] = None,
-    system: SystemOption = None,
-    map_: given.Names = None,
-    resample: given.Resample = None,
-    max_gap: given.MaxGap = None,
-    dt: given.Step = None,
-    set_: SetOption = None,
     guarantee: Annotated[
         bool,
         typer.Option("--guarantee", help="Of a run: how likely its backup meets a plan that works."),
     ] = False,
-    runs: Annotated[Path, typer.Option(help="Folder of all runs.")] = Path("runs"),
+    reading: given.Traces = given.TRACES,
     as_json: JsonOption = False,
 ) -> None:
     """Explain a code, a specification, or the violations of a trace.
@@ -70,7 +57,7 @@ def explain(
     each violated requirement is traced back to the sub-formula, the instant, the signal and its value.
     """
     if guarantee:
-        _guarantee(what or "latest", runs, parse_overrides(set_), as_json=as_json)
+        _guarantee(what or "latest", reading.runs, parse_overrides(reading.set_), as_json=as_json)
     elif what is None:
         _list_codes(as_json=as_json)
     elif _CODE.fullmatch(what):
@@ -78,23 +65,11 @@ def explain(
     elif what in _TOPICS:
         _page(what, as_json=as_json)
     elif what == "-" or Path(what).suffix in (".stl", ".stlc"):
-        _spec(what, require or [], as_json=as_json)
+        _spec(what, reading.require or [], as_json=as_json)
     else:
         from stlc.cli.check.causes import explain_trace
-        from stlc.cli.check.judge import Question, names_of, time_step
 
-        question = Question(
-            spec,
-            system,
-            names_of(map_),
-            tuple(require or ()),
-            at,
-            resample=time_step("--resample", resample),
-            overrides=parse_overrides(set_),
-            dt=time_step("--dt", dt),
-            max_gap=time_step("--max-gap", max_gap),
-        )
-        explain_trace(what, question, runs, as_json=as_json)
+        explain_trace(what, reading.question(at=at), reading.runs, as_json=as_json)
 
 
 def _list_codes(*, as_json: bool) -> None:

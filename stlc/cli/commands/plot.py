@@ -11,10 +11,6 @@ import typer
 from stlc.cli.check import options as given
 from stlc.cli.framework.options import (
     JsonOption,
-    RequireOption,
-    SetOption,
-    SystemOption,
-    parse_overrides,
 )
 from stlc.cli.framework.output import emit, emit_json, say
 from stlc.cli.framework.program import command
@@ -41,21 +37,11 @@ def plot(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="By default beside the trace, .svg.")
     ] = None,
-    require: RequireOption = None,
     trace: Annotated[int | None, typer.Option(min=0, metavar="K", help="Trace number K of the file.")] = None,
     places: Annotated[
         bool, typer.Option("--places", help="Paths over the places of the specification.")
     ] = False,
-    spec: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The specification, instead of the trace's own.")
-    ] = None,
-    system: SystemOption = None,
-    map_: given.Names = None,
-    resample: given.Resample = None,
-    max_gap: given.MaxGap = None,
-    dt: given.Step = None,
-    set_: SetOption = None,
-    runs: Annotated[Path, typer.Option(help="Folder of all runs.")] = Path("runs"),
+    reading: given.Traces = given.TRACES,
     as_json: JsonOption = False,
 ) -> None:
     """Draw signals, and the robustness of requirements beneath them.
@@ -64,24 +50,16 @@ def plot(
     one. With --places all paths are drawn over the places of the requirements: `[x, y] in dock` names
     one. The suffix of -o says what is written: .svg, .png or .pdf.
     """
-    from stlc.cli.check.judge import Question, laid_out, monitor_of, names_of, specification, time_step
+    from stlc.cli.check.judge import laid_out, monitor_of, specification
     from stlc.trace import read_recording
     from stlc.view import require_drawing
     from stlc.view.judged import margins_of, units_of
     from stlc.view.signals import draw_signals
 
     require_drawing()
-    path = _find(what, runs)
+    path = _find(what, reading.runs)
     target = _target(output, path)
-    question = Question(
-        spec,
-        system,
-        names_of(map_),
-        resample=time_step("--resample", resample),
-        overrides=parse_overrides(set_),
-        dt=time_step("--dt", dt),
-        max_gap=time_step("--max-gap", max_gap),
-    )
+    question = reading.question(require=())
     recording = read_recording(path)
     planned = recording.meta.planned  # margins over time are those of windows
     source, note = specification(recording.name, question.spec, planned)
@@ -89,9 +67,9 @@ def plot(
     recorded = laid_out(recording, monitor, question)
     if places:
         shown = list(range(recorded.traces)) if trace is None else [trace]
-        picture = _map(monitor, _one(recorded, trace), require or [])
+        picture = _map(monitor, _one(recorded, trace), reading.require or [])
     else:
-        verdict = monitor.check(recorded, require=require or [])
+        verdict = monitor.check(recorded, require=reading.require or [])
         margins, units = margins_of(monitor, verdict, recorded), units_of(verdict)
         choices = _choices(recorded, margins, trace)
         picture = draw_signals(_with_units(recorded, monitor.spec), margins, choices, units)

@@ -1,29 +1,44 @@
-"""What a monitor of samples says at the end of a stream or of a trace that was read in pieces."""
+"""Traces judged sample by sample: the standard input, and files larger than memory, read in pieces.
+
+The lines of the standard input are a `.csv` with a header, or one JSON object each. Their time step is that
+of `--dt`, or what the first two values of `t` say, or that of the system; `--resample` lays any times
+on a grid.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import math
+import sys
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stlc.cli.check.document import cause_entry, gap_entry
+from stlc.cli.check.judge import Question, instant_of, laid_reading, monitor_of, specification, usage
 from stlc.cli.check.outcome import WORDS, Outcome, Row
 from stlc.cli.check.text import in_unit, percent, signed
-from stlc.cli.framework.output import table
+from stlc.cli.framework.output import emit, table, wants_color
 from stlc.cli.framework.render import render_place
 from stlc.compile.ir.support import columns
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.diagnostics import Diagnostic, TraceError
 from stlc.escape import visible
+from stlc.files import find_spec, read_source
 from stlc.monitor.prepared import beside, gap_text
 from stlc.source import Source
 
 if TYPE_CHECKING:
+    from stlc.cli.check.many import Work
     from stlc.monitor.explain.report import Cause
     from stlc.monitor.judgement import Status
-    from stlc.monitor.online.online import Online
+    from stlc.monitor.online.online import Decision, Online
     from stlc.monitor.online.tally import Tally
+    from stlc.monitor.signals import Conversion
+    from stlc.monitor.verdict import Monitor
+    from stlc.trace.live import Sample, Uniform
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,3 +219,143 @@ def _requirement(name: str, tally: Tally, online: Online, cause: Cause | None) -
         "violated_traces": int(tally.status == "violated"),
         "cause": None if cause is None else cause_entry(cause),
     }
+
+
+NAME = "standard input"
+CLOCK = "t"
+
+
+def outcome_of_stream(question: Question, *, talk: bool) -> Outcome:
+    """Judge the standard input; where `talk` says so, print verdicts as soon as they are decided.
+
+    Raises:
+        UsageError: U101, no specification, or an option that needs the whole trace.
+        TraceError: a line that is no sample, or signals that are missing or not finite.
+    """
+    from stlc.trace.live import MAX_LINE, SampleStream, on_grid
+
+    if question.spec is None:
+        raise usage("which specification?", "stlc check SPEC -")
+    if question.semantics != "exact":
+        raise usage("`--semantics` needs the whole trace, and the standard input is judged line by line")
+    begun = time.perf_counter()
+    source = read_source(find_spec(question.spec))
+    monitor = monitor_of(source, question)
+    reading = laid_reading(monitor, question)
+    lines = SampleStream(NAME, reading)
+    raw = iter(lambda: sys.stdin.buffer.readline(MAX_LINE + 1), b"")
+    uniform = on_grid(lines.moments(raw), reading, NAME)
+    online = _online(monitor, question, uniform)
+    changes = _conversions(online, lines.units)
+    for sample in uniform.samples:
+        try:
+            decisions = online.push(_in_units(sample, changes, online))
+        except TraceError as error:
+            where = f"sample {online.samples} of the {NAME}"
+            raise TraceError(*(finding.with_note(where) for finding in error.diagnostics)) from None
+        if talk:
+            for decision in decisions:
+                _tell(decision, online)
+    step = online.compiled.grid.dt
+    told = Told(NAME, source, float(step or 0), online.samples, wants_color(sys.stdout))
+    return outcome_of_tallies(online, told, (), time.perf_counter() - begun)
+
+
+def _online(monitor: Monitor, question: Question, uniform: Uniform) -> Online:
+    from stlc.monitor.online.online import How
+
+    known = monitor.online(How(), require=question.require, dt=uniform.dt).compiled.grid.dt
+    at = instant_of(question.at, f"the {NAME}", float(known or 0), uniform.t0, None)
+    how = How(at, question.end, question.tolerance, uniform.t0, reasons=True)
+    return monitor.online(how, require=question.require, dt=uniform.dt)
+
+
+def _conversions(online: Online, units: Mapping[str, str]) -> dict[str, Conversion]:
+    """Conversions of recorded numbers whose unit is another one than is declared.
+
+    Raises:
+        TraceError: E605, a unit that is none, or of something else.
+    """
+    from stlc.monitor.signals import conversion
+    from stlc.units import CELSIUS, means_celsius, parse_unit
+
+    changes: dict[str, Conversion] = {}
+    for column in online.compiled.signature.columns:
+        if not units.get(column.name):
+            continue
+        try:
+            recorded = parse_unit(units[column.name])
+        except ValueError as error:
+            message = f"column `{column.name}` of the {NAME}: {error}"
+            help_ = (CELSIUS,) if means_celsius(units[column.name]) else ()
+            raise TraceError(Diagnostic("E605", message, help=help_)) from None
+        change = conversion(NAME, column, recorded)
+        if change is not None:
+            changes[column.name] = change
+    return changes
+
+
+def _in_units(sample: Sample, changes: Mapping[str, Conversion], online: Online) -> Sample:
+    """The sample in the units that are declared, and its time."""
+    converted = {name: change(sample[name]) for name, change in changes.items() if name in sample}
+    return {CLOCK: online.time(online.samples), **sample, **converted}
+
+
+def _tell(decision: Decision, online: Online) -> None:
+    """A violation always; that a requirement is satisfied only where it is judged once."""
+    repeated = online.repeats(decision.requirement)
+    if decision.status == "satisfied" and repeated:
+        return
+    low, high = decision.low, decision.high
+    bounds = signed(low) if low == high else f"[{signed(low)}, {signed(high)}]"
+    value = in_unit(bounds, online.rule(decision.requirement).unit)
+    judged = f", judged from t = {decision.time:.10g} s" if repeated else ""
+    now = online.time(decision.sample)
+    emit(f"t = {now:.10g} s  {visible(decision.requirement)}  {WORDS[decision.status]}  {value}{judged}")
+
+
+CHUNK = 250_000
+"""Samples that are read at a time."""
+
+
+def outcome_in_chunks(path: Path, work: Work) -> Outcome:
+    """Judge a file in pieces.
+
+    Raises:
+        UsageError: U101, an option that needs the whole trace.
+        TraceError: as `stlc.trace.chunks.pieces`.
+    """
+    from stlc.monitor.online.online import How
+    from stlc.trace.chunks import pieces
+
+    question = work.question
+    _require_pieces(path, work)
+    begun = time.perf_counter()
+    given = None if question.spec is None else monitor_of(read_source(find_spec(question.spec)), question)
+    read = pieces(path, work.chunk or CHUNK, laid_reading(given, question))
+    first = next(read)
+    source, note = specification(str(path), question.spec, first.meta.carried)
+    monitor = given or monitor_of(source, question, first.meta.carried)
+    at = instant_of(question.at, str(path), first.dt, first.t0, None)
+    how = How(at, question.end, question.tolerance, first.t0, reasons=True)
+    online = monitor.online(how, require=question.require, like=first)
+    online.feed(first)
+    for piece in read:
+        online.feed(piece)
+    told = Told(str(path), source, first.dt, online.samples, work.color)
+    return outcome_of_tallies(online, told, (note,) if note else (), time.perf_counter() - begun)
+
+
+def _require_pieces(path: Path, work: Work) -> None:
+    """Refuse what needs all samples at once."""
+    question = work.question
+    whole = {
+        "--resample": question.resample is not None,
+        "--max-gap": question.max_gap is not None,
+        "--out": work.out is not None,
+        "--semantics": question.semantics != "exact",
+    }
+    advice = "leave out --chunk" if work.chunk else "cut out what is of interest"
+    for option, asked in whole.items():
+        if asked:
+            raise usage(f"`{option}` needs the whole trace, and `{path}` is read in pieces", advice)
