@@ -244,7 +244,7 @@ def test_a_file_that_is_too_large_is_read_in_pieces(monkeypatch: pytest.MonkeyPa
     (name,) = files(a_trace(peak=3))
     monkeypatch.setattr("stlc.trace.chunks.LARGE", 100)
     monkeypatch.setattr("stlc.cli.check.many.SMALL", 100)
-    monkeypatch.setattr("stlc.trace.formats.npz.MAX_BYTES", 100)
+    monkeypatch.setattr("stlc.trace.formats.registry.MAX_BYTES", 100)
     assert check("s.stl", name, "-q") == 1
 
 

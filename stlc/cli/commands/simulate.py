@@ -125,7 +125,6 @@ def simulate(
     chosen = _guard(backup, guard)
     printed = _printed(json=json, margins=margins)
     from stlc.cli.framework.output import emit_json, show_diagnostics
-    from stlc.cli.simulate.pictures import draw, require_robots
     from stlc.cli.simulate.text import closing, screen
     from stlc.cli.simulate.watch import require_writable
     from stlc.controller.deployment.simulator import Setting
@@ -138,7 +137,7 @@ def simulate(
     opened = Run.open(run, root=runs, overrides=parse_overrides(set_))
     show_diagnostics(_longer(opened, steps or opened.task.system.decl.test.steps))
     if window:
-        require_robots(opened)
+        _require_robots(opened)
     test, which = opened.task.system.decl.test, parse_seeds(seeds)
     size = agents or test.agents, steps or test.steps
     setting = _hurried(Setting(which, *size, test.replan, ceiling=ceiling), time_limit)
@@ -148,7 +147,7 @@ def simulate(
     code = 1 if fail_under is not None and _satisfied(document, chosen) < fail_under else 0
     if not json:  # before the pictures: they must not change what was measured
         _print(screen(document, windows=windows), printed)
-    drawn = draw(opened) if pictures else {}
+    drawn = _pictures(opened) if pictures else {}
     if json:
         emit_json("simulate/1", ok=code == 0, exit_code=code, result=document | drawn)
     else:
@@ -169,10 +168,8 @@ def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
 
 
 def _end(run: Run, *, window: bool, code: int) -> None:
-    from stlc.cli.simulate.pictures import show
-
     if window:
-        show(run)
+        _show_robots(run)
     if code:
         raise typer.Exit(code)
 
@@ -354,3 +351,67 @@ def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rule
 def _laid_over(run: Run) -> str | None:
     scenario = run.task.system.decl.scenario
     return None if scenario is None else scenario.name
+
+
+# ------------------------------------------------------------------------- pictures
+
+
+def _pictures(run: Run) -> dict[str, str]:
+    """The animation and the report, where matplotlib is there; what was drawn, by kind."""
+    from stlc.cli.framework.output import PULSE, say
+    from stlc.view import available
+
+    if not available():
+        say("no pictures: they need matplotlib and pillow (pip install 'stlc[plot]')")
+        return {}
+    from stlc.view.animate import animate, seen_in
+    from stlc.view.bullet import ADVICE as BODIES
+    from stlc.view.bullet import available as in_space
+    from stlc.view.film import ADVICE as VIDEO
+    from stlc.view.report import write_report
+
+    seen = seen_in(run.dir)
+    if seen is not None and seen.stage is not None and not in_space():
+        say(f"robots are drawn as lines: bodies need pybullet ({BODIES})")
+    with PULSE.doing("drawing the animation"):
+        film = animate(run.dir)
+    with PULSE.doing("drawing the report"):
+        write_report(run.dir)
+    drawn = {"report": f"{run.dir.shown}/report.html"}
+    if film is None:
+        return drawn
+    if film.mp4 is None:
+        say(f"the animation is a GIF alone: an MP4 needs ffmpeg ({VIDEO})")
+    else:
+        drawn = {"video": f"{run.dir.shown}/{film.mp4.name}", **drawn}
+    return {"animation": f"{run.dir.shown}/{film.gif.name}", **drawn}
+
+
+def _require_robots(run: Run) -> None:
+    """Said before anything is driven: that a window can be opened, and that there is something for it.
+
+    Raises:
+        UsageError: U101, the run's world has no robots.
+        MissingError: R301, PyBullet is not installed; R302, there is no display.
+    """
+    from stlc.controller.stage import Staged
+    from stlc.controller.world import world_type
+    from stlc.view.bullet import require_window
+
+    if not isinstance(world_type(run.task.system.decl), Staged):
+        message = f"`--window` shows robots, and `{run.task.system.name}` has none"
+        raise UsageError(Diagnostic("U101", message))
+    require_window()
+
+
+def _show_robots(run: Run) -> None:
+    """Play the newest deployment in PyBullet's window."""
+    from stlc.cli.framework.output import PULSE
+    from stlc.view import bullet
+    from stlc.view.animate import seen_in
+
+    seen = seen_in(run.dir)
+    stage = None if seen is None else seen.stage
+    if seen is not None and stage is not None:
+        with PULSE.doing(""):
+            bullet.show(stage, seen.scene, seen.dt)

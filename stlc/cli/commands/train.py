@@ -10,15 +10,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import JsonOption, SetOption, SystemOption, parse_overrides
 from stlc.cli.framework.output import say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.cli.framework.ranges import parse_clock, parse_count, parse_seconds, parse_seeds
-from stlc.cli.train import options as o
 from stlc.cli.train.many import Many, train_many
 from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError
 from stlc.registry import METHODS
@@ -32,6 +32,69 @@ if TYPE_CHECKING:
     from stlc.controller.training.config import TrainConfig
     from stlc.controller.training.launch import Launch
     from stlc.controller.training.tensorboard import Opener
+
+SpecsArgument = Annotated[
+    list[Path] | None,
+    typer.Argument(metavar="SPEC", help="The specification, a .stl file; of several, each is trained for."),
+]
+BudgetOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="TIME", help="Time to train, such as 60s or 5min; planned as steps again and again."
+    ),
+]
+ClockOption = Annotated[
+    str,
+    typer.Option(
+        metavar="wall|processor", help="What a budget counts; processor time as on an idle machine."
+    ),
+]
+StepsOption = Annotated[
+    str | None,
+    typer.Option(metavar="N", help="Steps of the optimiser instead of a budget, or a recorded schedule."),
+]
+SeedOption = Annotated[
+    int | None,
+    typer.Option(min=0, max=2**63 - 1, help="Seed of everything random; the system file's if not given."),
+]
+SeedsOption = Annotated[
+    str | None,
+    typer.Option(metavar="SEEDS", help="Several runs, such as 0..2 or 0,3, in processes of their own."),
+]
+JobsOption = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Runs side by side.")]
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        metavar="auto|local|HOST:PORT",
+        help="Train on a Ray cluster, as many as it has cores for.",
+    ),
+]
+MethodOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="|".join(METHODS),
+        help="Search and distil, or the paper's plain gradient; guided unless the system says otherwise.",
+    ),
+]
+ResumeOption = Annotated[
+    str | None, typer.Option(metavar="RUN", help="Go on with an interrupted run.", autocompletion=run_names)
+]
+NameOption = Annotated[str | None, typer.Option(help="Name of the run; drawn if not given.")]
+DeviceOption = Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")]
+ThreadsOption = Annotated[int | None, typer.Option(min=1, help="Threads of torch.")]
+PlansOption = Annotated[int | None, typer.Option(min=1, help="Plans that the network proposes.")]
+RateOption = Annotated[float | None, typer.Option(help="Peak learning rate.")]
+BatchOption = Annotated[int | None, typer.Option(min=1, help="Fresh states a step.")]
+HeldOutOption = Annotated[int | None, typer.Option(min=1, help="Held-out starts of the verdict; 5000.")]
+DrivesOption = Annotated[
+    int | None, typer.Option(min=0, help="Drives after the training, under one guard at most; 400, 0: none.")
+]
+LogOption = Annotated[
+    str | None, typer.Option(metavar="tensorboard", help="Keep the curves for TensorBoard too.")
+]
+RunsOption = Annotated[Path, typer.Option(help="Folder of all runs.")]
+PicturesOption = Annotated[bool, typer.Option(help="Draw the curves and the report.")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,28 +117,28 @@ class Length:
     "stlc train specs/traffic.stl specs/ship_safe.stl --seeds 0..2 --cluster auto",
 )
 def train(
-    spec: o.SpecsArgument = None,
+    spec: SpecsArgument = None,
     system: SystemOption = None,
-    budget: o.BudgetOption = None,
-    clock: o.ClockOption = "wall",
-    steps: o.StepsOption = None,
-    seed: o.SeedOption = None,
-    seeds: o.SeedsOption = None,
-    jobs: o.JobsOption = 1,
-    cluster: o.ClusterOption = None,
-    method: o.MethodOption = None,
-    resume: o.ResumeOption = None,
-    name: o.NameOption = None,
-    device: o.DeviceOption = "cpu",
-    threads: o.ThreadsOption = None,
-    plans: o.PlansOption = None,
-    lr: o.RateOption = None,
-    batch: o.BatchOption = None,
-    held_out: o.HeldOutOption = None,
-    drives: o.DrivesOption = None,
-    log: o.LogOption = None,
-    runs: o.RunsOption = Path("runs"),
-    pictures: o.PicturesOption = True,
+    budget: BudgetOption = None,
+    clock: ClockOption = "wall",
+    steps: StepsOption = None,
+    seed: SeedOption = None,
+    seeds: SeedsOption = None,
+    jobs: JobsOption = 1,
+    cluster: ClusterOption = None,
+    method: MethodOption = None,
+    resume: ResumeOption = None,
+    name: NameOption = None,
+    device: DeviceOption = "cpu",
+    threads: ThreadsOption = None,
+    plans: PlansOption = None,
+    lr: RateOption = None,
+    batch: BatchOption = None,
+    held_out: HeldOutOption = None,
+    drives: DrivesOption = None,
+    log: LogOption = None,
+    runs: RunsOption = Path("runs"),
+    pictures: PicturesOption = True,
     set_: SetOption = None,
     json: JsonOption = False,
 ) -> None:
