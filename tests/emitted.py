@@ -20,7 +20,7 @@ from stlc.compile.backends.c.emit import Motion, emit
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.support import defined
+from stlc.compile.ir.defined import defined
 from stlc.compile.ir.traverse import leaves, subexpressions
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify

@@ -32,7 +32,7 @@ from stlc.compile.frontend.tags import nominal
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, in_samples, in_words
-from stlc.compile.ir.support import columns, defined, reach, uses_end
+from stlc.compile.ir.support import columns, reach, uses_end
 from stlc.compile.ir.traverse import absolute, margin_unit, mentions_horizon
 from stlc.compile.lowering.lower import as_written, lower
 from stlc.compile.lowering.simplify import simplify
@@ -285,7 +285,11 @@ def _signature(spec: typed.Spec, rules: Iterable[CompiledRequirement], timers: I
 
 
 def _leaves(rule: CompiledRequirement, grid: Grid) -> bool:
-    return grid.horizon is not None and not defined(rule.formula, grid.horizon + 1)[0]
+    if grid.horizon is None:
+        return False
+    from stlc.compile.ir.defined import defined
+
+    return not defined(rule.formula, grid.horizon + 1)[0]
 
 
 def _too_far(rule: CompiledRequirement, grid: Grid) -> Diagnostic:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.namespace import Array
+from stlc.compile.ir.defined import defined
 from stlc.compile.ir.discretize import Grid
-from stlc.compile.ir.support import defined
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.schedule.schedule import Boundary
 from stlc.diagnostics import Diagnostic, TraceError, UsageError

@@ -12,7 +12,8 @@ from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import columns_of, defined, history
+from stlc.compile.ir.defined import defined
+from stlc.compile.ir.support import columns_of, history
 from stlc.compile.ir.traverse import map_children, subexpressions
 from stlc.compile.schedule.schedule import Boundary
 from stlc.compile.semantics.semantics import Exact, Semantics

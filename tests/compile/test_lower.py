@@ -12,8 +12,9 @@ from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.defined import defined
 from stlc.compile.ir.discretize import Grid
-from stlc.compile.ir.support import defined, reach
+from stlc.compile.ir.support import reach
 from stlc.compile.ir.text import show_formula
 from stlc.compile.lowering.lower import lower
 from stlc.diagnostics import Diagnostic

@@ -9,7 +9,8 @@ from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.support import columns, defined, reach, uses_end
+from stlc.compile.ir.defined import defined
+from stlc.compile.ir.support import columns, reach, uses_end
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.lowering.lower import lower
 

@@ -1,4 +1,4 @@
-"""The support of a formula: lookback, lookahead, signals, and where it is defined on a finite trace.
+"""The support of a formula: lookback, lookahead and signals.
 
 All of them follow a formula from its predicates up. `Analysis` says what the value of a node is, given those
 of its operands; `fold` walks. Windows of the past are cut at the start of the trace, so they never ask for
@@ -10,11 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
 from typing import Generic, NamedTuple, TypeAlias, TypeVar, assert_never, final
-
-import numpy as np
-from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import leaves, nodes, numbers
@@ -232,87 +228,6 @@ def uses_end(formula: ir.Formula) -> bool:
     """Whether a window of the future runs to the end of the trace, or a segment would leave it (`sweep`)."""
     ahead = (node.window for node in nodes(formula) if isinstance(node, (ir.Temporal, ir.Until)))
     return any(window.hi is None for window in ahead) or any(map(looks_on, numbers(formula)))
-
-
-# -------------------------------------------------------------------------------- definedness
-
-Defined: TypeAlias = NDArray[np.bool_]
-_Instants: TypeAlias = NDArray[np.int_]
-
-
-def defined(formula: ir.Formula, samples: int) -> Defined:
-    """For every sample of a trace with `samples` of them: has `formula` a value there? Shape `(samples,)`.
-
-    No window of the future is cut: one that reaches beyond the last sample is undefined, and so are `prev`,
-    `next` and `shift` outside the trace. A window "to the end" is defined where it has a sample.
-    """
-    return fold(formula, _Definedness(samples))
-
-
-@final
-@dataclass(frozen=True, slots=True)
-class _Definedness(Analysis[Defined]):
-    samples: int
-
-    def predicate(self, num: ir.Num) -> Defined:
-        around, now = reach_of(num), np.arange(self.samples)
-        return np.asarray((now >= around.past) & (now < self.samples - around.future))
-
-    def constant(self) -> Defined:
-        return np.ones(self.samples, dtype=bool)
-
-    def all_of(self, parts: Sequence[Defined]) -> Defined:
-        return reduce(np.logical_and, parts)
-
-    def ahead(self, body: Defined, window: ir.Window) -> Defined:
-        return _throughout(body, *self._future(window))
-
-    def back(self, body: Defined, window: ir.Window) -> Defined:
-        return _throughout(body, *self._past(window))
-
-    def until(self, left: Defined, right: Defined, window: ir.Window) -> Defined:
-        """The left side is read from now on, and at this very instant in any case."""
-        (first, last), now = self._future(window), np.arange(self.samples)
-        return _throughout(left, now, np.maximum(last, now)) & _throughout(right, first, last)
-
-    def since(self, left: Defined, right: Defined, window: ir.Window) -> Defined:
-        """Neither side is read where the window lies before the start of the trace."""
-        (first, last), now = self._past(window), np.arange(self.samples)
-        held = _throughout(left, np.where(last < 0, now + 1, first), now)
-        return held & _throughout(right, first, last)
-
-    def shift(self, body: Defined, node: ir.Shift) -> Defined:
-        there = np.arange(self.samples) + node.steps
-        within = (there >= 0) & (there < self.samples)
-        return np.where(within, body[np.clip(there, 0, self.samples - 1)], node.outside is not None)
-
-    def at_start(self, body: Defined) -> Defined:
-        return np.full(self.samples, body[0])
-
-    def _future(self, window: ir.Window) -> tuple[_Instants, _Instants]:
-        """First and last instant of the window of every sample."""
-        now = np.arange(self.samples)
-        if window.hi is not None:
-            return now + window.lo, now + window.hi
-        beyond = now + window.lo >= self.samples
-        return now + window.lo, np.where(beyond, self.samples, self.samples - 1)
-
-    def _past(self, window: ir.Window) -> tuple[_Instants, _Instants]:
-        now = np.arange(self.samples)
-        first = np.zeros_like(now) if window.hi is None else np.maximum(now - window.hi, 0)
-        return first, now - window.lo
-
-
-def _throughout(inside: Defined, first: _Instants, last: _Instants) -> Defined:
-    """Whether all instants first..last lie within the trace and are defined; true for none at all."""
-    samples = len(inside)
-    known = int(np.argmin(inside)) if not inside.all() else samples
-    if not inside[known:].any():  # a formula that only looks ahead is defined up to some sample
-        return np.asarray(((last < known) | (last < first)) & (last < samples))
-    missing = np.concatenate([[0], np.cumsum(~inside)])
-    low, high = np.clip(first, 0, samples), np.clip(last + 1, 0, samples)
-    whole = missing[np.maximum(high, low)] == missing[low]
-    return np.asarray(whole & (last < samples))
 
 
 # ------------------------------------------------------------------------------ steady tails

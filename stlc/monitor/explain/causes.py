@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from stlc.compile.backends.array.graph import evaluate_parts
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.defined import defined
 from stlc.compile.ir.discretize import Grid
-from stlc.compile.ir.support import columns_of, defined, history
+from stlc.compile.ir.support import columns_of, history
 from stlc.compile.ir.traverse import (
     from_now,
     leaves,

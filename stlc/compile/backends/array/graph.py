@@ -19,7 +19,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.steps import ArrayPlan, all_values, array_plan
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import defined
+from stlc.compile.ir.defined import defined
 from stlc.compile.schedule.schedule import Boundary, IndexRange, TraceDomain, spanning
 from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
 from stlc.diagnostics import Diagnostic, TraceError

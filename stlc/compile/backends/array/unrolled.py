@@ -11,7 +11,7 @@ from stlc.compile.backends.c.numbers import Untranslatable
 from stlc.compile.backends.onnx.ops import ONNX
 from stlc.compile.backends.onnx.sheet import Value
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import defined
+from stlc.compile.ir.defined import defined
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
 from stlc.compile.schedule.schedule import spanning
 
