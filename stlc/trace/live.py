@@ -273,13 +273,18 @@ def _steady(first: TimedSample, rest: Iterator[TimedSample], dt: float | None, n
     if not step > 0:
         message = f"time in the {name} does not increase: {first.time:g} s, {second.time:g} s"
         raise TraceError(Diagnostic("E602", message))
-    return Uniform(first.time, step, _checked(first, second, rest, (step, dt is None, name)))
+    return Uniform(first.time, step, _checked(first, second, rest, step, name, measured=dt is None))
 
 
 def _checked(
-    first: TimedSample, second: TimedSample, rest: Iterator[TimedSample], how: tuple[float, bool, str]
+    first: TimedSample,
+    second: TimedSample,
+    rest: Iterator[TimedSample],
+    step: float,
+    name: str,
+    *,
+    measured: bool,
 ) -> Iterator[Sample]:
-    step, measured, name = how
     assert first.time is not None
     yield first.sample
     for number, moment in enumerate(_moments(second, rest), 1):

@@ -64,23 +64,23 @@ def perturbable(decl: SystemDecl) -> Perturbable:
     """The dynamics of a declaration with a factor at every uncertain number."""
     parts = moving_parts(decl)
     names = parts.names
-    seen, listed = _Seen(names), decl.test.uncertain
+    used, listed = _UsedNumbers(names), decl.test.uncertain
 
-    def read(marked: Names) -> tuple[tuple[Assign, ...], tuple[JumpDecl, ...]]:
-        cx = Context.of(Reader(decl.source), marked, parts.clock)  # findings are dropped
+    def read(rewriting: Names) -> tuple[tuple[Assign, ...], tuple[JumpDecl, ...]]:
+        cx = Context.of(Reader(decl.source), rewriting, parts.clock)  # findings are dropped
         return read_flow(parts.flow, cx), read_jumps(parts.jump, cx)
 
-    read(_Marked.of(names, seen.look))
-    chosen = seen.computed_with - seen.compared if listed is None else frozenset(listed)
+    read(_RewritingNames.of(names, used.look))
+    chosen = used.computed_with - used.compared if listed is None else frozenset(listed)
     texts = {_factor(name): name for name in sorted(chosen)}
     if listed is None:
-        texts |= {_place(each): each.span.text for each in seen.literals.values()}
-    marked = _Marked.of(names, seen.rewritten if listed is None else _as_it_is)
+        texts |= {_place(each): each.span.text for each in used.literals.values()}
+    rewriting = _RewritingNames.of(names, used.rewritten if listed is None else _as_it_is)
     for name in chosen:
-        marked.entries[name] = _times(names.entries[name], ir.Signal(_factor(name)))
+        rewriting.entries[name] = _times(names.entries[name], ir.Signal(_factor(name)))
     for factor in texts:
-        marked.entries[factor] = Known(Number(ir.Signal(factor), flexible=True, bare=True))
-    loose = _laid_over(decl, *read(marked))
+        rewriting.entries[factor] = Known(Number(ir.Signal(factor), flexible=True, bare=True))
+    loose = _laid_over(decl, *read(rewriting))
     found = (Uncertain(factor, text, _readers(loose, factor)) for factor, text in texts.items())
     return Perturbable(loose, tuple(each for each in found if each.states))
 
@@ -154,22 +154,22 @@ def _as_it_is(expr: ast.Expr) -> ast.Expr:
 
 
 @dataclass
-class _Marked(Names):
+class _RewritingNames(Names):
     """Names whose expressions are rewritten before they are resolved."""
 
     rewrite: Rewrite = field(default=_as_it_is)
 
     @classmethod
-    def of(cls, names: Names, rewrite: Rewrite) -> _Marked:
+    def of(cls, names: Names, rewrite: Rewrite) -> _RewritingNames:
         return cls(names.constants, names.columns, names.controls, dict(names.entries), names.places, rewrite)
 
     def expressions(self, reader: Reader) -> Expressions:
         """A compiler of rewritten expressions."""
-        return _Rewriting(reader, Names.expressions(self, reader).scope, rewrite=self.rewrite)
+        return _RewritingExpressions(reader, Names.expressions(self, reader).scope, rewrite=self.rewrite)
 
 
 @dataclass(frozen=True, slots=True)
-class _Rewriting(Expressions):
+class _RewritingExpressions(Expressions):
     rewrite: Rewrite = field(default=_as_it_is)
 
     def parse(self, node: Node | None, where: str) -> ast.Expr | None:
@@ -178,7 +178,7 @@ class _Rewriting(Expressions):
         return None if expr is None else self.rewrite(expr)
 
 
-class _Seen:
+class _UsedNumbers:
     """Constants and numbers that expressions compute with, and constants that conditions read."""
 
     def __init__(self, names: Names) -> None:

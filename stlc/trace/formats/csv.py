@@ -241,7 +241,7 @@ def _read_body(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array]:
         end = text.find("\n", begin + STRETCH) + 1 or len(text)
         columns = _read_fast(sheet, text[begin:end], width, texts)
         if columns is None:
-            columns = _read_strict(sheet, (begin, end), (width, texts), findings)
+            columns = _read_strict(sheet, begin, end, width, texts, findings)
         for part, column in zip(parts, columns, strict=True):
             part.append(column)
         begin = end
@@ -272,16 +272,14 @@ def _told(line: str, sheet: _Sheet) -> bool:
 
 
 def _read_strict(
-    sheet: _Sheet, ends: tuple[int, int], shape: tuple[int, frozenset[int]], findings: list[Diagnostic]
+    sheet: _Sheet, start: int, end: int, width: int, texts: frozenset[int], findings: list[Diagnostic]
 ) -> list[Array]:
     """The lines of a block cell by cell, with the place of every error."""
-    width, texts = shape
     rows: list[list[float | str]] = []
-    start, end = ends
     for line in sheet.source.text[start:end].removesuffix("\n").split("\n"):
         if _told(line, sheet):
             cells = list(_cells(sheet.source, start, line, sheet.delimiter))
-            rows.append(_read_row(sheet, cells, shape, findings))
+            rows.append(_read_row(sheet, cells, width, texts, findings))
         start += len(line) + 1
         if len(findings) >= _MAX_FINDINGS:
             break
@@ -294,10 +292,10 @@ def _read_strict(
 def _read_row(
     sheet: _Sheet,
     cells: Sequence[tuple[str, Span]],
-    shape: tuple[int, frozenset[int]],
+    width: int,
+    texts: frozenset[int],
     findings: list[Diagnostic],
 ) -> list[float | str]:
-    width, texts = shape
     if len(cells) != width:
         span = cells[0][1].to(cells[-1][1])
         message = f"this line has {len(cells)} cells, the header names {width} columns"
