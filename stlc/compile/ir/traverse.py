@@ -47,17 +47,18 @@ def _shape(node: Any) -> tuple[tuple[str, _Sort], ...]:
 # ----------------------------------------------------------------------------- one step down
 
 
-def children(node: Node) -> Iterator[Any]:
+def children(node: Node) -> tuple[Any, ...]:
     """The formulas and numbers directly below a node, in the order of its fields."""
+    found: tuple[Any, ...] = ()
     for name, sort in _shape(node):
         value = getattr(node, name)
-        match sort:
-            case "formula" | "number":
-                yield value
-            case "formulas" | "numbers":
-                yield from value
-            case "bindings":
-                yield from (num for _, num in value)
+        if sort in ("numbers", "formulas"):
+            found = found + value if found else value
+        elif sort == "bindings":
+            found = (*found, *(num for _, num in value))
+        else:
+            found = (*found, value)
+    return found
 
 
 def map_children(
@@ -132,17 +133,24 @@ def numbers(formula: ir.Formula | typed.Formula) -> Iterator[ir.Num]:
 
 def subexpressions(num: Node) -> Iterator[ir.Num]:
     """A number and all numbers in it, those of its conditions too."""
-    if isinstance(num, _NUMBERS):
-        yield num
-    for child in children(num):
-        yield from subexpressions(child)
+    stack: list[Any] = [num]
+    while stack:
+        part = stack.pop()
+        if isinstance(part, _NUMBERS):
+            yield part
+        if not isinstance(part, LEAVES):
+            stack.extend(reversed(children(part)))
 
 
 def leaves(num: Node) -> Iterator[NumberLeaf]:
     """The parts of a number without parts of their own, those of its conditions too."""
-    for part in subexpressions(num):
+    stack: list[Any] = [num]
+    while stack:
+        part = stack.pop()
         if isinstance(part, LEAVES):
             yield part
+        else:
+            stack.extend(reversed(children(part)))
 
 
 def map_leaves(node: N, change: Callable[[ir.Num], ir.Num]) -> N:
