@@ -1,1 +1,1 @@
-"""Who acts: tasks, policies, training, backup, deployment, worlds."""
+"""Controllers: tasks, policies, methods, training, guards, deployment, evaluation."""

@@ -1,4 +1,4 @@
-"""What worlds draw with: the colours of who decided, paths behind and plans ahead of the agents, violations.
+"""Drawing tools of worlds: colours by the source of a decision, past paths, plans, violations.
 
 Only NumPy is needed here; axes are those of matplotlib that `World.draw` is given.
 """
@@ -22,16 +22,16 @@ VIOLATED = "#c4161c"
 GROUND, WALL, STONE, GOAL, WATER, BANK, CHARGE = (
     *("#f1f3f5", "#9aa0aa", "#8a8f98", "#009e73", "#e8f0f7", "#c9d2bf", "#f0d58a"),
 )
-"""What stands around: floors, walls and obstacles in greys, what is to be reached in green."""
+"""Colours of surroundings: floors, walls and obstacles in greys, goals in green."""
 ROAD, STOP_LIGHT = "#e3e5e8", "#e5383b"
 NOTE = "#4a4f57"
 """Of small writing."""
 FADED = 0.75
-"""How strong a path is behind an agent: weaker, the policy's would look like that of a polished plan."""
+"""Opacity of a path behind an agent: weaker, the policy's would look like that of a repaired plan."""
 
 
 def deciders(scene: Scene, index: int, agents: int) -> NDArray[np.int64]:
-    """Who decided at frame `index`, (agents,); the policy where nobody recorded it."""
+    """Sources of the decisions at frame `index`, (agents,); the policy where none was recorded."""
     if "decision" not in scene:
         return np.zeros(agents, dtype=np.int64)
     return np.asarray(scene["decision"][index], dtype=np.int64)

@@ -49,7 +49,7 @@ class Stage:
 
 @runtime_checkable
 class Staged(Protocol):
-    """What a world has, too, whose agents are robots with a description (URDF)."""
+    """World whose agents are robots with a description (URDF)."""
 
     @staticmethod
     def stage(scene: Scene) -> Stage:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class World(Protocol):
-    """What agents meet, and what they cannot plan for. States are the system's, float64, without timers."""
+    """Environment of the agents, with what they cannot plan for; states float64, without timers."""
 
     def reset(self) -> Tensor:
         """Begin; (agents, n) states."""
@@ -38,10 +38,10 @@ class World(Protocol):
         """One step of the truth: (agents, n), (agents, m) -> (agents, n)."""
 
     def progress(self) -> Mapping[str, float]:
-        """How much of the task got done since `reset`."""
+        """Progress of the task since `reset`, name -> number."""
 
     def snapshot(self) -> Scene:
-        """What a picture of this instant needs: arrays that keep their shape through a deployment.
+        """Arrays for a picture of this instant, whose shapes stay the same through a deployment.
 
         What belongs to an agent has the agents first: (agents, …).
         """
@@ -56,7 +56,7 @@ class World(Protocol):
 
 @runtime_checkable
 class Choosing(Protocol):
-    """What a world has, too, where agents choose among ways to take it, such as the station to go to.
+    """World in which agents choose among options, such as the station to go to.
 
     A choice is made whenever a plan is, and takes the one that can be planned for best.
     """
@@ -70,7 +70,7 @@ class Choosing(Protocol):
 
 @runtime_checkable
 class Redrawing(Protocol):
-    """What a world has, too, where an agent may be given another start before anything has moved."""
+    """World that can give an agent another start before anything has moved."""
 
     def redraw(self, rows: Tensor) -> Tensor:
         """Draw the starts of some agents again, (k,) int64; returns all states, (agents, n).
@@ -81,17 +81,17 @@ class Redrawing(Protocol):
 
 @runtime_checkable
 class Charting(Protocol):
-    """What a world has, too, where plans can be drawn into its picture."""
+    """World into whose picture plans can be drawn."""
 
     def charted(self, states: Tensor) -> NDArray[np.float64]:
-        """Where planned states (agents, k, n) are in the picture as things are now, (agents, k, 2 or 3).
+        """Places of planned states (agents, k, n) in the present picture, (agents, k, 2 or 3).
 
         Row by row for the agents, from their present state on; NaN where the states are.
         """
 
 
 class WorldType(Protocol):
-    """How a world is made: everything random in it comes from `generator`."""
+    """Constructor of a world, whose randomness comes from `generator` alone."""
 
     draw: Callable[[Any, Scene, int], None]
 
@@ -129,7 +129,7 @@ class ModelWorld:
         return self._happen(moved)
 
     def progress(self) -> Mapping[str, float]:
-        """How often each event that waits for a state has happened, over all agents."""
+        """Number of times that each event with a condition has happened, over all agents."""
         return dict(self._counts)
 
     def units(self) -> Mapping[str, str]:

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 
 REDRAWN = 50
-"""How often the start of an agent is drawn again, at most."""
+"""Draws of the start of one agent, at most."""
 
 SURPRISE = 1e-6
-"""What moves a state further than this is no rounding."""
+"""Difference of a state above which it is no rounding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +178,7 @@ class Worlds:
     # ------------------------------------------------------------- what worlds tell of themselves
 
     def progress(self) -> tuple[Mapping[str, float], ...]:
-        """How much of the task got done, seed by seed."""
+        """Progress of the task, seed by seed."""
         found = []
         for world in self.worlds:
             with blamed(world, "progress", "say its progress"):
@@ -191,7 +191,7 @@ class Worlds:
             return {str(name): str(unit) for name, unit in self.worlds[0].units().items()}
 
     def snapshot(self) -> Mapping[str, NDArray[Any]]:
-        """What a picture of the first seed needs; arrays that keep their shapes."""
+        """Arrays for a picture of the first seed, which keep their shapes."""
         world = self.worlds[0]
         with blamed(world, "snapshot", "give a snapshot"):
             given = world.snapshot()
@@ -200,11 +200,11 @@ class Worlds:
 
     @property
     def charting(self) -> bool:
-        """Whether plans can be drawn into the picture of the first seed."""
+        """True where plans can be drawn into the picture of the first seed."""
         return isinstance(self.worlds[0], Charting)
 
     def charted(self, states: Tensor) -> NDArray[np.float64]:
-        """Where planned states of the first seed, (agents, k, n), are in its picture, (agents, k, 2 or 3)."""
+        """Places of planned states of the first seed, (agents, k, n), in its picture, (agents, k, 2 or 3)."""
         world = self.worlds[0]
         assert isinstance(world, Charting)
         with blamed(world, "charted", "say where plans are"):

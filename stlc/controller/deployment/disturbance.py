@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 SECOND = parse_unit("s")
 _GAINS, _PUSHES, _BLURS, _NUMBERS = range(4)
-"""Which stream of a seed is whose: worlds meet the same, whatever is disturbed."""
+"""Streams of a seed by their use: worlds meet the same, whatever is disturbed."""
 
 
 class Disturbance:
@@ -56,7 +56,7 @@ class Disturbance:
         self._spread = self._errors.sensor_noise * _ranges(system)
 
     def acted(self, action: Tensor) -> Tensor:
-        """What actuators make of (rows, m) commands at this step."""
+        """Actions that actuators make of (rows, m) commands at this step."""
         given = action
         if self._errors.actuator_gain:
             given = given * self._factor.to(given) + self._offset.to(given)
@@ -100,7 +100,7 @@ class Disturbance:
         return self._changed(x, {name: self._scale * value for name, value in added.items()}, clamped=True)
 
     def seen(self, x: Tensor, step: int) -> Tensor:
-        """What agents see of (rows, n) states; columns behind those of the system are as they are."""
+        """Measured (rows, n) states; columns behind those of the system are as they are."""
         seen = x
         if self._noises:
             seen = self._changed(x, self._drawn(self._noises, x, step), clamped=False)
@@ -133,7 +133,7 @@ class Disturbance:
 
 
 def errors_of(truth: System) -> dict[str, Any]:
-    """What the scenario of a system has wrong, as shares, and which numbers of its dynamics that concerns."""
+    """Errors of the scenario of a system, as shares, and the numbers of its dynamics that they concern."""
     scenario = truth.decl.scenario
     shares = {} if scenario is None else asdict(scenario.errors)
     found: dict[str, Any] = {name: share for name, share in shares.items() if share}
@@ -147,7 +147,7 @@ def _drawings(assigns: Sequence[Assign]) -> tuple[Drawing, ...]:
 
 
 def _ranges(system: System) -> Tensor:
-    """How wide the nominal range of each state is, (n,); 0 for clocks and for what is no measure."""
+    """Width of the nominal range of each state, (n,); 0 for clocks and for what is no measure."""
     widths = [
         column.high - column.low
         if column.kind == "real"

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class LiveMonitor:
-    """What the monitor says of all agents while they are driven; requirements are those of `stlc check`.
+    """Online margins of all agents during a deployment; requirements are those of `stlc check`.
 
     Taking a moment in is cheap; what is asked of it costs.
 
@@ -53,7 +53,7 @@ class LiveMonitor:
         return (self.moment.step if self.moment else 0) * self.task.dt
 
     def decided(self, row: int) -> str | None:
-        """Who decides for an agent: `policy`, `backup T0=2`, …; None at the end."""
+        """Source of an agent's decision: `policy`, `backup T0=2`, …; None at the end."""
         decision = self.moment.decision if self.moment else None
         if decision is None:
             return None

@@ -40,7 +40,7 @@ def blamed(world: object, method: str, what: str) -> Iterator[None]:
 
 
 def states_of(world: object, method: str, given: object, size: tuple[int, int]) -> Tensor:
-    """What a method of a world has given as states, float64, (agents, n). Raises SystemFileError (S207)."""
+    """States that a method of a world has given, float64, (agents, n). Raises SystemFileError (S207)."""
     if not isinstance(given, torch.Tensor):
         raise wrong(world, method, f"gives {_article(given)}, not a tensor of shape {size}")
     if given.shape != size:

@@ -1,1 +1,1 @@
-"""What plans and closed loops are worth."""
+"""Evaluation of plans and of closed loops."""

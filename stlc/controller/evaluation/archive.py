@@ -66,7 +66,7 @@ def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: 
 
 
 def _commanded(system: System, recording: DeploymentRecording) -> NDArray[np.float64]:
-    """What actuators got, (rows, steps, m)."""
+    """Commands to the actuators, (rows, steps, m)."""
     states = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
     planned = torch.from_numpy(recording.actions)
     return system.commanded(states, planned.flatten(0, 1)).reshape(planned.shape).numpy()

@@ -49,7 +49,7 @@ FEWER = 4
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """What was driven under one guard.
+    """Closed-loop runs under one guard, counted.
 
     Attributes:
         guard: which.
@@ -80,7 +80,7 @@ class Share:
         return wilson(self.share, self.drives)
 
     def better_than(self, other: Share) -> bool:
-        """Whether it is worth its cost: better by more than `NEAR`, and surely so where drives are few."""
+        """True where it is worth its cost: better by more than `NEAR`, and surely so where drives are few."""
         better = self.share > other.share + NEAR
         return better and (self.drives >= LEAST or _superiority(self, other, NEAR) >= SURE)
 
@@ -102,7 +102,7 @@ class Share:
 
 @dataclass(frozen=True, slots=True)
 class ClosedLoop:
-    """What was driven after a training.
+    """Closed-loop runs after a training.
 
     Attributes:
         shares: under each guard that was driven, the cheapest first; none where no drive came to its end.
@@ -295,7 +295,7 @@ class _Trial:
         return recording
 
     def _judged(self, recording: DeploymentRecording) -> tuple[NDArray[np.bool_], NDArray[np.bool_] | None]:
-        """Which drives satisfy the mission, and which what is tagged `@safety` in it."""
+        """Drives that satisfy the mission, and those that satisfy its requirements tagged `@safety`."""
         rows = len(recording.states)
         if self.rules is None:
             executed = judge_executed(self.task, recording, savable=np.ones(rows, dtype=bool))
@@ -308,7 +308,7 @@ class _Trial:
         return obeying(found, rows), safe
 
     def shares(self) -> tuple[Share, ...]:
-        """What was driven under each guard."""
+        """Counts under each guard."""
         free = self.known["none"].found
         shares = []
         for mode, known in self.known.items():

@@ -114,7 +114,7 @@ def deploy(
 def judged(
     guard: Guard, recording: DeploymentRecording, ceiling: int = 0, rules: Rules | None = None
 ) -> Deployment:
-    """What is to be known of a recorded deployment under a guard; see `feasible_states` for `ceiling`.
+    """Evaluation of a recorded deployment under a guard; see `feasible_states` for `ceiling`.
 
     Without `rules` a drive obeys where it satisfies the specification of plans from every start.
     """
@@ -136,13 +136,13 @@ def judged(
 
 
 def unsafe_agents(executed: Executed, agents: int) -> tuple[Unsafe, ...]:
-    """Who was not driven safely, of so many agents a seed."""
+    """Agents with an unsafe trajectory; `agents`: of one seed."""
     rows = np.flatnonzero(~executed.agents(executed.safety)).tolist()
     return tuple(Unsafe(*divmod(row, agents), bool(executed.savable[row])) for row in rows)
 
 
 def feasible_states(task: Task, recording: DeploymentRecording, count: int) -> NDArray[np.float64]:
-    """Whether some plan satisfies the specification, in `count` visited states, evenly spread: (rows, steps).
+    """Feasibility of `count` visited states, evenly spread: (rows, steps).
 
     1: the plan that was followed does, or a search has found one; 0: neither; NaN: nobody has looked.
     """
@@ -155,7 +155,7 @@ def feasible_states(task: Task, recording: DeploymentRecording, count: int) -> N
 
 
 def decided(recording: DeploymentRecording) -> dict[str, float]:
-    """Who decided, as shares of all decisions."""
+    """Shares of all decisions by their source."""
     found = {name: float((recording.source == index).mean()) for index, name in enumerate(SOURCES)}
     backup = recording.source == SOURCES.index("backup")
     for length in np.unique(recording.t0[backup]).tolist():

@@ -1,4 +1,4 @@
-"""What was driven, judged exactly: executed satisfaction, and how much of it went as the model foresaw."""
+"""Exact verdicts on simulated trajectories, and the share of them that is model-consistent."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def as_driven(rule: CompiledRequirement, task: Task) -> CompiledRequirement:
 
 
 def _held(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], horizon: int) -> Mask:
-    """Whether one requirement holds, (starts, rows)."""
+    """Satisfaction of one requirement, (starts, rows)."""
     samples, rows = next(iter(columns.values())).shape
     if not rule.windowed:
         return _margin(rule, columns, 1) >= -TOLERANCE
@@ -107,7 +107,7 @@ def _margin(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], coun
 
 
 def as_foreseen(task: Task, recording: DeploymentRecording) -> Mask:
-    """Whether the world did at a step what the model says, (rows, steps)."""
+    """Steps at which the world did as the model says, (rows, steps) booleans."""
     before = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
     action = torch.from_numpy(recording.actions).flatten(0, 1)
     predicted = task.system.step(before, action).numpy(force=True).reshape(recording.states[:, 1:].shape)
@@ -115,7 +115,7 @@ def as_foreseen(task: Task, recording: DeploymentRecording) -> Mask:
 
 
 def _throughout(right: Mask, task: Task, starts: int) -> Mask:
-    """Where it was so at every step of the window: (rows, steps) -> (starts, rows)."""
+    """Starts whose whole window is marked: (rows, steps) -> (starts, rows)."""
     so_far = np.concatenate([np.zeros((1, len(right)), dtype=int), np.cumsum(right.T, 0)])
     whole: Mask = so_far[task.horizon : task.horizon + starts] - so_far[:starts] == task.horizon
     return whole

@@ -46,7 +46,7 @@ JUDGED = 500
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """How a policy does on held-out states.
+    """Verdict on a policy on held-out states.
 
     Attributes:
         accuracy: share whose plan satisfies the specification (rho >= -1e-6 in float64).

@@ -224,7 +224,7 @@ HOLDS = "holds."
 
 
 def is_progress(key: str) -> bool:
-    """Whether a metric is one that the world tells of itself."""
+    """True for a metric that the world reports itself."""
     return key not in METRICS and not key.startswith(HOLDS)
 
 

@@ -105,13 +105,13 @@ class Broken:
 
     @property
     def excused(self) -> bool:
-        """Whether it does not count against a controller: lost from the start, or to what the world told."""
+        """True where the controller is excused: lost from the start, or to an exogenous event."""
         return self.lost is not None and self.lost.why in ("start", "told")
 
 
 @dataclass(frozen=True, slots=True)
 class Drives:
-    """What became of each drive, one agent over one seed.
+    """Verdicts on closed-loop runs, one agent over one seed each.
 
     Attributes:
         rules: rule -> status of each drive, (rows,): `satisfied`, `violated` or `inconclusive`.
@@ -225,7 +225,7 @@ def _kept(folder: RunDir, judge: JudgeRef, overrides: Mapping[str, str]) -> Rule
 
 
 def _named_since(folder: RunDir, decl: SystemDecl) -> JudgeRef | None:
-    """What the system file that a run was trained for names today, for the scenario that is laid over."""
+    """Rules that the system file of a run names today, for the scenario that is laid over."""
     path = Path(str(folder.record().get("system_path") or ""))
     if "test.judge" in decl.overrides or not path.is_file():
         return None
@@ -243,7 +243,7 @@ def _library_of(name: str) -> str:
 
 
 def _own(spec: ast.Spec, overrides: Mapping[str, str]) -> dict[str, str]:
-    """Those of the constants that were changed which a specification declares."""
+    """Overrides of constants that a specification declares."""
     own = {item.name for item in spec.items if isinstance(item, (ast.Const, ast.Param))}
     return {name: text for name, text in overrides.items() if name in own}
 
@@ -300,7 +300,7 @@ def verdict_on_drives(rules: Rules, task: Task, recording: DeploymentRecording) 
 def _lost(
     broken: Broken, safety: frozenset[str], task: Task, recording: DeploymentRecording, savable: bool
 ) -> Lost | None:
-    """When a drive was lost that broke rules, by the first of those tagged `@safety`, else by the first."""
+    """Time and cause of a loss, by the first broken rule tagged `@safety`, else by the first broken one."""
     row, unsafe = broken.row, not safety.isdisjoint(broken.rules)
     asked = safety_task(task) if unsafe and task.compiled.safety else task
     times = [time for name, time in broken.rules.items() if not unsafe or name in safety]
@@ -364,7 +364,7 @@ def _broken(verdict: Verdict, rules: Mapping[str, NDArray[np.str_]]) -> Iterator
 
 
 def _moments(verdict: Verdict, row: int, names: Sequence[str]) -> dict[str, float | None]:
-    """When a drive broke rules: at the sample that decides."""
+    """Times at which a drive broke rules: the samples that decide."""
     alone = np.zeros(verdict.traces, dtype=bool)
     alone[row] = True
     causes = {name: explain(verdict.within(alone), name) for name in names}

@@ -77,16 +77,16 @@ class Candidates:
 
     @property
     def satisfies(self) -> Tensor:
-        """Where phi holds, (…) booleans."""
+        """Plans that satisfy phi, (…) booleans."""
         return self.rho >= -TOLERANCE
 
     @property
     def is_safe(self) -> Tensor:
-        """Where phi_safe holds, (…) booleans."""
+        """Plans that satisfy phi_safe, (…) booleans."""
         return self.safe >= -TOLERANCE
 
     def of(self, rows: Tensor) -> Candidates:
-        """Those of some agents, (k,) indices or (agents,) booleans."""
+        """Rows of some agents, (k,) indices or (agents,) booleans."""
         return Candidates(*(getattr(self, name)[rows] for name in _FIELDS))
 
     def pick(self, choice: Tensor) -> Candidates:
@@ -166,7 +166,7 @@ class Deadline:
 
     @property
     def over(self) -> bool:
-        """Whether it has come."""
+        """True once it has come."""
         return perf_counter() >= self.until
 
 

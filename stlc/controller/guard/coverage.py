@@ -1,4 +1,4 @@
-"""How likely the backup policy's grid meets a plan that works: the paper's Theorem 1, and what it bounds.
+"""Probability that the backup policy's grid meets a plan that works: the paper's Theorem 1 and the truth.
 
 Suppose that there is a prefix u* of T0 actions such that every prefix within `radius` of it, in every control
 at every step, leads to satisfaction, and that u* lies anywhere in the control ranges with equal probability.

@@ -81,12 +81,12 @@ def solve(
 
 
 def solvable(task: Task, x0: Tensor) -> Tensor:
-    """Where some plan satisfies phi, as far as a search finds one: (B, n) -> (B,) booleans."""
+    """States from which a search finds a plan that satisfies phi: (B, n) -> (B,) booleans."""
     return solve(task, x0).rho >= -TOLERANCE
 
 
 def viable(task: Task, x0: Tensor) -> Tensor:
-    """Where some plan satisfies phi_safe, as far as a search finds one: (B, n) -> (B,) booleans."""
+    """States from which a search finds a plan that satisfies phi_safe: (B, n) -> (B,) booleans."""
     if not task.compiled.safety:
         return torch.ones(len(x0), dtype=torch.bool)
     return solvable(safety_task(task), x0)

@@ -27,7 +27,7 @@ GUARD_VERSION = 1
 
 @dataclass(frozen=True, slots=True)
 class GuardDecision:
-    """What agents do now, and why.
+    """Decisions of a guard: actions, the plans that they begin, and their sources.
 
     Attributes:
         action: (agents, m) float64, physical units.
@@ -61,11 +61,11 @@ class GuardDecision:
         return replace(self, plan=plan, action=plan[:, 0])
 
     def of(self, rows: Tensor) -> GuardDecision:
-        """Those of some agents, (k,) indices."""
+        """Rows of some agents, (k,) indices."""
         return GuardDecision(*(getattr(self, name)[rows] for name in _FIELDS))
 
     def with_new(self, rows: Tensor, new: GuardDecision) -> GuardDecision:
-        """These decisions, but for some agents, (k,) indices, which have decided anew."""
+        """The same with the rows of some agents, (k,) indices, replaced by `new`."""
         pairs = ((getattr(self, name), getattr(new, name)) for name in _FIELDS)
         return GuardDecision(*(old.index_copy(0, rows, fresh) for old, fresh in pairs))
 
@@ -148,7 +148,7 @@ class Guard:
 
     @torch.no_grad()
     def endangered(self, x: Tensor, begun: GuardDecision, steps: int | Tensor) -> Tensor:
-        """Who would, by the model, violate the safety requirements with the next steps of a begun plan.
+        """Agents that would, by the model, violate safety requirements with the next steps of a begun plan.
 
         Args:
             x: (agents, n) states.
@@ -166,7 +166,7 @@ class Guard:
 
     @torch.no_grad()
     def prefer(self, options: Tensor, begun: GuardDecision | None = None) -> Tensor:
-        """Which of its options each agent plans best for; of equals the first.
+        """Option of each agent that it plans best for; of equals the first.
 
         Args:
             options: (agents, k, n) states; option 0 is how things are.
@@ -189,7 +189,7 @@ class Guard:
 
     @torch.no_grad()
     def carried_on(self, x: Tensor, begun: GuardDecision, taken: Tensor) -> GuardDecision:
-        """What is left of plans for (agents, n) states, the policy's own from their end on.
+        """Remainders of plans for (agents, n) states, continued by the policy from their end on.
 
         `taken`: how many steps of each are behind it, (agents,); so many of its last actions are replaced.
         """
@@ -221,7 +221,7 @@ class Guard:
         return found
 
     def _deepened(self, rest: PlanVerdicts) -> Tensor:
-        """Whether what is left of a plan satisfies an open goal of the mission more and more, (agents,)."""
+        """Agents whose remaining plan increases the margin of a reached goal, (agents,) booleans."""
         if not self.task.promises.items:
             return torch.zeros_like(rest.rho, dtype=torch.bool)
         return self.task.promises.deepened(rest.columns)

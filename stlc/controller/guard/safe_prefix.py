@@ -1,4 +1,4 @@
-"""How far a plan that is not safe can be followed, and how soon and how much it fails."""
+"""Robustness of every prefix of a plan, whatever comes after it."""
 
 from __future__ import annotations
 

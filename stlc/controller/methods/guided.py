@@ -27,7 +27,7 @@ class Guided(NetworkMethod):
     mirrored = True
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
-        """As many hard states a step as fresh ones, four plans."""
+        """Four plans, and as many hard states a step as fresh ones."""
         found = base_config(task, config, batch=256, plans=4, searches=True)
         return replace(found, hard=found.batch)
 

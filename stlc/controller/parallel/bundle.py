@@ -70,7 +70,7 @@ class JobBundle:
 
     @property
     def shared(self) -> bool:
-        """Whether the caller's folders are seen from here."""
+        """True where the caller's folders are seen from here."""
         seen = (self.folder, self.probe, *self.inputs)
         return all(Path(path).exists() for path in seen)
 
@@ -177,7 +177,7 @@ def _ran(
 
 
 def _awaited(process: subprocess.Popen[str], probe: Path | None) -> tuple[str, str]:
-    """What a process says, awaited in short steps: an interrupt by Ray is not seen within a long one."""
+    """Output of a process, awaited in short steps: an interrupt by Ray is not seen within a long one."""
     while True:
         with suppress(subprocess.TimeoutExpired):
             return process.communicate(timeout=0.5)
@@ -221,7 +221,7 @@ def claimed(count: int) -> Iterator[frozenset[int]]:
 
 
 def mirrored(root: Path, path: str) -> Path:
-    """Where an absolute path lies in a mirror."""
+    """Place of an absolute path in a mirror."""
     return root / Path(path).relative_to(Path(path).anchor)
 
 

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from stlc.diagnostics import Diagnostic, MissingError
 
 PATIENCE = timedelta(minutes=10)
-"""How long a rank waits for another; building a kernel takes a minute at most."""
+"""Time that a rank waits for another; building a kernel takes a minute at most."""
 _SPREAD = 0x9E3779B97F4A7C15
 """Between the seeds of ranks: 2^64 over the golden ratio (D. Knuth, The Art of Computer Programming 6.4)."""
 
@@ -46,7 +46,7 @@ class Ranks:
 
     @property
     def first(self) -> bool:
-        """Whether this one prints and writes."""
+        """True for the rank that prints and writes."""
         return self.rank == 0
 
     def seed(self, seed: int) -> int:
@@ -74,7 +74,7 @@ class Ranks:
         return [total / self.size for total in self._reduced(values, dist.ReduceOp.SUM)]
 
     def any(self, flag: bool) -> bool:
-        """Whether some rank says so."""
+        """True where some rank says so."""
         return self._reduced([flag], dist.ReduceOp.MAX)[0] > 0.0
 
     def agree(self, value: float) -> float:
@@ -98,7 +98,7 @@ class Ranks:
         return bytes(sent.tolist()).decode()
 
     def gather(self, tensors: Mapping[str, Tensor]) -> list[dict[str, Tensor]]:
-        """What the ranks after the first give, in their order; on the first alone, [] elsewhere."""
+        """Tensors of the ranks after the first, in their order; on the first alone, [] elsewhere."""
         if self.first:
             return [self._received(rank) for rank in range(1, self.size)]
         data = save_tensors({name: part.detach().cpu().contiguous() for name, part in tensors.items()})

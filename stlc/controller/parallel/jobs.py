@@ -59,12 +59,12 @@ class JobResult:
 
     @property
     def result(self) -> dict[str, Any]:
-        """What the document says of the run; empty without one."""
+        """Entry of the document on the run; empty without one."""
         return (self.document or {}).get("result") or {}
 
     @property
     def why(self) -> str:
-        """Why it broke off: what is in the document, else what the process said last."""
+        """Cause of a break-off: findings of the document, else the last words of the process."""
         findings = (self.document or {}).get("diagnostics") or []
         lines = [f"{each['severity']}[{each['code']}]: {each['message']}" for each in findings]
         return "\n".join(lines) or self.said

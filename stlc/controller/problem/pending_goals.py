@@ -68,7 +68,7 @@ class PendingGoals:
         self.items = tuple(promise for promise in found if promise is not None)
 
     def short(self, columns: Mapping[str, Tensor]) -> Tensor:
-        """What plans lack of gamma where promises that are open at their start are concerned: (batch,).
+        """Shortfall of the margins of pending goals below gamma, summed over goals: (batch,).
 
         Args:
             columns: predicted states, name -> (time, batch); differentiable in them.
@@ -83,7 +83,7 @@ class PendingGoals:
         return lack
 
     def deepened(self, columns: Mapping[str, Tensor]) -> Tensor:
-        """Where the next step adds to what a promise that holds now has to spare: (batch,) booleans.
+        """Plans whose next step increases the margin of a goal that is reached now: (batch,) booleans.
 
         Args:
             columns: predicted states, name -> (time, batch).

@@ -36,7 +36,7 @@ MOST_VALUES = 32_000_000
 FLOAT32_SLACK = 1e-5
 """Rounding that a float32 rollout may add to a margin that is 0 by construction."""
 TIE = 1e-4
-"""What cost may weigh where robustness does not differ: it is flat where a deadline cannot be met."""
+"""Weight of cost where robustness does not differ: it is flat where a deadline cannot be met."""
 PULL = 0.1
 """Weight of the pull towards the next goal among the performance terms."""
 KEPT = 3.0
@@ -47,7 +47,7 @@ SHORT = 10.0
 
 @dataclass(frozen=True, slots=True)
 class PlanVerdicts:
-    """What became of a batch of plans, exact semantics, no gradient.
+    """Verdicts on a batch of plans, exact semantics, no gradient.
 
     Attributes:
         rho: robustness of the whole specification, (batch,).
@@ -65,7 +65,7 @@ class PlanVerdicts:
 
 
 def satisfied(rho: Tensor) -> Tensor:
-    """Where a robustness counts as satisfied: rho >= -1e-6, with float32 rounding allowed for.
+    """Satisfaction by robustness: rho >= -1e-6, with float32 rounding allowed for.
 
     Args:
         rho: (batch,), (batch, requirements), or any other shape; float64, or float32 with its own slack.
@@ -78,7 +78,7 @@ def satisfied(rho: Tensor) -> Tensor:
 
 
 class Task:
-    """What a policy is trained for.
+    """Specification and system that a policy is trained for.
 
     Attributes:
         compiled: the specification in steps, its timers included.
@@ -196,7 +196,7 @@ class Task:
         return NativeGradient.of(self.system, self.rules, self.native)
 
     def torch_reasons(self, device: str, *, searches: bool, smooth: bool) -> Mapping[str, str]:
-        """Why torch does the work: for each part of a training a reason, or "" where it runs as C.
+        """Reasons why torch does the work, for each part of a training; "" where it runs as C.
 
         The parts are `verdicts` of plans, `search` for better ones and the `gradient` of robustness.
 
@@ -267,7 +267,7 @@ class Task:
         return (self.horizon + 1) * (2 * len(self.names) + 2 * len(self.system.control_names) + 4 * parts)
 
     def cost(self, judged: PlanVerdicts) -> Tensor:
-        """What plans are chosen by where they satisfy the specification, without gradient: (batch,).
+        """Cost by which satisfying plans are chosen, without gradient: (batch,).
 
         These are the performance terms as if every plan were satisfying. On a mission the pull of the next
         goal draws plans to the edge of what is allowed now, so there it also costs to spare less than gamma.
@@ -297,16 +297,16 @@ class Task:
 
     @cached_property
     def promises(self) -> PendingGoals:
-        """What a mission promises, and how much it is to be kept with."""
+        """Goals of the mission, and the margin that they are to be reached with."""
         return PendingGoals(self.compiled, self.system.decl.objective.gamma)
 
     @cached_property
     def _pull(self) -> Program | None:
-        """How far the next goal of the mission is, sample by sample."""
+        """Distance to the next goal of the mission, sample by sample."""
         return None if self.compiled.guidance_cost is None else Program({"gap": self.compiled.guidance_cost})
 
     def alive(self, x: Tensor) -> Tensor:
-        """Whether the mission so far leaves a way to satisfy every requirement: (B, n) -> (B,) booleans."""
+        """States whose mission so far leaves a way to satisfy every requirement: (B, n) -> (B,) booleans."""
         env = {name: column[None] for name, column in zip(self.names, x.unbind(1), strict=True)}
         margins = evaluate([rule.alive for rule in self.rules], env, ops=TORCH)
         return torch.stack([margin[0].expand(len(x)) >= 0.0 for margin in margins]).all(0)

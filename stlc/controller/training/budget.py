@@ -172,7 +172,7 @@ class StepSchedule:
 
 
 class Pace:
-    """How fast a run goes, and how many steps a budget is worth at that pace.
+    """Pace of a run, and the number of steps that a budget allows at that pace.
 
     A search goes on beside the steps; the round after it, or a checkpoint, waits for its end. How long it
     takes is counted in steps, and so is what a round itself costs: a machine that becomes twice as slow is
@@ -277,11 +277,11 @@ class Pace:
 
     @property
     def planned(self) -> bool:
-        """Whether a number of steps was planned for a budget."""
+        """True once a number of steps was planned for a budget."""
         return self._left is not None
 
     def _due(self, left: float) -> bool:
-        """Whether enough has been timed since the last planning to plan anew."""
+        """True once enough has been timed since the last planning to plan anew."""
         if self._left is None:
             first = self._marks[0][1]
             return len(self._marks) > FIRST or self._marks[-1][1] - first >= WINDOW * self._seconds

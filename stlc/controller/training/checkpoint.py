@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 FOLDER = "ckpt"
 POINTER = "last.json"
 _DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RuntimeError)
-"""What comes of a text or a tensor that is not what was written."""
+"""Errors of reading a text or a tensor that is not what was written."""
 _NAME = re.compile(r"step-\d{6,}\.safetensors")
 
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """What was saved: tensors by name, and plain facts."""
+    """Saved state of a training: tensors by name, and plain facts."""
 
     tensors: dict[str, Tensor]
     facts: dict[str, Any]
@@ -67,7 +67,7 @@ def save_checkpoint(
 
 
 def never_saved(run: RunDir) -> bool:
-    """Whether no checkpoint of a run was ever written."""
+    """True where no checkpoint of a run was ever written."""
     return not (run.path / FOLDER).exists()
 
 

@@ -30,7 +30,7 @@ MISSION_MOST = 128
 
 @dataclass(frozen=True, slots=True)
 class TrainConfig:
-    """What the user may say; None leaves the choice to the system file, then to the engine.
+    """Options of the user; None leaves the choice to the system file, then to the method.
 
     Attributes:
         method: a name of `stlc.registry.METHODS`.

@@ -47,7 +47,7 @@ SHOWN = 6
 
 @dataclass(frozen=True, slots=True)
 class TrainingStep:
-    """What a training step was made with.
+    """Inputs of a training step.
 
     Attributes:
         task: that is trained for.
@@ -209,7 +209,7 @@ _WRONG: tuple[tuple[str, Callable[[Tensor, Tensor], Tensor], str], ...] = (
     ("robustness of `{}` is minus infinity", lambda value, _: value == -torch.inf, _ENDLESS),
     ("gradient of `{}` is not a number", lambda _, slope: ~_finite(slope), _ROOT),
 )
-"""What can be wrong with the value and the gradient of a requirement, and the way out."""
+"""Faults of the value and the gradient of a requirement, each with its test and the way out."""
 
 
 def _first(marks: Tensor) -> int | None:
@@ -240,7 +240,7 @@ TRIES = 4000
 
 
 def conflict(task: Task, enough: Stop = never) -> Diagnostic:
-    """What to say of a task that no plan was found for: R404, with the requirements that are to blame.
+    """Diagnostic R404 of a task that no plan was found for, with the requirements that are to blame.
 
     Those that are proved to have no plan, else what is left where requirements are left out one after the
     other as long as no plan is found for the rest; that ends where `enough` says so.
@@ -261,7 +261,7 @@ def conflict(task: Task, enough: Stop = never) -> Diagnostic:
 
 
 def refuted(task: Task) -> bool:
-    """Whether it is proved of some requirement that no plan satisfies it, from any of `STARTS` starts."""
+    """True where it is proved of some requirement that no plan from any of `STARTS` starts satisfies it."""
     return any(_impossible(task, rule) for rule in task.rules)
 
 
@@ -282,7 +282,7 @@ def _climbed(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> 
 
 
 def _explored(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> bool:
-    """Whether exploration finds a plan for these requirements alone."""
+    """True where exploration finds a plan for these requirements alone."""
     generator = torch.Generator().manual_seed(0)
     found = Exploration(_alone(task, rules)).solved(_starts(task)[:2], EFFORTS[0], generator, ENOUGH, enough)
     return len(found.rho) > 0
@@ -330,7 +330,7 @@ def _proof() -> str:
 
 
 def _tried(core: Sequence[CompiledRequirement]) -> str:
-    """How hard it was searched, and that this is no proof."""
+    """Note on the effort of the search, which is no proof."""
     rest = "" if len(core) == 1 else "; without one of these requirements some were found"
     return (
         f"{TRIES:,} plans were tried for each of {STARTS} starts, and plans were put together step by step "
@@ -346,7 +346,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _impossible(task: Task, rule: CompiledRequirement) -> bool:
-    """Whether bounds prove that no plan from any of the starts satisfies a requirement."""
+    """True where bounds prove that no plan from any of the starts satisfies a requirement."""
     return all(_most(rule.formula, _reached(task, x.tolist())) < -TOLERANCE for x in _starts(task).double())
 
 
@@ -430,7 +430,7 @@ class _Most:
 
 SAMPLES = 1024
 NEAR = 1e-6
-"""What rounding may change, relative to 1 or to the value, whichever is larger."""
+"""Difference by rounding, relative to 1 or to the value, whichever is larger."""
 ODD = 0.02
 """Share of samples that may disagree: rounding decides where a switch is nearly tied."""
 

@@ -48,7 +48,7 @@ COUNTED = 6
 GROWTH = 0.1
 """Mean share of the horizon by which a beginning grows in one go."""
 NEAR = 8.0
-"""How much sooner the nearest beginnings are gone on with: e to this power against the farthest."""
+"""Preference of the nearest prefixes over the farthest, as a power of e."""
 EFFORTS = (8, 24, 72)
 """Sweeps of a plan over `USUAL` steps: what is tried first, and what is tried where that found nothing."""
 USUAL = 30
@@ -100,14 +100,14 @@ class Layer:
         return Layer(*(getattr(self, name)[index] for name in Layer.__slots__))
 
     def joined(self, other: Layer) -> Layer:
-        """These and those."""
+        """The rows of both."""
         pairs = ((getattr(self, name), getattr(other, name)) for name in Layer.__slots__)
         return Layer(*map(np.concatenate, pairs))
 
 
 @dataclass(frozen=True, slots=True)
 class ExplorationResult:
-    """What one start came to.
+    """Result of the exploration from one start.
 
     Attributes:
         plan: satisfying, (T, m) float64; None where none was found.
@@ -242,7 +242,7 @@ class Exploration:
     # ------------------------------------------------------------------ beginnings
 
     def _grown(self, layer: Layer, random: np.random.Generator) -> Layer:
-        """What follows some beginnings of a layer, as far as it may still satisfy the specification."""
+        """Continuations of some prefixes of a layer that may still satisfy the specification."""
         chosen = self._chosen(layer, random)
         np.add.at(layer.visits, chosen, 1.0)
         horizon, before = self.task.horizon, layer.plans[chosen]
@@ -253,7 +253,7 @@ class Exploration:
         return self._begun(np.concatenate((states, after[:, 1:]), 1), np.concatenate((before, piece), 1))
 
     def _begun(self, states: Numbers, plans: Numbers) -> Layer:
-        """Those of some beginnings that may still satisfy the specification."""
+        """Prefixes, of some, that may still satisfy the specification."""
         good = np.isfinite(states).all((1, 2))
         states, plans = states[good], plans[good]
         whole = states.shape[1] == self.task.horizon + 1
@@ -277,7 +277,7 @@ class Exploration:
         return np.stack([np.broadcast_to(each[0], len(states)) for each in found], 1)
 
     def _chosen(self, layer: Layer, random: np.random.Generator) -> NDArray[np.int64]:
-        """Which beginnings are gone on with: those that have come far, the nearest and the rarest first."""
+        """Prefixes to continue, (CHILDREN,): those with more pieces met, the nearest and the rarest first."""
         kind = _numbered(layer.kind)
         rank = np.empty(len(layer))
         for each in range(kind.max() + 1):

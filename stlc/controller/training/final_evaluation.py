@@ -108,16 +108,16 @@ class FinalEvaluation:
         return closed_loop(run, lambda: end - time.now(), self.config.drives)
 
     def _out_of_time(self) -> bool:
-        """Whether the verdict has to come to its end."""
+        """True once the verdict has to end."""
         return self.time.now() - self.trained > self._verdict_seconds
 
     def _late(self) -> bool:
-        """Whether what follows the verdict has to come to its end, too."""
+        """True once everything behind the verdict has to end, too."""
         return self.time.now() - self.trained > 2.0 * self._verdict_seconds
 
     @property
     def _verdict_seconds(self) -> float:
-        """What is left of the budget for the verdict; without a budget a share of what the steps took."""
+        """Seconds of the budget left for the verdict; without a budget a share of what the steps took."""
         spent = self.trained - self.time.begun
         if not self.time.allowed:
             return max(VERDICT_LEAST, VERDICT_SHARE * spent)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Launch:
-    """Where and under which name a run is made.
+    """Place and name of a new run.
 
     Attributes:
         root: folder of all runs.

@@ -58,7 +58,7 @@ RISE = 30
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """What a search round saw on fresh states, of all ranks.
+    """Shares and counts on fresh states, of all ranks.
 
     Attributes:
         accuracy: share whose plan satisfies the specification.
@@ -155,17 +155,17 @@ class Trainer:
 
     @property
     def searches(self) -> bool:
-        """Whether failing states are repaired beside the steps."""
+        """True where failing states are repaired beside the steps."""
         return self.method.searches
 
     @property
     def searching(self) -> bool:
-        """Whether a repair goes on at this moment."""
+        """True while a repair goes on."""
         return self.repairing is not None and not self.repairing.done()
 
     @property
     def solved(self) -> bool:
-        """Whether a satisfying plan was ever found by a search."""
+        """True once a search has found a satisfying plan."""
         return self.buffer.count > 0
 
     def torch_reasons(self) -> Mapping[str, str]:
@@ -211,7 +211,7 @@ class Trainer:
 
     @property
     def exhausted(self) -> bool:
-        """Whether exploration has been tried with all the effort there is, and found nothing."""
+        """True once exploration was tried with all the effort there is, and found nothing."""
         return self.effort >= len(EFFORTS)
 
     @torch.no_grad()
@@ -254,7 +254,7 @@ class Trainer:
             self.repairing.cancel()
 
     def _of_all(self, look: Validation) -> Validation:
-        """What the ranks saw together."""
+        """Validation over all ranks."""
         counts = (look.failing, look.repaired, look.explored)
         own = (look.feasible or 0.0, *counts, look.accuracy, *look.requirements)
         feasible, failing, repaired, explored, accuracy, *shares = self.ranks.mean(own)
@@ -316,7 +316,7 @@ class Trainer:
 
     @torch.no_grad()
     def _winner(self, x0: Tensor, plans: Tensor) -> tuple[Tensor, Tensor]:
-        """Which plan is trained, the one that does best, (B,), and whether it satisfies the specification."""
+        """Index of the best plan, which is trained, (B,), and whether it satisfies the specification."""
         batch, count = plans.shape[:2]
         if count == 1 and self.config.hard == 0:
             first = torch.zeros(batch, dtype=torch.int64, device=self.device)
@@ -377,7 +377,7 @@ class Trainer:
         return found
 
     def _own(self) -> dict[str, Tensor]:
-        """What every rank has for itself."""
+        """Tensors that every rank has for itself."""
         found: dict[str, Tensor] = {"generator": self.generator.get_state()}
         if not self.ranks.first:
             counts = [self.accuracy, self.buffer.count, self.barren, self.effort]
@@ -445,7 +445,7 @@ class Trainer:
     def _restored(
         self, tensors: dict[str, Tensor], facts: dict[str, float | int]
     ) -> tuple[dict[str, Tensor], dict[str, float | int]]:
-        """What this rank goes on with: its own part in the place of the first one's."""
+        """State that this rank goes on with: its own part in the place of the first one's."""
         if self.ranks.first:
             return tensors, facts
         shared = ("network.", "average.", "adam.")

@@ -41,7 +41,7 @@ LOOK = 0.1
 
 @dataclass(frozen=True, slots=True)
 class SearchResult:
-    """What a search found.
+    """Result of a search.
 
     Attributes:
         states: where plans start, (B, n).
@@ -55,7 +55,7 @@ class SearchResult:
 
     @property
     def solved(self) -> Tensor:
-        """Where the plan satisfies the specification with a little to spare, (B,)."""
+        """States whose plan satisfies the specification by more than rounding, (B,) booleans."""
         return self.rho >= FLOAT32_SLACK
 
     def to(self, device: torch.device) -> SearchResult:
@@ -100,7 +100,7 @@ class Search:
         return self
 
     def done(self) -> bool:
-        """Whether it has come to its end."""
+        """True once the search has ended."""
         return self._found.done()
 
     def advance(self) -> None:
@@ -112,7 +112,7 @@ class Search:
                     break
 
     def result(self, stop: Stop = never) -> SearchResult | None:
-        """What was found once it has come to its end; None where `stop` says first not to wait any longer."""
+        """Result at the end of the search; None where `stop` ends the waiting first."""
         while not self.done():
             if stop():
                 return None
@@ -257,7 +257,7 @@ class _TorchClimb:
         return self.left > 0
 
     def finish(self, stop: Stop = never) -> SearchResult:
-        """What was found at the end."""
+        """Result at the end of the search."""
         while not stop() and self.generation(stop):
             pass
         return self.found

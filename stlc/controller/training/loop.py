@@ -46,7 +46,7 @@ SAVE_SECONDS = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """How the outside follows a run and ends it early.
+    """Callbacks of a training.
 
     Attributes:
         begun: called once with what the engine chose, the margin and the number of steps among it.
@@ -292,7 +292,7 @@ class _Session:
         return not learner.ranks.any(self.watch.stop())
 
     def _goes_on(self) -> bool | None:
-        """Whether there is a step to make, after a validation where one is due; None: the run is to stop.
+        """True where there is a step to make, after a validation where one is due; None: the run is to stop.
 
         Both the end and a validation wait for the search that goes on beside the steps. Where at the end that
         takes less than was expected there is time for more steps.
@@ -351,7 +351,7 @@ class _Session:
         return not self.learner.ranks.any(not came)
 
     def _hopeless(self) -> bool:
-        """Whether neither the policy nor the search has ever satisfied the specification for any state."""
+        """True where neither the policy nor the search has ever satisfied the specification for any state."""
         learner = self.learner
         enough = max(BARREN_LOOKS * learner.config.every, BARREN_SHARE * learner.steps)
         if not self.barren or not learner.searches:

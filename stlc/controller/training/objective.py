@@ -1,4 +1,4 @@
-"""What training minimises: the paper's truncated robustness and its performance terms (Eq. 8 to 10)."""
+"""Loss of a training: the paper's truncated robustness and its performance terms (Eq. 8 to 10)."""
 
 from __future__ import annotations
 

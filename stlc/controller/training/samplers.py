@@ -33,7 +33,7 @@ BLOCK = 8192
 
 
 class Supply(Protocol):
-    """Where training states come from."""
+    """Source of training states."""
 
     def take(self, n: int) -> Tensor:
         """The next `n` states, (n, dim), float32."""
@@ -70,10 +70,10 @@ class Draws:
         return taken
 
     def follow(self, states: Tensor, plans: Tensor) -> None:
-        """Where a plan leads does not matter to independent draws."""
+        """Ignored: draws are independent."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """What was drawn and not yet handed out."""
+        """States drawn and not yet handed out."""
         return {"block": self.block}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
@@ -104,7 +104,7 @@ class FixedSet:
         return self.states[taken]
 
     def follow(self, states: Tensor, plans: Tensor) -> None:
-        """Where a plan leads does not change the set."""
+        """Ignored: the set is fixed."""
 
     def tensors(self) -> dict[str, Tensor]:
         """The set, and what of it is still to come."""
@@ -124,7 +124,7 @@ GLIMPSES = 4
 STARTS = 0.1
 """Share of mission starts among the states that are handed out."""
 ROUNDS = 5
-"""How often what recurs for ever is driven round: so long what policies come to is on record."""
+"""Rounds over which a mission without end is simulated."""
 GIVE_UP = 0.3
 """Chance that a mission ends with a leg whose plan fails."""
 
@@ -163,7 +163,7 @@ class Missions:
             self.pool[place], self.age[place] = reached[: len(place)], 0.0
 
     def tensors(self) -> dict[str, Tensor]:
-        """Where all missions stand."""
+        """States of all missions."""
         return {"block": self.block, "pool": self.pool, "age": self.age}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
@@ -199,7 +199,7 @@ class Missions:
         self.pool[place], self.age[place] = self._starts(len(place)), 0.0
 
     def _legs(self, n: int) -> Tensor:
-        """How far plans are followed: up to half of the horizon, (n,) int64."""
+        """Steps over which plans are followed, up to half of the horizon, (n,) int64."""
         most = max(self._task.horizon // 2, 1)
         return torch.randint(1, most + 1, (n,), generator=self._generator).to(self._device)
 
@@ -218,7 +218,7 @@ class Missions:
 
 
 def mission_steps(task: Task) -> int:
-    """How long missions are driven: past the last step that is named; of those without end, some rounds."""
+    """Steps of a mission: past the last one that is named; of one without end, some rounds."""
     named, recurring = task.compiled.mission, task.compiled.recurring
     if named is None:
         return task.horizon * 4

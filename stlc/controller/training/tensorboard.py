@@ -18,7 +18,7 @@ _PLAIN = ("accuracy", "feasible", "loss", "lr", "s_per_step")
 
 
 class Writer(Protocol):
-    """What a `SummaryWriter` is used for."""
+    """Subset of `SummaryWriter` that is used here."""
 
     def add_scalar(self, tag: str, value: float, step: int, /) -> None:
         """Enter a number."""
@@ -62,7 +62,7 @@ class TensorBoardLogger:
 
 
 def find_writer() -> Opener:
-    """How logs are opened here: by tensorboardX, else by torch with tensorboard.
+    """Opener of logs: tensorboardX, else torch with tensorboard.
 
     Raises:
         MissingError: R301, neither is installed.

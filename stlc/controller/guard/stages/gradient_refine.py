@@ -47,7 +47,7 @@ SHARES = 8
 SLOPE = 5.0
 """Of conditions, per unit, in the gradient."""
 STEEP = 1e100
-"""What is steeper is no slope, nor is what is no number."""
+"""Largest slope that counts as a number."""
 AGENTS = 256
 """Agents whose plans are raised side by side, at most."""
 SEED = 20_231
@@ -121,7 +121,7 @@ class GradientAscent:
         return np.take_along_axis(plans, order[..., None, None], 1), np.take_along_axis(value, order, 1)
 
     def _eased(self, x: Numbers, own: Numbers, found: Numbers) -> Numbers:
-        """As little of the way from plans (agents, T, m) to those that were found as is enough."""
+        """Plans as near to (agents, T, m) on the way to those that were found as still keep the margin."""
         share = np.arange(1, SHARES)[:, None, None] / SHARES
         tried = np.concatenate((own[:, None] + share * (found - own)[:, None], found[:, None]), 1)
         each, _ = self._judged(np.repeat(x, SHARES, 0), tried.reshape(-1, *own.shape[1:]))

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Restarts(GuardStage):
-    """What `feasibility.solve` finds until the deadline."""
+    """Plans of `feasibility.solve` until the deadline."""
 
     turns: ClassVar[Mapping[str, int]] = {"full": 30}
 
