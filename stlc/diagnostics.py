@@ -190,7 +190,7 @@ CODES: dict[str, str] = {
     "E309": "a past operator that asks for too much memory",
     "E310": "an absolute operator over more of the future than states can hold",
     "E311": "`T`, `dt` or a number of steps without a system that says what they are",
-    "E312": "an absolute promise without a deadline, in a specification to train on",
+    "E312": "an absolute goal without a deadline, in a specification to train on",
     "E313": "a requirement that a stream cannot judge at a bounded cost",
     "W101": "a bare number as an interval bound",
     # numbers

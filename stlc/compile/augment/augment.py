@@ -160,7 +160,7 @@ def _looks_ahead(span: Span, why: str = "not about one instant of the mission") 
 def _without_deadline(span: Span) -> Diagnostic:
     return Diagnostic(
         "E312",
-        "an absolute promise without a deadline cannot be trained for",
+        "an absolute goal without a deadline cannot be trained for",
         span,
         "no finite mission can break it",
         help=("give its interval an end, such as `eventually@[0 s, 60 s]`",),
