@@ -1,6 +1,6 @@
 """Samples that nobody knows: what a formula is worth at least and at most, whatever they were.
 
-In arrays a value that is not known is NaN. Bounds are those of open traces (`stlc.monitor.endings`): a
+In arrays a value that is not known is NaN. Bounds are those of open traces (`stlc.monitor.prefix_bounds`): a
 predicate that reads an unknown value is unknown, -inf at least and +inf at most, and all operators are
 monotone in their predicates. So a verdict that follows from the bounds holds for every value that the samples
 may have had.

@@ -146,7 +146,7 @@ def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator
 # ------------------------------------------------------------------ signals that nobody gave
 
 
-def granted(formula: ir.Formula, names: Collection[str]) -> ir.Formula:
+def assume_missing_true(formula: ir.Formula, names: Collection[str]) -> ir.Formula:
     """The formula where a predicate is true that reads other columns than those: the most that it can be.
 
     Names that `freeze` binds to what nobody gave are such columns, too.
@@ -156,10 +156,10 @@ def granted(formula: ir.Formula, names: Collection[str]) -> ir.Formula:
             return formula if _read(num) <= set(names) else ir.Truth(True)
         case ir.Freeze(bindings=bindings, body=body):
             known = tuple(each for each in bindings if _read(each[1]) <= set(names))
-            inner = granted(body, {*names, *(name for name, _ in known)})
+            inner = assume_missing_true(body, {*names, *(name for name, _ in known)})
             return replace(formula, bindings=known, body=inner) if known else inner
         case _:
-            return map_children(formula, formulas=lambda part: granted(part, names))
+            return map_children(formula, formulas=lambda part: assume_missing_true(part, names))
 
 
 def _read(num: ir.Num) -> set[str]:

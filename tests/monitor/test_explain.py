@@ -16,7 +16,7 @@ from stlc.compile.backends.array.graph import evaluate_parts
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import typed
 from stlc.diagnostics import UsageError
-from stlc.monitor.explain.causes import Blame, Blamer
+from stlc.monitor.explain.causes import CauseFinder, CauseNode
 from stlc.monitor.explain.report import explain, explain_all, names_in, shown
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
@@ -26,7 +26,7 @@ from stlc.units import parse_unit
 GOLDEN = Path(__file__).parents[1] / "golden" / "check"
 
 
-def nodes(blame: Blame) -> Iterator[Blame]:
+def nodes(blame: CauseNode) -> Iterator[CauseNode]:
     yield blame
     for part in blame.parts:
         yield from nodes(part)
@@ -40,7 +40,7 @@ def test_every_node_is_what_it_is_said_to_be(formula: typed.Formula, env: dict[s
     value = judge.at(formula, 0)
     assert value is not None
     assume(value[1] < 0)
-    tree = Blamer(Record(env, NUMPY), GRID).blame(formula, 0)
+    tree = CauseFinder(Record(env, NUMPY), GRID).blame(formula, 0)
     assert -abs(tree.rho) == pytest.approx(value[1])
     for node in nodes(tree):
         if node.until is None:
@@ -65,7 +65,7 @@ def test_the_cause_is_the_value_behind_the_number(formula: typed.Formula, env: d
 
     value = worth(env)
     assume(-np.inf < value < 0)
-    tree, alone = Blamer(Record(env, NUMPY), GRID).why(formula, 0)
+    tree, alone = CauseFinder(Record(env, NUMPY), GRID).why(formula, 0)
     assert (tree.leaf.rho if not tree.leaf.holds else -tree.leaf.rho) == pytest.approx(value)
     if not alone:
         return
@@ -89,10 +89,10 @@ def test_an_operator_that_never_succeeds_is_explained_by_its_best(
     value = judge.at(formula, 0)
     assert value is not None
     assume(value[1] < 0)
-    tree = Blamer(Record(env, NUMPY), GRID).blame(formula, 0)
+    tree = CauseFinder(Record(env, NUMPY), GRID).blame(formula, 0)
     for node in nodes(tree):
         match node:
-            case Blame(formula=typed.Temporal(body=body), until=int() as last, parts=(best,)):
+            case CauseNode(formula=typed.Temporal(body=body), until=int() as last, parts=(best,)):
                 wanted = not node.holds
                 ends = [judge.at(body, k, wanted) for k in range(node.sample, last + 1)]
                 margins = [end[1] if wanted else -end[0] for end in ends if end is not None]

@@ -15,7 +15,7 @@ from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import TraceError
 from stlc.monitor.explain.report import explain
-from stlc.monitor.online.asked import Asked
+from stlc.monitor.online.asked import TrackingOptions
 from stlc.monitor.online.online import How
 from stlc.monitor.online.trackers import Trackers
 from stlc.monitor.values import Record, bounds, by_truth, window_bounds
@@ -79,7 +79,7 @@ def test_a_stream_with_holes_says_what_the_whole_trace_says(written, trace, endi
     rule = random_formulas.a_rule(formula)
     everywhere, samples = not rule.uses_end, len(trace["x"])
     unknown = holed(trace, seed, 0.2)
-    tracker = Trackers(None).of(rule, Asked(ending, truth), everywhere=everywhere)
+    tracker = Trackers(None).of(rule, TrackingOptions(ending, truth), everywhere=everywhere)
     seen = [(-np.inf, np.inf)]
     for now in range(1, samples + 1):
         tracker.grow({name: x[:now] for name, x in unknown.items()}, 0, now)

@@ -11,7 +11,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.monitor.instants import rule_bounds
 from stlc.monitor.online.margins import Margins
-from stlc.monitor.online.trackers import Whole
+from stlc.monitor.online.trackers import RecomputeTracker
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
 
@@ -69,7 +69,7 @@ def anew(judge: Monitor, rule, data):  # type: ignore[no-untyped-def]
         starts = range(max(last - max(horizon, rule.reach), 0), last + 1)
     ends = []
     for trace in range(TRACES):
-        whole = Whole(rule, horizon, "open")
+        whole = RecomputeTracker(rule, horizon, "open")
         whole.grow({"x": data[:, 0, trace, None], "y": data[:, 1, trace, None]}, 0, len(data))
         ends.append(whole.live(starts.start, starts.stop))
     return [end.low.min() for end in ends], [end.high.min() for end in ends]

@@ -21,17 +21,17 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import StlcError, UsageError
-from stlc.monitor.endings import lengthened, may_end, with_seen
 from stlc.monitor.online import paced
 from stlc.monitor.online import trackers as tracking
-from stlc.monitor.online.asked import Asked
+from stlc.monitor.online.asked import TrackingOptions
 from stlc.monitor.online.columns import FAR
-from stlc.monitor.online.everywhere import Everywhere
-from stlc.monitor.online.interval_columns import Paired
+from stlc.monitor.online.everywhere import BoundedTracker
+from stlc.monitor.online.interval_columns import IntervalTracker
 from stlc.monitor.online.online import How
-from stlc.monitor.online.paced import Paced
-from stlc.monitor.online.trackers import FromTheStart, Trackers, Whole
-from stlc.monitor.online.windowed import Windowed
+from stlc.monitor.online.paced import PacedTracker
+from stlc.monitor.online.trackers import RecomputeTracker, Trackers, UnboundedTracker
+from stlc.monitor.online.windowed import PlanningWindowTracker
+from stlc.monitor.prefix_bounds import lengthened, prefix_bound, with_seen
 from stlc.monitor.values import Record, bounds
 from stlc.monitor.verdict import Monitor
 
@@ -45,7 +45,9 @@ def at_ends(
     """Bounds wherever the trace ends, by the evaluator: endless windows run over many unknown samples."""
     record = Record(with_seen(known), NUMPY)
     low, high = (
-        record.values([lengthened(may_end(formula, end, cut=cut), record.samples + 60)], starts, end, FAR)
+        record.values(
+            [lengthened(prefix_bound(formula, end, cut=cut), record.samples + 60)], starts, end, FAR
+        )
         for end in ("lower", "upper")
     )
     return low[0][:, 0], high[0][:, 0]
@@ -75,7 +77,7 @@ def test_a_stream_gives_what_the_whole_trace_gives(written, trace, ending, steps
     rule = random_formulas.a_rule(formula)
     everywhere = not rule.uses_end
     samples = len(trace["x"])
-    tracker = Trackers(None).of(rule, Asked(ending), everywhere=everywhere)
+    tracker = Trackers(None).of(rule, TrackingOptions(ending), everywhere=everywhere)
     kept, first, now, done = {name: x[:0] for name, x in trace.items()}, 0, 0, 0
     for step in steps:
         more = {name: x[now : now + step] for name, x in trace.items()}
@@ -111,7 +113,7 @@ def test_frozen_values_and_other_samples_give_what_the_whole_trace_gives(written
     rule = random_formulas.a_rule(formula)
     everywhere = not rule.uses_end
     samples = len(trace["x"])
-    tracker = Trackers(None).of(rule, Asked(ending), everywhere=everywhere)
+    tracker = Trackers(None).of(rule, TrackingOptions(ending), everywhere=everywhere)
     for now in range(1, samples + 1):
         known = {name: x[:now] for name, x in trace.items()}
         tracker.grow(known, 0, now)
@@ -351,17 +353,23 @@ def test_which_memory_a_requirement_needs() -> None:
     for name in REQUIREMENTS:
         (watched,) = monitor_of(name).online()._watched
         kinds[name] = type(watched.values)
-        if isinstance(watched.values, Paced):
+        if isinstance(watched.values, PacedTracker):
             assert watched.values.all_kept
-            kinds[name] = Whole
-    assert kinds["end_under_a_window"] is Whole
+            kinds[name] = RecomputeTracker
+    assert kinds["end_under_a_window"] is RecomputeTracker
     assert {kinds[n] for n in ("always", "response", "infinitely_often", "until", "late_until")} == {
-        FromTheStart
+        UnboundedTracker
     }
-    assert {kinds[n] for n in ("windowed", "whole_past", "since", "state")} == {Paired, FromTheStart}
-    assert {kinds[n] for n in kinds if "window_to_end" in n or "beyond" in n} == {Paired, Windowed}
+    assert {kinds[n] for n in ("windowed", "whole_past", "since", "state")} == {
+        IntervalTracker,
+        UnboundedTracker,
+    }
+    assert {kinds[n] for n in kinds if "window_to_end" in n or "beyond" in n} == {
+        IntervalTracker,
+        PlanningWindowTracker,
+    }
     (watched,) = monitor_of("windowed").online(How(end="truncate"))._watched
-    assert type(watched.values) is Everywhere
+    assert type(watched.values) is BoundedTracker
 
 
 def test_open_starts_and_standing() -> None:
@@ -453,7 +461,7 @@ def test_no_more_rows_for_windows_that_are_longer_than_the_stream(name: str) -> 
         for k in range(20):
             online.push({"x": float(k % 3)})
         (watched,) = online._watched
-        assert isinstance(watched.values, Paced)
+        assert isinstance(watched.values, PacedTracker)
         kept = [getattr(watched.values._inner, "shared", None), *getattr(watched.values._inner, "_sides", [])]
         kept += [front.side for front in getattr(watched.values._inner, "_fronts", [])]
         columns = [

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stlc.diagnostics import StlcError
-from stlc.monitor.online.interval_columns import Paired
+from stlc.monitor.online.interval_columns import IntervalTracker
 from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor
 
@@ -46,7 +46,7 @@ def test_every_requirement_is_as_it_is_alone(tolerance: float, at) -> None:
     whole, how = signals(1), How(at=at, tolerance=tolerance)
     together = monitor_of(list(REQUIREMENTS)).online(how)
     alone = {name: monitor_of([name]).online(how) for name in REQUIREMENTS}
-    assert {type(watched.values) for watched in together._watched} == {Paired}
+    assert {type(watched.values) for watched in together._watched} == {IntervalTracker}
     kept = 0
     for k in range(SAMPLES):
         sample = {name: values[k] for name, values in whole.items()}

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from stlc.monitor.online.online import Online
-from stlc.monitor.online.paced import Paced
-from stlc.monitor.online.trackers import Whole
-from stlc.monitor.online.windowed import Windowed
+from stlc.monitor.online.paced import PacedTracker
+from stlc.monitor.online.trackers import RecomputeTracker
+from stlc.monitor.online.windowed import PlanningWindowTracker
 from stlc.monitor.verdict import Monitor
 
 REQUIREMENTS = {
@@ -26,7 +26,7 @@ REQUIREMENTS = {
 def judging(online: Online) -> type:
     """The class that judges the first requirement, after every sample or now and then."""
     tracker = online._watched[0].values
-    return type(tracker._inner if isinstance(tracker, Paced) else tracker)
+    return type(tracker._inner if isinstance(tracker, PacedTracker) else tracker)
 
 
 @pytest.mark.parametrize("name", REQUIREMENTS)
@@ -40,7 +40,7 @@ def test_bounds_are_those_of_the_samples_so_far(name: str, step: int) -> None:
         online = monitor.online()
         for k in range(0, 17, step):
             online.feed({key: values[k : k + step] for key, values in whole.items()})
-            assert judging(online) is (Whole if name == "swept" else Windowed)
+            assert judging(online) is (RecomputeTracker if name == "swept" else PlanningWindowTracker)
             known = {key: values[: k + step] for key, values in whole.items()}
             low, high = monitor.bounds(known)
             tally = online.standing("r")

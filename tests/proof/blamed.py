@@ -20,7 +20,7 @@ from proof.streamed import drawn
 from stlc.compile.ir import typed
 from stlc.compile.ir.traverse import from_now, on_clock
 from stlc.diagnostics import TraceError
-from stlc.monitor.explain.causes import Blame
+from stlc.monitor.explain.causes import CauseNode
 from stlc.monitor.explain.report import Cause, explain
 from stlc.monitor.instants import window_of
 from stlc.monitor.online.online import How
@@ -133,7 +133,7 @@ def _labels(case: Case, monitor: Monitor, cause: Cause) -> Iterator[str]:
                 yield f"label: {formula.span.text} {'true' if node.holds else 'false'} at {k}, not {ends}"
 
 
-def _said(tree: Blame) -> Iterator[Blame]:
+def _said(tree: CauseNode) -> Iterator[CauseNode]:
     if tree.until is not None or tree.premise or not tree.parts:
         yield tree
     for part in tree.parts:
@@ -171,7 +171,7 @@ def _change(case: Case, monitor: Monitor, cause: Cause) -> Iterator[str]:
         yield f"change: {closer} of `{leaf.formula.span.text}` at {leaf.sample} leave {rho}"
 
 
-def _margin(leaf: Blame, trace: reference.Trace) -> float:
+def _margin(leaf: CauseNode, trace: reference.Trace) -> float:
     ends = _Definition(trace).at(leaf.formula, leaf.sample, not leaf.holds)
     assert ends is not None
     return -ends[0] if leaf.holds else ends[1]

@@ -88,7 +88,7 @@ class Record:
         return self.everywhere & ~((1 << self.samples) - 1)
 
     @property
-    def granted(self) -> Instants:
+    def assume_missing_true(self) -> Instants:
         """What optimists take for true where nothing is known."""
         return self.unknown if self.end == "upper" else 0
 
@@ -161,7 +161,7 @@ class Sets:
 
     def _atom(self, atom: Atom, truth: bool) -> Instants:
         """What reads a sample or a frozen value that does not exist is what is thought of the unknown."""
-        ask, found, end = self._asks[truth], self.record.granted, self.record.end
+        ask, found, end = self._asks[truth], self.record.assume_missing_true, self.record.end
         for t, row in enumerate(self.record.rows):
             key = (atom, t, *self.held.items())
             if key not in self.record.margins:

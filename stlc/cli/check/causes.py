@@ -17,7 +17,7 @@ from stlc.escape import visible
 if TYPE_CHECKING:
     from stlc.cli.check.judge import Question
     from stlc.cli.check.outcome import Checked
-    from stlc.monitor.explain.causes import Blame
+    from stlc.monitor.explain.causes import CauseNode
     from stlc.monitor.explain.report import Cause
 
 _WIDTH = 72
@@ -62,7 +62,7 @@ def _lines(cause: Cause, result: Checked) -> Iterator[str]:
         yield f"  {'  ' * depth}{visible(_line(node, cause, result))}"
 
 
-def _walk(tree: Blame) -> Iterator[tuple[int, Blame]]:
+def _walk(tree: CauseNode) -> Iterator[tuple[int, CauseNode]]:
     """The tree, the part that decides first, without recursion."""
     stack = [(0, tree)]
     while stack:
@@ -73,7 +73,7 @@ def _walk(tree: Blame) -> Iterator[tuple[int, Blame]]:
         stack.extend((depth + 1, part) for part in reversed([*main, *others]))
 
 
-def _line(node: Blame, cause: Cause, result: Checked) -> str:
+def _line(node: CauseNode, cause: Cause, result: Checked) -> str:
     """One sub-formula: its text, what it is, when, and what its signals were."""
     text = " ".join(node.span.text.split())
     short = text if len(text) <= _WIDTH else f"{text[: _WIDTH - 1]}…"
@@ -87,7 +87,7 @@ def _line(node: Blame, cause: Cause, result: Checked) -> str:
     return f"{short}    is {str(node.holds).lower()} at {when}{said}, robustness {margin}"
 
 
-def _readings(node: Blame, cause: Cause, result: Checked) -> Sequence[str]:
+def _readings(node: CauseNode, cause: Cause, result: Checked) -> Sequence[str]:
     from stlc.monitor.explain.report import shown
 
     subject = result.verdict.subject

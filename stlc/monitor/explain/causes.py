@@ -32,7 +32,7 @@ from stlc.compile.ir.traverse import (
 )
 from stlc.compile.lowering.lower import lower
 from stlc.monitor.holes import KNOWN, unsure
-from stlc.monitor.values import Record, bounds, granted
+from stlc.monitor.values import Record, assume_missing_true, bounds
 from stlc.source import Span
 
 Floats = NDArray[np.float64]
@@ -48,7 +48,7 @@ _MOST_LATER = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Blame:
+class CauseNode:
     """A sub-formula that is not as it should be.
 
     Attributes:
@@ -70,7 +70,7 @@ class Blame:
     rho: float
     until: int | None = None
     reads: tuple[tuple[str, int], ...] = ()
-    parts: tuple[Blame, ...] = ()
+    parts: tuple[CauseNode, ...] = ()
     main: int = 0
     premise: bool = False
     moves: bool = True
@@ -91,7 +91,7 @@ class Blame:
         return self.formula.span
 
     @property
-    def leaf(self) -> Blame:
+    def leaf(self) -> CauseNode:
         """The predicate that decides."""
         return self.parts[self.main].leaf if self.parts else self
 
@@ -101,7 +101,7 @@ class Blame:
         return self.moves and (not self.parts or self.parts[self.main].path_moves)
 
     @property
-    def leaves(self) -> tuple[Blame, ...]:
+    def leaves(self) -> tuple[CauseNode, ...]:
         """All predicates."""
         return tuple(leaf for part in self.parts for leaf in part.leaves) if self.parts else (self,)
 
@@ -169,7 +169,7 @@ def _over_columns(formula: ir.Formula, names: Mapping[ir.Formula, str]) -> ir.Fo
 
 
 @dataclass(frozen=True, slots=True)
-class Blamer:
+class CauseFinder:
     """Explains failures on one trace.
 
     Attributes:
@@ -190,7 +190,7 @@ class Blamer:
 
     # --------------------------------------------------------------------- ties
 
-    def why(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> tuple[Blame, bool]:
+    def why(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> tuple[CauseNode, bool]:
         """Why `formula` is not `wanted`, and whether the value at the end of the path decides alone.
 
         Where other values are equal to it, the path leads to one whose own change changes the robustness, if
@@ -239,7 +239,7 @@ class Blamer:
         env = {name: np.asarray(x, np.float64) for name, x in zip(names.values(), values, strict=True)}
         return _Tied(self.record, names, env, stop=self.stop)
 
-    def blame(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> Blame:
+    def blame(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> CauseNode:
         """Why `formula` is not `wanted` at `sample`."""
         match formula:
             case typed.Truth() | typed.Recalled():
@@ -302,7 +302,7 @@ class Blamer:
         key = (formula, wanted)
         if key not in self.cache:
             goal = formula if wanted else typed.Not(formula.span, formula)
-            given = granted(lower(goal, self.grid, []), self.record.env)
+            given = assume_missing_true(lower(goal, self.grid, []), self.record.env)
             self.cache[key] = unsure(given, self.record.holes, least=False) if self.record.holes else given
         return self.cache[key]
 
@@ -335,11 +335,11 @@ class Blamer:
                 return rows.astype(np.float64)
         return None
 
-    def _node(self, formula: typed.Formula, wanted: bool, sample: int) -> Blame:
+    def _node(self, formula: typed.Formula, wanted: bool, sample: int) -> CauseNode:
         margin = float(self._margins(formula, wanted, range(sample, sample + 1))[0])
-        return Blame(formula, not wanted, sample, margin if wanted else -margin)
+        return CauseNode(formula, not wanted, sample, margin if wanted else -margin)
 
-    def _predicate(self, formula: typed.Formula, sample: int, wanted: bool) -> Blame:
+    def _predicate(self, formula: typed.Formula, sample: int, wanted: bool) -> CauseNode:
         found = {
             (leaf.name, self._later(leaf, sample))
             for num in numbers(self._lowered(formula, wanted))
@@ -365,7 +365,7 @@ class Blamer:
 
     # ---------------------------------------------------------------- connectives
 
-    def _logic(self, formula: typed.Logic, sample: int, wanted: bool) -> Blame:
+    def _logic(self, formula: typed.Logic, sample: int, wanted: bool) -> CauseNode:
         node = self._node(formula, wanted, sample)
         match formula.op:
             case "and" | "or":
@@ -399,7 +399,7 @@ class Blamer:
         ways = [[(left, sample, its), (right, sample, its is same)] for its in (True, False)]
         return sorted(map(self._least, ways), key=lambda item: item[0] is right)
 
-    def _edge(self, formula: typed.Edge, sample: int, wanted: bool) -> Blame:
+    def _edge(self, formula: typed.Edge, sample: int, wanted: bool) -> CauseNode:
         node = self._node(formula, wanted, sample)
         if sample == 0:
             return node
@@ -436,14 +436,14 @@ class Blamer:
         """The first instant after the last sample at which nothing is known of the parts of a formula."""
         return self.record.samples + min(max(map(history, operands(lowered))), _MOST_LATER)
 
-    def _timed(self, formula: typed.Temporal | typed.Until, sample: int, wanted: bool) -> Blame:
+    def _timed(self, formula: typed.Temporal | typed.Until, sample: int, wanted: bool) -> CauseNode:
         if on_clock(formula):
             return self._timed(from_now(formula), 0, wanted)
         if isinstance(formula, typed.Temporal):
             return self._temporal(formula, sample, wanted)
         return self._until(formula, sample, wanted)
 
-    def _temporal(self, formula: typed.Temporal, sample: int, wanted: bool) -> Blame:
+    def _temporal(self, formula: typed.Temporal, sample: int, wanted: bool) -> CauseNode:
         node = self._node(formula, wanted, sample)
         instants = self._instants(formula, sample, wanted)
         if not instants:
@@ -456,7 +456,7 @@ class Blamer:
         part = self.blame(formula.body, best, wanted=wanted)
         return replace(node, sample=instants[0], until=instants[-1], parts=(part,))
 
-    def _until(self, formula: typed.Until, sample: int, wanted: bool) -> Blame:
+    def _until(self, formula: typed.Until, sample: int, wanted: bool) -> CauseNode:
         if formula.op == "unless":
             return self._unless(formula, sample, wanted)
         node = self._node(formula, wanted, sample)
@@ -499,7 +499,7 @@ class Blamer:
         instants = self._instants(formula, sample, wanted)
         return not instants or instants[-1] < sample + lowered.window.hi
 
-    def _unless(self, formula: typed.Until, sample: int, wanted: bool) -> Blame:
+    def _unless(self, formula: typed.Until, sample: int, wanted: bool) -> CauseNode:
         """`always[0, b] left or left until[a, b] right`."""
         whole = replace(formula.interval, lo=typed.Time(), lo_open=False)
         held = typed.Temporal(formula.span, "always", whole, formula.left)

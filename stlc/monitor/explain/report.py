@@ -11,7 +11,7 @@ from stlc.compile.ir import typed
 from stlc.compile.ir.traverse import margin_unit
 from stlc.diagnostics import Label
 from stlc.grammar import ast
-from stlc.monitor.explain.causes import Blame, Blamer
+from stlc.monitor.explain.causes import CauseFinder, CauseNode
 from stlc.monitor.instants import window_of
 from stlc.monitor.judgement import Judgement, Verdict
 from stlc.monitor.prepared import Prepared
@@ -70,7 +70,7 @@ class Cause:
     place: Label
     labels: tuple[Label, ...]
     because: str
-    tree: Blame
+    tree: CauseNode
     alone: bool
 
     @property
@@ -126,7 +126,7 @@ def _cause(
     record = record if stop is None else record.cut(stop)
     going_on = stop if stop is not None and stop > record.samples else None
     formula = from_first_sample(rule.typed.formula) if rule.absolute else rule.typed.formula
-    tree, alone = Blamer(record, subject.compiled.grid, stop=going_on).why(formula, start)
+    tree, alone = CauseFinder(record, subject.compiled.grid, stop=going_on).why(formula, start)
     words = _Words(subject, record, rule.typed.written, definitions)
     leaf = tree.leaf
     place, *labels = words.labels(tree)
@@ -157,7 +157,7 @@ class _Words:
     written: ast.Expr
     definitions: dict[str, ast.Expr]
 
-    def readings(self, blame: Blame) -> tuple[Reading, ...]:
+    def readings(self, blame: CauseNode) -> tuple[Reading, ...]:
         """The signals that the predicates below read, each at the instants where they do."""
         seen: dict[tuple[str, int], Reading] = {}
         read = self.subject.compiled.signature
@@ -172,7 +172,7 @@ class _Words:
                 seen.setdefault((name, sample), Reading(name, value, read[name].unit.text, text))
         return tuple(seen.values())
 
-    def labels(self, tree: Blame) -> list[Label]:
+    def labels(self, tree: CauseNode) -> list[Label]:
         """What to underline: the predicate that decides first."""
         found: dict[Span, str] = {}
         for blame in _told(tree):
@@ -181,7 +181,7 @@ class _Words:
         spans = sorted(found, key=lambda span: (span != first, span.start))
         return [Label(span, found[span]) for span in spans]
 
-    def told(self, blame: Blame) -> str:
+    def told(self, blame: CauseNode) -> str:
         """What is said beside an underlined part."""
         word = "true" if blame.holds else "false"
         if blame.until is not None:
@@ -193,7 +193,7 @@ class _Words:
         values = ", ".join(reading.text for reading in self.readings(blame))
         return f"{word} at {moment} ({values})" if values else f"{word} at {moment}"
 
-    def because(self, tree: Blame) -> str:
+    def because(self, tree: CauseNode) -> str:
         """Why, in words: where a premise decides, what the conclusion was is told, too."""
         text = self.reason(tree)
         while tree.parts:
@@ -202,7 +202,7 @@ class _Words:
             tree = tree.parts[tree.main]
         return text
 
-    def reason(self, tree: Blame) -> str:
+    def reason(self, tree: CauseNode) -> str:
         """`before_junction means x < x_inter / 2, and x = 0.27 m at t = 4.6 s (line 17)`."""
         leaf = tree.leaf
         moment, truth = self.subject.moment(leaf.sample), "true" if leaf.holds else "false"
@@ -238,7 +238,7 @@ class _Words:
         return None
 
 
-def _in_order(leaf: Blame) -> list[tuple[str, int]]:
+def _in_order(leaf: CauseNode) -> list[tuple[str, int]]:
     """The signals of a predicate as its text has them; those behind a name come last."""
     words = re.findall(r"\w+(?:\[\d+\])?", leaf.span.text)
     places = {word: place for place, word in reversed(list(enumerate(words)))}
@@ -247,7 +247,7 @@ def _in_order(leaf: Blame) -> list[tuple[str, int]]:
     )
 
 
-def _told(tree: Blame) -> Iterator[Blame]:
+def _told(tree: CauseNode) -> Iterator[CauseNode]:
     """The nodes that get a label: premises as a whole, windows without success, predicates."""
     if tree.premise or tree.until is not None or not tree.parts:
         yield replace(tree, formula=_body(tree.formula)) if tree.until is not None else tree
@@ -256,14 +256,14 @@ def _told(tree: Blame) -> Iterator[Blame]:
         yield from _told(part)
 
 
-def _telling(tree: Blame) -> Blame:
+def _telling(tree: CauseNode) -> CauseNode:
     """The one among them that decides."""
     if tree.until is not None:
         return replace(tree, formula=_body(tree.formula))
     return _telling(tree.parts[tree.main]) if tree.parts else tree
 
 
-def _closest(tree: Blame) -> bool:
+def _closest(tree: CauseNode) -> bool:
     """Whether the predicate that decides is what a window looks for, the best in it, and nothing succeeds."""
     if not tree.parts:
         return False

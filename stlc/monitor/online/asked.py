@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
-from stlc.monitor.endings import may_end
 from stlc.monitor.online.columns import End, Side
-from stlc.monitor.online.streams import Plan
+from stlc.monitor.online.streams import ColumnPlan
+from stlc.monitor.prefix_bounds import prefix_bound
 
 Floats: TypeAlias = NDArray[np.float64]
 Ending: TypeAlias = Literal["open", "truncate"]
-Plans: TypeAlias = Mapping[End, Plan]
+ColumnPlans: TypeAlias = Mapping[End, ColumnPlan]
 """Least and greatest value wherever the trace ends, and the requirement as it is written."""
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class TrackingOptions:
     """How values are taken.
 
     Attributes:
@@ -47,10 +47,10 @@ def worst(
 ) -> ir.Formula:
     """The formula for one end of what is possible; with a `window`, an early end is unknown or cuts."""
     cut = ending == "truncate"
-    return may_end(formula, end, cut=cut) if cut or window is None else formula
+    return prefix_bound(formula, end, cut=cut) if cut or window is None else formula
 
 
-def sides_of(plans: Plans, beyond: int, asked: Asked) -> list[Side]:
+def sides_of(plans: ColumnPlans, beyond: int, asked: TrackingOptions) -> list[Side]:
     """Both ends of what is possible, and where windows are cut at the end both of what it is there."""
     going_on: list[End] = ["lower", "upper"]
     sides = [Side(plans[end], end, beyond, asked.truth, least=end == "lower") for end in going_on]
@@ -61,7 +61,7 @@ def sides_of(plans: Plans, beyond: int, asked: Asked) -> list[Side]:
     ]
 
 
-def first_needed(planned: Plan, samples: int) -> int:
+def first_needed(planned: ColumnPlan, samples: int) -> int:
     """The first sample whose signals a column still reads."""
     reads = [samples - stream.ahead - stream.back for stream in planned.streams if hasattr(stream, "formula")]
     return max(min(reads, default=samples), 0)

@@ -21,9 +21,16 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns as names_of_columns
 from stlc.compile.schedule.schedule import TraceDomain, spanning
 from stlc.compile.semantics.semantics import Exact
-from stlc.monitor.endings import reads_seen, with_seen
 from stlc.monitor.holes import holes_in, unsure, without_holes
-from stlc.monitor.online.streams import Latch, Latched, Leaf, Plan, column, read_by
+from stlc.monitor.online.streams import (
+    ColumnPlan,
+    PredicateColumn,
+    RecursiveColumn,
+    RecursiveOp,
+    column,
+    read_by,
+)
+from stlc.monitor.prefix_bounds import reads_seen, with_seen
 from stlc.monitor.values import by_truth
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -118,7 +125,7 @@ class Side:
         rows: column -> values from `base` on, (kept + beyond, traces).
     """
 
-    plan: Plan
+    plan: ColumnPlan
     end: End
     beyond: int
     truth: bool = False
@@ -130,18 +137,18 @@ class Side:
     _seen: tuple[Mapping[str, Floats], int, int] | None = None
     _settled: dict[str, int] = field(default_factory=dict)
     _pads: dict[str, int] = field(default_factory=dict)
-    _leaves: list[tuple[list[Leaf], Reader]] = field(default_factory=list)
-    _latched: list[tuple[Latched, Reader]] = field(default_factory=list)
+    _leaves: list[tuple[list[PredicateColumn], Reader]] = field(default_factory=list)
+    _latched: list[tuple[RecursiveColumn, Reader]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        leaves = [stream for stream in self.plan.streams if isinstance(stream, Leaf)]
+        leaves = [stream for stream in self.plan.streams if isinstance(stream, PredicateColumn)]
         self._told = any(reads_seen(leaf.formula) for leaf in leaves)
         for reads in dict.fromkeys((leaf.back, leaf.ahead) for leaf in leaves):
             alike = [leaf for leaf in leaves if (leaf.back, leaf.ahead) == reads]
             formulas = [by_truth(leaf.formula) if self.truth else leaf.formula for leaf in alike]
             going_on = self.end != "truncate" and not self._over
             self._leaves.append((alike, Reader(formulas, self.end, going_on=going_on, back=reads[0])))
-        latched = [stream for stream in self.plan.streams if isinstance(stream, Latched)]
+        latched = [stream for stream in self.plan.streams if isinstance(stream, RecursiveColumn)]
         self._latched = [(stream, Reader(stream.parts, self.end)) for stream in latched]
         if self.end == "truncate":
             self._pads = dict.fromkeys((stream.name for stream in self.plan.streams), 0)
@@ -192,7 +199,11 @@ class Side:
             self.base = base
 
     def _grow_leaves(
-        self, leaves: Sequence[Leaf], reader: Reader, signals: tuple[Mapping[str, Floats], int], samples: int
+        self,
+        leaves: Sequence[PredicateColumn],
+        reader: Reader,
+        signals: tuple[Mapping[str, Floats], int],
+        samples: int,
     ) -> None:
         env, first = signals
         start, ahead = self._settled.get(leaves[0].name, 0), leaves[0].ahead
@@ -202,7 +213,7 @@ class Side:
             self._put(leaf.name, start, values[: samples + self._pads[leaf.name] - start])
             self._settled[leaf.name] = max(samples - ahead, start)
 
-    def _grow_latched(self, stream: Latched, reader: Reader, samples: int) -> None:
+    def _grow_latched(self, stream: RecursiveColumn, reader: Reader, samples: int) -> None:
         start = self._settled.get(stream.name, 0)
         count = samples + self._pads[stream.name] - start
         parts = self.values(reader, start, count)
@@ -217,7 +228,7 @@ class Side:
         self.rows[name] = values if kept is None else np.concatenate([kept[: start - self.base], values])
 
 
-def continued(op: Latch, parts: Sequence[Floats], last: Floats | None) -> Floats:
+def continued(op: RecursiveOp, parts: Sequence[Floats], last: Floats | None) -> Floats:
     """The values of a past operator, given its operands and the value before them."""
     match op:
         case "once":

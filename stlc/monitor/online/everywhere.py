@@ -8,17 +8,25 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stlc.compile.ir.support import history, reach
-from stlc.monitor.online.asked import Asked, Bounds, Floats, Plans, decided_first, first_needed, sides_of
+from stlc.monitor.online.asked import (
+    Bounds,
+    ColumnPlans,
+    Floats,
+    TrackingOptions,
+    decided_first,
+    first_needed,
+    sides_of,
+)
 from stlc.monitor.online.columns import Reader, Side
-from stlc.monitor.online.streams import Plan
+from stlc.monitor.online.streams import ColumnPlan
 
 
 @dataclass(slots=True)
-class Everywhere:
+class BoundedTracker:
     """A formula whose windows have an end, at consecutive instants."""
 
-    plans: Plans
-    asked: Asked
+    plans: ColumnPlans
+    asked: TrackingOptions
     samples: int = 0
     _sides: list[Side] = field(default_factory=list)
     _readers: list[Reader] = field(default_factory=list)
@@ -33,7 +41,7 @@ class Everywhere:
         self._readers = [Reader([side.plan.formula], side.end) for side in self._sides]
 
     @property
-    def planned(self) -> Plan:
+    def planned(self) -> ColumnPlan:
         """The requirement as it is written."""
         return self.plans["truncate"]
 

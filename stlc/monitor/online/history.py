@@ -14,7 +14,7 @@ _SPARE = 64
 """Rows that are free after the columns were moved."""
 
 
-class Kept:
+class SampleHistory:
     """Columns (samples, 1) of consecutive samples; one sample more costs amortized constant time.
 
     Attributes:

@@ -14,9 +14,9 @@ import numpy as np
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import history, reach
-from stlc.monitor.online.asked import Bounds, Floats, Plans
+from stlc.monitor.online.asked import Bounds, ColumnPlans, Floats
 from stlc.monitor.online.columns import NOTHING, Reader, continued
-from stlc.monitor.online.streams import Latched, Leaf, Plan, plan
+from stlc.monitor.online.streams import ColumnPlan, PredicateColumn, RecursiveColumn, plan
 from stlc.monitor.values import by_truth
 
 _UNKNOWN = (-math.inf, math.inf)
@@ -25,20 +25,20 @@ _SPARE = 64
 """Rows that are free after the columns were moved."""
 
 
-def fits(plans: Plans) -> bool:
+def fits(plans: ColumnPlans) -> bool:
     """Whether both ends follow from the same formula, over predicates of the present and what is latched."""
     planned = plans["truncate"]
     return plans["lower"] == plans["upper"] == planned and all(map(_of_the_present, planned.streams))
 
 
-def _of_the_present(stream: Leaf | Latched) -> bool:
-    if isinstance(stream, Latched):
+def _of_the_present(stream: PredicateColumn | RecursiveColumn) -> bool:
+    if isinstance(stream, RecursiveColumn):
         return not stream.ahead
     return isinstance(stream.formula, ir.Predicate) and not stream.back and not stream.ahead
 
 
 @dataclass(slots=True)
-class Pairs:
+class IntervalColumns:
     """The columns of requirements whose instants are counted at the same time.
 
     Attributes:
@@ -50,9 +50,9 @@ class Pairs:
     samples: int = 0
     _formulas: list[ir.Formula] = field(default_factory=list)
     _starts: list[int] = field(default_factory=list)
-    _plan: Plan | None = None
+    _plan: ColumnPlan | None = None
     _leaves: tuple[list[str], Reader] | None = None
-    _latched: list[tuple[Latched, Reader]] = field(default_factory=list)
+    _latched: list[tuple[RecursiveColumn, Reader]] = field(default_factory=list)
     _reader: Reader = field(init=False)
     _beyond: int = 0
     _back: int = 0
@@ -64,11 +64,11 @@ class Pairs:
     _env: dict[str, Floats] = field(default_factory=dict)
     _found: tuple[tuple[int, int], list[Floats]] | None = None
 
-    def add(self, formula: ir.Formula) -> Paired:
+    def add(self, formula: ir.Formula) -> IntervalTracker:
         """One more requirement; before the first sample."""
         self._formulas.append(formula)
         self._starts.append(0)
-        return Paired(self, len(self._starts) - 1, reach(formula).future)
+        return IntervalTracker(self, len(self._starts) - 1, reach(formula).future)
 
     def grow(self, signals: Mapping[str, Floats], samples: int) -> None:
         """Take in the samples that are new; `signals` (kept, 1) end with the last one."""
@@ -117,11 +117,13 @@ class Pairs:
         self._plan = whole
         self._beyond = max(reach(formula).future for formula in formulas)
         self._latched = [
-            (stream, Reader(stream.parts, "both")) for stream in whole.streams if isinstance(stream, Latched)
+            (stream, Reader(stream.parts, "both"))
+            for stream in whole.streams
+            if isinstance(stream, RecursiveColumn)
         ]
         self._back = max(map(history, formulas))
         self._latch_back = max((max(stream.back, 1) for stream, _ in self._latched), default=0)
-        leaves = [stream for stream in whole.streams if isinstance(stream, Leaf)]
+        leaves = [stream for stream in whole.streams if isinstance(stream, PredicateColumn)]
         judged = [by_truth(leaf.formula) if self.truth else leaf.formula for leaf in leaves]
         if leaves:
             self._leaves = [leaf.name for leaf in leaves], Reader(judged, "truncate")
@@ -144,7 +146,7 @@ class Pairs:
 
 
 @dataclass(frozen=True, slots=True)
-class Paired:
+class IntervalTracker:
     """A formula whose windows have an end, at consecutive instants, beside others.
 
     Attributes:
@@ -153,7 +155,7 @@ class Paired:
         ahead: samples after an instant that it reads.
     """
 
-    shared: Pairs
+    shared: IntervalColumns
     which: int
     ahead: int
 

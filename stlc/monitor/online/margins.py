@@ -13,7 +13,7 @@ from stlc.compile.ir.support import columns, history
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.monitor.instants import window_of
 from stlc.monitor.judgement import Status
-from stlc.monitor.online.trackers import Whole
+from stlc.monitor.online.trackers import RecomputeTracker
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
@@ -64,7 +64,7 @@ class _Watched:
 
     rule: CompiledRequirement
     horizon: int | None
-    whole: Whole
+    whole: RecomputeTracker
     next: int = 0
     violated: Counts = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     last: Margin | None = None
@@ -145,7 +145,7 @@ class Margins:
     """
 
     def __init__(self, rules: Sequence[CompiledRequirement], horizon: int | None) -> None:
-        self._watched = [_Watched(rule, horizon, Whole(rule, horizon, "open")) for rule in rules]
+        self._watched = [_Watched(rule, horizon, RecomputeTracker(rule, horizon, "open")) for rule in rules]
         self._names = sorted({name for rule in rules for name in columns(rule.formula)})
         self._kept: dict[str, Floats] = {}
         self._first = 0

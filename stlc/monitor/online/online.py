@@ -17,11 +17,11 @@ from stlc.monitor.explain.report import Cause
 from stlc.monitor.instants import At, check_length, starts_of
 from stlc.monitor.judgement import Status, unknown_requirement
 from stlc.monitor.needs import Need, needs_of
-from stlc.monitor.online.asked import Asked, Bounds
-from stlc.monitor.online.history import Kept
-from stlc.monitor.online.paced import Paced
-from stlc.monitor.online.recall import Recall, Worst
+from stlc.monitor.online.asked import Bounds, TrackingOptions
+from stlc.monitor.online.history import SampleHistory
+from stlc.monitor.online.paced import PacedTracker
 from stlc.monitor.online.tally import Flags, Judged, Tally
+from stlc.monitor.online.trace_buffer import TraceBuffer, Worst
 from stlc.monitor.online.trackers import Tracker, Trackers
 from stlc.monitor.signals import Gap, arrange, not_finite
 from stlc.trace import Trace
@@ -89,7 +89,7 @@ class Watched:
     tally: Tally = field(default_factory=Tally)
     decided: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
-    def grow(self, kept: Kept) -> None:
+    def grow(self, kept: SampleHistory) -> None:
         """Take new samples in."""
         if self.over or self.values.samples == kept.samples:
             return
@@ -100,7 +100,7 @@ class Watched:
 
     def due(self, samples: int) -> bool:
         """Whether it is worth the work to judge it after so many samples."""
-        return not self.over and (not isinstance(self.values, Paced) or self.values.due(samples))
+        return not self.over and (not isinstance(self.values, PacedTracker) or self.values.due(samples))
 
     @property
     def over(self) -> bool:
@@ -145,11 +145,11 @@ class Online:
         self._needs = needs_of(compiled, [*rules, *compiled.assumptions])
         self.gaps: dict[str, Gap] = {}
         """Where signals are not known."""
-        self._kept = Kept()
+        self._kept = SampleHistory()
         self._trackers = Trackers(compiled.grid.horizon)
         self._watched = [self._watch(rule) for rule in rules]
         self._scope = [self._watch(rule, once=True) for rule in compiled.assumptions]
-        self._recall = Recall(compiled, self.how.t0) if self.how.reasons else None
+        self._recall = TraceBuffer(compiled, self.how.t0) if self.how.reasons else None
 
     def _watch(self, rule: CompiledRequirement, *, once: bool = False) -> Watched:
         horizon = self.compiled.grid.horizon
@@ -161,7 +161,7 @@ class Online:
             raise UsageError(Diagnostic("U101", message, help=("judge it once, without `--at all`",)))
         ending: Literal["open", "truncate"] = "truncate" if self.how.end == "truncate" else "open"
         trackers = [
-            self._trackers.of(rule, Asked(ending, truth, begin), everywhere=everywhere)
+            self._trackers.of(rule, TrackingOptions(ending, truth, begin), everywhere=everywhere)
             for truth in ((False, True) if self.how.tolerance == 0 else (False,))
         ]
         truths = trackers[1] if trackers[1:] else None

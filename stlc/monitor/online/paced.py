@@ -196,7 +196,7 @@ class Inner(Protocol):
 
 
 class Asking(Protocol):
-    """How a requirement is asked for; `Paced` says it of itself."""
+    """How a requirement is asked for; `PacedTracker` says it of itself."""
 
     everywhere: bool
     all_kept: bool
@@ -221,7 +221,7 @@ Make: TypeAlias = Callable[[CompiledRequirement], Inner]
 
 
 @dataclass(slots=True)
-class Paced:
+class PacedTracker:
     """A requirement that is judged now and then.
 
     Attributes:

@@ -16,7 +16,7 @@ from stlc.compile.ir.support import history, reach
 from stlc.compile.ir.traverse import leaves as readings
 from stlc.compile.ir.traverse import map_children, nodes, numbers
 
-Latch: TypeAlias = Literal["once", "historically", "since", "trigger"]
+RecursiveOp: TypeAlias = Literal["once", "historically", "since", "trigger"]
 
 
 class EndlessError(Exception):
@@ -24,7 +24,7 @@ class EndlessError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Leaf:
+class PredicateColumn:
     """A column that follows from the signals: the robustness of a predicate.
 
     Attributes:
@@ -41,7 +41,7 @@ class Leaf:
 
 
 @dataclass(frozen=True, slots=True)
-class Latched:
+class RecursiveColumn:
     """A column that continues from its last value: a past operator from the start of the trace on.
 
     `once`: max(body, last). `since`: min(left, max(right, last)); the others are their duals.
@@ -55,17 +55,17 @@ class Latched:
     """
 
     name: str
-    op: Latch
+    op: RecursiveOp
     parts: tuple[ir.Formula, ...]
     back: int
     ahead: int
 
 
-Stream: TypeAlias = Leaf | Latched
+DerivedColumn: TypeAlias = PredicateColumn | RecursiveColumn
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ColumnPlan:
     """A formula over columns, and the columns, each after those that it reads.
 
     Attributes:
@@ -75,11 +75,11 @@ class Plan:
     """
 
     formula: ir.Formula
-    streams: tuple[Stream, ...]
+    streams: tuple[DerivedColumn, ...]
     lag: int
 
 
-def _lag(streams: Sequence[Stream]) -> int:
+def _lag(streams: Sequence[DerivedColumn]) -> int:
     lags: dict[str, int] = {}
     for stream in streams:
         before = max((lags[name] for name in read_by(stream)), default=0)
@@ -87,10 +87,12 @@ def _lag(streams: Sequence[Stream]) -> int:
     return max(lags.values(), default=0)
 
 
-def read_by(stream: Stream) -> frozenset[str]:
+def read_by(stream: DerivedColumn) -> frozenset[str]:
     """Names of the columns that a stream reads."""
     return (
-        frozenset() if isinstance(stream, Leaf) else frozenset().union(*map(names_of_columns, stream.parts))
+        frozenset()
+        if isinstance(stream, PredicateColumn)
+        else frozenset().union(*map(names_of_columns, stream.parts))
     )
 
 
@@ -109,7 +111,7 @@ def column(name: str) -> ir.Predicate:
 # ------------------------------------------------------------------------- planning
 
 
-def plan(formula: ir.Formula) -> Plan:
+def plan(formula: ir.Formula) -> ColumnPlan:
     """Cut a formula into columns.
 
     Raises:
@@ -118,12 +120,12 @@ def plan(formula: ir.Formula) -> Plan:
     planner = _Planner()
     over_columns = planner.over_columns(formula)
     streams = tuple(planner.streams.values())
-    return Plan(over_columns, streams, _lag(streams))
+    return ColumnPlan(over_columns, streams, _lag(streams))
 
 
 @dataclass(slots=True)
 class _Planner:
-    streams: dict[object, Stream] = field(default_factory=dict)
+    streams: dict[object, DerivedColumn] = field(default_factory=dict)
 
     def over_columns(self, formula: ir.Formula) -> ir.Formula:
         """The formula with columns for predicates and for unbounded past operators."""
@@ -149,7 +151,7 @@ class _Planner:
                 if isinstance(formula, ir.Predicate)
                 else ahead + looks_on(formula)
             )
-            self.streams[formula] = Leaf(f"#{len(self.streams)}", formula, history(formula), ahead)
+            self.streams[formula] = PredicateColumn(f"#{len(self.streams)}", formula, history(formula), ahead)
         return column(self.streams[formula].name)
 
     def _frozen(self, formula: ir.Formula) -> ir.Formula:
@@ -159,13 +161,13 @@ class _Planner:
             raise EndlessError
         return self._leaf(formula)
 
-    def _latched(self, op: Latch, *parts: ir.Formula) -> ir.Formula:
+    def _latched(self, op: RecursiveOp, *parts: ir.Formula) -> ir.Formula:
         if any(map(endless, parts)):
             raise EndlessError
         key = (op, parts)
         if key not in self.streams:
             back, ahead = max(map(history, parts)), max(reach(part).future for part in parts)
-            self.streams[key] = Latched(f"#{len(self.streams)}", op, parts, back, ahead)
+            self.streams[key] = RecursiveColumn(f"#{len(self.streams)}", op, parts, back, ahead)
         return column(self.streams[key].name)
 
     def _past(self, op: Literal["historically", "once"], window: ir.Window, body: ir.Formula) -> ir.Formula:

@@ -13,27 +13,27 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import reach, uses_end
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Diagnostic, UsageError
-from stlc.monitor.endings import lengthened, with_seen
 from stlc.monitor.holes import unsure
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.online.asked import (
-    Asked,
     Bounds,
+    ColumnPlans,
     Ending,
     Floats,
-    Plans,
+    TrackingOptions,
     decided_first,
     first_needed,
     sides_of,
     worst,
 )
 from stlc.monitor.online.columns import FAR, End
-from stlc.monitor.online.everywhere import Everywhere
-from stlc.monitor.online.interval_columns import Pairs, fits
-from stlc.monitor.online.paced import MOST, WIDE, Paced, Work, effort, span
+from stlc.monitor.online.everywhere import BoundedTracker
+from stlc.monitor.online.interval_columns import IntervalColumns, fits
+from stlc.monitor.online.paced import MOST, WIDE, PacedTracker, Work, effort, span
 from stlc.monitor.online.streams import EndlessError, endless, looks_on, plan
-from stlc.monitor.online.unbounded import Frontier, skeleton
-from stlc.monitor.online.windowed import Windowed
+from stlc.monitor.online.unbounded import UnboundedState, skeleton
+from stlc.monitor.online.windowed import PlanningWindowTracker
+from stlc.monitor.prefix_bounds import lengthened, with_seen
 from stlc.monitor.values import Record, by_truth, window_bounds
 
 
@@ -73,9 +73,9 @@ class Trackers:
     """
 
     horizon: int | None
-    _pairs: dict[tuple[bool, bool, int, int], Pairs] = field(default_factory=dict)
+    _pairs: dict[tuple[bool, bool, int, int], IntervalColumns] = field(default_factory=dict)
 
-    def of(self, rule: CompiledRequirement, asked: Asked, *, everywhere: bool) -> Tracker:
+    def of(self, rule: CompiledRequirement, asked: TrackingOptions, *, everywhere: bool) -> Tracker:
         """The tracker of a requirement that needs the least memory.
 
         Args:
@@ -88,12 +88,12 @@ class Trackers:
         """
         alone = Trackers(self.horizon)
         tried = alone.plain(rule, asked, everywhere=everywhere)
-        window = tried.window if isinstance(tried, Windowed) else None
+        window = tried.window if isinstance(tried, PlanningWindowTracker) else None
 
         def make(part: CompiledRequirement) -> Tracker:
             return Trackers(self.horizon).plain(part, asked, everywhere=everywhere)
 
-        paced = Paced(rule, make, everywhere, isinstance(tried, Whole), window)
+        paced = PacedTracker(rule, make, everywhere, isinstance(tried, RecomputeTracker), window)
         found = effort(rule.formula, sum(span(rule.formula)) + (window or 0), paced)
         if found.own > MOST:
             raise UsageError(_too_much(rule, found))
@@ -101,7 +101,7 @@ class Trackers:
             return paced
         return self.plain(rule, asked, everywhere=everywhere)
 
-    def plain(self, rule: CompiledRequirement, asked: Asked, *, everywhere: bool) -> Tracker:
+    def plain(self, rule: CompiledRequirement, asked: TrackingOptions, *, everywhere: bool) -> Tracker:
         """The tracker that judges a requirement after every sample."""
         formula, window = rule.formula, window_of(rule, self.horizon)
         if window is not None and (bounded := without_end(formula, window)) is not None:
@@ -111,19 +111,21 @@ class Trackers:
             if window is not None:
                 if plans["truncate"].lag or not everywhere:
                     raise EndlessError
-                return Windowed(plans, asked, window)
+                return PlanningWindowTracker(plans, asked, window)
             if endless(plans["truncate"].formula):
                 if everywhere:
                     raise EndlessError
-                return FromTheStart(plans, asked)
+                return UnboundedTracker(plans, asked)
             if asked.ending == "truncate" or not fits(plans):
-                return Everywhere(plans, asked)
+                return BoundedTracker(plans, asked)
             counted = (self.horizon if rule.windowed else rule.reach) if everywhere else 0
             later = max(counted or 0, reach(formula).future)
-            pairs = self._pairs.setdefault((everywhere, asked.truth, asked.begin, later), Pairs(asked.truth))
+            pairs = self._pairs.setdefault(
+                (everywhere, asked.truth, asked.begin, later), IntervalColumns(asked.truth)
+            )
             return pairs.add(formula)
         except EndlessError:
-            return Whole(rule, self.horizon, asked.ending, asked.truth)
+            return RecomputeTracker(rule, self.horizon, asked.ending, asked.truth)
 
 
 def without_end(formula: ir.Formula, window: int) -> ir.Formula | None:
@@ -164,19 +166,19 @@ def _too_much(rule: CompiledRequirement, found: Work) -> Diagnostic:
     )
 
 
-def _plans(formula: ir.Formula, ending: Ending, window: int | None) -> Plans:
+def _plans(formula: ir.Formula, ending: Ending, window: int | None) -> ColumnPlans:
     lower, upper = (worst(formula, end, ending, window) for end in ("lower", "upper"))
     return {"lower": plan(lower), "upper": plan(upper), "truncate": plan(formula)}
 
 
 @dataclass(slots=True)
-class FromTheStart:
+class UnboundedTracker:
     """A formula with endless windows, at the first sample."""
 
-    plans: Plans
-    asked: Asked
+    plans: ColumnPlans
+    asked: TrackingOptions
     samples: int = 0
-    _fronts: list[Frontier] = field(default_factory=list)
+    _fronts: list[UnboundedState] = field(default_factory=list)
     _lag: int = 0
     _back: int = 0
 
@@ -187,7 +189,7 @@ class FromTheStart:
         beyond = max(bones[end].reach + bones[end].unsure(planned) for end, planned in self.plans.items())
         sides = sides_of(self.plans, beyond, self.asked)
         begin = self.asked.begin
-        self._fronts = [Frontier(bones[side.end], side, begin, begin) for side in sides]
+        self._fronts = [UnboundedState(bones[side.end], side, begin, begin) for side in sides]
 
     @property
     def settled(self) -> int:
@@ -223,7 +225,7 @@ class FromTheStart:
 
 
 @dataclass(slots=True)
-class Whole:
+class RecomputeTracker:
     """A requirement that has to be judged on the whole trace: nothing is forgotten."""
 
     rule: CompiledRequirement

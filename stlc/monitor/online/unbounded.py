@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import history, reach
 from stlc.monitor.online.columns import NOTHING, Reader, Side
-from stlc.monitor.online.streams import EndlessError, Plan, column, endless
+from stlc.monitor.online.streams import ColumnPlan, EndlessError, column, endless
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ _FOREVER = ir.Window(0, None)
 
 
 @dataclass(frozen=True, slots=True)
-class Moved:
+class DelayedFormula:
     """A formula without endless windows, read some samples later than its instant."""
 
     formula: ir.Formula
@@ -42,7 +42,7 @@ class Moved:
 
 
 @dataclass(slots=True)
-class Skeleton:
+class UnboundedOperators:
     """The endless operators of a formula over columns `$0`, `$1`, …; each with `lo` 0.
 
     What an operator is worth from the last row on is a column of its own, `!0`, `!1`, …: the rest.
@@ -55,8 +55,8 @@ class Skeleton:
     """
 
     root: ir.Formula
-    parts: dict[str, Moved] = field(default_factory=dict)
-    origins: dict[str, Moved] = field(default_factory=dict)
+    parts: dict[str, DelayedFormula] = field(default_factory=dict)
+    origins: dict[str, DelayedFormula] = field(default_factory=dict)
     operators: dict[str, ir.Formula] = field(default_factory=dict)
 
     @property
@@ -64,7 +64,7 @@ class Skeleton:
         """Samples after an instant that have to be known before it goes into a polynomial."""
         return max((part.reach for part in (*self.parts.values(), *self.origins.values())), default=0)
 
-    def unsure(self, plan: Plan) -> int:
+    def unsure(self, plan: ColumnPlan) -> int:
         """After how many unknown samples one more makes no difference."""
         streams = sum(stream.back + stream.ahead for stream in plan.streams)
         return self.reach + self.back + streams + 1
@@ -75,20 +75,20 @@ class Skeleton:
         return max((history(part.formula) for part in self.parts.values()), default=0)
 
 
-def skeleton(formula: ir.Formula) -> Skeleton:
+def skeleton(formula: ir.Formula) -> UnboundedOperators:
     """Take a formula over columns apart.
 
     Raises:
         EndlessError: an endless operator stands under one with an end, or there are too many.
     """
-    found = Skeleton(formula)
+    found = UnboundedOperators(formula)
     found.root = _taken(formula, 0, found)
     if len(found.origins) > _MOST:
         raise EndlessError
     return found
 
 
-def _taken(formula: ir.Formula, steps: int, found: Skeleton) -> ir.Formula:
+def _taken(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.Formula:
     """The formula `steps` samples later, over columns."""
     if not endless(formula):
         return _part(formula, steps, found)
@@ -99,7 +99,7 @@ def _taken(formula: ir.Formula, steps: int, found: Skeleton) -> ir.Formula:
             return _taken(body, steps + later, found)
         case ir.Temporal(op, ir.Window(lo, None), body):
             seen = ir.Temporal(op, _FOREVER, _taken(body, steps + lo, found))
-            rest = _rest(Moved(formula, steps), found)
+            rest = _rest(DelayedFormula(formula, steps), found)
             found.operators[rest] = ir.BoolOp("and" if op == "always" else "or", (seen, column(rest)))
             return found.operators[rest]
         case ir.Until(op, ir.Window(lo, None), left, right):
@@ -111,7 +111,7 @@ def _taken(formula: ir.Formula, steps: int, found: Skeleton) -> ir.Formula:
             raise EndlessError
 
 
-def _rest(origin: Moved, found: Skeleton) -> str:
+def _rest(origin: DelayedFormula, found: UnboundedOperators) -> str:
     """The column of what an operator is worth from the last row on.
 
     Operators that read the same columns may still end in different ways: `next` of an operator is not the
@@ -125,10 +125,10 @@ def _rest(origin: Moved, found: Skeleton) -> str:
     return name
 
 
-def _met(node: ir.Until, steps: int, found: Skeleton) -> ir.Formula:
+def _met(node: ir.Until, steps: int, found: UnboundedOperators) -> ir.Formula:
     """`until` or `release` without a lower bound: met among the rows, or held through them and met later."""
     left, right = _taken(node.left, steps, found), _taken(node.right, steps, found)
-    name = _rest(Moved(node, steps), found)
+    name = _rest(DelayedFormula(node, steps), found)
     seen, rest = ir.Until(node.op, _FOREVER, left, right), column(name)
     if node.op == "until":
         held = ir.BoolOp("and", (ir.Temporal("always", _FOREVER, left), rest))
@@ -140,7 +140,7 @@ def _met(node: ir.Until, steps: int, found: Skeleton) -> ir.Formula:
 
 
 def _held(
-    every: bool, window: ir.Window, left: tuple[ir.Formula, int, Skeleton], then: ir.Formula
+    every: bool, window: ir.Window, left: tuple[ir.Formula, int, UnboundedOperators], then: ir.Formula
 ) -> ir.Formula:
     """What `until` asks of its left side before its window starts; of `release` the dual."""
     formula, steps, found = left
@@ -150,10 +150,10 @@ def _held(
     return ir.BoolOp("and" if every else "or", (_part(before, steps, found), then))
 
 
-def _part(formula: ir.Formula, steps: int, found: Skeleton) -> ir.Formula:
+def _part(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.Formula:
     if isinstance(formula, ir.Truth):
         return formula
-    moved = Moved(formula, steps)
+    moved = DelayedFormula(formula, steps)
     for name, known in found.parts.items():
         if known == moved:
             return column(name)
@@ -162,14 +162,14 @@ def _part(formula: ir.Formula, steps: int, found: Skeleton) -> ir.Formula:
     return column(name)
 
 
-def _neutral(origin: Moved) -> float:
+def _neutral(origin: DelayedFormula) -> float:
     """What the rest of an operator is worth where all rows are there: nothing more is met, nothing fails."""
     assert isinstance(origin.formula, (ir.Temporal, ir.Until))
     return math.inf if origin.formula.op in ("always", "release") else -math.inf
 
 
 @dataclass(slots=True)
-class Frontier:
+class UnboundedState:
     """The value of a formula at its first sample, at one end of what is possible.
 
     Attributes:
@@ -181,7 +181,7 @@ class Frontier:
             there on and the others -inf; None at first.
     """
 
-    bones: Skeleton
+    bones: UnboundedOperators
     side: Side
     begin: int = 0
     at: int = 0
@@ -240,7 +240,7 @@ class Frontier:
 
     def _plain(self, formula: ir.Formula, at: int, samples: int) -> Floats:
         """A formula over columns at one sample, endless windows up to the last sample."""
-        parts: dict[str, Moved] = {}
+        parts: dict[str, DelayedFormula] = {}
         plain = _outlined(formula, parts)
         first = min(self.at, at)
         reader = Reader([part.formula for part in parts.values()], self.side.end)
@@ -263,10 +263,10 @@ class Frontier:
         return np.asarray(np.minimum(worth, self.coefficients[:, None]).max(axis=0))
 
 
-def _outlined(formula: ir.Formula, parts: dict[str, Moved]) -> ir.Formula:
+def _outlined(formula: ir.Formula, parts: dict[str, DelayedFormula]) -> ir.Formula:
     """The formula with columns for all that has no endless window."""
     if not endless(formula):
-        return _part(formula, 0, Skeleton(formula, parts))
+        return _part(formula, 0, UnboundedOperators(formula, parts))
     match formula:
         case ir.BoolOp(op, items):
             return ir.BoolOp(op, tuple(_outlined(item, parts) for item in items))

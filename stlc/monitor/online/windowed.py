@@ -11,22 +11,22 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import history, reach
 from stlc.monitor.online.asked import (
-    Asked,
     Bounds,
+    ColumnPlans,
     Ending,
     Floats,
-    Plans,
+    TrackingOptions,
     decided_first,
     first_needed,
     sides_of,
 )
 from stlc.monitor.online.columns import Side
-from stlc.monitor.online.streams import Latched, Plan
+from stlc.monitor.online.streams import ColumnPlan, RecursiveColumn
 from stlc.monitor.values import Record, window_bounds
 
 
 @dataclass(slots=True)
-class Windowed:
+class PlanningWindowTracker:
     """A formula with windows to the end of a planning window, at consecutive instants.
 
     Every instant sees the record up to the end of its window. Windows of the formula that reach beyond it may
@@ -40,8 +40,8 @@ class Windowed:
         samples: how many there are by now.
     """
 
-    plans: Plans
-    asked: Asked
+    plans: ColumnPlans
+    asked: TrackingOptions
     window: int
     samples: int = 0
     _sides: list[Side] = field(default_factory=list)
@@ -58,7 +58,7 @@ class Windowed:
         self._sides = sides_of(self.plans, self.window + self._beyond, self.asked)
 
     @property
-    def planned(self) -> Plan:
+    def planned(self) -> ColumnPlan:
         """The requirement as it is written."""
         return self.plans["truncate"]
 
@@ -137,9 +137,9 @@ class Windowed:
         return np.asarray(np.concatenate(ends, axis=1)[0])
 
 
-def _remembers(planned: Plan) -> bool:
+def _remembers(planned: ColumnPlan) -> bool:
     """Whether more than nothing is known of a column beyond the last sample."""
     return any(
-        isinstance(stream, Latched) or stream.back > 0 or not isinstance(stream.formula, ir.Predicate)
+        isinstance(stream, RecursiveColumn) or stream.back > 0 or not isinstance(stream.formula, ir.Predicate)
         for stream in planned.streams
     )

@@ -1,8 +1,8 @@
 """Bounds for a stream that may end with any sample: windows that an early end cuts say so themselves.
 
 A window to the end of the trace has no end yet. `eventually` is worth least if the trace ends now, `always`
-if it goes on; the greatest values are the other way round. `may_end` writes that into the formula, with a
-predicate that is true at every sample and unknown afterwards: what is found beyond the last sample then does
+if it goes on; the greatest values are the other way round. `prefix_bound` writes that into the formula, with
+a predicate that is true at every sample and unknown afterwards: values found beyond the last sample then do
 not count. So the two ends of what is possible are two formulas.
 """
 
@@ -28,7 +28,7 @@ _SEEN = ir.Predicate(ir.Signal(SEEN), guard=True)
 _UNSEEN = ir.Predicate(ir.Signal(SEEN), sign=-1, guard=True)
 
 
-def may_end(formula: ir.Formula, end: Literal["lower", "upper"], *, cut: bool) -> ir.Formula:
+def prefix_bound(formula: ir.Formula, end: Literal["lower", "upper"], *, cut: bool) -> ir.Formula:
     """The formula whose least (or greatest) value holds wherever the trace ends from the last sample on.
 
     Args:
@@ -36,11 +36,11 @@ def may_end(formula: ir.Formula, end: Literal["lower", "upper"], *, cut: bool) -
         end: which end of what is possible.
         cut: the end of the trace cuts windows that have an end of their own, too.
     """
-    return _Ending(end == "lower", cut).of(formula)
+    return _PrefixBound(end == "lower", cut).of(formula)
 
 
 @dataclass(frozen=True, slots=True)
-class _Ending:
+class _PrefixBound:
     least: bool
     cut: bool
 

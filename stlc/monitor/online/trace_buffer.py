@@ -15,7 +15,7 @@ from stlc.monitor.explain.report import Cause, explain
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.judgement import Judgement, Verdict
 from stlc.monitor.online.asked import Floats
-from stlc.monitor.online.history import Kept
+from stlc.monitor.online.history import SampleHistory
 from stlc.monitor.online.streams import endless, looks_on
 from stlc.monitor.prepared import Prepared
 from stlc.monitor.signals import Signals
@@ -39,7 +39,7 @@ class Worst:
 
 
 @dataclass(slots=True)
-class Recall:
+class TraceBuffer:
     """The last samples, and the causes that were found before samples were forgotten.
 
     Attributes:
@@ -49,7 +49,7 @@ class Recall:
 
     compiled: Compiled
     t0: float
-    _kept: Kept = field(default_factory=Kept)
+    _kept: SampleHistory = field(default_factory=SampleHistory)
     _found: dict[str, tuple[Worst, Cause]] = field(default_factory=dict)
     _wide: int = 1
 
