@@ -15,7 +15,7 @@ from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import TraceError
 from stlc.monitor.explain.report import explain
-from stlc.monitor.online.asked import TrackingOptions
+from stlc.monitor.online.bounds import TrackingOptions
 from stlc.monitor.online.online import How
 from stlc.monitor.online.trackers import Trackers
 from stlc.monitor.values import Record, bounds, by_truth, window_bounds

@@ -23,14 +23,18 @@ from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import StlcError, UsageError
 from stlc.monitor.online import paced
 from stlc.monitor.online import trackers as tracking
-from stlc.monitor.online.asked import TrackingOptions
+from stlc.monitor.online.bounds import TrackingOptions
 from stlc.monitor.online.columns import FAR
-from stlc.monitor.online.everywhere import BoundedTracker
 from stlc.monitor.online.interval_columns import IntervalTracker
 from stlc.monitor.online.online import How
 from stlc.monitor.online.paced import PacedTracker
-from stlc.monitor.online.trackers import RecomputeTracker, Trackers, UnboundedTracker
-from stlc.monitor.online.windowed import PlanningWindowTracker
+from stlc.monitor.online.trackers import (
+    BoundedTracker,
+    PlanningWindowTracker,
+    RecomputeTracker,
+    Trackers,
+    UnboundedTracker,
+)
 from stlc.monitor.prefix_bounds import lengthened, prefix_bound, with_seen
 from stlc.monitor.values import Record, bounds
 from stlc.monitor.verdict import Monitor

@@ -7,8 +7,7 @@ import pytest
 
 from stlc.monitor.online.online import Online
 from stlc.monitor.online.paced import PacedTracker
-from stlc.monitor.online.trackers import RecomputeTracker
-from stlc.monitor.online.windowed import PlanningWindowTracker
+from stlc.monitor.online.trackers import PlanningWindowTracker, RecomputeTracker
 from stlc.monitor.verdict import Monitor
 
 REQUIREMENTS = {

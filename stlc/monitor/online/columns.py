@@ -35,6 +35,8 @@ from stlc.monitor.values import by_truth
 
 Floats: TypeAlias = NDArray[np.float64]
 End: TypeAlias = Literal["lower", "upper", "truncate"]
+ColumnPlans: TypeAlias = Mapping[End, ColumnPlan]
+"""Least and greatest value wherever the trace ends, and the requirement as it is written."""
 Beyond: TypeAlias = Literal["lower", "upper", "truncate", "both"]
 
 NOTHING = ""

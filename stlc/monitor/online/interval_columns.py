@@ -14,8 +14,8 @@ import numpy as np
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import history, reach
-from stlc.monitor.online.asked import Bounds, ColumnPlans, Floats
-from stlc.monitor.online.columns import NOTHING, Reader, continued
+from stlc.monitor.online.bounds import Bounds, Floats
+from stlc.monitor.online.columns import NOTHING, ColumnPlans, Reader, continued
 from stlc.monitor.online.streams import ColumnPlan, PredicateColumn, RecursiveColumn, plan
 from stlc.monitor.values import by_truth
 

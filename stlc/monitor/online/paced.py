@@ -16,7 +16,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import Reach, farthest, reach
 from stlc.compile.ir.traverse import map_children, nodes, operands
 from stlc.compile.pipeline import CompiledRequirement
-from stlc.monitor.online.asked import Bounds, Floats
+from stlc.monitor.online.bounds import Bounds, Floats, Tracker
 from stlc.monitor.online.streams import endless
 
 WIDE = 1 << 13
@@ -171,30 +171,6 @@ def _shorter(window: ir.Window, most: int | None) -> ir.Window:
 # ------------------------------------------------------------------------------- pacing
 
 
-class Inner(Protocol):
-    """The tracker that is paced; `stlc.monitor.online.trackers.Tracker` is the same."""
-
-    @property
-    def samples(self) -> int:
-        """How many it has taken in."""
-
-    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take new samples in."""
-
-    @property
-    def settled(self) -> int:
-        """The first instant whose value may still change."""
-
-    def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations."""
-
-    def ended(self, starts: range) -> Bounds:
-        """The same where the trace is over."""
-
-    def drop(self, start: int) -> int:
-        """Forget instants before `start`."""
-
-
 class Asking(Protocol):
     """How a requirement is asked for; `PacedTracker` says it of itself."""
 
@@ -217,7 +193,7 @@ def _unbounded(node: ir.Formula) -> bool:
     return isinstance(node, (ir.PastTemporal, ir.Since)) and node.window.hi is None
 
 
-Make: TypeAlias = Callable[[CompiledRequirement], Inner]
+Make: TypeAlias = Callable[[CompiledRequirement], Tracker]
 
 
 @dataclass(slots=True)
@@ -239,7 +215,7 @@ class PacedTracker:
     all_kept: bool
     window: int | None = None
     samples: int = 0
-    _inner: Inner | None = None
+    _inner: Tracker | None = None
     _most: int | None = 0
     _pace: int = 1
 

@@ -1,169 +1,141 @@
-"""One requirement while its signals come in: what is known of it at which instants."""
+"""One requirement while its signals come in: the trackers, and which one a requirement gets."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Literal
 
 import numpy as np
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import reach, uses_end
+from stlc.compile.ir.support import history, reach, uses_end
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.holes import unsure
 from stlc.monitor.instants import rule_bounds, window_of
-from stlc.monitor.online.asked import (
-    Bounds,
-    ColumnPlans,
-    Ending,
-    Floats,
-    TrackingOptions,
-    decided_first,
-    first_needed,
-    sides_of,
-    worst,
-)
-from stlc.monitor.online.columns import FAR, End
-from stlc.monitor.online.everywhere import BoundedTracker
+from stlc.monitor.online.bounds import Bounds, Ending, Floats, Tracker, TrackingOptions
+from stlc.monitor.online.columns import FAR, ColumnPlans, End, Reader, Side
 from stlc.monitor.online.interval_columns import IntervalColumns, fits
 from stlc.monitor.online.paced import MOST, WIDE, PacedTracker, Work, effort, span
-from stlc.monitor.online.streams import EndlessError, endless, looks_on, plan
+from stlc.monitor.online.streams import ColumnPlan, EndlessError, RecursiveColumn, endless, looks_on, plan
 from stlc.monitor.online.unbounded import UnboundedState, skeleton
-from stlc.monitor.online.windowed import PlanningWindowTracker
-from stlc.monitor.prefix_bounds import lengthened, with_seen
+from stlc.monitor.prefix_bounds import lengthened, prefix_bound, with_seen
 from stlc.monitor.values import Record, by_truth, window_bounds
 
 
-class Tracker(Protocol):
-    """What is known of a requirement.
+def worst(
+    formula: ir.Formula, end: Literal["lower", "upper"], ending: Ending, window: int | None
+) -> ir.Formula:
+    """The formula for one end of what is possible; with a `window`, an early end is unknown or cuts."""
+    cut = ending == "truncate"
+    return prefix_bound(formula, end, cut=cut) if cut or window is None else formula
 
-    Instants are settled one after the other: from then on their value cannot change.
-    """
+
+def sides_of(plans: ColumnPlans, beyond: int, options: TrackingOptions) -> list[Side]:
+    """Both ends of what is possible, and where windows are cut at the end both of what it is there."""
+    going_on: list[End] = ["lower", "upper"]
+    sides = [Side(plans[end], end, beyond, options.truth, least=end == "lower") for end in going_on]
+    if options.ending == "open":
+        return sides
+    return sides + [
+        Side(plans["truncate"], "truncate", 0, options.truth, least=least) for least in (True, False)
+    ]
+
+
+def first_needed(planned: ColumnPlan, samples: int) -> int:
+    """The first sample whose signals a column still reads."""
+    reads = [samples - stream.ahead - stream.back for stream in planned.streams if hasattr(stream, "formula")]
+    return max(min(reads, default=samples), 0)
+
+
+# ----------------------------------------------------------------------------- in common
+
+
+class _CutTracker(ABC):
+    """A tracker that knows settled instants where windows are cut, and bounds of any others."""
+
+    __slots__ = ()
 
     @property
-    def samples(self) -> int:
-        """How many it has taken in."""
-
-    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take new samples in; the arguments are those of `Side.grow`."""
-
-    @property
+    @abstractmethod
     def settled(self) -> int:
         """The first instant whose value may still change."""
 
+    @property
+    @abstractmethod
+    def cuts(self) -> bool:
+        """Whether the end of the trace cuts windows."""
+
+    @abstractmethod
+    def certain(self, starts: range) -> Bounds:
+        """Bounds at settled instants, where windows are cut to the trace."""
+
+    @abstractmethod
+    def either(self, start: int, stop: int) -> Bounds:
+        """Bounds at any instants, where nothing is assumed of what lies outside of the trace."""
+
     def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations at instants that are not settled, or just were."""
+        """Bounds over all continuations.
+
+        Where windows are cut, what a settled instant reads before the first sample is false, not unknown.
+        """
+        middle = min(max(self.settled, start), stop)
+        if not self.cuts or middle <= start:
+            return self.either(start, stop)
+        known, rest = self.certain(range(start, middle)), self.either(middle, stop)
+        return Bounds(*map(np.concatenate, zip(known, rest, strict=True)))
 
     def ended(self, starts: range) -> Bounds:
-        """The same where the trace is over and windows to its end end with the last sample."""
-
-    def drop(self, start: int) -> int:
-        """Forget instants before `start`; the number of the first sample that is still needed."""
+        """Bounds where the trace is over."""
+        return self.certain(starts) if self.cuts else self.either(starts.start, starts.stop)
 
 
 @dataclass(slots=True)
-class Trackers:
-    """Makes the trackers of requirements; what is counted at the same time shares its columns.
+class _ColumnTracker(_CutTracker):
+    """A formula over columns at consecutive instants: two sides where windows are open, four where cut.
 
     Attributes:
-        horizon: what `T` means, in steps.
+        plans: the columns.
+        options: how values are taken.
+        samples: how many there are by now.
     """
 
-    horizon: int | None
-    _pairs: dict[tuple[bool, bool, int, int], IntervalColumns] = field(default_factory=dict)
+    plans: ColumnPlans
+    options: TrackingOptions
+    samples: int = 0
+    _sides: list[Side] = field(default_factory=list, init=False)
+    _back: int = field(default=0, init=False)
 
-    def of(self, rule: CompiledRequirement, asked: TrackingOptions, *, everywhere: bool) -> Tracker:
-        """The tracker of a requirement that needs the least memory.
+    @property
+    def planned(self) -> ColumnPlan:
+        """The requirement as it is written."""
+        return self.plans["truncate"]
 
-        Args:
-            rule: the requirement.
-            asked: how its values are taken.
-            everywhere: it is judged at every instant, and not only at the first one.
+    @property
+    def cuts(self) -> bool:
+        """Whether the end of the trace cuts windows."""
+        return self.options.ending == "truncate"
 
-        Raises:
-            UsageError: E313, what every instant has windows of its own for is too much.
-        """
-        alone = Trackers(self.horizon)
-        tried = alone.plain(rule, asked, everywhere=everywhere)
-        window = tried.window if isinstance(tried, PlanningWindowTracker) else None
+    def certain(self, starts: range) -> Bounds:
+        """Bounds at settled instants, where windows are cut to the trace."""
+        return Bounds(*(self._values(which, starts.start, starts.stop) for which in (2, 3)))
 
-        def make(part: CompiledRequirement) -> Tracker:
-            return Trackers(self.horizon).plain(part, asked, everywhere=everywhere)
+    def either(self, start: int, stop: int) -> Bounds:
+        """Bounds at any instants, where nothing is assumed of what lies outside of the trace."""
+        return Bounds(self._values(0, start, stop), self._values(1, start, stop))
 
-        paced = PacedTracker(rule, make, everywhere, isinstance(tried, RecomputeTracker), window)
-        found = effort(rule.formula, sum(span(rule.formula)) + (window or 0), paced)
-        if found.own > MOST:
-            raise UsageError(_too_much(rule, found))
-        if paced.all_kept or found.rows > WIDE:
-            return paced
-        return self.plain(rule, asked, everywhere=everywhere)
+    def drop(self, start: int) -> int:
+        """Forget instants before `start`."""
+        for side in self._sides:
+            side.drop(start - self._back)
+        return first_needed(self.planned, self.samples)
 
-    def plain(self, rule: CompiledRequirement, asked: TrackingOptions, *, everywhere: bool) -> Tracker:
-        """The tracker that judges a requirement after every sample."""
-        formula, window = rule.formula, window_of(rule, self.horizon)
-        if window is not None and (bounded := without_end(formula, window)) is not None:
-            formula, window = bounded, None
-        try:
-            plans = _plans(formula, asked.ending, window)
-            if window is not None:
-                if plans["truncate"].lag or not everywhere:
-                    raise EndlessError
-                return PlanningWindowTracker(plans, asked, window)
-            if endless(plans["truncate"].formula):
-                if everywhere:
-                    raise EndlessError
-                return UnboundedTracker(plans, asked)
-            if asked.ending == "truncate" or not fits(plans):
-                return BoundedTracker(plans, asked)
-            counted = (self.horizon if rule.windowed else rule.reach) if everywhere else 0
-            later = max(counted or 0, reach(formula).future)
-            pairs = self._pairs.setdefault(
-                (everywhere, asked.truth, asked.begin, later), IntervalColumns(asked.truth)
-            )
-            return pairs.add(formula)
-        except EndlessError:
-            return RecomputeTracker(rule, self.horizon, asked.ending, asked.truth)
-
-
-def without_end(formula: ir.Formula, window: int) -> ir.Formula | None:
-    """The formula with `end` so many samples after its instant; None where `end` depends on more than that.
-
-    It does under another window, for segments that would leave it (`sweep`), and where windows with an end of
-    their own reach beyond it.
-    """
-    moved = _ended(formula, window)
-    if moved is None or endless(moved) or uses_end(moved) or reach(moved).future > window:
-        return None
-    return moved
-
-
-def _ended(formula: ir.Formula, window: int) -> ir.Formula | None:
-    match formula:
-        case ir.BoolOp(items=items):
-            found = [_ended(item, window) for item in items]
-            return None if None in found else replace(formula, items=tuple(each for each in found if each))
-        case ir.Temporal(window=ir.Window(lo, None)) | ir.Until(window=ir.Window(lo, None)) if lo <= window:
-            return replace(formula, window=ir.Window(lo, window))
-        case _:
-            return formula
-
-
-def _too_much(rule: CompiledRequirement, found: Work) -> Diagnostic:
-    """E313 for a formula that every instant judges on its own, on too many samples."""
-    assert found.heaviest is not None
-    what = "every instant keeps values of its own" if isinstance(found.heaviest, ir.Freeze) else "`end` moves"
-    return Diagnostic(
-        "E313",
-        f"a stream cannot judge `{rule.name}`: {what}, and {found.own:,} samples to look at",
-        found.heaviest.span or rule.span,
-        help=(
-            "shorten its intervals",
-            "`stlc check SPEC TRACE` judges a recording",
-        ),
-    )
+    @abstractmethod
+    def _values(self, which: int, start: int, stop: int) -> Floats:
+        """Values of one side."""
 
 
 def _plans(formula: ir.Formula, ending: Ending, window: int | None) -> ColumnPlans:
@@ -171,12 +143,142 @@ def _plans(formula: ir.Formula, ending: Ending, window: int | None) -> ColumnPla
     return {"lower": plan(lower), "upper": plan(upper), "truncate": plan(formula)}
 
 
+# ----------------------------------------------------------------------------- trackers
+
+
+@dataclass(slots=True)
+class BoundedTracker(_ColumnTracker):
+    """A formula whose windows have an end, at consecutive instants."""
+
+    _readers: list[Reader] = field(default_factory=list, init=False)
+    _ahead: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        formula = self.planned.formula
+        self._ahead, self._back = reach(formula).future, history(formula)
+        self._sides = sides_of(self.plans, self._ahead, self.options)
+        self._readers = [Reader([side.plan.formula], side.end) for side in self._sides]
+
+    @property
+    def settled(self) -> int:
+        """The first instant whose value may still change."""
+        return max(self.samples - self._ahead - self.planned.lag, 0)
+
+    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
+        """Take new samples in."""
+        for side in self._sides:
+            side.grow(signals, first, samples)
+        self.samples = samples
+
+    def ended(self, starts: range) -> Bounds:
+        """Bounds where the trace is over."""
+        sides = self._sides
+        self._sides = [side.over() for side in sides]
+        try:
+            return _CutTracker.ended(self, starts)
+        finally:
+            self._sides = sides
+
+    def _values(self, which: int, start: int, stop: int) -> Floats:
+        if stop <= start:
+            return np.zeros(0)
+        return self._sides[which].values(self._readers[which], start, stop - start)[0][:, 0]
+
+
+@dataclass(slots=True)
+class PlanningWindowTracker(_ColumnTracker):
+    """A formula with windows to the end of a planning window, at consecutive instants.
+
+    Every instant sees the record up to the end of its window. Windows of the formula that reach beyond it may
+    still meet what the past holds there: the columns as they go on from that sample, nothing else being
+    known. Samples are then taken one by one, and a value is kept when its window is full.
+
+    Attributes:
+        window: how many samples after its instant the end of a window is.
+    """
+
+    window: int = field(kw_only=True)
+    _beyond: int = field(default=0, init=False)
+    _kept: list[Bounds] = field(default_factory=list, init=False)
+    _first: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        formula = self.planned.formula
+        self._back = history(formula)
+        if self.options.ending == "open" and _remembers(self.planned):
+            self._beyond = max(reach(formula).future - self.window, 0)
+        self._sides = sides_of(self.plans, self.window + self._beyond, self.options)
+
+    @property
+    def settled(self) -> int:
+        """The first instant whose value may still change."""
+        return max(self.samples - self.window, 0)
+
+    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
+        """Take new samples in."""
+        for now in range(self.samples + 1, samples + 1) if self._beyond else (samples,):
+            known = {name: values[: now - first] for name, values in signals.items()}
+            for side in self._sides:
+                side.grow(known, first, now)
+            self.samples = now
+            if self._beyond and self.settled:
+                self._kept.append(_ColumnTracker.either(self, self.settled - 1, self.settled))
+
+    def either(self, start: int, stop: int) -> Bounds:
+        """At any instants, where nothing is assumed of what lies outside of the trace."""
+        if not self._beyond:
+            return _ColumnTracker.either(self, start, stop)
+        middle = min(max(self.settled, start), stop)
+        kept = self._kept[start - self._first : middle - self._first]
+        return Bounds(
+            *map(np.concatenate, zip(*kept, _ColumnTracker.either(self, middle, stop), strict=True))
+        )
+
+    def drop(self, start: int) -> int:
+        """Forget instants before `start`."""
+        del self._kept[: start - self._first]
+        self._first = start
+        return _ColumnTracker.drop(self, start)
+
+    def _values(self, which: int, start: int, stop: int) -> Floats:
+        if stop <= start:
+            return np.zeros(0)
+        side = self._sides[which]
+        record = Record(side.rows, NUMPY)
+        starts = range(start - side.base, stop - side.base)
+        if self._beyond:
+            return self._continued(side, record, starts)
+        ends: Ending = "truncate" if side.end == "truncate" else "open"
+        low, high = window_bounds(side.plan.formula, record, starts, self.window, ends)
+        return np.asarray((high if side.end == "upper" else low)[:, 0])
+
+    def _continued(self, side: Side, record: Record, starts: range) -> Floats:
+        """Where the formula reads the columns beyond the ends of its windows, many instants at once."""
+        formulas, back = [side.plan.formula], self._back
+        early = range(starts.start, max(min(back, starts.stop), starts.start))
+        ends = [record.values(formulas, range(k, k + 1), side.end, k + self.window + 1)[0] for k in early]
+        chosen = np.arange(early.stop, starts.stop)
+        if len(chosen):
+            rows = np.arange(-back, self.window + self._beyond + 1)[:, None] + chosen
+            around = Record({name: x[rows, 0] for name, x in record.env.items()}, NUMPY)
+            ends += around.values(formulas, range(back, back + 1), side.end, back + self.window + 1)
+        return np.asarray(np.concatenate(ends, axis=1)[0])
+
+
+def _remembers(planned: ColumnPlan) -> bool:
+    """Whether more than nothing is known of a column beyond the last sample."""
+    return any(
+        isinstance(stream, RecursiveColumn) or stream.back > 0 or not isinstance(stream.formula, ir.Predicate)
+        for stream in planned.streams
+    )
+
+
 @dataclass(slots=True)
 class UnboundedTracker:
     """A formula with endless windows, at the first sample."""
 
     plans: ColumnPlans
-    asked: TrackingOptions
+    options: TrackingOptions
     samples: int = 0
     _fronts: list[UnboundedState] = field(default_factory=list)
     _lag: int = 0
@@ -187,8 +289,8 @@ class UnboundedTracker:
         self._lag = max(bones[end].reach + planned.lag for end, planned in self.plans.items()) + 1
         self._back = max(each.back for each in bones.values())
         beyond = max(bones[end].reach + bones[end].unsure(planned) for end, planned in self.plans.items())
-        sides = sides_of(self.plans, beyond, self.asked)
-        begin = self.asked.begin
+        sides = sides_of(self.plans, beyond, self.options)
+        begin = self.options.begin
         self._fronts = [UnboundedState(bones[side.end], side, begin, begin) for side in sides]
 
     @property
@@ -225,7 +327,7 @@ class UnboundedTracker:
 
 
 @dataclass(slots=True)
-class RecomputeTracker:
+class RecomputeTracker(_CutTracker):
     """A requirement that has to be judged on the whole trace: nothing is forgotten."""
 
     rule: CompiledRequirement
@@ -260,11 +362,10 @@ class RecomputeTracker:
         """Take new samples in."""
         self._signals, self.samples = signals, samples
 
-    def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations."""
-        if self.ending == "truncate":
-            return decided_first(self, start, stop)
-        return self.either(start, stop)
+    @property
+    def cuts(self) -> bool:
+        """Whether the end of the trace cuts windows."""
+        return self.ending == "truncate"
 
     def certain(self, starts: range) -> Bounds:
         """At settled instants, where windows are cut to the trace."""
@@ -307,3 +408,108 @@ class RecomputeTracker:
     def drop(self, start: int) -> int:  # noqa: ARG002
         """Nothing can be forgotten."""
         return 0
+
+
+# ----------------------------------------------------------------------------- which one
+
+
+@dataclass(slots=True)
+class Trackers:
+    """Makes the trackers of requirements; what is counted at the same time shares its columns.
+
+    Attributes:
+        horizon: what `T` means, in steps.
+    """
+
+    horizon: int | None
+    _pairs: dict[tuple[bool, bool, int, int], IntervalColumns] = field(default_factory=dict)
+
+    def of(self, rule: CompiledRequirement, options: TrackingOptions, *, everywhere: bool) -> Tracker:
+        """The tracker of a requirement that needs the least memory.
+
+        Args:
+            rule: the requirement.
+            options: how its values are taken.
+            everywhere: it is judged at every instant, and not only at the first one.
+
+        Raises:
+            UsageError: E313, what every instant has windows of its own for is too much.
+        """
+        alone = Trackers(self.horizon)
+        tried = alone.plain(rule, options, everywhere=everywhere)
+        window = tried.window if isinstance(tried, PlanningWindowTracker) else None
+
+        def make(part: CompiledRequirement) -> Tracker:
+            return Trackers(self.horizon).plain(part, options, everywhere=everywhere)
+
+        paced = PacedTracker(rule, make, everywhere, isinstance(tried, RecomputeTracker), window)
+        found = effort(rule.formula, sum(span(rule.formula)) + (window or 0), paced)
+        if found.own > MOST:
+            raise UsageError(_too_much(rule, found))
+        if paced.all_kept or found.rows > WIDE:
+            return paced
+        return self.plain(rule, options, everywhere=everywhere)
+
+    def plain(self, rule: CompiledRequirement, options: TrackingOptions, *, everywhere: bool) -> Tracker:
+        """The tracker that judges a requirement after every sample."""
+        formula, window = rule.formula, window_of(rule, self.horizon)
+        if window is not None and (bounded := without_end(formula, window)) is not None:
+            formula, window = bounded, None
+        try:
+            plans = _plans(formula, options.ending, window)
+            if window is not None:
+                if plans["truncate"].lag or not everywhere:
+                    raise EndlessError
+                return PlanningWindowTracker(plans, options, window=window)
+            if endless(plans["truncate"].formula):
+                if everywhere:
+                    raise EndlessError
+                return UnboundedTracker(plans, options)
+            if options.ending == "truncate" or not fits(plans):
+                return BoundedTracker(plans, options)
+            counted = (self.horizon if rule.windowed else rule.reach) if everywhere else 0
+            later = max(counted or 0, reach(formula).future)
+            pairs = self._pairs.setdefault(
+                (everywhere, options.truth, options.begin, later), IntervalColumns(options.truth)
+            )
+            return pairs.add(formula)
+        except EndlessError:
+            return RecomputeTracker(rule, self.horizon, options.ending, options.truth)
+
+
+def without_end(formula: ir.Formula, window: int) -> ir.Formula | None:
+    """The formula with `end` so many samples after its instant; None where `end` depends on more than that.
+
+    It does under another window, for segments that would leave it (`sweep`), and where windows with an end of
+    their own reach beyond it.
+    """
+    moved = _ended(formula, window)
+    if moved is None or endless(moved) or uses_end(moved) or reach(moved).future > window:
+        return None
+    return moved
+
+
+def _ended(formula: ir.Formula, window: int) -> ir.Formula | None:
+    match formula:
+        case ir.BoolOp(items=items):
+            found = [_ended(item, window) for item in items]
+            return None if None in found else replace(formula, items=tuple(each for each in found if each))
+        case ir.Temporal(window=ir.Window(lo, None)) | ir.Until(window=ir.Window(lo, None)) if lo <= window:
+            return replace(formula, window=ir.Window(lo, window))
+        case _:
+            return formula
+
+
+def _too_much(rule: CompiledRequirement, found: Work) -> Diagnostic:
+    """E313 for a formula that every instant judges on its own, on too many samples."""
+    assert found.heaviest is not None
+    what = "every instant keeps values of its own" if isinstance(found.heaviest, ir.Freeze) else "`end` moves"
+    return Diagnostic(
+        "E313",
+        f"a stream cannot judge `{rule.name}`: {what}, and {found.own:,} samples to look at",
+        found.heaviest.span or rule.span,
+        help=(
+            "shorten its intervals",
+            "`stlc check SPEC TRACE` judges a recording",
+        ),
+    )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stlc.monitor.explain.report import Cause, explain
-from stlc.monitor.online import recall
+from stlc.monitor.online import trace_buffer
 from stlc.monitor.online.online import How, Online
 from stlc.monitor.verdict import Monitor
 
@@ -77,7 +77,7 @@ LONG = {
 
 @pytest.mark.parametrize("name", LONG)
 def test_a_cause_is_remembered_when_its_samples_are_gone(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recall, "_MOST", 100)
+    monkeypatch.setattr(trace_buffer, "_MOST", 100)
     monitor = monitor_of(LONG[name])
     whole = {signal: np.random.default_rng(3).normal(size=900) for signal in ("a", "b")}
     whole["a"][30], whole["b"][31] = -4.0 if name == "whole_past" else 4.9, 3.9
