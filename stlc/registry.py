@@ -80,6 +80,8 @@ class Registry(Generic[T]):
 
     def get(self, name: str) -> T:
         """The entry `name`. Raises UsageError (U101) that names the nearest entry and all others."""
+        if name in self._entries:
+            return self._entries[name]
         if name not in self:
             finding = Diagnostic("U101", f"unknown {self.kind} `{name}`", help=(self.suggest(name),))
             raise UsageError(finding)
@@ -125,7 +127,7 @@ class PackageRegistry(Registry[T]):
 
     def get(self, name: str) -> T:
         """The entry `name`, its module imported. Raises UsageError (U101) as `Registry.get` does."""
-        if name in self and name not in self._entries:
+        if name not in self._entries and name in self:
             self._entries[name] = getattr(import_module(f"{self._package}.{name}"), self._attribute)
         return super().get(name)
 

@@ -8,7 +8,7 @@ import numpy as np
 import onnxruntime
 
 from stlc.compile.backends.onnx.sheet import BATCH, Sheet, Value
-from stlc.export.onnx_file import model_of
+from stlc.export.onnx_write import model_of
 
 
 def columns_on(sheet: Sheet, names: tuple[str, ...], rows: int) -> dict[str, Value]:

@@ -21,7 +21,7 @@ from stlc.controller.problem.task import Task
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.load import load_system_decl
 from stlc.dynamics.model.system import System
-from stlc.export.emit import header, main_of
+from stlc.export.c_header import header, main_of
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
 from stlc.jsontext import dumps

@@ -1,24 +1,437 @@
-"""The graphs of a controller: it decides, it judges, it says how far plans are safe.
+"""The graphs of a controller as ONNX: rollout, policy, verdicts, and the length of safe prefixes.
 
-What is between them, the paper's backup policy and the plans that are gone on with, is `stlc.runtime`.
+The paper's backup policy and the plans that are kept stand between the graphs, in `stlc.runtime`.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from typing import TYPE_CHECKING, TypeAlias
 
-from stlc.compile.backends.onnx.ops import ONNX_OPS as ONNX
+from torch import nn
+
+from stlc.compile.backends.array.arith import Program
+from stlc.compile.backends.array.unrolled import Columns, require_numbers, written
+from stlc.compile.backends.onnx.ops import ONNX, ONNX_OPS
 from stlc.compile.backends.onnx.sheet import BATCH, Sheet, Value, joined
+from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.export.onnx_judge import columns_of, deepened, falls, judged, rank
-from stlc.export.onnx_policy import proposed
-from stlc.export.onnx_rollout import assigned
+from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
+from stlc.controller.problem.pending_goals import HELD
+from stlc.controller.problem.task import KEPT, PULL, SHORT, TIE, Task
+from stlc.dynamics.declaration.learning import START
+from stlc.dynamics.model.algebra import names_in
+from stlc.dynamics.model.controls import EPS, raw_width
+from stlc.dynamics.model.schedule import RolloutStage, schedule
+from stlc.dynamics.model.step import Step
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator
 
+    from torch import Tensor
+
+    from stlc.compile.pipeline import CompiledRequirement
     from stlc.controller.policies.policy import PlanNetwork
-    from stlc.controller.problem.task import Task
+    from stlc.dynamics.declaration.columns import ControlDecl
+
+
+# --------------------------------------------------------------------------------------------- rollout
+
+
+def rolled(step: Step, start: Mapping[str, Value], controls: Mapping[str, Value]) -> Columns:
+    """The states under a plan, exact switching.
+
+    Args:
+        step: one step of the system.
+        start: states, (1, batch) each.
+        controls: (steps, batch) each.
+
+    Returns:
+        The states, (steps + 1, batch) each.
+
+    Raises:
+        Untranslatable: the step calls a function of Python.
+    """
+    require_numbers([*(num for _, num in step.lets), *step.next.values()])
+    steps = len(next(iter(controls.values())))
+    film = _Film(start, controls, step.next.keys(), steps)
+    for stage in schedule(step):
+        film.run(stage)
+    still = {name: value.spread(steps + 1, value.shape[1]) for name, value in start.items()}
+    return still | film.states
+
+
+class _Film:
+    """What is known so far: the states that move, and numbers at all steps or, in one row, at each."""
+
+    def __init__(
+        self, start: Mapping[str, Value], controls: Mapping[str, Value], moving: Iterable[str], steps: int
+    ) -> None:
+        self.start, self.steps = start, steps
+        self.states: Columns = {}
+        moving = frozenset(moving)
+        self.now: Columns = {name: value for name, value in start.items() if name not in moving}
+        self.now |= controls
+
+    def run(self, stage: RolloutStage) -> None:
+        """A stage whose inputs are known."""
+        if stage.early:
+            self.now.update(Program(stage.early)(self.now, ONNX))
+        for state, source in stage.follows.items():
+            self._enter(state, ONNX.cat([self.start[state], self._full(source)]))
+        for state, source in stage.sums.items():
+            parts = ONNX.cat([self.start[state], self._full(source)])
+            axis = parts.sheet.constant(0, "int64")
+            (total,) = parts.sheet.emit("CumSum", (parts, axis), [parts.shape], parts.kind)
+            self._enter(state, total)
+        if stage.blocks:
+            self._loop(stage)
+
+    def _enter(self, name: str, column: Value) -> None:
+        self.states[name] = column
+        self.now[name] = column[:-1]
+
+    def _full(self, name: str) -> Value:
+        value = self.now[name]
+        return value.spread(self.steps, value.shape[1])
+
+    def _loop(self, stage: RolloutStage) -> None:
+        """Step what feeds back into itself."""
+        inside = stage.stepped.keys() | {name for block in stage.blocks for name in block}
+        read = {name for block in stage.blocks for num in block.values() for name in names_in(num)}
+        outside = sorted(read - inside)
+        timed = [name for name in outside if len(self.now[name]) == self.steps]
+        steady = [name for name in outside if name not in timed]
+        blocks = [Program(block) for block in stage.blocks]
+        moving, sources = list(stage.stepped), list(stage.stepped.values())
+        kept = list(dict.fromkeys((*sources, *stage.lets)))
+
+        def turn(
+            sheet: Sheet, now: Sequence[Value], rows: Sequence[Value]
+        ) -> tuple[Sequence[Value], Sequence[Value]]:
+            env = {name: self.now[name].on(sheet) for name in steady}
+            env |= dict(zip(timed, rows, strict=False))
+            env |= dict(zip(moving, now, strict=True))
+            for block in blocks:
+                env.update(block(env, ONNX))
+            later = [env[name].spread(1, BATCH, like=now[0]) for name in sources]
+            return later, [env[name] for name in kept]
+
+        carried = [self.start[name] for name in moving]
+        rows = [self.now[name] for name in timed] or [
+            carried[0].sheet.constant([[float(k)] for k in range(self.steps)])
+        ]
+        seen = carried[0].sheet.repeated(carried, rows, turn)
+        history = dict(zip(kept, seen, strict=True))
+        for state, source in stage.stepped.items():
+            self._enter(state, ONNX.cat([self.start[state], history[source]]))
+        self.now.update((name, history[name]) for name in stage.lets)
+
+
+def assigned(numbers: Mapping[str, ir.Num], columns: Mapping[str, Value]) -> Columns:
+    """Numbers that follow from columns, which broadcast against them.
+
+    Raises:
+        Untranslatable: one calls a function of Python.
+    """
+    require_numbers(list(numbers.values()))
+    return Program(dict(numbers))(columns, ONNX) if numbers else {}
+
+
+# ---------------------------------------------------------------------------------------------- policy
+
+
+def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Value:
+    """All plans of a network.
+
+    Args:
+        task: that it was trained for.
+        network: in float32, as it was trained.
+        state: (1, batch) each.
+
+    Returns:
+        (batch, plans, T, m) float64.
+
+    Raises:
+        Untranslatable: what is observed or mirrored calls a function of Python.
+    """
+    folded, swapped = _folded(task, network, state)
+    raw = _layers(network, _observed(task, folded))
+    raw = raw.reshaped(BATCH, network.plans, task.horizon, raw_width(task.system.controls))
+    columns = iter(raw.transposed(3, 0, 1, 2).rows())
+    controls = {each.name: _squashed(each, columns) for each in task.system.controls}
+    if swapped is not None:
+        mask = swapped.reshaped(1, BATCH, 1, 1)
+        images = _images(task, controls)
+        controls = {name: ONNX_OPS.where(mask, images[name], value) for name, value in controls.items()}
+    return joined(list(controls.values())).transposed(1, 2, 3, 0).cast("float64")
+
+
+def _folded(
+    task: Task, network: PlanNetwork, state: Mapping[str, Value]
+) -> tuple[Mapping[str, Value], Value | None]:
+    """States on the side of the mirror that the network knows, and which of them are images."""
+    if network.mirror is None:
+        return state, None
+    names = set(task.names)
+    images = [each for each in task.system.decl.policy.mirror if each.name in names]
+    moved = assigned({each.name: each.value for each in images}, state)
+    side = task.names[network.mirror.side]
+    swapped = ONNX_OPS.gt(moved[side], state[side])
+    folded = {name: ONNX_OPS.where(swapped, moved[name], state[name]) for name in moved}
+    return {**state, **folded}, swapped
+
+
+def _observed(task: Task, state: Mapping[str, Value]) -> Value:
+    """What the network sees, (batch, k) float32."""
+    system = task.system
+    numbers: list[ir.Num] = [*system.decl.policy.observe, *(ir.Signal(each.name) for each in system.added)]
+    if not system.decl.policy.observe:
+        numbers = [ir.Signal(name) for name in system.names]
+    seen = assigned({str(place): number for place, number in enumerate(numbers)}, state)
+    like = next(iter(state.values()))
+    rows = [seen[str(place)].spread(1, BATCH, like=like) for place in range(len(numbers))]
+    return joined(rows).T.cast("float32")
+
+
+def _layers(network: PlanNetwork, seen: Value) -> Value:
+    sheet = seen.sheet
+    x = (seen - _weights(seen, network.centre)) / _weights(seen, network.spread)
+    for layer in network.body:
+        if isinstance(layer, nn.Linear):
+            parts = (x, _weights(seen, layer.weight), _weights(seen, layer.bias))
+            (x,) = sheet.emit("Gemm", parts, [(BATCH, layer.out_features)], "float32", {"transB": 1})
+        else:
+            x = x.apply("Relu")
+    return x
+
+
+def _weights(like: Value, tensor: Tensor) -> Value:
+    return like.sheet.constant(tensor.detach().numpy(force=True), "float32")
+
+
+def _squashed(control: ControlDecl, columns: Iterator[Value]) -> Value:
+    """One control in physical units, from one column of the network or two."""
+    first = next(columns)
+    match control.squash:
+        case "tanh":
+            unit = first.apply("Tanh")
+        case "clip":
+            unit = ONNX_OPS.clamp(first, -1.0, 1.0)
+        case "angle":
+            unit = ONNX_OPS.atan2(next(columns), first + EPS) / math.pi
+    scaled: Value = unit * ((control.high - control.low) / 2) + (control.low + control.high) / 2
+    return scaled
+
+
+def _images(task: Task, controls: Mapping[str, Value]) -> dict[str, Value]:
+    """The mirror images of controls; angles stay within a turn of their range."""
+    names = set(task.names)
+    images = [each for each in task.system.decl.policy.mirror if each.name not in names]
+    moved = {**controls, **assigned({each.name: each.value for each in images}, controls)}
+    for each in task.system.controls:
+        if each.squash == "angle":
+            moved[each.name] = ONNX_OPS.mod(moved[each.name] - each.low, 2.0 * math.pi) + each.low
+    return moved
+
+
+# -------------------------------------------------------------------------------------------- verdicts
+
+
+States: TypeAlias = Mapping[str, Value]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdicts:
+    """What became of a batch of plans.
+
+    Attributes:
+        rho: (1, batch), -inf where a plan or what follows from it is no number.
+        safe: the same of phi_safe.
+        each: the same of every requirement, in order.
+        cost: (1, batch).
+        states: (T + 1, batch) each.
+    """
+
+    rho: Value
+    safe: Value
+    each: tuple[Value, ...]
+    cost: Value
+    states: States
+
+
+def columns_of(state: Value, names: Sequence[str]) -> dict[str, Value]:
+    """(batch, n) -> (1, batch) each."""
+    return dict(zip(names, state.T.rows(), strict=True))
+
+
+def inputs_of(plans: Value, task: Task) -> dict[str, Value]:
+    """(batch, T, m) -> (T, batch) each."""
+    rows = plans.transposed(2, 1, 0).rows()
+    return {
+        name: row.reshaped(task.horizon, BATCH)
+        for name, row in zip(task.system.control_names, rows, strict=True)
+    }
+
+
+def judged(task: Task, start: States, plans: Value) -> Verdicts:
+    """`Task.judge` and `Task.cost` of plans (batch, T, m) from states (1, batch) each.
+
+    Raises:
+        Untranslatable: the task holds something that has no form as a graph.
+    """
+    like = next(iter(start.values()))
+    controls = inputs_of(plans, task)
+    states = rolled(task.system.exact_step, start, controls)
+    margins = written([rule.formula for rule in task.rules], states)
+    margins = [margin.spread(1, BATCH, like=like) for margin in margins]
+    broken = _broken(task, plans, states, margins)
+    each = tuple(ONNX_OPS.where(broken, -math.inf, margin) for margin in margins)
+    by_name = dict(zip((rule.name for rule in task.rules), each, strict=True))
+    rho = _overall(task.rules, by_name, like)
+    safe = ONNX_OPS.where(broken, -math.inf, _overall(task.compiled.safety, by_name, like))
+    return Verdicts(rho, safe, each, _cost(task, states, controls, rho), states)
+
+
+def _overall(rules: Sequence[CompiledRequirement], each: States, like: Value) -> Value:
+    """The weighed minimum, (1, batch); +inf without rules."""
+    if not rules:
+        return like.sheet.constant([[math.inf]]).spread(1, BATCH, like=like)
+    weighed = [
+        each[rule.name] if rule.weight == rule.scale else each[rule.name] * (rule.weight / rule.scale)
+        for rule in rules
+    ]
+    least: Value = ONNX_OPS.join(weighed, "min")
+    return least
+
+
+def _broken(task: Task, plans: Value, states: States, margins: Sequence[Value]) -> Value:
+    """Where a plan holds what is no finite number, or something that follows from it is NaN, (1, batch)."""
+    nothing = _reduced("ReduceSum", plans * 0.0, (1, 2)).reshaped(1, BATCH)
+    moving = [states[name] for name in task.system.exact_step.next]
+    like = next(iter(states.values()))
+    wide = [column.spread(column.shape[0], BATCH, like=like) for column in (*moving, *margins)]
+    together = joined([nothing, *wide])
+    lost = together.apply("IsNaN", kind="bool").cast("float32")
+    return _reduced("ReduceMax", lost, (0,)).apply("Greater", 0.5, kind="bool")
+
+
+def _reduced(op: str, x: Value, axes: tuple[int, ...]) -> Value:
+    """A reduction that keeps its axes."""
+    shape = tuple(1 if place in axes else length for place, length in enumerate(x.shape))
+    (out,) = x.sheet.emit(op, (x, x.sheet.constant(axes, "int64")), [shape], x.kind, {"keepdims": 1})
+    return out
+
+
+def rank(found: Verdicts) -> Value:
+    """`stlc.controller.problem.task.rank`, (1, batch)."""
+    rho, cost = found.rho, found.cost
+    unknown = cost.apply("IsNaN", kind="bool")
+    cheap = ONNX_OPS.where(
+        unknown, 0.0, 1.0 / (1.0 + ONNX_OPS.clamp(ONNX_OPS.where(unknown, 0.0, cost), 0.0, None))
+    )
+    size = rho.apply("Abs")
+    poor = ONNX_OPS.where(ONNX_OPS.gt(math.inf, size), rho / (1.0 + size), -1.0) + cheap * TIE
+    poor = ONNX_OPS.where(ONNX_OPS.ge(found.safe, -TOLERANCE), poor, poor - 2.0)
+    good = ONNX_OPS.both(ONNX_OPS.ge(rho, -TOLERANCE), unknown.apply("Not"))
+    score: Value = ONNX_OPS.where(good, 1.0 + cheap, poor)
+    return score
+
+
+# ------------------------------------------------------------------------ cost
+
+
+def _cost(task: Task, states: States, controls: States, rho: Value) -> Value:
+    """The performance terms as if every plan were satisfying, (1, batch)."""
+    system, rows = task.system, task.horizon
+    moments = rho.sheet.constant([[float(k)] for k in range(rows + 1)])
+    env = {"k": moments, "t": moments * task.dt, "sat": ONNX_OPS.full((1, 1), 1.0, rho), "rho": rho}
+    env |= {name + START: column[:1] for name, column in states.items()}
+    over_states, over_controls = system.objective
+    before = {name: column[:rows] for name, column in (env | dict(states)).items()}
+    parts = [rho.sheet.constant([[0.0]])]
+    if over_states is not None:
+        parts.append(_mean(over_states, env | dict(states), rows + 1))
+    if over_controls is not None:
+        parts.append(_mean(over_controls, before | dict(controls), rows))
+    if task.promises.items:
+        parts.append(_short(task, states) * KEPT)
+    if task.compiled.guidance_cost is not None:
+        parts.append(_mean(task.compiled.guidance_cost, states, rows + 1) * PULL)
+    if task.compiled.timers:
+        parts.append(_lacking(task, rho) * SHORT)
+    return reduce(ONNX_OPS.add, parts).spread(1, BATCH, like=rho)
+
+
+def _mean(number: ir.Num, env: States, rows: int) -> Value:
+    value = assigned({"cost": number}, env)["cost"]
+    return _reduced("ReduceMean", value.spread(rows, value.shape[1]), (0,))
+
+
+def _lacking(task: Task, spared: Value) -> Value:
+    """What something lacks of gamma."""
+    gamma = task.system.decl.objective.gamma
+    lack: Value = ONNX_OPS.clamp(gamma - spared, 0.0, gamma)
+    return lack
+
+
+def _short(task: Task, states: States) -> Value:
+    """`Promises.short`."""
+    promises = task.promises
+    clock = states[promises.clock]
+    margins = written([each.body for each in promises.items], states, count=len(clock))
+    lacks = []
+    for promise, margin in zip(promises.items, margins, strict=True):
+        counts = ONNX_OPS.both(ONNX_OPS.ge(clock, promise.first), ONNX_OPS.ge(promise.last, clock))
+        best = ONNX_OPS.amax(ONNX_OPS.where(counts, margin, -math.inf))
+        still_open = ONNX_OPS.gt(HELD, ONNX_OPS.abs(states[promise.status][:1]))
+        lacks.append(ONNX_OPS.where(still_open, _lacking(task, best), 0.0))
+    return reduce(ONNX_OPS.add, lacks)
+
+
+def deepened(task: Task, states: States) -> Value:
+    """`Promises.deepened`, (1, batch) booleans; there is at least one promise."""
+    soon = {name: column[:2] for name, column in states.items()}
+    gamma, found = task.system.decl.objective.gamma, []
+    for margin in written([each.body for each in task.promises.items], soon, count=2):
+        now, next_ = margin.spread(2, margin.shape[1])[:1], margin.spread(2, margin.shape[1])[1:]
+        held = ONNX_OPS.both(ONNX_OPS.ge(now, 0.0), ONNX_OPS.gt(gamma, now))
+        found.append(ONNX_OPS.both(held, ONNX_OPS.gt(next_, now)))
+    return reduce(ONNX_OPS.either, found)
+
+
+# ------------------------------------------------------------------------ prefixes
+
+
+def falls(task: Task, start: States, plans: Value) -> Value:
+    """`stlc.controller.guard.safe_prefix.prefix_robustness`, (T + 1, batch).
+
+    Every prefix is a trajectory of its own, as there: columns are (T + 1, prefixes * batch).
+    """
+    rows = task.horizon + 1
+    states = rolled(task.system.exact_step, start, inputs_of(plans, task))
+    like = next(iter(start.values()))
+    prefixes = [[[1.0 if k > end else -1.0] for end in range(rows)] for k in range(rows)]
+    beyond = like.sheet.constant(prefixes).spread(rows, rows, BATCH, like=like)
+    columns = {
+        name: column.spread(rows, BATCH, like=like)
+        .reshaped(rows, 1, BATCH)
+        .spread(rows, rows, BATCH, like=like)
+        for name, column in states.items()
+    }
+    columns[BEYOND] = beyond
+    flat = {name: column.reshaped(rows, BATCH) for name, column in columns.items()}
+    formulas = [open_ended(anchored(rule.formula)) for rule in task.compiled.safety]
+    margins = written(formulas, flat)
+    least = ONNX_OPS.join([margin.spread(1, BATCH, like=flat[BEYOND]) for margin in margins], "min")
+    found: Value = least.reshaped(rows, BATCH)
+    return found
+
+
+# ---------------------------------------------------------------------------------------------- graphs
 
 
 def deciding(task: Task, network: PlanNetwork) -> dict[str, Value]:
@@ -54,10 +467,10 @@ def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
     table = _table(task, state, joined([fresh, begun.reshaped(BATCH, 1, *begun.shape[1:])], axis=1))
     best = _best(table["rank"].T[:count].T)
     policy = _picked(table, best)
-    better = ONNX.ge(_one(table["rank"], count), policy["rank"])
+    better = ONNX_OPS.ge(_one(table["rank"], count), policy["rank"])
     if task.promises.items:
-        better = ONNX.either(better, _one(table["deepened"], count))
-    kept = ONNX.both(better, ONNX.ge(_one(table["rho"], count), -TOLERANCE))
+        better = ONNX_OPS.either(better, _one(table["deepened"], count))
+    kept = ONNX_OPS.both(better, ONNX_OPS.ge(_one(table["rho"], count), -TOLERANCE))
     index = kept.reshaped(BATCH, 1).apply("Where", sheet.constant([[count]], "int64"), best, kind="int64")
     shown = {"kept": kept, "policy_plan": policy["plan"], "policy_rho": policy["rho"]}
     return _shown(_picked(table, index)) | shown | _added(task, state)

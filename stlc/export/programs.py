@@ -1,10 +1,15 @@
-"""What a controller computes, as a module that can be recorded for any number of agents."""
+"""A controller and the paper's backup policy as modules that can be recorded for any number of agents.
+
+`stlc.controller.guard.shooting` goes on to a longer T0 only where a shorter one found nothing. A recorded
+program has no such turns: it tries every T0, costs what its longest prefixes cost, and gives the same plans.
+"""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -75,3 +80,123 @@ def recorded(task: Task, network: PlanNetwork) -> ExportedProgram:
         module(x)  # constants that are remembered are made here, not while recording
         batch = torch.export.Dim("batch", min=1)
         return torch.export.export(module, (x,), strict=False, dynamic_shapes=({0: batch},))
+
+
+# --------------------------------------------------------------------------------------- backup policy
+
+
+AT_ONCE = 32_768
+"""Plans of one state that are judged at once."""
+
+_NOTHING: tuple[Tensor, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Tried:
+    """Plans of one T0: (states, choices, …); `falls` (states, choices, T+1) where the last T0 asks for it."""
+
+    plans: Tensor
+    rho: Tensor
+    safe: Tensor
+    each: Tensor
+    cost: Tensor
+    falls: Tensor | None
+
+
+class Guarding(nn.Module):
+    """States (B, n) and the policy's plans (B, T, m) -> what the backup policy does instead; float64.
+
+    The outputs are plan (B, T, m), rho and safe (B,), requirements (B, R), and int64 source (1 where phi or
+    phi_safe holds, 2 where the longest safe prefix decided) and t0 (B,), as
+    `stlc.controller.guard.candidates.Candidates`.
+    """
+
+    def __init__(self, task: Task, network: PlanNetwork, grid: Grid | None = None) -> None:
+        super().__init__()
+        self.deciding = Deciding(task, network)
+        self.grid = grid or grid_of(task)
+        self._task = task
+        self._formulas = [rule.formula for rule in task.compiled.safety]
+        self._prefixes = [torch.from_numpy(self.grid.prefixes(length)) for length in self.grid.lengths]
+
+    def forward(self, x: Tensor, plan: Tensor) -> tuple[Tensor, ...]:
+        """Choose as the stages of the paper's guard do where no plan was followed before."""
+        own = finite(plan, self._task)
+        nobody = torch.zeros_like(x[:, 0])
+        if not self._prefixes:
+            each = torch.zeros_like(x[:, :1]).expand(-1, len(self._task.rules)) - torch.inf
+            return own, nobody - torch.inf, nobody - torch.inf, each, nobody.long() + 2, nobody.long()
+        decided, found = torch.zeros_like(nobody, dtype=torch.bool), _NOTHING
+        for length, prefixes in zip(self.grid.lengths, self._prefixes, strict=True):
+            last = length == self.grid.lengths[-1]
+            tried = self._tried(x, own, prefixes, falls=last)
+            good = tried.rho >= -TOLERANCE
+            allowed = torch.where(good.any(1, keepdim=True), good, tried.safe >= -TOLERANCE)
+            done = allowed.any(1)
+            pick = best(allowed, (tried.rho, -tried.cost))
+            if tried.falls is not None:
+                pick = torch.where(done, pick, _safest(tried, tried.falls))
+            here = (*_picked(tried, pick), torch.where(done, 1, 2), torch.full_like(pick, length))
+            found = here if not found else _earlier(decided, found, here)
+            decided = decided | done
+        return found
+
+    def _tried(self, x: Tensor, own: Tensor, prefixes: Tensor, *, falls: bool) -> _Tried:
+        """All plans of one T0, judged; the first begins as the policy's own plan does."""
+        heads = torch.cat((own[:, None, : prefixes.shape[1]], prefixes.expand(x.shape[0], -1, -1, -1)), 1)
+        size = max(AT_ONCE // self.deciding.network.plans, 1)
+        pieces = [self._finished(x, some, falls=falls) for some in torch.split(heads, size, 1)]
+        columns = [torch.cat(column, 1) for column in zip(*pieces, strict=True)]
+        plans, rho, safe, each, cost = columns[:5]
+        return _Tried(plans, rho, safe, each, cost, columns[5] if falls else None)
+
+    def _finished(self, x: Tensor, heads: Tensor, *, falls: bool) -> list[Tensor]:
+        """Plans that begin with `heads` (B, C, L, m) and go on as the policy plans; their verdicts."""
+        count, length = heads.shape[1:3]
+        starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])
+        head = heads.reshape(-1, *heads.shape[2:])
+        ends = self._task.system.rollout_columns(starts, head)
+        reached = torch.stack([ends[name][-1].expand(starts.shape[0]) for name in self._task.names], 1)
+        tail = finite(self.deciding(reached)[0], self._task)
+        plans = torch.cat((head, tail[:, : self._task.horizon - length]), 1)
+        judged = judged_openly(self._task, starts, plans)
+        rows = [plans, judged.rho, judged.safe, judged.requirements, self._task.cost(judged)]
+        if falls:
+            rows.append(prefix_robustness(self._formulas, judged.columns).t())
+        return [row.reshape(-1, count, *row.shape[1:]) for row in rows]
+
+
+def _safest(tried: _Tried, falls: Tensor) -> Tensor:
+    """The plan with the longest safe prefix; of several the most robust, the latest to fail."""
+    samples = (falls >= -TOLERANCE).sum(2)
+    depth = falls.clamp(max=0.0).mean(2)
+    longest = samples == samples.amax(1, keepdim=True)
+    return best(longest, (tried.rho, depth, -tried.cost))
+
+
+def _picked(tried: _Tried, pick: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def at(values: Tensor) -> Tensor:
+        index = pick.view(-1, *[1] * (values.dim() - 1)).expand(-1, 1, *values.shape[2:])
+        return values.gather(1, index)[:, 0]
+
+    return at(tried.plans), at(tried.rho), at(tried.safe), at(tried.each)
+
+
+def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """What a shorter prefix decided, and elsewhere what this one found."""
+    return tuple(
+        torch.where(decided.view(-1, *[1] * (old.dim() - 1)), old, new)
+        for old, new in zip(before, here, strict=True)
+    )
+
+
+def recorded_guard(task: Task, network: PlanNetwork) -> ExportedProgram:
+    """The backup policy as a program for any number of states; they and the plans are float64."""
+    module = Guarding(task, network).eval()
+    x = task.sample(2, seed=0, dtype=torch.float64)
+    plan = torch.zeros(2, task.horizon, len(task.system.controls), dtype=torch.float64)
+    with torch.no_grad(), unmoved():
+        module(x, plan)  # constants that are remembered are made here, not while recording
+        batch = torch.export.Dim("batch", min=1)
+        shapes = ({0: batch}, {0: batch})
+        return torch.export.export(module, (x, plan), strict=False, dynamic_shapes=shapes)

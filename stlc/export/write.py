@@ -12,11 +12,10 @@ import torch
 
 from stlc.compile.backends.c.numbers import Untranslatable
 from stlc.diagnostics import Diagnostic, UsageError
-from stlc.export import c_weights, emit
-from stlc.export.c_public import public
-from stlc.export.guarding import recorded_guard
+from stlc.export import c_header
+from stlc.export.c_header import public, weights
 from stlc.export.onnx_write import Latency, timed, write_onnx
-from stlc.export.programs import recorded
+from stlc.export.programs import recorded, recorded_guard
 from stlc.export.verify import (
     Agreement,
     Unchecked,
@@ -127,15 +126,15 @@ def _onnx(run: Run, folder: Path) -> Checked:
 def _c(run: Run, folder: Path) -> Checked:
     """A header, its weights, an example program and its Makefile."""
     try:
-        text = emit.header(run.task, run.network)
+        text = c_header.header(run.task, run.network)
     except Untranslatable as error:
         finding = Diagnostic("U101", f"this task has no C form: {error}", help=("take --to torch instead",))
         raise UsageError(finding) from error
-    headers = {"stlc_controller.h": text, "stlc_weights.h": c_weights.weights(run.network)}
+    headers = {"stlc_controller.h": text, "stlc_weights.h": weights(run.network)}
     texts = {
         **public(headers, "STLC_CONTROLLER_H"),
-        "main.c": emit.main_of(run.task),
-        "Makefile": emit.makefile(),
+        "main.c": c_header.main_of(run.task),
+        "Makefile": c_header.makefile(),
     }
     for name, content in texts.items():
         (folder / name).write_text(content, encoding="utf-8")

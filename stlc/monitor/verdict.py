@@ -30,7 +30,7 @@ from stlc.monitor.instants import (
     starts_of,
 )
 from stlc.monitor.judgement import Bools, Judgement, Status, Verdict, unknown_requirement
-from stlc.monitor.needs import needs_of
+from stlc.monitor.needs import Need, needs_of
 from stlc.monitor.prepared import Prepared
 from stlc.monitor.reading import reading_of
 from stlc.monitor.signals import Given, arrange
@@ -85,6 +85,7 @@ class Monitor:
             self._system, self._interface = system_of(str(system), self.spec, self._overrides)
         self._resolved = resolve_for(self.spec, self._interface, self._overrides, "check")
         self._compiled: dict[Grid, Compiled] = {}
+        self._needs: dict[tuple[Grid, tuple[str, ...], bool], tuple[Need, ...]] = {}
         known = Times(self._asked.dt, self._asked.horizon).or_else(self._system)
         if not self._lacks(known):  # else the first trace may say the time step
             self._compile(known)
@@ -242,8 +243,10 @@ class Monitor:
         rules = _chosen(compiled.requirements, require)
         if not rules:
             raise UsageError(Diagnostic("U101", f"`{compiled.name}` has no requirement to judge"))
-        read = [*rules, *compiled.assumptions] if plain else rules
-        signals = arrange(given, needs_of(compiled, read), plain=plain)
+        key = (compiled.grid, tuple(rule.name for rule in rules), plain)
+        if key not in self._needs:
+            self._needs[key] = needs_of(compiled, [*rules, *compiled.assumptions] if plain else rules)
+        signals = arrange(given, self._needs[key], plain=plain)
         return Prepared(compiled, rules, signals, Record.of(signals.env, signals.ops))
 
     def _ready(self, recorded: Times) -> Compiled:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from stlc.export.c_public import public
+from stlc.export.c_header import public
 
 HEADER = """\
 #ifndef OURS_H

@@ -10,15 +10,15 @@ from exported import run_of
 
 from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.search import StagedSearch
-from stlc.export import guarding
-from stlc.export.guarding import Guarding
+from stlc.export import programs
+from stlc.export.programs import Guarding
 from stlc.runtime.prefixes import Grid
 
 
-@pytest.mark.parametrize("at_once", [guarding.AT_ONCE, 40], ids=["whole", "in pieces"])
+@pytest.mark.parametrize("at_once", [programs.AT_ONCE, 40], ids=["whole", "in pieces"])
 def test_every_rule_of_the_backup(at_once: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = run_of("traffic", "car", tmp_path)
-    monkeypatch.setattr(guarding, "AT_ONCE", at_once)
+    monkeypatch.setattr(programs, "AT_ONCE", at_once)
     x = run.task.sample(60, seed=5, dtype=torch.float64)
     plan = run.policy.plan(x)
     plan[7] = torch.nan

@@ -18,9 +18,7 @@ from stlc.dynamics.model.algebra import substitute
 from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.step import Step
-from stlc.export.onnx_graphs import deciding, judging
-from stlc.export.onnx_judge import columns_of, deepened, judged
-from stlc.export.onnx_rollout import rolled
+from stlc.export.onnx_graphs import columns_of, deciding, deepened, judged, judging, rolled
 from stlc.export.verify import kept_agreement, same_verdicts
 from stlc.runtime.facts import read_facts
 from stlc.runtime.graphs import Graphs

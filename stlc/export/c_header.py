@@ -1,0 +1,455 @@
+"""A controller as one C header: policy, model, monitor and the paper's backup policy; for C99 and C++11.
+
+The passes are those of the native kernel, which stands alone and calls its functions `roll` and `check`. In a
+header such names would meet those of the program that includes it, so every name gets a prefix.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import reduce
+from importlib.resources import files
+from string import Template
+from typing import TYPE_CHECKING, assert_never
+
+import torch
+from torch import nn
+
+from stlc.compile.backends.c.emit import CHECK, HEAD, forward_blocks, passes, state_index
+from stlc.compile.backends.c.numbers import Leaf, NumberWriter, Untranslatable, literal
+from stlc.compile.backends.c.parts import declared, in_parts
+from stlc.compile.backends.c.plan import plan_of
+from stlc.compile.ir import nodes as ir
+from stlc.controller.guard.candidates import grid_of
+from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
+from stlc.controller.problem.native import motion_of
+from stlc.controller.problem.task import KEPT, PULL, SHORT, Task
+from stlc.dynamics.declaration.learning import START
+from stlc.dynamics.model.controls import raw_width
+from stlc.dynamics.model.step import commands
+from stlc.escape import c_comment, c_string
+from stlc.runtime.prefixes import generators
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from stlc.compile.augment.timers import Timer
+    from stlc.compile.backends.c.emit import Motion
+    from stlc.compile.backends.c.plan import Plan
+    from stlc.compile.pipeline import CompiledRequirement
+    from stlc.controller.policies.policy import PlanNetwork
+    from stlc.controller.problem.pending_goals import Promise
+    from stlc.dynamics.model.mirror import Mirror
+    from stlc.signature import Column
+
+
+# ------------------------------------------------------------------------------------ names of its own
+
+
+PREFIX = "stlc_"
+OWN = ("stlc_", "STLC_")
+
+_DECLARED = (
+    re.compile(r"^(?:APART )?static (?:inline )?(?:const )?\w+ \**(\w+)\(", re.M),  # functions
+    re.compile(r"^typedef \w+ (\w+)(?:\[\w+\])*;", re.M),
+    re.compile(r"^static const [\w *]*?(\w+)(?:\[\w*\])+ = ", re.M),  # arrays
+)
+_DEFINED = re.compile(r"^#define (\w+)", re.M)
+_TOKEN = re.compile(
+    r"""/\*.*?\*/ | "(?:\\.|[^"\\])*" | \#include[^\n]*            # left as they are
+    | (?P<hex>0x[0-9a-f]+(?:\.[0-9a-f]*)?p[+-]?\d+)
+    | (?P<word>(?<![\w.])(?<!->)[A-Za-z_]\w*)""",
+    re.S | re.X,
+)
+_OPENING = """
+#ifdef __cplusplus
+#define STLC_RESTRICT __restrict
+#else
+#define STLC_RESTRICT restrict
+#endif
+#if defined(__GNUC__) /* what the generated passes do not need of what they are given */
+#pragma GCC diagnostic push
+#pragma GCC diagnostic ignored "-Wunused-parameter"
+#pragma GCC diagnostic ignored "-Wunused-variable"
+#endif
+"""
+_CLOSING = """
+#if defined(__GNUC__)
+#pragma GCC diagnostic pop
+#endif
+"""
+
+
+def public(texts: Mapping[str, str], guard: str) -> dict[str, str]:
+    """Files of a header with every name of theirs prefixed, and with nothing that C++11 does not know.
+
+    Args:
+        texts: name of a file -> its text; what one declares the others may use.
+        guard: the macro that keeps the header from being read twice, by an `#endif` in its last line.
+    """
+    names = dict(found for text in texts.values() for found in _renamed(text))
+    names |= {"restrict": "STLC_RESTRICT", guard: guard}
+    written = {file: _TOKEN.sub(lambda token: _written(token, names), text) for file, text in texts.items()}
+    return {file: _framed(text, f"#define {guard}\n") for file, text in written.items()}
+
+
+def _renamed(text: str) -> Iterator[tuple[str, str]]:
+    """What a text declares, and what it is called from now on."""
+    for pattern in _DECLARED:
+        yield from ((name, PREFIX + name) for name in pattern.findall(text) if not name.startswith(OWN))
+    for name in _DEFINED.findall(text):
+        if not name.startswith(OWN):
+            yield name, PREFIX.upper() + name
+
+
+def _written(token: re.Match[str], names: Mapping[str, str]) -> str:
+    if token["hex"]:
+        return repr(float.fromhex(token["hex"]))  # C++ knows hexadecimal fractions from C++17 on
+    return names.get(token["word"], token[0]) if token["word"] else token[0]
+
+
+def _framed(text: str, guard: str) -> str:
+    """The file with the guard, between what its compiler is told before and after; others as they are."""
+    if guard not in text:
+        return text
+    body, end = text.replace(guard, guard + _OPENING, 1).rsplit("#endif", 1)
+    return f"{body.rstrip()}\n{_CLOSING}\n#endif{end}"
+
+
+# --------------------------------------------------------------------------------------------- weights
+
+
+def weights(network: PlanNetwork) -> str:
+    """`centre` and `scale` of what is observed, and a `weight_0` (in, out) and a `bias_0` per layer."""
+    lines = ["/* float32, row by row; generated */"]
+    lines += [f"static const float centre[] = {{{_row(network.centre)}}};"]
+    lines += [f"static const float spread[] = {{{_row(network.spread)}}};"]
+    for number, layer in enumerate(_layers(network)):
+        rows = ",\n".join(f"{{{_row(row)}}}" for row in layer.weight.detach().t())
+        lines.append(
+            f"static const float weight_{number}[{layer.in_features}][{layer.out_features}] = {{\n{rows}}};"
+        )
+        lines.append(f"static const float bias_{number}[{layer.out_features}] = {{{_row(layer.bias)}}};")
+    return "\n".join(lines) + "\n"
+
+
+def forward(network: PlanNetwork) -> list[str]:
+    """Statements that take `seen` (double) to `raw` (float), through the buffers `h0`, `h1`."""
+    layers = list(_layers(network))
+    lines = [
+        f"for (int i = 0; i < {layers[0].in_features}; ++i) h0[i] = ((float)seen[i] - centre[i]) / spread[i];"
+    ]
+    for number, layer in enumerate(layers):
+        last = number == len(layers) - 1
+        source, target = f"h{number % 2}", "raw" if last else f"h{(number + 1) % 2}"
+        sizes = f"{layer.in_features}, {layer.out_features}"
+        lines.append(
+            f"layer({source}, {target}, &weight_{number}[0][0], bias_{number}, {sizes}, {int(not last)});"
+        )
+    return lines
+
+
+def widest(network: PlanNetwork) -> int:
+    """Numbers that a layer takes at most."""
+    return max(layer.in_features for layer in _layers(network))
+
+
+def _layers(network: PlanNetwork) -> Iterator[nn.Linear]:
+    return (layer for layer in network.body if isinstance(layer, nn.Linear))
+
+
+def _row(values: Tensor) -> str:
+    return ", ".join(_float(value) for value in values.detach().to(torch.float32).tolist())
+
+
+def _float(value: float) -> str:
+    """A float32 that C reads back bit for bit."""
+    text = f"{value:.9g}"
+    return f"{text}f" if any(mark in text for mark in ".en") else f"{text}.0f"
+
+
+# --------------------------------------------------------------------------------------------- numbers
+
+
+def observed(task: Task) -> list[str]:
+    """Statements that fill `seen` from the state `x`."""
+    system = task.system
+    numbers = [*system.decl.policy.observe, *(ir.Signal(column.name) for column in system.added)]
+    if not system.decl.policy.observe:
+        numbers = [ir.Signal(name) for name in system.names]
+    return _assigned("seen", numbers, {name: f"x[{i}]" for i, name in enumerate(system.names)})
+
+
+def later(task: Task) -> list[str]:
+    """Statements that fill `later` with what clocks, statuses and timers are a step after the state `x`."""
+    numbers = [timer.update for timer in task.system.timers]
+    return _assigned("later", numbers, {name: f"x[{i}]" for i, name in enumerate(task.names)})
+
+
+def image_of_state(mirror: Mirror, task: Task) -> list[str]:
+    """Statements that fill `image` from the state `x`."""
+    names = task.names
+    moved = {each.name: each.value for each in task.system.decl.policy.mirror}
+    numbers = [moved.get(name, ir.Signal(name)) for name in names]
+    assert mirror.side < len(names)
+    return _assigned("image", numbers, {name: f"x[{i}]" for i, name in enumerate(names)})
+
+
+def image_of_action(task: Task) -> list[str]:
+    """Statements that fill `image` from the controls `u`; angles stay within a turn of their range."""
+    controls = task.system.controls
+    moved = {each.name: each.value for each in task.system.decl.policy.mirror}
+    numbers = [moved.get(each.name, ir.Signal(each.name)) for each in controls]
+    lines = _assigned("image", numbers, {each.name: f"u[{i}]" for i, each in enumerate(controls)})
+    for i, each in enumerate(controls):
+        if each.squash == "angle":
+            low = literal(each.low)
+            lines.append(f"image[{i}] = floored_mod(image[{i}] - {low}, 2.0 * PI) + {low};")
+    return lines
+
+
+def squashed(task: Task) -> list[str]:
+    """Statements that fill `u` from what the network gives for one step, `raw`."""
+    lines, at = [], 0
+    for i, each in enumerate(task.system.controls):
+        middle, half = literal((each.low + each.high) / 2), literal((each.high - each.low) / 2)
+        match each.squash:
+            case "tanh":
+                unit, width = f"tanhf(raw[{at}])", 1
+            case "clip":
+                unit, width = f"MIN(MAX(raw[{at}], -1.0f), 1.0f)", 1
+            case "angle":
+                unit, width = f"atan2f(raw[{at + 1}], raw[{at}] + 1e-6f) / (float)PI", 2
+        lines.append(f"u[{i}] = (float){middle} + {unit} * (float){half};")
+        at += width
+    return lines
+
+
+def command(task: Task) -> list[str]:
+    """Statements that fill `command` from the state `x` and the first action `u` of a plan."""
+    names, given = task.system.control_names, commands(task.system.decl)
+    places = {name: f"x[{i}]" for i, name in enumerate(task.names)}
+    places |= {name: f"u[{i}]" for i, name in enumerate(names)}
+    return _assigned("command", [given.get(name, ir.Signal(name)) for name in names], places)
+
+
+def _assigned(target: str, numbers: Sequence[ir.Num], places: Mapping[str, str]) -> list[str]:
+    writer = NumberWriter(_columns(places))
+    values = [writer.number(number) for number in numbers]
+    return [*writer.lines, *(f"{target}[{i}] = {value};" for i, value in enumerate(values))]
+
+
+def _columns(places: Mapping[str, str]) -> Callable[[Leaf], str | None]:
+    return lambda leaf: places[leaf.name] if isinstance(leaf, ir.Signal) else None
+
+
+# ------------------------------------------------------------------------ cost
+
+
+def cost(task: Task) -> list[str]:
+    """Statements that add what a plan costs to `cost`, of lane `j` with robustness `rho`."""
+    at = {name: f"x[{i}][k][j]" for i, name in enumerate(task.names)}
+    at |= {name + START: f"x[{i}][0][j]" for i, name in enumerate(task.names)}
+    at |= {"k": "(double)k", "t": f"(k * {literal(task.dt)})", "sat": "1.0", "rho": "rho"}
+    inputs = {name: f"u[{i}][k][j]" for i, name in enumerate(task.system.control_names)}
+    states, controlled = task.system.objective
+    lines: list[str] = []
+    if states is not None:
+        lines += _mean(states, at, task.horizon + 1)
+    if controlled is not None:
+        lines += _mean(controlled, at | inputs, task.horizon)
+    for promise in task.promises.items:
+        lines += _promise(promise, task, at)
+    if task.compiled.guidance_cost is not None:
+        lines += _mean(ir.Op("mul", (ir.Const(PULL), task.compiled.guidance_cost)), at, task.horizon + 1)
+    if task.compiled.timers:
+        gamma = literal(task.system.decl.objective.gamma)
+        lines.append(f"cost += {literal(SHORT)} * MIN(MAX({gamma} - rho, 0.0), {gamma});")
+    return lines
+
+
+def _mean(number: ir.Num, places: Mapping[str, str], count: int) -> list[str]:
+    writer = NumberWriter(_columns(places))
+    value = writer.number(number)
+    body = " ".join([*writer.lines, f"sum += {value};"])
+    return [f"{{ double sum = 0.0; for (int k = 0; k < {count}; ++k) {{ {body} }} cost += sum / {count}; }}"]
+
+
+def _promise(promise: Promise, task: Task, places: Mapping[str, str]) -> list[str]:
+    """What is lacked of gamma where a promise is open."""
+    writer = NumberWriter(_columns(places))
+    margin = writer.number(margin_of(promise.body))
+    clock = places[task.promises.clock]
+    status = places[promise.status].replace("[k]", "[0]")
+    gamma = literal(task.system.decl.objective.gamma)
+    counts = f"{clock} >= {literal(promise.first)} && {clock} <= {literal(promise.last)}"
+    body = " ".join([*writer.lines, f"if ({counts}) top = MAX(top, {margin});"])
+    return [
+        f"if (fabs({status}) < 0.5) {{ double top = -INFINITY;",
+        f"for (int k = 0; k <= {task.horizon}; ++k) {{ {body} }}",
+        f"cost += {literal(KEPT)} * MIN(MAX({gamma} - top, 0.0), {gamma}); }}",
+    ]
+
+
+def margin_of(formula: ir.Formula) -> ir.Num:
+    """The exact robustness of a state formula as a number. Raises Untranslatable for any other formula."""
+    match formula:
+        case ir.Predicate(num, sign, guard=False):
+            return num if sign > 0 else ir.Op("neg", (num,))
+        case ir.BoolOp(op, items):
+            pick = "min" if op == "and" else "max"
+            return reduce(lambda a, b: ir.Op(pick, (a, b)), map(margin_of, items))
+        case ir.Truth(value):
+            return ir.Const(float("inf") if value else float("-inf"))
+        case _:
+            raise Untranslatable(type(formula).__name__)
+
+
+# ------------------------------------------------------------------------------------------ the header
+
+
+def header(task: Task, network: PlanNetwork) -> str:
+    """The text of `stlc_controller.h`, which includes `stlc_weights.h`.
+
+    Raises:
+        Untranslatable: the task holds something that has no C form.
+    """
+    motion = motion_of(task)
+    judged = plan_of([rule.formula for rule in task.rules], task.horizon + 1)
+    falling = plan_of([open_ended(anchored(rule.formula)) for rule in task.compiled.safety], task.horizon + 1)
+    parts = _numbers(task, network) | {
+        "HEAD": HEAD,
+        "PASSES": "\n".join([*passes(motion, judged), *_falling(motion, falling)]),
+        "ROOM": max(judged.size, falling.size, 1),
+    }
+    return _template("controller.h.txt").substitute({name: str(value) for name, value in parts.items()})
+
+
+def main_of(task: Task) -> str:
+    """An example program: states from standard input, decisions to standard output."""
+    return _template("main.c.txt").substitute({"SYSTEM": c_comment(task.system.name)})
+
+
+def makefile() -> str:
+    """How the example is built."""
+    return _template("Makefile.txt").substitute()
+
+
+def _template(name: str) -> Template:
+    return _Template(files("stlc.export").joinpath("templates", name).read_text(encoding="utf-8"))
+
+
+class _Template(Template):
+    delimiter = "@"
+
+
+def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
+    """Sizes, constants and straight-line code."""
+    grid, mirror = grid_of(task), network.mirror
+    most = max((grid.count(length) for length in grid.lengths), default=0)
+    controls = task.system.controls
+    return {
+        "NAME": c_comment(task.system.name),
+        "SPEC": c_comment(task.compiled.name),
+        "STATES": len(task.names),
+        **_added(task),
+        "NAMES": ", ".join(map(c_string, task.names)),
+        "INPUTS": ", ".join(c_string(control.name) for control in controls),
+        "CONTROLS": len(controls),
+        "STEPS": task.horizon,
+        "DT": literal(task.dt),
+        "RULES": len(task.rules),
+        "RULE_NAMES": ", ".join(c_string(rule.name) for rule in task.rules),
+        "SAFETY": len(task.compiled.safety),
+        "PLANS": network.plans,
+        "RAW": raw_width(controls),
+        "OBSERVED": task.system.observed_count,
+        "WIDEST": widest(network),
+        "CHOICES": most + 1,
+        "LENGTHS": ", ".join(map(str, grid.lengths)) or "0",
+        "LENGTH_COUNT": len(grid.lengths),
+        "SAMPLES": grid.samples,
+        "RANDOM": int(grid.sampling == "random"),
+        "GENERATORS": _generators(len(controls) * max(grid.lengths, default=1)),
+        "LEVEL_COUNTS": ", ".join(str(len(values)) for values in grid.values),
+        "MOST_LEVELS": max(map(len, grid.values)),
+        "LEVELS": ", ".join("{" + ", ".join(map(literal, values)) + "}" for values in grid.values),
+        "REST": ", ".join(literal(min(max(0.0, each.low), each.high)) for each in controls),
+        "MIRRORED": int(mirror is not None),
+        "SIDE": 0 if mirror is None else mirror.side,
+        "OBSERVE": _block(observed(task)),
+        "IMAGE_STATE": "" if mirror is None else _block(image_of_state(mirror, task)),
+        "IMAGE_ACTION": "" if mirror is None else _block(image_of_action(task)),
+        "SQUASH": _block(squashed(task)),
+        "FORWARD": _block(forward(network)),
+        "COMMAND": _block(command(task)),
+        "COST": _block(cost(task)),
+        "OVERALL": _block(_overall(task.rules, task.rules)),
+        "SAFE": _block(_overall(task.compiled.safety, task.rules)),
+    }
+
+
+def _in_its_unit(text: str, column: Column) -> str:
+    return f"{text} [{column.unit.text}]" if column.unit.text else text
+
+
+def _added(task: Task) -> dict[str, object]:
+    """What the specification adds to states: what it holds, how it begins and how it goes on."""
+    system, first = task.system, len(task.system.decl.signature.names)
+    measured = [_in_its_unit("measured", column) for column in system.decl.signature.columns]
+    tables = [
+        (_in_its_unit("parameter, the caller's", each.column), each.column) for each in system.parameters
+    ]
+    tables += [(_holds(timer), timer.column) for timer in system.timers]
+    place = first + len(system.parameters)
+    listed = [f"     {c_comment(column.name)}: {c_comment(text)}" for text, column in tables]
+    return {
+        "MEASURED": first,
+        "PARAMETERS": len(system.parameters),
+        "TIMERS": len(system.timers),
+        "ADDED": "\n".join(listed) or "     nothing",
+        "ABOUT": ", ".join(map(c_string, [*measured, *(text for text, _ in tables)])),
+        "BEGIN": _block(
+            [f"x[{place + i}] = {literal(each.initial)};" for i, each in enumerate(system.timers)]
+        ),
+        "ADVANCE": _block(later(task)),
+    }
+
+
+def _holds(timer: Timer) -> str:
+    """What a state holds that the specification adds, in words."""
+    match timer.kind:
+        case "status":
+            about = timer.about.removeprefix("open | true | false").strip()
+            return f"status, 0 open, 1 true, -1 false: {about}"
+        case "latch":
+            return f"1 or 0: {timer.about}"
+        case "clock" | "timer":
+            return timer.about
+        case _:
+            assert_never(timer.kind)
+
+
+def _generators(dims: int) -> str:
+    return ", ".join(f"{each}u" for each in generators(dims))
+
+
+def _block(lines: Sequence[str]) -> str:
+    return "\n".join(f"  {line}" for line in lines)
+
+
+def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequirement]) -> list[str]:
+    """Statements that lower `least` to the weighed robustness of some requirements."""
+    names = [rule.name for rule in among]
+    return [
+        f"least = MIN(least, each[{names.index(rule.name)}] * {literal(rule.weight / rule.scale)});"
+        for rule in rules
+    ]
+
+
+def _falling(motion: Motion, plan: Plan) -> list[str]:
+    """`fall`: the least robustness of phi_safe on a prefix; row STATES is positive beyond its end."""
+    blocks = forward_blocks(plan, state_index(motion) | {BEYOND: len(motion.states)})
+    return in_parts(replace(CHECK, name="fall"), blocks, declared(plan))
