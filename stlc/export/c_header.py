@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from stlc.compile.backends.c.plan import Plan
     from stlc.compile.pipeline import CompiledRequirement
     from stlc.controller.policies.policy import PlanNetwork
-    from stlc.controller.problem.pending_goals import Promise
+    from stlc.controller.problem.pending_goals import PendingGoal
     from stlc.dynamics.model.mirror import Mirror
     from stlc.signature import Column
 
@@ -277,7 +277,7 @@ def _mean(number: ir.Num, places: Mapping[str, str], count: int) -> list[str]:
     return [f"{{ double sum = 0.0; for (int k = 0; k < {count}; ++k) {{ {body} }} cost += sum / {count}; }}"]
 
 
-def _promise(promise: Promise, task: Task, places: Mapping[str, str]) -> list[str]:
+def _promise(promise: PendingGoal, task: Task, places: Mapping[str, str]) -> list[str]:
     """What is lacked of gamma where a promise is open."""
     writer = NumberWriter(_columns(places))
     margin = writer.number(margin_of(promise.body))
@@ -316,7 +316,7 @@ def header(task: Task, network: PlanNetwork) -> str:
     Raises:
         Untranslatable: the task holds something that has no C form.
     """
-    motion = motion_of(task)
+    motion = motion_of(task.system)
     judged = plan_of([rule.formula for rule in task.rules], task.horizon + 1)
     falling = plan_of([open_ended(anchored(rule.formula)) for rule in task.compiled.safety], task.horizon + 1)
     parts = _numbers(task, network) | {

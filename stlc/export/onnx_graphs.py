@@ -330,9 +330,8 @@ def rank(found: Verdicts) -> Value:
     """`stlc.controller.problem.task.rank`, (1, batch)."""
     rho, cost = found.rho, found.cost
     unknown = cost.apply("IsNaN", kind="bool")
-    cheap = ONNX_OPS.where(
-        unknown, 0.0, 1.0 / (1.0 + ONNX_OPS.clamp(ONNX_OPS.where(unknown, 0.0, cost), 0.0, None))
-    )
+    paid = ONNX_OPS.clamp(ONNX_OPS.where(unknown, 0.0, cost), 0.0, None)
+    cheap = ONNX_OPS.where(unknown, 0.0, 1.0 / (1.0 + paid))
     size = rho.apply("Abs")
     poor = ONNX_OPS.where(ONNX_OPS.gt(math.inf, size), rho / (1.0 + size), -1.0) + cheap * TIE
     poor = ONNX_OPS.where(ONNX_OPS.ge(found.safe, -TOLERANCE), poor, poor - 2.0)
