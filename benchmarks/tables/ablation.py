@@ -10,17 +10,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 
 from benchmarks.options import OnlyOption, Output, Training, chosen
+from benchmarks.store import Result
+from benchmarks.table import Table, provenance, show, write_section
+from benchmarks.training import Cell, Length, filled, grouped
 from stlc.cli.framework.program import command
-
-if TYPE_CHECKING:
-    from benchmarks.store import Result
-    from benchmarks.table import Table
-    from benchmarks.training import Cell, Length
 
 BENCHMARK = "traffic"
 BUDGETS = (60.0,)
@@ -153,8 +151,6 @@ COLUMNS: dict[str, Callable[[Row], str]] = {
 
 def cells_of(axes: Sequence[str], trainings: Sequence[tuple[int, Length]], held_out: int) -> list[Cell]:
     """The trainings of the tables; what several tables have in common is one of them."""
-    from benchmarks.training import Cell
-
     settings = [("base", "")]
     settings += [
         (axis.name, value)
@@ -175,9 +171,6 @@ def cells_of(axes: Sequence[str], trainings: Sequence[tuple[int, Length]], held_
 
 def table(results: Sequence[Result], axes: Sequence[str]) -> Table[Any, Row]:
     """The rows of axis after axis, each with the defaults in their place."""
-    from benchmarks.table import Table
-    from benchmarks.training import grouped
-
     groups = grouped(results, lambda cell: (cell.axis, cell.value, cell.length.text))
     lengths = dict.fromkeys(length for _, _, length in groups)
     cells = []
@@ -208,8 +201,6 @@ def _row(axis: Axis, value: str, length: str, own: Sequence[Result]) -> Row:
 
 def section(results: Sequence[Result]) -> list[str]:
     """The section of the page; an axis of which only the default is known is left out."""
-    from benchmarks.table import provenance
-
     lines = ["## Ablation", "", TEXT.rstrip()]
     for axis in AXES:
         made = table(results, [axis.name])
@@ -227,9 +218,6 @@ def ablation(only: OnlyOption = None, training: Training = _TRAINING, output: Ou
     60 s if no budget is given. Results of the same inputs are kept; a training that was cut short goes on
     where it stopped. Exit code 1 if a training broke off.
     """
-    from benchmarks.table import show, write_section
-    from benchmarks.training import filled
-
     axes = chosen(only, [axis.name for axis in AXES], "table")
     place = training.place("ablation")
     filling = filled(cells_of(axes, training.seeds_and_lengths(BUDGETS), training.held_out), place)

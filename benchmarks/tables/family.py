@@ -10,17 +10,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 
 from benchmarks.options import OnlyOption, Output, Training, chosen
+from benchmarks.store import Key, Result, ResultStore, load
+from benchmarks.table import Table, provenance, show, write_section
+from benchmarks.training import Cell, Place, filled, grouped
+from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
-
-if TYPE_CHECKING:
-    from benchmarks.store import Key, Result, ResultStore
-    from benchmarks.table import Table
-    from benchmarks.training import Place
+from stlc.controller.evaluation.held_out import score, wilson
+from stlc.controller.training.run import Run
 
 BUDGETS = (60.0,)
 TEXT = """\
@@ -54,8 +55,6 @@ class Family:
 
     def sampled(self) -> tuple[float, float]:
         """The range that training draws from, as the specification declares it."""
-        from benchmarks.store import load
-
         (each,) = load(self.name).compiled.parameters
         assert each.column.low is not None
         assert each.column.high is not None
@@ -130,17 +129,12 @@ def _named(name: str) -> Family:
 
 def key_of(training: Result, value: float) -> Key:
     """The inputs of the verdict on a trained policy at one value."""
-    from benchmarks.store import Key
-
     values = {"training": training["key"], "trained": training["made"]["date"], "value": value}
     return Key(f"{training['name']} at {value:g}", values)
 
 
 def judge_all(trainings: Sequence[Result], place: Place, verdicts: ResultStore) -> list[dict[str, str]]:
     """Judge policies at the values where they were not judged yet; name and reason of those that cannot."""
-    from benchmarks.training import Cell
-    from stlc.cli.framework.output import say
-
     failed = []
     for training in trainings:
         cell = Cell.of(training)
@@ -160,18 +154,12 @@ def judge_all(trainings: Sequence[Result], place: Place, verdicts: ResultStore) 
 
 def _verdict(run: Path, family: Family, value: float, held_out: int) -> Mapping[str, Any]:
     """Held-out accuracy of a policy where the parameter has one value."""
-    from stlc.controller.evaluation.held_out import score
-    from stlc.controller.training.run import Run
-
     opened = Run.open(run, overrides={family.parameter: f"{value}{family.unit}"})
     return score(opened.task, opened.policy, n=held_out).summary()
 
 
 def table(trainings: Sequence[Result], verdicts: ResultStore) -> Table[Any, Row]:
     """Families, then lengths, then values."""
-    from benchmarks.table import Table
-    from benchmarks.training import grouped
-
     cells = [
         (family, length, value, found)
         for (benchmark, length), own in grouped(
@@ -186,8 +174,6 @@ def table(trainings: Sequence[Result], verdicts: ResultStore) -> Table[Any, Row]
 
 
 def _row(family: Family, length: str, value: float, found: Sequence[tuple[Result, Result]]) -> Row:
-    from stlc.controller.evaluation.held_out import wilson
-
     low, high = family.sampled()
     accuracy = fmean(float(verdict["accuracy"]) for _, verdict in found)
     return Row(
@@ -201,8 +187,6 @@ def _row(family: Family, length: str, value: float, found: Sequence[tuple[Result
 
 def section(trainings: Sequence[Result], made: Table[Any, Row]) -> list[str]:
     """The section of the page: a table for each family."""
-    from benchmarks.table import provenance
-
     lines = ["## One policy for a family", "", TEXT.rstrip()]
     for family in FAMILIES:
         if own := [row for row in made.rows if row.family == family.name]:
@@ -226,10 +210,6 @@ def family(only: OnlyOption = None, training: Training = _TRAINING, output: Outp
     60 s if no budget is given. Results of the same inputs are kept, verdicts at single values too; a training
     that was cut short goes on where it stopped. Exit code 1 if a training broke off.
     """
-    from benchmarks.store import ResultStore
-    from benchmarks.table import show, write_section
-    from benchmarks.training import Cell, filled
-
     names = chosen(only, [each.name for each in FAMILIES], "family")
     cells = [
         Cell(name, "guided", seed, length, training.held_out)

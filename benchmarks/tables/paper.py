@@ -6,18 +6,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from benchmarks.curves import Panel, curve_of, draw_benchmarks
+from benchmarks.feasible import KnownFeasible, known_feasible, search_on
 from benchmarks.options import OnlyOption, Output, Training, chosen
+from benchmarks.store import BENCHMARKS, Result, ResultStore
+from benchmarks.table import Table, provenance, show, write_section
+from benchmarks.training import Cell, benchmark_order, filled, grouped
 from stlc.cli.framework.program import command
+from stlc.controller.evaluation.held_out import wilson
+from stlc.files import write_atomic
 from stlc.registry import METHODS
-
-if TYPE_CHECKING:
-    from benchmarks.feasible import KnownFeasible
-    from benchmarks.store import Result
-    from benchmarks.table import Table
+from stlc.view import available
 
 BUDGETS = (60.0, 300.0)
 PICTURE = "img/results.svg"
@@ -75,9 +78,6 @@ class Row:
 
 def row_of(own: Sequence[Result], known: Mapping[str, KnownFeasible]) -> Row:
     """The row of the results of a benchmark, method and length."""
-    from benchmarks.training import Cell
-    from stlc.controller.evaluation.held_out import wilson
-
     cell, accuracies = Cell.of(own[0]), tuple(float(each["accuracy"]) for each in own)
     found = known.get(cell.benchmark)
     return Row(
@@ -123,9 +123,6 @@ FEASIBLE: dict[str, Callable[[KnownFeasible], str]] = {
 
 def tables(results: Sequence[Result], known: Mapping[str, KnownFeasible]) -> dict[str, Table[Any, Any]]:
     """The rows of benchmarks, methods and lengths; and the known feasible shares of these benchmarks."""
-    from benchmarks.table import Table
-    from benchmarks.training import benchmark_order, grouped
-
     groups = grouped(results, lambda cell: (cell.benchmark, cell.method, cell.length.text))
     ordered = sorted(
         groups.values(),
@@ -145,8 +142,6 @@ def tables(results: Sequence[Result], known: Mapping[str, KnownFeasible]) -> dic
 
 def section(results: Sequence[Result], known: Mapping[str, KnownFeasible], *, picture: bool) -> list[str]:
     """The section of the page."""
-    from benchmarks.table import Table, provenance
-
     made = tables(results, known)
     requirements = Table("requirements", made["rows"].rows, lambda row: row, REQUIREMENTS)
     return [
@@ -160,10 +155,6 @@ def section(results: Sequence[Result], known: Mapping[str, KnownFeasible], *, pi
 
 def draw(results: Sequence[Result], known: Mapping[str, KnownFeasible], folder: Path) -> bool:
     """Draw accuracy over time of the longest trainings into the page's folder, where that can be done."""
-    from benchmarks.curves import Panel, curve_of, draw_benchmarks
-    from stlc.files import write_atomic
-    from stlc.view import available
-
     longest: dict[str, dict[tuple[str, int], Result]] = {}
     for each in sorted(results, key=lambda each: float(each["seconds"])):
         key = each["key"]
@@ -203,11 +194,6 @@ def paper(
     60 s and 300 s if no budget is given. Results of the same inputs are kept; a training that was cut short
     goes on where it stopped. Exit code 1 if a training broke off.
     """
-    from benchmarks.feasible import known_feasible, search_on
-    from benchmarks.store import BENCHMARKS, ResultStore
-    from benchmarks.table import show, write_section
-    from benchmarks.training import Cell, filled
-
     names = chosen(only, BENCHMARKS, "benchmark")
     which = [method for method in METHODS.names if method in chosen(methods, METHODS.names, "method")]
     cells = [
