@@ -313,7 +313,7 @@ def test_margins_come_as_json_lines(there: RunDir, capsys: pytest.CaptureFixture
     assert "step 30 / 30" in captured.err
     lines = [json.loads(line) for line in Path("m.jsonl").read_text().splitlines()]
     assert len(lines) == 31 * 8
-    wanted = load_schema("simulate/1")["$defs"]["margins"]
+    wanted = load_schema("robustness-line")
     assert [misfits(line, wanted) for line in lines] == [[]] * len(lines)
     assert [(line["step"], line["seed"], line["agent"]) for line in lines] == [
         (step, seed, agent) for step in range(31) for seed in (0, 1) for agent in range(4)

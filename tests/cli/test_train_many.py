@@ -39,15 +39,15 @@ def test_every_seed_is_a_run_of_its_own(
 ) -> None:
     """In this process, as far as the processes of `test_sweep.py` are not asked for."""
 
-    def here(errands, *, jobs, begun):
-        assert jobs == 2
-        for errand in errands:
-            begun(errand)
-            code = main(["train", *errand.arguments, "--threads", "1", "--json"])
-            yield JobResult(errand, code, json.loads(capsys.readouterr().out), "", 1)
+    def here(executor, jobs, begun):
+        assert executor.workers == 2
+        for job in jobs:
+            begun(job)
+            code = main(["train", *job.arguments, "--threads", "1", "--json"])
+            yield JobResult(job, code, json.loads(capsys.readouterr().out), "", 1)
 
     if not real:
-        monkeypatch.setattr("stlc.controller.parallel.jobs.side_by_side", here)
+        monkeypatch.setattr("stlc.controller.parallel.jobs.LocalExecutor.run", here)
     words = ["train", SPEC, "--seeds", "3..4", "--jobs", "2", "--steps", "2", "--set", "T_red=3s", *QUICK]
     code = main([*words, "--name", "pair", "--runs", str(tmp_path), "--json"])
     document = json.loads(capsys.readouterr().out)

@@ -34,9 +34,9 @@ def schema(
 
 def names() -> list[str]:
     """All schemas, such as `check/1`; `system-file/1` is that of system files."""
-    from stlc.cli.framework.documents import RESULTS
+    from stlc.cli.framework.documents import LINES, RESULTS
 
-    return sorted(f"{name}/1" for name in (*RESULTS, SYSTEM_FILE))
+    return sorted(f"{name}/1" for name in (*RESULTS, *LINES, SYSTEM_FILE))
 
 
 def load_schema(name: str) -> dict[str, Any]:
@@ -55,8 +55,10 @@ def load_schema(name: str) -> dict[str, Any]:
         from stlc.dynamics.declaration.load import system_schema
 
         return {"$schema": _DIALECT, "title": wanted, **system_schema()}
-    from stlc.cli.framework.documents import RESULTS, Document, schema_of
+    from stlc.cli.framework.documents import LINES, RESULTS, Document, schema_of
 
+    if command in LINES:
+        return {"$schema": _DIALECT, "title": wanted, **schema_of(LINES[command])}
     frame = schema_of(Document)
     frame["properties"] |= {"schema": {"const": wanted}, "result": schema_of(RESULTS[command] | None)}
     return {"$schema": _DIALECT, "title": wanted, **frame}

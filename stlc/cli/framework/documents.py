@@ -458,6 +458,25 @@ class JudgeSpec(TypedDict):
     rules: dict[str, str]
 
 
+class LiveMargin(TypedDict):
+    status: Literal["satisfied", "violated", "inconclusive"]
+    low: Num
+    high: Num
+    violated: Count
+
+
+class RobustnessLine(TypedDict):
+    step: Count
+    t: float
+    seed: int
+    agent: Count
+    decided: str | None
+    plan_rho: Num | None
+    policy_rho: Num | None
+    plan_safe: bool | None
+    margins: dict[str, LiveMargin]
+
+
 class Simulation(TypedDict):
     scenarios: NotRequired[dict[str, ScenarioResult]]
     spec: str
@@ -613,6 +632,8 @@ RESULTS: dict[str, Any] = {
     "train": TrainedRun | TrainedRuns,
 }
 """The result of each command's document, by the name of its schema."""
+LINES: dict[str, Any] = {"robustness-line": RobustnessLine}
+"""Documents without a frame, one a line: those of `simulate --robustness`."""
 
 
 # ------------------------------------------------------------------------------ JSON Schema
