@@ -59,7 +59,7 @@ class ControlDecl:
     levels: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(repr=False, eq=False)
 class StateKeys:
     """The keys of a state."""
 
@@ -76,7 +76,7 @@ class StateKeys:
     to: Node | None = key(raw(EXPRESSION), "value after a reset; 0 unless given")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(repr=False, eq=False)
 class ParamKeys:
     """The keys of a parameter."""
 
@@ -88,7 +88,7 @@ class ParamKeys:
     boolean: bool = key(FLAG, "takes 0 and 1", False, name="bool")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(repr=False, eq=False)
 class ControlKeys:
     """The keys of a control."""
 

@@ -57,7 +57,7 @@ class FunctionDecl:
         raise SystemFileError(Diagnostic("S208", message, self.span, "named here", help=(form,)))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(repr=False, eq=False)
 class FunctionKeys:
     """The keys of a function from outside."""
 

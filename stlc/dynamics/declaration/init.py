@@ -33,7 +33,6 @@ from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Sequence
 from stlc.files import beside
 from stlc.signature import Column
 from stlc.source import Span
-from stlc.trace.formats.registry import SUFFIXES
 
 MAX_COUNT = 1_000_000
 
@@ -96,7 +95,7 @@ class InitDecl:
     span: Span | None = field(default=None, compare=False, repr=False)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(repr=False, eq=False)
 class SituationKeys:
     """The keys of a situation, and of each branch of one."""
 
@@ -108,7 +107,7 @@ class SituationKeys:
     also: Node | None = key(_DRAWS, "further values, in place of those of `draw`")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(repr=False, eq=False)
 class InitKeys:
     """The section `init`."""
 
@@ -120,7 +119,7 @@ class InitKeys:
     let: Node | None = key(_DRAWS, "local names for `draw`")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(repr=False, eq=False)
 class AxisKeys:
     """Evenly spaced values of a grid."""
 
@@ -355,6 +354,8 @@ def _file(node: Node, names: tuple[str, ...], cx: Context) -> FileDecl | None:
     text = cx.reader.text(node, "`from`")
     if text is None:
         return None
+    from stlc.trace.formats.registry import SUFFIXES
+
     if Path(text).suffix.lower() not in SUFFIXES:
         cx.reader.wrong(node, "`from`", "a file of states", f"formats: {', '.join(SUFFIXES)}")
     return FileDecl(beside(Path(node.span.source.name).parent, text), names, node.span)

@@ -75,7 +75,7 @@ _EXTENDS = "extends"
 _PLUGIN = "dynamics from a plugin"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(repr=False, eq=False)
 class SystemKeys:
     """The sections of a system file."""
 
