@@ -104,7 +104,7 @@ SEARCHES: dict[str, Callable[[int], float]] = {
 
 @pytest.mark.parametrize("slow", STEADY)
 @pytest.mark.parametrize("search", SEARCHES)
-@pytest.mark.parametrize("step_cost", [0.004, 0.01, 0.03])
+@pytest.mark.parametrize("step_cost", [0.004, 0.03])
 @pytest.mark.parametrize("seconds", [30.0, 120.0])
 def test_a_budget_is_met_whatever_the_machine_does(
     slow: str, search: str, step_cost: float, seconds: float
