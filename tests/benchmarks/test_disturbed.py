@@ -132,7 +132,7 @@ def test_starts_are_searched_once(monkeypatch: pytest.MonkeyPatch) -> None:
         asked.append(len(x0))
         return x0[:, 0] > 0
 
-    monkeypatch.setattr(drives, "savable", search)
+    monkeypatch.setattr(drives, "viable", search)
     starts, x0 = Deployments(ResultStore("some"), Drives()), torch.tensor([[1.0], [-1.0]])
     for _ in range(3):
         assert starts.viable(None, x0.clone()).tolist() == [True, False]  # type: ignore[arg-type]

@@ -37,7 +37,7 @@ def returned(job: Job, seed: int, code: int) -> JobResult:
 def test_every_seed_is_a_run_of_its_own(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *, real: bool
 ) -> None:
-    """In this process, as far as the processes of `test_sweep.py` are not asked for."""
+    """In this process, for the processes themselves see `test_jobs.py`."""
 
     def here(executor, jobs, begun):
         assert executor.workers == 2
