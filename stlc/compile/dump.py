@@ -28,7 +28,7 @@ _TIED = re.compile(r" (?=[<>=!*/+-]+ )|(?<= [<>=!*/+-]) |(?<=[<>=!]=) ")
 """Blanks around the signs of comparisons and sums."""
 
 Part: TypeAlias = Literal["all", "steps", "states", "ir"]
-"""What to show: everything, what became of time, the states, or the formulas."""
+"""Part to show: everything, time in samples, the states, or the formulas."""
 
 
 def dump(compiled: Compiled, part: Part = "all") -> str:
@@ -67,7 +67,7 @@ def _rules(compiled: Compiled) -> Iterator[tuple[CompiledRequirement, str]]:
 
 
 def _beside(compiled: Compiled) -> Iterator[str]:
-    """What was written on the left, what became of it on the right."""
+    """The requirements as written on the left, as compiled on the right."""
     written = [show(rule.typed.written) for rule, _ in _rules(compiled)]
     left = min(max(map(len, [*written, "written"])), LEFT)
     yield f"    {'written':<{left}}  compiled"

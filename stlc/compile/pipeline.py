@@ -43,7 +43,7 @@ from stlc.signature import Signature
 from stlc.source import Span
 
 Purpose: TypeAlias = Literal["train", "check"]
-"""What a specification is compiled for.
+"""Purpose of a compilation.
 
 `train`: for plans over the horizon; absolute intervals and the past become states, and no window may leave
 the plan (E306).
@@ -139,7 +139,7 @@ class Compiled:
 
     @property
     def reach(self) -> int:
-        """How many steps of the future the whole needs."""
+        """Lookahead of the whole, in steps."""
         return max((rule.reach for rule in self.requirements), default=0)
 
 

@@ -1,1 +1,1 @@
-"""What was written: concrete syntax, AST, parser, printer."""
+"""The language: concrete syntax, AST, parser, printer."""

@@ -1,4 +1,4 @@
-"""Where a formula without parentheses means one thing here and another in other tools.
+"""Formulas that mean one thing here and another in other tools for want of parentheses.
 
 What the others do, from their grammars:
 
@@ -58,7 +58,7 @@ def ambiguities(spec: ast.Spec, *, implications: bool = False) -> Iterator[Ambig
 
 
 class _Words:
-    """What stands beside a part of the text, and which parts will be in parentheses."""
+    """Words beside a part of the text, and parts that will be in parentheses."""
 
     def __init__(self, spec: ast.Spec) -> None:
         self.items: list[Lexeme] = list(lexemes(spec.source.text))
@@ -66,7 +66,7 @@ class _Words:
         self.parenthesised: set[tuple[int, int]] = set()
 
     def closed(self, node: ast.Node, *, left: bool) -> bool:
-        """Whether an operand stands in parentheses; `left` says on which side of its operator."""
+        """True if an operand stands in parentheses; `left` says on which side of its operator."""
         if (node.span.start, node.span.end) in self.parenthesised:
             return True
         at = bisect_left(self.starts, node.span.end if left else node.span.start)

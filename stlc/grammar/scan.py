@@ -79,7 +79,7 @@ def declaration_starts(text: str) -> list[int]:
 
 
 def _is_pragma(text: str, word: Lexeme, behind: Lexeme) -> bool:
-    """Whether `spec name`, `system "path"` or `time unit` begins a line; no expression has such a pair."""
+    """True if `spec name`, `system "path"` or `time unit` begins a line; no expression has such a pair."""
     if word.text not in PRAGMAS or (word.start and text[word.start - 1] != "\n"):
         return False
     named = behind.kind in ("word", "quoted", "string") and behind.text not in _NO_PRAGMA
@@ -106,10 +106,10 @@ def brackets(items: Sequence[Lexeme]) -> list[Bracket]:
 
 
 def opens_interval(before: Lexeme) -> bool:
-    """Whether a bracket behind this lexeme may hold an interval."""
+    """True if a bracket behind this lexeme may hold an interval."""
     return before.text == "@" or (before.kind == "word" and before.text.rstrip("_") in _TEMPORAL)
 
 
 def closes(bracket: Bracket, text: str) -> bool:
-    """Whether `text` closes an open bracket."""
+    """True if `text` closes an open bracket."""
     return text == _CLOSES[bracket.opening.text] or (bracket.interval and text in (")", "]"))

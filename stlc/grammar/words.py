@@ -83,4 +83,4 @@ PATTERNS = MappingProxyType(
         "EXPONENT": r"(?:\^-?\d+(?!\.?\d)|⁻?[¹²³⁴])",
     }
 )
-"""What stands for `{{NAME}}` in `stl.lark`."""
+"""Replacements of `{{NAME}}` in `stl.lark`."""

@@ -1,1 +1,1 @@
-"""What is worth saying about a specification that is valid: unclear, unused, unusual."""
+"""Linter: findings in valid specifications, unclear, unused or unusual."""

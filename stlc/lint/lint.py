@@ -109,7 +109,7 @@ class Selection:
                 raise UsageError(Diagnostic("U101", f"there is no code `{prefix}`", help=(advice,)))
 
     def wants(self, code: str) -> bool:
-        """Whether findings of this code are told."""
+        """True if findings of this code are told."""
         if not code.startswith("W"):
             return True
         if self.ignore and code.startswith(self.ignore):
@@ -151,7 +151,7 @@ def lint(
 
 
 def _compiled(spec: ast.Spec, within: Surroundings | None) -> Sequence[Diagnostic]:
-    """What the compiler says."""
+    """Findings of the compiler."""
     warnings: list[Diagnostic] = []
     try:
         resolved = resolve(spec, interface=None if within is None else within.interface, sink=warnings)

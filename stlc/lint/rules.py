@@ -82,7 +82,7 @@ def foreign_spellings(spec: ast.Spec) -> Iterator[Diagnostic]:
 
 
 def _own(item: Lexeme, following: Lexeme) -> str | None:
-    """How the language spells a word or sign of another tool."""
+    """Spelling in this language of a word or sign of another tool."""
     if item.kind == "sign":
         return _SIGNS.get(item.text)
     if item.kind != "word":
@@ -93,7 +93,7 @@ def _own(item: Lexeme, following: Lexeme) -> str | None:
 
 
 def _glues(item: Lexeme, following: Lexeme) -> bool:
-    """Whether the word behind a sign would become one with the word that replaces it."""
+    """True if the word behind a sign would become one with the word that replaces it."""
     return following.start == item.end and following.kind in ("word", "number")
 
 

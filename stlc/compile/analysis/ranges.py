@@ -19,7 +19,7 @@ _CHANGES: Mapping[str, Callable[[float, float], float]] = MappingProxyType(
 
 
 def usual_range(num: ir.Num) -> tuple[float, float] | None:
-    """Where nearly all draws of a sampler with known arguments lie; None where nothing is known."""
+    """Range of nearly all draws of a sampler with known arguments; None where nothing is known."""
     match num:
         case ir.Const(value):
             return value, value

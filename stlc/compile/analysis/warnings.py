@@ -135,7 +135,7 @@ def jumps(formula: typed.Formula, ranges: KnownRanges) -> Iterator[Diagnostic]:
 
 
 def _jumps(num: ir.Num, ranges: KnownRanges) -> bool:
-    """Whether `num` is a modulo whose left side may pass a multiple of its right side."""
+    """True if `num` is a modulo whose left side may pass a multiple of its right side."""
     if not isinstance(num, ir.Op) or num.name != "mod":
         return False
     value, period = (bounds(arg, ranges) for arg in num.args)
@@ -242,7 +242,7 @@ def safety_never_violated(requirement: typed.Requirement, tag: ast.Tag | None) -
 
 
 def _constrains(formula: typed.Formula) -> bool:
-    """Whether some finite prefix, shorter than the horizon, can violate a formula in negation normal form."""
+    """True if some finite prefix, shorter than the horizon, can violate a formula in negation normal form."""
     if isinstance(formula, typed.Truth):
         return False
     match formula:
@@ -261,7 +261,7 @@ def _constrains(formula: typed.Formula) -> bool:
 
 
 def _open(window: typed.Interval) -> bool:
-    """Whether a window reaches the horizon or the end."""
+    """True if a window reaches the horizon or the end."""
     return window.hi is None or window.hi.horizons > 0
 
 

@@ -1,4 +1,4 @@
-"""What draws a plan towards deadlines beyond its horizon: a performance term made of the goals.
+"""Guidance cost: a performance term that leads plans towards deadlines beyond their horizon.
 
 Within the horizon robustness says what to do; beyond it nothing does, and a plan could go anywhere. So the
 next open goal, the one that is due first, adds how far its formula is from holding, sample by sample: the
@@ -23,7 +23,7 @@ _ZERO = ir.Const(0.0)
 
 @dataclass(frozen=True, slots=True)
 class _Draw:
-    """How far a goal is from being met, and how many steps it has left."""
+    """Distance of a goal from being met, and the steps that it has left."""
 
     gap: ir.Num
     left: ir.Num

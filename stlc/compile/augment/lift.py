@@ -53,7 +53,7 @@ def _out_of(node: typed.Temporal, body: typed.Formula, sink: list[Diagnostic]) -
 
 
 def _constant(formula: typed.Formula) -> bool:
-    """Whether the truth of `formula` is the same at every instant."""
+    """True if the truth of `formula` is the same at every instant."""
     match formula:
         case typed.Truth():
             return True

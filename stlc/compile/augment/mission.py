@@ -101,7 +101,7 @@ def update(formula: Absolute, clock: ir.Signal) -> Callable[[ir.Signal], ir.Num]
 
 
 def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
-    """What an open status becomes after the sample at hand."""
+    """Next value of an open status, after the sample at hand."""
     inside, left, right = _inside(formula.window, clock), formula.left_now, formula.right_now
     over = _passed(formula.window, clock)
     match formula.op:
@@ -128,7 +128,7 @@ def _inside(window: ir.Window, clock: ir.Signal) -> ir.Formula:
 
 
 def _passed(window: ir.Window, clock: ir.Signal) -> ir.Formula:
-    """Whether the sample at hand is the last one of the window."""
+    """True if the sample at hand is the last one of the window."""
     return ir.Truth(False) if window.hi is None else at_least(clock, ir.Const(float(window.hi)))
 
 
@@ -136,7 +136,7 @@ def _passed(window: ir.Window, clock: ir.Signal) -> ir.Formula:
 
 
 def progress(goal: Goal, horizon: int) -> typed.Formula:
-    """What a plan has to satisfy, from where it starts: true unless falsified by its end."""
+    """Progressed formula: what a plan has to satisfy from its start, true unless falsified by its end."""
     match goal:
         case GoalBranch(op, items, span):
             return typed.Logic(span, op, tuple(progress(item, horizon) for item in items))
@@ -175,7 +175,7 @@ def _remainder(leaf: GoalLeaf, formula: Absolute, horizon: int) -> typed.Formula
 
 
 def possible(goal: Goal) -> typed.Formula:
-    """Whether the mission so far leaves a way to satisfy it; a guard on the state at hand."""
+    """True if the mission so far leaves a way to satisfy it; a guard on the state at hand."""
     match goal:
         case GoalBranch(op, items, span):
             return typed.Logic(span, op, tuple(map(possible, items)))
@@ -186,7 +186,7 @@ def possible(goal: Goal) -> typed.Formula:
 
 
 def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formula:
-    """Whether the sample at hand is in a window of the mission."""
+    """True if the sample at hand is in a window of the mission."""
     begun = time_test(clock, ir.Const(float(window.lo)), span)
     if window.hi is None:
         return begun
@@ -195,7 +195,7 @@ def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formu
 
 
 def _beyond(formula: Absolute, clock: ir.Signal, horizon: int) -> typed.Formula:
-    """Whether the end of the window lies beyond the end of the plan."""
+    """True if the end of the window lies beyond the end of the plan."""
     hi = formula.window.hi
     if hi is None or hi - horizon < 1:
         return typed.Truth(formula.span, hi is None)

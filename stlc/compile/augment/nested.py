@@ -41,7 +41,7 @@ class TooFarError(Exception):
 
 
 def looks_ahead(formula: typed.Formula) -> bool:
-    """Whether `formula` has an operator of the future."""
+    """True if `formula` has an operator of the future."""
     return any(map(_forwards, nodes(formula)))
 
 
@@ -272,7 +272,7 @@ class _Writer:
     # ---------------------------------------------------------------- later, by a fixed time
 
     def delayed(self, formula: typed.Formula, steps: int) -> typed.Formula:
-        """What a formula said `steps` samples ago, by when it is known."""
+        """Truth of a formula `steps` samples ago, by when it is known."""
         if not looks_ahead(formula):
             return self._ago(formula, steps)
         match formula:
@@ -322,7 +322,7 @@ class _Writer:
         return self._and(*when, typed_inside(window, clock, self._span))
 
     def _until_step(self, step: int | None) -> typed.Formula:
-        """Whether the mission is at most so many samples old; always where None is said."""
+        """True if the mission is at most so many samples old; always where None is said."""
         if step is None or step < 0:
             return typed.Truth(self._span, step is None)
         return time_test(ir.Const(float(step)), self._ledger.clock(step + 1), self._span)

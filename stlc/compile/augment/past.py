@@ -145,7 +145,7 @@ class Past:
         )
 
     def _seen(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
-        """Whether `body` held at one of the `most` samples before."""
+        """True if `body` held at one of the `most` samples before."""
         condition = self._condition(body)
         if most is None:
             draft = self._draft("latch", "seen", 0.0, 1.0, f"whether {_short(node.body)} ever held")
@@ -157,7 +157,7 @@ class Past:
         return _Test(ir.Const(float(most)), since, node.span, later=1).decides()
 
     def _held(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
-        """Whether `body` held at all of the `most` samples before."""
+        """True if `body` held at all of the `most` samples before."""
         condition = self._condition(body)
         if most is None:
             draft = self._draft("latch", "kept", 1.0, 1.0, f"whether {_short(node.body)} always held")
@@ -203,7 +203,7 @@ class Past:
     def _recent(
         self, node: typed.Until, left: ir.Formula, right: ir.Formula, most: int | None, *, positive: bool
     ) -> typed.Recalled:
-        """Whether q held at one of the samples before, and p from there on up to now; or its contrary."""
+        """True if q held at one of the samples before, and p from there on up to now; or its contrary."""
         held, met = (left, right) if positive else (negate(left), negate(right))
         about = f"{_short(node.right)}, and {_short(node.left)} from there on"
         if most is None:
@@ -241,7 +241,7 @@ class Past:
         *,
         before: bool,
     ) -> typed.Formula:
-        """What `body` said so many samples ago, in a register; `before`: what it said before the start."""
+        """Truth of `body` some samples ago, in a register; `before` stands for it before the start."""
         if steps > REGISTER:
             return self._refused(node.span, f"that asks what was more than {REGISTER} samples ago")
         condition = self._condition(body)
@@ -357,7 +357,7 @@ class Past:
 
 
 def _counted(own: ir.Num, most: int) -> ir.Num:
-    """One more, up to `most`."""
+    """Saturating increment."""
     return ir.Op("min", (ir.Op("add", (own, _ONE)), ir.Const(float(most))))
 
 

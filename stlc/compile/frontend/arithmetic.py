@@ -240,7 +240,7 @@ def _sense(args: Sequence[Number]) -> Sense:
 
 
 def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) -> bool:
-    """Whether this is a plain number times a difference, or the root of squares: differences again."""
+    """True if this is a plain number times a difference, or the root of squares: differences again."""
     if function.rule in ("sqrt", "pow"):
         return unit.dims == _TEMPERATURE != args[0].unit.dims
     if function.rule not in ("mul", "div"):
@@ -252,7 +252,7 @@ def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) 
 
 
 def _scaled_point(function: Function, args: Sequence[Number]) -> bool:
-    """Whether this is a plain number times a point: a part of a mean, or of a conversion to another scale."""
+    """True if this is a plain number times a point: a part of a mean, or of a conversion to another scale."""
     told = [arg for arg in args if arg.unit.offset or arg.sense == "open"]
     rest = [arg for arg in args if arg not in told]
     plain = all(arg.bare or (arg.unit.dimensionless and not arg.flexible) for arg in rest)
@@ -506,7 +506,7 @@ def _fold(function: Function, args: Sequence[Number], shell: Number, scope: Scop
 
 
 def _whole(function: Function, args: Sequence[Number], shell: Number) -> bool:
-    """Whether the result is a whole number, whatever the arguments are at the moment.
+    """True if the result is a whole number, whatever the arguments are at the moment.
 
     `floor` and its like make whole numbers of SI units: in kilometres these need not be whole.
     """

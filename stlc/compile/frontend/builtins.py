@@ -224,7 +224,7 @@ def _later(number: Number, delay: typed.Time, span: Span) -> Number:
 
 
 def _delta(value: Value, expr: ast.Expr, span: Span, scope: Scope) -> Value:
-    """What changed since the sample before."""
+    """Difference from the sample before."""
     now = (
         value
         if isinstance(value, Vector)

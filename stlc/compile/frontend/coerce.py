@@ -20,7 +20,7 @@ from stlc.source import Span
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """Who wants a value, for messages.
+    """Sort that a place expects, for messages.
 
     Attributes:
         who: the operator or function, with its verb: "`+` adds numbers", "`always` needs a formula".

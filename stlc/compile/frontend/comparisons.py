@@ -46,7 +46,7 @@ def comparison(expr: ast.Compare, values: Sequence[Value], scope: Scope) -> type
 
 
 def sign_span(sign: str, left: Span, right: Span) -> Span:
-    """Where an operator stands between its operands."""
+    """Span of an operator between its operands."""
     gap = left.source.text[left.end : right.start]
     at = gap.find(sign)
     if at < 0:

@@ -70,7 +70,7 @@ def _binds(node: object) -> frozenset[str]:
 
 
 def _parts(node: object) -> Iterator[object]:
-    """What stands inside a node, without the functions that it calls and the modules that it names."""
+    """Children of a node, without the functions that it calls and the modules that it names."""
     if isinstance(node, tuple):
         yield from node
     elif isinstance(node, ast.Node) and not isinstance(node, ast.Attr):
@@ -315,7 +315,7 @@ _SORTS: Mapping[str, Sort] = {"real": "number", "int": "number", "bool": "formul
 
 @dataclass(slots=True)
 class Declared:
-    """What the declarations of a file come to.
+    """Declarations of a file.
 
     Attributes:
         entries: value namespace.

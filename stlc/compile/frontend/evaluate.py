@@ -136,7 +136,7 @@ _VERBS = {"+": "adds", "-": "subtracts", "*": "multiplies", "/": "divides", "%":
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    """How a kind of node is valued: its parts, in order, and what their values make."""
+    """Evaluation rule of a kind of node: its parts, in order, and the value that follows from theirs."""
 
     parts: Callable[[Any], Sequence[ast.Expr]]
     value: Callable[[Any, Sequence[Value], Scope], Value]
@@ -313,7 +313,7 @@ def evaluate(expr: ast.Expr, scope: Scope) -> Value:
 
 
 def _is_written_twice(expr: ast.Expr, value: Value) -> bool:
-    """Whether parts of a formula appear twice in what it means: `a <-> b` is `a -> b` and `b -> a`."""
+    """True if parts of a formula appear twice in what it means: `a <-> b` is `a -> b` and `b -> a`."""
     match expr:
         case ast.Logic(op="<->" | "xor") | ast.Until(op="unless"):
             return True
@@ -385,7 +385,7 @@ def _attr(expr: ast.Attr, scope: Scope) -> Value:
 
 
 def _named(expr: ast.Name, home: Scope, scope: Scope) -> Value:
-    """What a name of `home` is worth in `scope`."""
+    """Value of a name of `home` in `scope`."""
     entry = home.entries.get(expr.name)
     if entry is None:
         return home.unknown(expr)

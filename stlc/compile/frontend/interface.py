@@ -1,4 +1,4 @@
-"""What the compiler may know of a system without loading it."""
+"""Interface of a system: the facts that the compiler knows without loading it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Function(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Interface:
-    """What a system offers to a specification.
+    """States, constants and functions that a system offers to a specification.
 
     Attributes:
         name: of the system.
@@ -54,5 +54,5 @@ class Interface:
 
     @property
     def where(self) -> str:
-        """How messages call it: the path of its file, else its name."""
+        """Name in messages: the path of its file, else its name."""
         return self.path or self.name

@@ -22,7 +22,7 @@ from stlc.source import Source
 STD = "@std"
 _STD_FILE = Path(__file__).with_name("std.stl")
 _MOST = 100
-"""How many files one specification may import, directly or not; one that is imported twice counts twice."""
+"""Limit on imported files, direct or not; one that is imported twice counts twice."""
 
 
 @dataclass(frozen=True, slots=True)

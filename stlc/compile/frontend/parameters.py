@@ -100,7 +100,7 @@ def parameters(
 
 
 def _text(decl: ast.Param) -> str:
-    """How it is drawn, as written."""
+    """Distribution of a parameter, as written."""
     match decl.domain:
         case (low, high):
             return f"in [{low.span.text}, {high.span.text}]"
@@ -126,7 +126,7 @@ def _even(
 
 
 def distribution(expr: ast.Expr, columns: Sequence[Column], unit: Unit, scope: Scope) -> tuple[ir.Num, ...]:
-    """What a distribution gives to each column, in its unit; one number stands for every component.
+    """Draws of a distribution for each column, in its unit; one number stands for every component.
 
     Raises Failed: E203 for another unit, E205 where it reads what is not known before a trajectory begins.
     """

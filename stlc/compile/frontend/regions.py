@@ -54,7 +54,7 @@ def area(corners: Sequence[PlanePoint]) -> float:
 
 
 def simple(corners: Sequence[PlanePoint]) -> bool:
-    """Whether no two edges cross and no two neighbours coincide."""
+    """True if no two edges cross and no two neighbours coincide."""
     edges = list(zip(corners, (*corners[1:], corners[0]), strict=True))
     if any(a == b for a, b in edges):
         return False
@@ -67,7 +67,7 @@ def _crossing(first: tuple[PlanePoint, PlanePoint], second: tuple[PlanePoint, Pl
 
 
 def convex(corners: Sequence[Vector]) -> bool:
-    """Whether a simple polygon with known, counter-clockwise corners is convex."""
+    """True if a simple polygon with known, counter-clockwise corners is convex."""
     plain = points(corners)
     assert plain is not None
     return all(turn(plain[i - 2], plain[i - 1], plain[i]) >= 0 for i in range(len(plain)))
@@ -96,7 +96,7 @@ def triangles(corners: Sequence[Vector]) -> list[tuple[Vector, ...]]:
 
 
 def _is_ear(plain: Sequence[PlanePoint], left: Sequence[int], k: int) -> bool:
-    """Whether corner `k` can be cut off: it is convex and its triangle holds no other corner."""
+    """True if corner `k` can be cut off: it is convex and its triangle holds no other corner."""
     a, b, c = (plain[left[i % len(left)]] for i in (k - 1, k, k + 1))
     if turn(a, b, c) <= 0:
         return False
@@ -105,7 +105,7 @@ def _is_ear(plain: Sequence[PlanePoint], left: Sequence[int], k: int) -> bool:
 
 
 def dimension(region: Region) -> int | None:
-    """How many components its points have; None where any will do."""
+    """Dimension of a region; None where any will do."""
     match region:
         case Ball(center):
             return len(center.items)
@@ -122,7 +122,7 @@ def dimension(region: Region) -> int | None:
 
 
 def signed_distance(point: Vector, region: Region, span: Span, scope: Scope) -> Number:
-    """How far `point` is inside `region` (negative: outside), in SI units.
+    """Signed distance of `point` to the boundary of `region`, in SI units; positive inside.
 
     Raises:
         Failed: the point has another number of components, or another unit (E205, E203).
@@ -190,7 +190,7 @@ def to_segment(point: Vector, start: Vector, end: Vector, span: Span, scope: Sco
 
 
 def _left_of_all(point: Vector, corners: Sequence[Vector], span: Span, scope: Scope) -> ir.Formula:
-    """Whether the point lies left of every edge of a convex, counter-clockwise polygon."""
+    """True if the point lies left of every edge of a convex, counter-clockwise polygon."""
     atoms = []
     for start, end in zip(corners, (*corners[1:], corners[0]), strict=True):
         turn = cross(minus(end, start, span, scope), minus(point, start, span, scope), span, scope)

@@ -205,7 +205,7 @@ def _finish(findings: Sequence[Diagnostic], spec: ast.Spec, sink: list[Diagnosti
 
 
 def _elsewhere(interface: Interface | None) -> dict[str, str]:
-    """What to write for a name that only the system knows."""
+    """Advice for each name that only the system knows."""
     if interface is None:
         return {}
     found = {}
@@ -346,7 +346,7 @@ def _requirements(
 
 
 def _scale(tags: Tags, formula: typed.Formula, ranges: KnownRanges, scope: Scope) -> float:
-    """What the robustness is divided by. Raises Failed (E205) where a range is not known."""
+    """Divisor of the robustness. Raises Failed (E205) where a range is not known."""
     if isinstance(tags.scale, ir.Const):
         return tags.scale.value
     place = tags.scale_span or formula.span

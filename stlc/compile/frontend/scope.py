@@ -49,7 +49,7 @@ class Meter:
 
     @property
     def over(self) -> bool:
-        """Whether a limit is passed."""
+        """True if a limit is passed."""
         return self.nodes > MAX_NODES or self.deepest > MAX_LEVELS
 
     def enter(self) -> None:
@@ -206,7 +206,7 @@ class Scope:
 
     @property
     def in_spec(self) -> bool:
-        """Whether this is a specification, where `T`, `end` and `dt` are words of the language."""
+        """True if this is a specification, where `T`, `end` and `dt` are words of the language."""
         return not issubclass(self.error, SystemFileError)
 
     def extended(self, entries: Mapping[str, Entry], *, samplers: bool | None = None) -> Scope:
@@ -317,5 +317,5 @@ def enforced(columns: Iterable[Column]) -> dict[str, Bounds]:
 
 
 def reserved(name: str) -> bool:
-    """Whether a call of `name` means a built-in function."""
+    """True if a call of `name` means a built-in function."""
     return name in (*callable_names(), *sampler_names())

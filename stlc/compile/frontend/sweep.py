@@ -38,7 +38,7 @@ from stlc.source import Span
 _SHORT = 1e-9
 """Segments shorter than this, in SI units, count as points."""
 _AHEAD = 1e-6
-"""How far behind the start of a piece its formula is read off."""
+"""Offset behind the start of a piece at which its active faces are determined."""
 
 Pair = tuple[Number, Number]
 """A number at both ends of the segment; linear in between."""
@@ -123,7 +123,7 @@ class _Sweep:
         return self._over(faces, (*self.at_ends(box), *outside))
 
     def _over(self, faces: Sequence[Pair], outside: Sequence[Number]) -> Number:
-        """How deep the segment gets between the faces, or how close where it stays outside of one."""
+        """Greatest depth of the segment between the faces, or its least distance where it stays outside."""
         depth = self._depth(faces)
         close = self.apply("max", *outside)
         return self._choose(ir.Predicate(depth.num), depth, close)
@@ -176,7 +176,7 @@ class _Sweep:
         return found
 
     def _passing(self, face: Pair) -> Number:
-        """Where on the segment, from 0 to 1, it passes a face; anywhere if it does not."""
+        """Share of the segment, from 0 to 1, at which it passes a face; any share if it does not."""
         before, after = face
         slope = self.apply("sub", after, before)
         product_ = self.apply("mul", self.negative(before), slope)
@@ -188,7 +188,7 @@ class _Sweep:
     # ------------------------------------------------------------------------ polygons
 
     def _edges(self, corners: Sequence[Vector]) -> list[Pair]:
-        """How far both ends of the segment are left of every edge."""
+        """Signed distances of both ends of the segment to every edge, positive on the left."""
         found = []
         for start, stop in _cycle(corners):
             along = minus(stop, start, self.span, self.scope)
@@ -237,7 +237,7 @@ class _Sweep:
         )
 
     def past(self, place: Vector) -> Number:
-        """How close the segment comes to a point, which may move in a straight line too."""
+        """Least distance of the segment to a point, which may move in a straight line too."""
         now, then = (
             minus(end, there, self.span, self.scope)
             for end, there in zip(self.ends, (place, _vector_later(place)), strict=True)

@@ -73,7 +73,7 @@ _KNOWN = (*MARKS, "weight", "id", "group", "scale", "product")
 
 @dataclass(frozen=True, slots=True)
 class Tags:
-    """What the tags of one requirement say; see `typed.Requirement`.
+    """Tags of one requirement, evaluated; see `typed.Requirement`.
 
     Attributes:
         marks: bare tag names.

@@ -1,4 +1,4 @@
-"""What an expression is worth once its names are bound: a number, a vector, a region, a time, a formula."""
+"""Values of expressions: numbers, vectors, regions, times, enum members and formulas."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Labels: TypeAlias = tuple[tuple[str, float], ...]
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where a named value was declared: the place, and the words for it ("line 5")."""
+    """Declaration of a named value: its span, and the words for it ("line 5")."""
 
     span: Span | None
     text: str
@@ -172,7 +172,7 @@ Value: TypeAlias = Number | Vector | Swept | EnumMember | TimeExpr | Region | ty
 
 
 def is_formula(value: Value) -> bool:
-    """Whether it has margins of its own (the margin of a bool signal is always a half)."""
+    """True if it has margins of its own (the margin of a bool signal is always a half)."""
     return isinstance(value, typed.Node) or (isinstance(value, Number) and value.formula is not None)
 
 

@@ -81,7 +81,7 @@ class _Definedness(Analysis[Defined]):
 
 
 def _throughout(inside: Defined, first: _Instants, last: _Instants) -> Defined:
-    """Whether all instants first..last lie within the trace and are defined; true for none at all."""
+    """True if all instants first..last lie within the trace and are defined; true for none at all."""
     samples = len(inside)
     known = int(np.argmin(inside)) if not inside.all() else samples
     if not inside[known:].any():  # a formula that only looks ahead is defined up to some sample

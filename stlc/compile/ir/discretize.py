@@ -38,7 +38,7 @@ class Grid:
 
 
 def lacks(grid: Grid, formula: typed.Formula) -> bool:
-    """Whether a time in a formula needs a step or a horizon that the grid does not say."""
+    """True if a time in a formula needs a step or a horizon that the grid does not say."""
     return any(
         (time.seconds and grid.dt is None) or (time.horizons and grid.horizon is None)
         for time in _times(formula)

@@ -93,7 +93,7 @@ class Extern:
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """What a function computes: straight-line code.
+    """Body of a function: straight-line code.
 
     Attributes:
         formals: columns that stand for its arguments, component by component.
@@ -115,7 +115,7 @@ _LONG = 1 << 30
 
 
 def at_first(column: Signal) -> ShiftedSignal:
-    """What a column holds at the first sample, wherever it is read."""
+    """Value of a signal at the first sample, wherever it is read."""
     return ShiftedSignal(column.name, -_LONG, clamped=True)
 
 

@@ -215,17 +215,17 @@ def columns(formula: ir.Formula) -> frozenset[str]:
 
 
 def looks_at_ends(num: ir.Num) -> bool:
-    """Whether the value of a number depends on where the trace begins, or on where it ends."""
+    """True if the value of a number depends on where the trace begins, or on where it ends."""
     return any(leaf.clamped for leaf in _shifts(num))
 
 
 def looks_on(num: ir.Num) -> bool:
-    """Whether the value of a number depends on where the trace ends."""
+    """True if the value of a number depends on where the trace ends."""
     return any(leaf.clamped and leaf.steps > 0 for leaf in _shifts(num))
 
 
 def uses_end(formula: ir.Formula) -> bool:
-    """Whether a window of the future runs to the end of the trace, or a segment would leave it (`sweep`)."""
+    """True if a window of the future runs to the end of the trace, or a segment would leave it (`sweep`)."""
     ahead = (node.window for node in nodes(formula) if isinstance(node, (ir.Temporal, ir.Until)))
     return any(window.hi is None for window in ahead) or any(map(looks_on, numbers(formula)))
 

@@ -228,7 +228,7 @@ def margin_unit(formula: typed.Formula) -> str:
 
 
 def on_clock(node: typed.Formula) -> TypeGuard[typed.Temporal | typed.Until]:
-    """Whether the interval of this operator is on the mission clock."""
+    """True if the interval of this operator is on the mission clock."""
     return isinstance(node, (typed.Temporal, typed.Until)) and node.interval.clock == "start"
 
 
@@ -238,19 +238,19 @@ def from_now(node: typed.Temporal | typed.Until) -> typed.Temporal | typed.Until
 
 
 def absolute(formula: typed.Formula) -> bool:
-    """Whether an interval of a formula is on the mission clock."""
+    """True if an interval of a formula is on the mission clock."""
     return any(map(on_clock, nodes(formula)))
 
 
 def looks_back(formula: typed.Formula) -> bool:
-    """Whether a formula has an operator of the past."""
+    """True if a formula has an operator of the past."""
     past = ("once", "historically", "since")
     timed = (node.op for node in nodes(formula) if isinstance(node, (typed.Temporal, typed.Until)))
     return any(op in past for op in timed) or any(isinstance(node, typed.Edge) for node in nodes(formula))
 
 
 def is_state(formula: typed.Formula, *, augmented: bool = False) -> bool:
-    """Whether the truth of a formula depends on one instant alone, with the values that are frozen around it.
+    """True if the truth of a formula depends on one instant alone, with the values that are frozen around it.
 
     Args:
         formula: as typed.
@@ -267,7 +267,7 @@ def is_state(formula: typed.Formula, *, augmented: bool = False) -> bool:
 
 
 def mentions_horizon(formula: typed.Formula) -> bool:
-    """Whether a bound of a formula is written with `T`."""
+    """True if a bound of a formula is written with `T`."""
     timed = (node.interval for node in nodes(formula) if isinstance(node, (typed.Temporal, typed.Until)))
     return any(end is not None and end.horizons != 0 for each in timed for end in (each.lo, each.hi))
 

@@ -1,4 +1,4 @@
-"""What `resolve` hands on: names bound, sorts and units checked, macros expanded, time still in seconds.
+"""Typed specifications: names bound, sorts and units checked, macros expanded, time in seconds.
 
 Numbers are already those of `stlc.compile.ir.nodes`; formulas keep their negations, implications and spans.
 """
@@ -151,7 +151,7 @@ class Freeze(Node):
 
 @dataclass(frozen=True, slots=True)
 class Recalled(Node):
-    """What was written about the past, made of timers; it is under no negation.
+    """A past operator rewritten with timers; it is under no negation.
 
     Attributes:
         now: as a formula about one instant, whose timers decide truth alone.

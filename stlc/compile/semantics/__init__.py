@@ -1,1 +1,1 @@
-"""What the extremum of values means: exact, smooth, means."""
+"""Semantics of robustness: extrema that are exact, smooth, or means."""

@@ -1,4 +1,4 @@
-"""What a semantics must say: how the extremum of some values is taken, at once and piece by piece."""
+"""Protocol of a semantics: extrema of values, at once and piece by piece."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.schedule.schedule import Pick
 
 Parts: TypeAlias = tuple[Array, ...]
-"""What is known of some operands of an extremum: the extremum itself, or sums that it follows from."""
+"""Partial result of an extremum: the extremum itself, or sums that it follows from."""
 
 
 class Semantics(Protocol):
-    """How extrema are taken. Values are `(time, batch)`; infinite ones are neutral and carry no gradient.
+    """Definition of extrema. Values are `(time, batch)`; infinite ones are neutral and carry no gradient.
 
     Windows are put together piece by piece: operands are lifted to `Parts`, the parts of some operands and
     those of others are merged, and in the end parts become a value.

@@ -1,4 +1,4 @@
-"""How a condition becomes a number, and a choice a blend (Eq. 6 of the paper).
+"""Switches: conditions as numbers, and choices as blends (Eq. 6 of the paper).
 
 A system flows where a condition fails and jumps where it holds. `Hard` is that rule; `Tanh` is the paper's
 smooth stand-in; `StraightThrough` steps hard and differentiates as if it were smooth.
@@ -13,7 +13,7 @@ from stlc.compile.backends.array.namespace import Array, Ops
 
 
 class Switch(Protocol):
-    """What a program does with conditions.
+    """Evaluation of conditions in a program.
 
     `exact` says that only the truth of a condition matters, never its margin; such a switch is evaluated with
     comparisons and masks, and every atom keeps its own strictness.
@@ -21,7 +21,7 @@ class Switch(Protocol):
 
     @property
     def exact(self) -> bool:
-        """Whether only truth matters."""
+        """True if only truth matters."""
 
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:
         """A number in 0..1: does a condition of margin `rho` hold?

@@ -196,12 +196,12 @@ def _repair(failure: ParseFailure) -> Diagnostic | None:
 
 
 def _open_interval(failure: ParseFailure) -> bool:
-    """Whether an interval is open, which `]` and `)` close with different meanings."""
+    """True if an interval is open, which `]` and `)` close with different meanings."""
     return bool(failure.open_brackets) and failure.open_brackets[-1].interval
 
 
 def _closing(failure: ParseFailure) -> str | None:
-    """What closes the bracket that was opened last."""
+    """The closing bracket of the one that was opened last."""
     if not failure.open_brackets:
         return None
     return {"(": ")", "[": "]", "{": "}"}.get(failure.open_brackets[-1].opening.text)
@@ -221,7 +221,7 @@ def _definition_colon(failure: ParseFailure) -> Diagnostic | None:
 def _missing(
     failure: ParseFailure, sign: str, low: int, high: int, text: str, *, sure: bool = True
 ) -> Diagnostic:
-    """That a sign is missing; where it is not `sure` that no other one was meant, nothing is repaired."""
+    """Diagnostic for a missing sign; a repair is offered where it is `sure` that no other one was meant."""
     label = f"expected `{sign}` before this" if low == high and failure.found is not None else ""
     return Diagnostic(
         "E010",

@@ -1,4 +1,4 @@
-"""Where the parser gave up, and what stands around it: what the hints look at."""
+"""Failures of the parser, with the tokens around them: the input of the hints."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Piece:
         return self.text[: start - self.start] + replacement + self.text[end - self.start :]
 
     def repaired_by(self, start: int, end: int, replacement: str) -> bool:
-        """Whether that edit makes it parse."""
+        """True if that edit makes it parse."""
         return self.parses(self.edited(start, end, replacement), self.rule)
 
 
@@ -78,7 +78,7 @@ class ParseFailure:
 
     @cached_property
     def follower(self) -> Lexeme | None:
-        """What stands behind the piece: the start of the next declaration."""
+        """The text behind the piece: the start of the next declaration."""
         if self.piece.rule != "start":
             return None
         return next(lexemes(self.piece.source.text, self.piece.end), None)
@@ -90,12 +90,12 @@ class ParseFailure:
 
     @property
     def wants_operand(self) -> bool:
-        """Whether an expression, or a part of one, should begin here."""
+        """True if an expression, or a part of one, should begin here."""
         return "NUMBER" in self.accepts and "NAME" in self.accepts
 
     @property
     def wants_operator(self) -> bool:
-        """Whether an expression could go on here."""
+        """True if an expression could go on here."""
         return "AND" in self.accepts or "CMP" in self.accepts
 
     @cached_property

@@ -30,7 +30,7 @@ _TAKES_LEFT = frozenset({"in", "not", "<", "<=", ">", ">=", "==", "!=", "*", "/"
 
 
 def diagnose(piece: Piece, at: int) -> Diagnostic:
-    """What is wrong with a piece in which the parser gave up at offset `at`."""
+    """Diagnostics for a piece in which the parser gave up at offset `at`."""
     failure = ParseFailure(piece, at)
     for recognise in RECOGNISERS:
         finding = recognise(failure)

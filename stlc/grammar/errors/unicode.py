@@ -12,7 +12,7 @@ from stlc.grammar.scan import Lexeme, lexemes
 
 @dataclass(frozen=True, slots=True)
 class Replacement:
-    """What to do about a character; `text` is what to write in its place, None if that depends."""
+    """Advice about a character; `text` is its replacement, None if that depends."""
 
     help: str
     text: str | None = None
@@ -63,12 +63,12 @@ _OF_THE_LANGUAGE = frozenset("()[]{}.,:;=<>!&|+-*/%^~@#")
 
 
 def replacement(char: str) -> Replacement | None:
-    """What to write instead of a character that the language does not have."""
+    """Advice about a character that the language does not have."""
     return _ADVICE.get(char)
 
 
 def unexpected_character(lexeme: Lexeme) -> bool:
-    """Whether a lexeme begins with a character that no token begins with."""
+    """True if a lexeme begins with a character that no token begins with."""
     if lexeme.kind == "sign":
         return lexeme.text[0] not in _OF_THE_LANGUAGE
     return lexeme.text[0] in _ADVICE and lexeme.kind == "word"

@@ -76,7 +76,7 @@ def words(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def hangs(text: Text, start: int, end: int) -> bool:
-    """Whether the tokens are one bracket, perhaps with a name before it, that can stay behind a `=`."""
+    """True if the tokens are one bracket, perhaps with a name before it, that can stay behind a `=`."""
     last = end - 1
     opening = text.partner.get(last, last)
     return start <= opening < last and all(
@@ -90,7 +90,7 @@ def _word(text: Text, index: int) -> Word:
 
 
 def _splits(text: Text, start: int, end: int, row: frozenset[str]) -> list[int]:
-    """Where the operators of a row stand that are not within brackets or between `if` and `else`."""
+    """Indices of the operators of one row that are not within brackets or between `if` and `else`."""
     found: list[int] = []
     index, conditions = start, 0
     while index < end:
@@ -165,7 +165,7 @@ def _sequence(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def _bracket(text: Text, opening: int) -> Group:
-    """What stands between two brackets, one entry a line where it does not fit."""
+    """The entries between two brackets, one a line where they do not fit."""
     closing = text.partner[opening]
     edge = LINE if text.roles[opening] == "enum" else SOFT
     inside: list[Doc] = [edge]
@@ -300,7 +300,7 @@ def _body(text: Text, rule: str) -> int:
 
 
 def _head(text: Text, rule: str) -> int:
-    """How many columns of the line belong to its first column; 0 where it has none."""
+    """Width of the first column of a line; 0 where it has none."""
     if rule == "signal_decl":
         count = 1 if text.tokens[0].kind == "ROLE" else 0
     elif rule in _OWN_COLUMN:

@@ -82,7 +82,7 @@ def render(parts: Sequence[Doc], *, width: int, indent: int = 0) -> list[str]:
 
 
 def is_plain(parts: Sequence[Doc]) -> bool:
-    """Whether a document holds no comment."""
+    """True if a document holds no comment."""
     stack = list(parts)
     while stack:
         doc = stack.pop()
@@ -94,7 +94,7 @@ def is_plain(parts: Sequence[Doc]) -> bool:
 
 
 def _fits(group: Group, rest: Sequence[_Entry], room: int) -> bool:
-    """Whether a group, and what follows it up to the next line break, fits into `room` columns."""
+    """True if a group, and what follows it up to the next line break, fits into `room` columns."""
     inside: list[_Entry] = [(0, True, group)]
     behind = len(rest)
     while inside or behind:
@@ -116,7 +116,7 @@ def _fits(group: Group, rest: Sequence[_Entry], room: int) -> bool:
 
 
 def _width(doc: Word | Blank | Line) -> int:
-    """How many columns it takes in a line."""
+    """Width of a document on one line, in columns."""
     match doc:
         case Word(text, before, _):
             return 0 if before else len(text)
@@ -127,7 +127,7 @@ def _width(doc: Word | Blank | Line) -> int:
 
 
 def _ends_line(doc: Word | Blank | Line, *, flat: bool) -> bool:
-    """Whether the line ends before or behind it, whatever follows."""
+    """True if the line ends before or behind it, whatever follows."""
     if isinstance(doc, Word):
         return bool(doc.before) or doc.after is not None
     return isinstance(doc, Line) and not flat
@@ -145,7 +145,7 @@ class _Page:
 
     @property
     def column(self) -> int:
-        """How far the current line has come."""
+        """Column at which the current line ends."""
         return (self.indent if not self.line else len(self.line)) + self.blank
 
     def write(self, word: Word, level: int) -> None:

@@ -1,4 +1,4 @@
-"""What tokens say to a formatter: their one spelling, which brackets belong together, where blanks stand.
+"""Tokens for the formatter: their one spelling, matching brackets, blanks between them.
 
 Unary plus and doubled parentheses say nothing and are dropped; the comments at them move to their neighbours.
 """
@@ -40,14 +40,14 @@ class Text:
     roles: dict[int, Role]
 
     def ends_operand(self, index: int) -> bool:
-        """Whether an operand ends with this token, so that `-` behind it subtracts and `(` calls."""
+        """True if an operand ends with this token, so that `-` behind it subtracts and `(` calls."""
         token = self.tokens[index]
         if token.text in _CLOSING:
             return self.roles[self.partner[index]] != "interval"
         return token.kind in _OPERAND
 
     def is_sign(self, index: int) -> bool:
-        """Whether this is a unary `-` or `+`."""
+        """True if this is a unary `-` or `+`."""
         return self.tokens[index].kind in ("PLUS", "MINUS") and not (index and self.ends_operand(index - 1))
 
 
@@ -79,7 +79,7 @@ def spelling(kind: str, text: str) -> str:
 
 
 def gap(text: Text, index: int) -> str:
-    """What stands between the token before `index` and the one there: a blank or nothing."""
+    """The separator before the token at `index`: a blank or nothing."""
     left, right = text.tokens[index - 1], text.tokens[index]
     if _hugs_right(text, index - 1) or _hugs_left(text, index):
         return ""
@@ -91,7 +91,7 @@ def gap(text: Text, index: int) -> str:
 
 
 def _hugs_right(text: Text, index: int) -> bool:
-    """Whether nothing may stand behind this token."""
+    """True if nothing may stand behind this token."""
     token = text.tokens[index]
     if token.text in _OPENING:
         return text.roles[index] != "enum"
@@ -99,7 +99,7 @@ def _hugs_right(text: Text, index: int) -> bool:
 
 
 def _hugs_left(text: Text, index: int) -> bool:
-    """Whether nothing may stand before this token."""
+    """True if nothing may stand before this token."""
     token = text.tokens[index]
     if token.text in _CLOSING:
         return text.roles[text.partner[index]] != "enum"
@@ -113,7 +113,7 @@ def _typed(text: Text, index: int) -> bool:
 
 
 def _would_join(left: Token, right: Token) -> bool:
-    """Whether two tokens without a blank between them would read as others: `1 .x`, `1. ..`, `m ^2`."""
+    """True if two tokens without a blank between them would read as others: `1 .x`, `1. ..`, `m ^2`."""
     if right.text == "^":
         return left.kind == "UNIT"
     if left.kind == "NUMBER":
@@ -145,7 +145,7 @@ def _paired(tokens: tuple[Token, ...]) -> Text:
 
 
 def _role(text: Text, index: int) -> Role:
-    """What an opening bracket opens, as far as the tokens before it say."""
+    """The kind of an opening bracket, from the tokens before it."""
     token = text.tokens[index]
     before = text.tokens[index - 1] if index else None
     if before is not None and before.kind.endswith(("_AT", "_BRACKET")):
@@ -158,7 +158,7 @@ def _role(text: Text, index: int) -> Role:
 
 
 def _holds_interval(text: Text, opening: int) -> bool:
-    """Whether the parenthesis behind a temporal word holds two bounds; any other holds no comma."""
+    """True if the parenthesis behind a temporal word holds two bounds; any other holds no comma."""
     closing = text.partner[opening]
     if not opening or text.tokens[opening - 1].kind not in ("UNARY", "BINARY"):
         return False

@@ -39,7 +39,7 @@ class TerminalToken:
 
 @dataclass(slots=True)
 class Context:
-    """What a rule may need besides its children.
+    """Context of a rule besides its children.
 
     Attributes:
         source: the whole text.

@@ -86,7 +86,7 @@ class _PieceError(Exception):
 
 
 def _check_size(source: Source, start: int, end: int) -> None:
-    """What takes longer to read than anybody would wait was not written by hand."""
+    """Limit on the length of a text: longer ones are not written by hand, and take minutes to parse."""
     if end - start > MAX_TEXT:
         raise SpecError(Diagnostic("E005", f"`{source.name}` is larger than {MAX_TEXT // 1_000_000} MB"))
     if any(islice(lexemes(source.text, start, end), MAX_LEXEMES, None)):
@@ -104,7 +104,7 @@ def _build(piece: Piece, context: Context) -> Any:
 
 
 def _offset(error: UnexpectedInput, piece: Piece) -> int:
-    """Where in the whole text the parser gave up."""
+    """Offset in the whole text at which the parser gave up."""
     token = getattr(error, "token", None)
     if token is not None and token.type == "$END":
         return piece.end

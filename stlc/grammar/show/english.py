@@ -15,7 +15,7 @@ _EQUAL = {"==": "is", "!=": "is not"}
 
 
 def sentence(item: ast.Require | ast.Assume) -> str:
-    """What a requirement demands, as one sentence."""
+    """A requirement as one English sentence."""
     text = say(item.formula)
     begins = text.partition(" ")[0] in _OPENINGS
     return f"{text[0].upper()}{text[1:]}." if begins else f"{text}."

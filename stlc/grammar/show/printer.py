@@ -21,7 +21,7 @@ _PLAIN_DIGITS = 16
 
 
 class Level(IntEnum):
-    """How tightly an expression binds, loosest first; an operand needs at least the level of its place."""
+    """Precedence levels, loosest first; an operand needs at least the level of its place."""
 
     IFF = 0
     IMPLIES = 1
@@ -94,7 +94,7 @@ def _postfix(expr: ast.Index | ast.Attr | ast.Call) -> str:
 
 
 def _base(expr: ast.Expr) -> str:
-    """What an index, a point or an argument list follows; a number would swallow them."""
+    """The operand before an index, a point or an argument list; a number would swallow them."""
     return f"({show_expr(expr)})" if isinstance(expr, ast.Quantity) else show_at(expr, Level.POSTFIX)
 
 
@@ -147,7 +147,7 @@ def _temporal(expr: ast.Temporal | ast.Until) -> str:
 
 
 def _body(expr: ast.Expr, interval: str) -> str:
-    """What a temporal operator governs; a vector would be read as its interval."""
+    """The operand of a temporal operator; a vector would be read as its interval."""
     text = show_at(expr, Level.PREFIX)
     return f"({text})" if text.startswith("[") and not interval else text
 

@@ -35,11 +35,11 @@ class Mean(ABC):
 
     @abstractmethod
     def gain(self, x: Array, ops: Ops) -> Array:
-        """What an operand x > 0 adds where all are satisfied."""
+        """Summand of an operand x > 0 where all are satisfied."""
 
     @abstractmethod
     def loss(self, x: Array, ops: Ops) -> Array:
-        """What an operand -x, x >= 0, adds where one is violated; 0 at 0."""
+        """Summand of an operand -x, x >= 0, where one is violated; 0 at 0."""
 
     @abstractmethod
     def satisfied(self, gains: Array, count: Array, ops: Ops) -> Array:
