@@ -106,7 +106,9 @@ def at_least(instant: Instant, least: int) -> Instant:
 
 def at_most(instant: Instant, most: int) -> Instant:
     """An instant; `most` where it may lie beyond that."""
-    return most if latest(instant) > most else instant
+    if isinstance(instant, int):
+        return min(instant, most)
+    return most if instant.high > most else instant
 
 
 @dataclass(frozen=True, slots=True)

@@ -109,7 +109,8 @@ class NumpyOps:
 
     def join(self, items: Sequence[Array], pick: Pick) -> Array:
         """Exact extremum of one or more arrays."""
-        return reduce(np.minimum if pick == "min" else np.maximum, items)
+        choose = np.minimum if pick == "min" else np.maximum
+        return choose(*items) if len(items) == 2 else reduce(choose, items)
 
     def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
         """Exact extrema of sliding windows of wide rows, by the kernel; None elsewhere."""
