@@ -27,7 +27,7 @@ Frame = Mapping[str, NDArray[Any]]
 
 @dataclass(frozen=True, slots=True)
 class DeploymentRecording:
-    """What happened to `agents` agents of each seed; rows are the agents of the first seed, then of the next.
+    """Trajectories of `agents` agents of each seed; rows are those of the first seed, then of the next.
 
     Attributes:
         agents: of one seed.
@@ -67,7 +67,7 @@ class DeploymentRecording:
 
     @property
     def steps(self) -> int:
-        """How many steps were taken."""
+        """Number of steps taken."""
         return int(self.actions.shape[1])
 
 
@@ -108,7 +108,7 @@ class Recorder:
         self.options.append(options)
 
     def recording(self) -> DeploymentRecording | None:
-        """What there is so far, whole steps only; None before the first one."""
+        """Recording so far, whole steps only; None before the first one."""
         steps = min(len(self.actions), len(self.frames) - 1)
         if steps < 1:
             return None
@@ -162,7 +162,7 @@ Watch = Callable[[SimulationStep], None]
 
 
 class _Pilot:
-    """Who follows which plan, and since when."""
+    """Plans that agents follow, and their ages."""
 
     def __init__(self, guard: Guard, setting: Setting) -> None:
         self.guard, self.replan = guard, setting.replan
@@ -172,7 +172,7 @@ class _Pilot:
         self.age = torch.zeros(0, dtype=torch.int64)
 
     def due(self, x: Tensor, seen: Tensor, step: int) -> Tensor:
-        """Who plans now, (k,) rows: everybody every `replan` steps, and whom the world told something.
+        """Rows that plan now, (k,): all every `replan` steps, and those that the world told something.
 
         So does whom the full guard sees run into danger with what is left of its plan. Where a plan is used
         up before the others plan again, its last action counts until then. The last sample of a plan does
@@ -185,7 +185,7 @@ class _Pilot:
         return torch.nonzero((x != self.before)[:, self.told].any(1) | danger).squeeze(1)
 
     def prefer(self, options: Tensor, due: Tensor) -> Tensor:
-        """Which option everybody takes, (rows,); those who do not plan now stay with theirs."""
+        """Option of each row, (rows,); rows that do not plan now keep theirs."""
         pick = torch.zeros(len(options), dtype=torch.int64)
         if len(due):
             pick[due] = self.guard.prefer(options[due], self._begun(due, options[:, 0]))
@@ -257,7 +257,7 @@ def drive(
 def _replaced(
     worlds: Worlds, guard: Guard, decision: GuardDecision, seen: Tensor, due: Tensor
 ) -> dict[str, NDArray[np.float32]] | None:
-    """Where the plans of the first seed lead that a guard has just replaced, and those in their place.
+    """Places along plans of the first seed that a guard has just replaced, and along those in their place.
 
     None without a guard, and where the world does not say where planned states are in its picture.
     """
