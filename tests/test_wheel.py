@@ -259,7 +259,7 @@ def test_an_extra_of_a_training(extra, wheel, bare, folder):
 
 def test_every_extra_is_tried():
     extras = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])
-    assert extras == {*QUICK, *PROGRAMS, *COMMANDS, "lsp", "peers", "cluster", "all", "dev"}
+    assert extras == {*QUICK, *PROGRAMS, *COMMANDS, "lsp", "peers", "cluster", "docs", "all", "dev"}
 
 
 @pytest.mark.slow
