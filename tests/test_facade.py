@@ -57,7 +57,7 @@ def test_an_unknown_name_is_an_attribute_error():
 )
 def test_the_package_compile_can_be_called_whatever_came_first(statement):
     check = "assert callable(stlc.compile) and stlc.compile.__path__; from stlc.compile.ir import nodes"
-    modules_after(f"{statement}; {check}; nodes.Lit(1.0)")
+    modules_after(f"{statement}; {check}; nodes.Const(1.0)")
 
 
 def test_a_loaded_spec_knows_its_path():

@@ -93,7 +93,7 @@ def run(count: int, seed: int, kinds: tuple[str, ...] = LIGHT) -> list[fuzz.Outc
 
 
 def test_random_inputs_through_the_program() -> None:
-    kinds = {outcome.kind for outcome in run(40, seed=3)}
+    kinds = {outcome.kind for outcome in run(60, seed=3)}
     assert {"text", "spec", "system", "trace", "stream", "csv", "bag"} <= kinds
 
 
