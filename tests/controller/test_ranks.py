@@ -19,9 +19,10 @@ from stlc.controller.parallel.ddp import ALONE, Ranks, expected, joined
 from stlc.controller.problem.task import Task
 from stlc.controller.training.checkpoint import load_checkpoint
 from stlc.controller.training.config import TrainConfig
+from stlc.controller.training.final_evaluation import TrainingOutcome
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.learner import Trainer
-from stlc.controller.training.loop import Outcome, Watch, resume, train
+from stlc.controller.training.loop import Watch, resume, train
 from stlc.controller.training.run import spec_hash, system_hash
 from stlc.diagnostics import MissingError, StlcError, UsageError
 from stlc.rundir import RunDir, every_run
@@ -176,7 +177,7 @@ def test_two_processes_agree_on_the_steps_of_a_budget(tiny: Task, tmp_path: Path
     config = replace(CONFIG, steps=None, budget=0.5)
     folder = open_folder(tiny, config, Launch(root=tmp_path))
 
-    def work(ranks: Ranks) -> Outcome | int:
+    def work(ranks: Ranks) -> TrainingOutcome | int:
         outcome = train(tiny, config, folder, ranks=ranks)
         return int(outcome.run.dir.record()["steps"])
 
