@@ -236,9 +236,7 @@ def test_what_was_foreseen_went_as_the_model_says(car_task: Task, recorded: Depl
     executed = judge_executed(car_task, recorded)
     assert 0 < executed.foreseen.mean() < 1
     for start, row in np.argwhere(executed.foreseen)[::17]:
-        window = slice(
-            start, start + car_task.horizon
-        )  # step by step: rounding decides who is at a stop line
+        window = slice(start, start + car_task.horizon)  # one step each: rounding decides who stops
         x, u = (torch.from_numpy(each[row, window]) for each in (recorded.states, recorded.actions))
         predicted = car_task.rollout(x, u[:, None])[:, 1]
         happened = recorded.states[row, start + 1 : start + car_task.horizon + 1]
