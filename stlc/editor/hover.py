@@ -234,12 +234,11 @@ def _about_temporal(document: Document, node: ast.Temporal | ast.Until) -> str:
     if node.interval is None:
         time = "up to now" if node.op in _PAST else "from now to the end of the trace"
     else:
-        time = "" if found is None else _time(node.op, found, document.grid)
+        time = "" if found is None else _time(node.op, *found, document.grid)
     return "\n\n".join(filter(None, (TEMPORAL[node.op], time)))
 
 
-def _time(op: str, found: tuple[typed.Interval, Window | None], grid: Grid) -> str:
-    interval, window = found
+def _time(op: str, interval: typed.Interval, window: Window | None, grid: Grid) -> str:
     if window is None:
         return ""
     samples = f"samples {window.lo}..{'end' if window.hi is None else window.hi}"

@@ -10,7 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from stlc.cli.framework.output import say, show_diagnostics
+from stlc.cli.framework.output import ColorMode, say, show_diagnostics
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.escape import operand
 from stlc.files import find_spec, read_source
@@ -61,6 +61,29 @@ class Question:
     semantics: str = "exact"
     dt: float | None = None
     max_gap: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """One file and what to do with it.
+
+    Attributes:
+        name: of the file as given.
+        question: what is asked of it.
+        runs: folder of all runs.
+        out: where its robustness signals go.
+        chunk: judge it piece by piece, so many samples at a time; 0 as a whole where it fits.
+        color: whether texts may be coloured.
+        mode: of the colour of the whole program.
+    """
+
+    name: str
+    question: Question
+    runs: Path
+    out: Path | None = None
+    chunk: int = 0
+    color: bool = False
+    mode: ColorMode = "never"
 
 
 def usage(message: str, *advice: str) -> UsageError:
@@ -196,21 +219,20 @@ def monitor_of(source: Source, question: Question, carried: Carried | None = Non
     changed = question.overrides
     if carried is not None and question.spec is None:
         library, changed = carried.library, {**carried.overrides, **changed}
-    spec = source.name, source.text, tuple(library.items())
-    return _monitor(spec, question.system, tuple(changed.items()))
+    return _monitor(source, tuple(library.items()), question.system, tuple(changed.items()))
 
 
 @lru_cache(maxsize=8)
 def _monitor(
-    spec: tuple[str, str, tuple[tuple[str, str], ...]],
+    source: Source,
+    library: tuple[tuple[str, str], ...],
     system: str | None,
     overrides: tuple[tuple[str, str], ...],
 ) -> Monitor:
     from stlc.grammar.parse.parser import parse
     from stlc.monitor.verdict import Monitor
 
-    name, text, library = spec
-    parsed = replace(parse(Source(name, text)), library=dict(library) or None)
+    parsed = replace(parse(source), library=dict(library) or None)
     return Monitor(parsed, system=system, overrides=dict(overrides))
 
 

@@ -6,40 +6,16 @@ import multiprocessing
 import os
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-from stlc.cli.check.judge import Question, found, judged, taken
+from stlc.cli.check.judge import Work, found, judged, taken
 from stlc.cli.check.outcome import WORDS, Outcome, Row, overall
-from stlc.cli.framework.output import COLOR, ColorMode, table
+from stlc.cli.framework.output import COLOR, table
 from stlc.diagnostics import Diagnostic, StlcError, UsageError
 from stlc.stopping import leaving
 
 SMALL = 1_000_000
 """Bytes: no file of less unpacks to more than fits into memory."""
-
-
-@dataclass(frozen=True, slots=True)
-class Work:
-    """One file and what to do with it.
-
-    Attributes:
-        name: of the file as given.
-        question: what is asked of it.
-        runs: folder of all runs.
-        out: where its robustness signals go.
-        chunk: judge it piece by piece, so many samples at a time; 0 as a whole where it fits.
-        color: whether texts may be coloured.
-        mode: of the colour of the whole program.
-    """
-
-    name: str
-    question: Question
-    runs: Path
-    out: Path | None = None
-    chunk: int = 0
-    color: bool = False
-    mode: ColorMode = "never"
 
 
 def all_outcomes(works: Sequence[Work], jobs: int) -> Iterator[Outcome]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stlc.cli.check.document import cause_entry, gap_entry
-from stlc.cli.check.judge import Question, instant_of, laid_reading, monitor_of, specification, usage
+from stlc.cli.check.judge import Question, Work, instant_of, laid_reading, monitor_of, specification, usage
 from stlc.cli.check.outcome import WORDS, Outcome, Row
 from stlc.cli.check.text import in_unit, percent, signed
 from stlc.cli.framework.output import emit, table, wants_color
@@ -31,7 +31,6 @@ from stlc.monitor.prepared import beside, gap_text
 from stlc.source import Source
 
 if TYPE_CHECKING:
-    from stlc.cli.check.many import Work
     from stlc.monitor.explain.report import Cause
     from stlc.monitor.judgement import Status
     from stlc.monitor.online.online import Decision, Online

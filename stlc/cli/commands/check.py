@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from stlc.cli.check import options as given
-from stlc.cli.check.judge import Question, usage
+from stlc.cli.check.judge import Question, Work, usage
 from stlc.cli.framework.options import FailUnderOption, JsonOption
 from stlc.cli.framework.output import COLOR, PULSE, QUIET, emit, emit_json, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
@@ -51,7 +51,7 @@ def check(
     is judged in pieces. Exit code: 0 all satisfied, 1 violated,
     4 a trace is too short to say; with -q nothing else is said.
     """
-    from stlc.cli.check.many import Work, all_outcomes, out_paths
+    from stlc.cli.check.many import all_outcomes, out_paths
     from stlc.cli.check.outcome import exit_code
 
     spec, traces = _split_files(files, reading.spec)

@@ -174,7 +174,7 @@ class Side:
         traces = next(iter(signals.values())).shape[1]
         self.rows[NOTHING] = np.zeros((samples + self.beyond - self.base, traces))
         for leaves, reader in self._leaves:
-            self._grow_leaves(leaves, reader, (signals, first), samples)
+            self._grow_leaves(leaves, reader, signals, first, samples)
         for stream, reader in self._latched:
             self._grow_latched(stream, reader, samples)
 
@@ -204,10 +204,10 @@ class Side:
         self,
         leaves: Sequence[PredicateColumn],
         reader: Reader,
-        signals: tuple[Mapping[str, Floats], int],
+        env: Mapping[str, Floats],
+        first: int,
         samples: int,
     ) -> None:
-        env, first = signals
         start, ahead = self._settled.get(leaves[0].name, 0), leaves[0].ahead
         count = samples + max(self._pads[leaf.name] for leaf in leaves) - start
         found = reader.of_signals(env, start - first, count, least=self.least)

@@ -106,7 +106,7 @@ def _taken(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.For
             met = _met(ir.Until(op, _FOREVER, left, right), steps + lo, found)
             if not lo:
                 return met
-            return _held(op == "until", ir.Window(0, lo - 1), (left, steps, found), met)
+            return _held(op == "until", ir.Temporal("always", ir.Window(0, lo - 1), left), met, steps, found)
         case _:
             raise EndlessError
 
@@ -140,13 +140,13 @@ def _met(node: ir.Until, steps: int, found: UnboundedOperators) -> ir.Formula:
 
 
 def _held(
-    every: bool, window: ir.Window, left: tuple[ir.Formula, int, UnboundedOperators], then: ir.Formula
+    every: bool, before: ir.Temporal, then: ir.Formula, steps: int, found: UnboundedOperators
 ) -> ir.Formula:
     """What `until` asks of its left side before its window starts; of `release` the dual."""
-    formula, steps, found = left
-    if endless(formula):
+    if endless(before.body):
         raise EndlessError
-    before = ir.Temporal("always" if every else "eventually", window, formula)
+    if not every:
+        before = replace(before, op="eventually")
     return ir.BoolOp("and" if every else "or", (_part(before, steps, found), then))
 
 
