@@ -14,7 +14,7 @@ from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import pytest
-from hostile import CANARY, NAMES
+from helpers.hostile import CANARY, NAMES
 from hypothesis import given
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt

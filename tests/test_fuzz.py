@@ -21,12 +21,12 @@ TOOLS = Path(__file__).resolve().parents[1] / "tools"
 sys.path.insert(0, str(TOOLS))
 
 import fuzz  # noqa: E402
-import fuzz_bombs  # noqa: E402
-import fuzz_grammar  # noqa: E402
-import fuzz_inputs  # noqa: E402
-import fuzz_valid  # noqa: E402
-from fuzz_laws import HangError, laws, stage  # noqa: E402
-from fuzz_specs import SYSTEM  # noqa: E402
+from fuzzing import bombs as fuzz_bombs  # noqa: E402
+from fuzzing import grammar as fuzz_grammar  # noqa: E402
+from fuzzing import inputs as fuzz_inputs  # noqa: E402
+from fuzzing import valid as fuzz_valid  # noqa: E402
+from fuzzing.laws import HangError, laws, stage  # noqa: E402
+from fuzzing.specs import SYSTEM  # noqa: E402
 
 SECONDS = 2.0
 

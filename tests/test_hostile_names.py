@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from hostile import CANARY, NAMES, sample
+from helpers.hostile import CANARY, NAMES, sample
 
 from stlc import escape
 from stlc.cli.framework.app import main

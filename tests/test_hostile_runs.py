@@ -12,7 +12,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
-from hostile import CANARY, NAMES, sample
+from helpers.hostile import CANARY, NAMES, sample
 from test_hostile_names import seen_in_markup, steering
 
 from stlc import escape, native
@@ -179,7 +179,7 @@ int main(void) {
     "names", [sample(15), pytest.param(NAMES, marks=pytest.mark.slow)], ids=["sample", "all"]
 )
 def test_a_header_compiles_without_a_warning_and_gives_names_back(names: list[str], folder: Path) -> None:
-    from exported import untrained
+    from helpers.exported import untrained
 
     from stlc.export.write import export
 
@@ -313,7 +313,7 @@ def test_a_page_has_the_elements_of_a_plain_one(capsys: pytest.CaptureFixture[st
 @pytest.mark.slow
 @pytest.mark.parametrize("target", ["onnx", "torch"])
 def test_an_export_says_every_name(target: str, folder: Path) -> None:
-    from exported import untrained
+    from helpers.exported import untrained
 
     from stlc.export.write import export
 

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from doc_examples import BOUNDS, VALUE, Claim, Example, Recorded, codes, examples, recorded
+from helpers.doc_examples import BOUNDS, VALUE, Claim, Example, Recorded, codes, examples, recorded
 
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import paper
 import pytest
-from paper import Array
+from helpers import paper
+from helpers.paper import Array
 
 DT, WIDTH, V_MAX, H, LEVEL, R = 0.2, 5.0, 5.0, 0.5, 2.5, 0.4
 

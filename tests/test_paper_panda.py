@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import paper
 import pytest
-from paper import Array
+from helpers import paper
+from helpers.paper import Array
 
 LOW = np.radians([-166, -101, -166, -176, -166, -1, -166])
 HIGH = np.radians([166, 101, 166, -4, 166, 215, 166])

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import reference
 import torch
+from helpers import reference
 
 from stlc.compile.backends.array.graph import RobustnessGraph
 from stlc.compile.ir.discretize import Grid

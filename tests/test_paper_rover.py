@@ -6,10 +6,10 @@ import math
 from pathlib import Path
 
 import numpy as np
-import paper
 import pytest
 import torch
-from paper import Array
+from helpers import paper
+from helpers.paper import Array
 
 from stlc.dynamics.model.system import System
 

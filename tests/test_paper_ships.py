@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import paper
 import pytest
 import torch
-from paper import Array
+from helpers import paper
+from helpers.paper import Array
 
 LIMITS = ((2, 0.5), (4, 0.3), (5, 0.5))  # column and bound: heading, sway, turn rate
 

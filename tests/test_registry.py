@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from effort import effort
+from helpers.effort import effort
 from hypothesis import given
 from hypothesis import strategies as st
 

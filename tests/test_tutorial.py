@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from walkthrough import labels, steps, walk
+from helpers.walkthrough import labels, steps, walk
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 ANY = (0, 1, 4)

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("hatchling", reason="builds the wheel")
-from installed import ROOT, Installed, Said, build_wheel, findings, install
+from helpers.installed import ROOT, Installed, Said, build_wheel, findings, install
 
 SPECS = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "specs").rglob("*.stl"))
 SYSTEMS = sorted(path.name for path in (ROOT / "examples").glob("*.yaml"))
@@ -152,7 +152,8 @@ with open('a.mcap', 'wb') as f:
     writer.finish()
 """
 BAG = """
-import bz2, lz4.frame, robot_logs
+import bz2, lz4.frame
+from helpers import robot_logs
 bz2.compress = lz4.frame.compress
 open("a.bag", "wb").write(robot_logs.bag([0.0, 1.0]).replace(b"compression=bz2", b"compression=lz4"))
 """
@@ -174,7 +175,7 @@ def recordings(tmp_path_factory) -> Path:
     """A folder with a recording of every kind that can be written here."""
     folder = tmp_path_factory.mktemp("recordings")
     (folder / "low.stl").write_text(SPEC)
-    helpers = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "tools"), *sys.path])}
+    helpers = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "tests"), *sys.path])}
     needs = {"parquet": "pyarrow", "mat": "h5py", "mcap": "mcap_ros2", "bag": "lz4"}
     programs = [text for extra, (text, _) in QUICK.items() if extra not in needs or find_spec(needs[extra])]
     subprocess.run([sys.executable, "-c", "\n".join(programs)], cwd=folder, env=helpers, check=True)

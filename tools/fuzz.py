@@ -2,9 +2,9 @@
 
     python tools/fuzz.py --count 40000 --seed 0 --jobs 16 --seconds 10 --memory 2048 --log fuzz.jsonl
 
-Runs `stlc` in process on random, mutated and malicious inputs (`fuzz_inputs.py`) and prints what came out. An
-input fails if `stlc` crashes (exit code 70, a traceback, a Python warning, a dead process), needs more than
-`--seconds` of processor time, or asks for more than `--memory` MB beyond what the program needs. What failed
+Runs `stlc` in process on random, mutated and malicious inputs (`tests/fuzzing/inputs.py`) and prints what
+came out. An input fails if `stlc` crashes (exit code 70, a traceback, a Python warning, a dead process),
+needs more than `--seconds` of processor time, or asks for more than `--memory` MB beyond what the program needs. What failed
 is kept in `--keep`, with a README that says how to run it again. With `--log` a run that was stopped goes on
 where it was; with `--kind csv --kind run` only such inputs are drawn. Formats whose library is not installed
 are left out, and that is said. Exit code: 1 if anything failed.
@@ -29,14 +29,16 @@ import warnings
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import fuzz_foreign
-import fuzz_inputs
-import fuzz_runs
-import fuzz_valid
-from fuzz_laws import laws, stage
-from fuzz_specs import SMALL, SYSTEM
-from fuzz_traces import small_trace
-from fuzz_valid import FORMATS
+sys.path[:0] = [str(Path(__file__).parents[1] / "tests")]
+
+from fuzzing import foreign as fuzz_foreign  # noqa: E402
+from fuzzing import inputs as fuzz_inputs  # noqa: E402
+from fuzzing import runs as fuzz_runs  # noqa: E402
+from fuzzing import valid as fuzz_valid  # noqa: E402
+from fuzzing.laws import laws, stage  # noqa: E402
+from fuzzing.specs import SMALL, SYSTEM  # noqa: E402
+from fuzzing.traces import small_trace  # noqa: E402
+from fuzzing.valid import FORMATS  # noqa: E402
 
 BATCH = 250
 EVERY = 5000

@@ -3,9 +3,9 @@
     python tools/proofs.py --count 100000 --jobs 16 --seed 1 --log proofs.jsonl
     python tools/proofs.py values online --count 500
 
-Runs the checks of `tests/proof/` and `tests/laws.py` on cases that nobody has seen, or on those of `--seed`,
-in blocks of 100, `--jobs` of them at the same time. With `--log` each finished block is a line of that file;
-the same command again goes on behind the last one. A mismatch is printed with its case. In the end a table
+Runs the checks of `tests/proof/` and `tests/helpers/laws.py` on cases that nobody has seen, or on those of
+`--seed`, in blocks of 100, `--jobs` of them at the same time. With `--log` each finished block is a line of that
+file; the same command again goes on behind the last one. A mismatch is printed with its case. In the end a table
 says, for each proof, how many cases there were, how many disagreed, the greatest difference of two finite
 values that should be equal, and the seconds of processor time.
 Exit code: 1 if one disagreed.
@@ -34,10 +34,10 @@ from hypothesis import strategies as st
 sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-import laws
-from emitted import choosing, near_switches, slopes_agree
-from formula_strategies import formulas, traces
-from mission_strategies import bodies, missions, nested
+from helpers import laws
+from helpers.emitted import choosing, near_switches, slopes_agree
+from helpers.formula_strategies import formulas, traces
+from helpers.mission_strategies import bodies, missions, nested
 from proof import blamed, monitored, slopes, streamed
 from proof import missions as states
 from proof.cases import Case

@@ -1,10 +1,10 @@
 from __future__ import annotations
 
 import pytest
-import reference
+from helpers import reference
+from helpers.resolving import HEAD, formula, state
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from resolving import HEAD, formula, state
 
 from stlc.compile.frontend.expressions import resolve_state_formula
 from stlc.compile.frontend.scope import Scope, column_entries

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import reference
-from formula_strategies import GRID, traces
+from helpers import reference
+from helpers.formula_strategies import GRID, traces
 from hypothesis import given, settings
 
 from stlc.compile.backends.array.graph import robustness_signal

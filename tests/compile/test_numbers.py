@@ -5,7 +5,7 @@ import operator
 from fractions import Fraction
 
 import pytest
-import reference
+from helpers import reference
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mission_strategies import augmented
+from helpers.mission_strategies import augmented
 
 from stlc.compile.backends.array.arith import Program
 from stlc.compile.backends.array.graph import evaluate

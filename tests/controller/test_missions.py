@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from mission_strategies import augmented
+from helpers.mission_strategies import augmented
 from torch import Tensor
 
 from stlc.compile.backends.torch.ops import TORCH

@@ -8,7 +8,7 @@ from torch import Tensor
 from stlc.controller.guard.stages.sampled_shooting import SampledPrefixes
 from stlc.controller.problem.task import Task
 from stlc.runtime.prefixes import Grid
-from tests.controller.test_prefix_shooting import F64, Constant, grid
+from tests.controller.guard.test_prefix_shooting import F64, Constant, grid
 
 
 class Reached:

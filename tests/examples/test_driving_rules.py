@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.traffic_drivers import Driver, careful, driver, reckless
 from torch import Tensor
-from traffic_drivers import Driver, careful, driver, reckless
 
 import stlc
 from stlc.controller.world import world_type

@@ -7,7 +7,7 @@ import runpy
 import sys
 
 import pytest
-from exported import ROOT, exported
+from helpers.exported import ROOT, exported
 
 from stlc.gym import make
 from stlc.runtime import Controller

@@ -11,7 +11,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from exported import ROOT, untrained
+from helpers.exported import ROOT, untrained
 
 from stlc.export.write import export
 from stlc.runtime import Controller

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from traffic_drivers import Driver, careful, reckless
+from helpers.traffic_drivers import Driver, careful, reckless
 
 from stlc.controller.world import world_type
 from stlc.dynamics.model.system import System

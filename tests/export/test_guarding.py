@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from exported import run_of
+from helpers.exported import run_of
 
 from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.search import StagedSearch

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from exported import CART, exported, mission, untrained
-from sheets import computed
+from helpers.exported import CART, exported, mission, untrained
+from helpers.sheets import computed
 
 from stlc.compile.backends.onnx import sheet as sheets
 from stlc.compile.backends.onnx.sheet import BATCH, Sheet

@@ -9,7 +9,7 @@ from pathlib import Path
 import onnx
 import pytest
 import torch
-from exported import exported, run_of, untrained
+from helpers.exported import exported, run_of, untrained
 
 from stlc.diagnostics import MissingError, RunError, UsageError
 from stlc.export.verify import same_verdicts

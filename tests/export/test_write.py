@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from documents import misfits
-from exported import CART, MISSION, run_of, untrained
+from helpers.documents import misfits
+from helpers.exported import CART, MISSION, run_of, untrained
 
 from stlc import native
 from stlc.cli.commands.schema import load_schema

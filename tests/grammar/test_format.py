@@ -6,9 +6,9 @@ import re
 from pathlib import Path
 
 import pytest
+from helpers.strategies import specs
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from strategies import specs
 
 from stlc.diagnostics import SpecError
 from stlc.files import read_source

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from effort import refused
+from helpers.effort import refused
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

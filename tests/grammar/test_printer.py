@@ -6,8 +6,8 @@ from fractions import Fraction
 from pathlib import Path
 
 import pytest
+from helpers.strategies import SPAN, declarations, expressions, specs
 from hypothesis import given, settings
-from strategies import SPAN, declarations, expressions, specs
 
 from stlc.files import read_source
 from stlc.grammar import ast

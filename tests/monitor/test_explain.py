@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import reference
-from formula_strategies import GRID, formulas, traces
+from helpers import reference
+from helpers.formula_strategies import GRID, formulas, traces
 from hypothesis import assume, given, settings
 
 from stlc.cli.framework.render import render_place

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
-import reference
+from helpers import reference
 from proof.cases import Case
 from proof.draw import Taste
 from proof.streamed import drawn

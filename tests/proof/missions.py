@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
-from formula_strategies import SPAN
+from helpers.formula_strategies import SPAN
+from helpers.laws import OnTheClock
+from helpers.mission_strategies import GRID, SAMPLES, augmented, requirement, walks
+from helpers.reference import Interval, Trace
 from hypothesis import assume
-from laws import OnTheClock
-from mission_strategies import GRID, SAMPLES, augmented, requirement, walks
-from reference import Interval, Trace
 
 from stlc.compile.augment.augment import augment
 from stlc.compile.augment.lift import from_first_sample

@@ -11,7 +11,7 @@ import math
 from typing import Any
 
 import numpy as np
-import reference
+from helpers import reference
 from proof.cases import Case
 from proof.draw import HORIZON, Taste
 from proof.levels import robustness, truth

@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 import typer
-from formula_strategies import formulas
+from helpers.formula_strategies import formulas
 from hypothesis import strategies as st
 from proof.cases import Case
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from exported import ROOT, exported, mission, run_of
+from helpers.exported import ROOT, exported, mission, run_of
 
 from stlc.controller.guard.candidates import SOURCES
 from stlc.controller.guard.guard import Guard

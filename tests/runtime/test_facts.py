@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from exported import exported, mission
+from helpers.exported import exported, mission
 
 from stlc.diagnostics import RunError, UsageError
 from stlc.runtime.facts import read_facts

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import random
 import struct
-import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -22,9 +21,7 @@ scipy_io = pytest.importorskip("scipy.io")
 h5py = pytest.importorskip("h5py")
 mcap_writer = pytest.importorskip("mcap_ros2.writer")
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
-
-import robot_logs  # noqa: E402
+from helpers import robot_logs  # noqa: E402
 
 N = 21
 T = np.arange(N) * 0.1

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import struct
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -18,9 +17,7 @@ from stlc.trace import Reading, Trace, TraceMeta, load_trace, save_trace
 from stlc.units import parse_unit
 
 writers = pytest.importorskip("mcap.writer")
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
-
-import robot_logs  # noqa: E402
+from helpers import robot_logs  # noqa: E402
 
 X = np.sin(np.arange(21) / 10)
 

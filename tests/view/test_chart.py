@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from helpers.walks import SPEC, judged, walk
 from PIL import Image
-from walks import SPEC, judged, walk
 
 from stlc.rundir import RunDir
 from stlc.trace import save_trace

@@ -1,0 +1,66 @@
+"""`stlc plot --places`: all paths or one, and what it says where there is no map."""
+
+import json
+
+import numpy as np
+import pytest
+from helpers.walks import walk
+
+from stlc.cli.commands.plot import _with_units
+from stlc.cli.framework.app import main
+from stlc.grammar.parse.parser import parse
+from stlc.monitor.verdict import Monitor
+from stlc.source import Source
+from stlc.trace import load_trace, save_trace
+from stlc.view.judged import margins_of
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_trace("walk.npz", walk())
+
+
+def test_a_map_of_one_trace(tmp_path, capsys):
+    assert main(["plot", "walk.npz", "--places", "--trace", "2", "-o", "map.svg", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["result"]["shown"] == [2]
+    assert (tmp_path / "map.svg").read_text().startswith("<svg")
+    assert main(["plot", "walk.npz", "--places", "--trace", "4"]) == 2
+    assert "they go from 0 to 3" in capsys.readouterr().err
+
+
+TANK = """\
+spec tank
+signal level [m]
+require low: always (level < 2 m -> eventually[0 s, 3 s] level >= 2.5 m)
+"""
+PLANNED = TANK + "require plan: always[0 s, T] level > 0 m\n"
+
+
+def test_what_is_violated_is_never_an_empty_panel(tmp_path, capsys):
+    (tmp_path / "tank.stl").write_text(TANK)
+    (tmp_path / "tank.csv").write_text("t,level\n" + "".join(f"{k},{1.5 + 0.1 * k}\n" for k in range(6)))
+    trace = load_trace(tmp_path / "tank.csv")
+    monitor = Monitor(PLANNED, dt=1, horizon=2)
+    verdict = monitor.check(trace)
+    assert verdict["low"].status == ["violated"]
+    found = margins_of(monitor, verdict, trace)
+    np.testing.assert_allclose(found["low"], [[-0.5] * 6])  # `always` has no end that all windows fit before
+    np.testing.assert_allclose(found["plan"], [[1.5, 1.6, 1.7, 1.8, np.nan, np.nan]])
+    assert main(["plot", "tank.csv", "--spec", "tank.stl", "--require", "low", "-o", "tank.svg"]) == 0
+    assert main(["plot", "tank.csv", "--spec", "tank.stl", "--require", "high"]) == 2
+    assert "there is no requirement `high`" in capsys.readouterr().err
+
+
+def test_a_file_without_units_is_labelled_with_those_of_the_specification(tmp_path):
+    (tmp_path / "tank.csv").write_text("t,level\n0,1\n1,2\n2,3\n")
+    trace = load_trace(tmp_path / "tank.csv")
+    told = _with_units(trace, parse(Source("tank.stl", TANK)))
+    assert (trace.signature["level"].unit.text, told.signature["level"].unit.text) == ("", "m")
+
+
+def test_a_specification_without_places_has_no_map(tmp_path, capsys):
+    (tmp_path / "slow.stl").write_text("spec slow\nsignal v [m/s]\nrequire slow: always v < 2 m/s\n")
+    assert main(["plot", "walk.npz", "--places", "--spec", "slow.stl"]) == 2
+    assert "no requirement of `slow` names a place" in capsys.readouterr().err
+    assert main(["plot", "walk.npz", "--places", "--require", "slow", "-o", "map.svg"]) == 2

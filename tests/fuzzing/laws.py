@@ -1,0 +1,102 @@
+"""What holds for every text, checked in process without the command line.
+
+Every way in gives a value or diagnostics; `fmt` keeps the meaning and settles at once; what is well-formed
+can be said in English.
+"""
+
+import signal
+import zlib
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+
+from fuzzing.specs import SYSTEM
+
+
+def laws(source, limit: float, *, one_in: int = 1) -> int:
+    """0 for a text that compiles with a system or without, else 3; raises what is wrong with `stlc`.
+
+    Args:
+        source: of a specification.
+        limit: seconds of processor time that one stage may take.
+        one_in: of so many texts one is laid out, which takes longer than everything else.
+    """
+    from stlc.compile.ir.discretize import Grid
+    from stlc.compile.pipeline import compile_spec
+    from stlc.diagnostics import StlcError
+    from stlc.grammar.parse.parser import parse
+    from stlc.grammar.show.english import sentence
+    from stlc.lint.lint import Selection, Surroundings, lint
+
+    decl = _system()
+    within = Surroundings(decl.interface(), Grid(decl.dt, decl.horizon))
+    with stage("lint", limit):
+        found = lint(source, selection=Selection(("ALL",)))
+        _some(found)
+    try:
+        with stage("parse", limit):
+            spec = parse(source)
+    except StlcError as error:
+        _some(error.diagnostics)
+        return 3
+    if zlib.crc32(source.text.encode("utf-8", "replace")) % one_in == 0:
+        _formatted(spec, source, limit)
+    with stage("explain", limit):
+        assert all(sentence(item) for item in spec.items if hasattr(item, "formula"))
+    code = 3
+    grids = ((Grid(decl.dt, decl.horizon), within.interface, "train"), (Grid(decl.dt, None), None, "check"))
+    for grid, interface, purpose in grids:
+        try:
+            with stage(f"compile to {purpose}", limit):
+                compile_spec(spec, grid=grid, interface=interface, purpose=purpose)
+                code = 0
+        except StlcError as error:
+            _some(error.diagnostics)
+    return code
+
+
+def _some(findings) -> None:
+    """Render findings; every one has a headline."""
+    from stlc.cli.framework.render import render_text
+
+    assert all(finding.message for finding in findings)
+    assert not findings or render_text(tuple(findings), color=False)
+
+
+def _formatted(spec, source, limit) -> None:
+    from stlc.grammar.format.format import format_text
+    from stlc.grammar.parse.parser import parse
+    from stlc.source import Source
+
+    with stage("format", limit):
+        once = Source("once.stl", format_text(source))
+    assert parse(once) == spec, "fmt changed the meaning"
+    assert format_text(once) == once.text, "fmt is not idempotent"
+
+
+class HangError(BaseException):
+    """A stage took too long."""
+
+
+@contextmanager
+def stage(name: str, limit: float):
+    """Raise HangError in what takes more than `limit` seconds of processor time."""
+
+    def alarm(_number, _frame):
+        raise HangError(f"{name} takes more than {limit:g} s")
+
+    before = signal.signal(signal.SIGPROF, alarm)
+    signal.setitimer(signal.ITIMER_PROF, limit)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
+
+
+@cache
+def _system():
+    from stlc.dynamics.declaration.load import parse_system
+    from stlc.source import Source
+
+    return parse_system(Source("b.yaml", SYSTEM), Path("b.yaml"))
