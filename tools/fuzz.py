@@ -6,8 +6,8 @@ Runs `stlc` in process on random, mutated and malicious inputs (`tests/fuzzing/i
 came out. An input fails if `stlc` crashes (exit code 70, a traceback, a Python warning, a dead process),
 needs more than `--seconds` of processor time, or asks for more than `--memory` MB beyond what the program
 needs. What failed is kept in `--keep`, with a README that says how to run it again. With `--log` a run that
-was stopped goes on where it was; with `--kind csv --kind run` only such inputs are drawn. Formats whose library is not installed
-are left out, and that is said. Exit code: 1 if anything failed.
+was stopped goes on where it was; with `--kind csv --kind run` only such inputs are drawn. Formats whose
+library is not installed are left out, and that is said. Exit code: 1 if anything failed.
 """
 
 import argparse

@@ -6,8 +6,8 @@
 Runs the checks of `tests/proof/` and `tests/helpers/laws.py` on cases that nobody has seen, or on those of
 `--seed`, in blocks of 100, `--jobs` of them at the same time. With `--log` each finished block is a line of
 that file; the same command again goes on behind the last one. A mismatch is printed with its case. In the
-end a table says, for each proof, how many cases there were, how many disagreed, the greatest difference of two finite
-values that should be equal, and the seconds of processor time.
+end a table says, for each proof, how many cases there were, how many disagreed, the greatest difference of
+two finite values that should be equal, and the seconds of processor time.
 Exit code: 1 if one disagreed.
 """
 
