@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import formula_strategies as random_formulas
 import numpy as np
 import pytest
+from helpers import formula_strategies as random_formulas
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import formula_strategies as random_formulas
 import numpy as np
 import pytest
+from helpers import formula_strategies as random_formulas
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

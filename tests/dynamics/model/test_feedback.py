@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import torch
-from dynamics.test_motion_in_c import agree
+from dynamics.model.test_motion_in_c import agree
 from helpers.exported import untrained
 
 from stlc.controller.deployment.batched import Setting, Worlds

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from dynamics.test_motion import RICH
+from dynamics.model.test_motion import RICH
 from dynamics.test_vectors import ARM
 
 from stlc.compile.backends.c.emit import Motion, emit

@@ -10,9 +10,9 @@ from functools import cache
 from itertools import pairwise
 from typing import Any
 
-import formula_strategies as random_formulas
 import numpy as np
 import pytest
+from helpers import formula_strategies as random_formulas
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
