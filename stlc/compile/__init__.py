@@ -1,1 +1,1 @@
-"""What "satisfied" means: numbers and formulas as one intermediate representation."""
+"""Compiler: from the syntax tree of a specification to an intermediate representation and its back ends."""

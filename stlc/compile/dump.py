@@ -1,4 +1,4 @@
-"""A compiled specification as text: what the solver sees, and what became of time."""
+"""Text form of a compiled specification: formulas in steps, added states, and intervals in samples."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from stlc.escape import screen
 from stlc.grammar.show.printer import show, show_name
 
 WIDTH, LEFT = 110, 44
-"""Columns of the whole text, and at most of what was written."""
+"""Width of the text, and maximum width of the source column, in characters."""
 LONG, SHOWN = 24, 8
-"""Lines from which a formula is cut short, and lines that are left of it."""
+"""Length in lines from which a formula is truncated, and lines shown then."""
 
 _TIED = re.compile(r" (?=[<>=!*/+-]+ )|(?<= [<>=!*/+-]) |(?<=[<>=!]=) ")
 """Blanks around the signs of comparisons and sums."""
@@ -32,7 +32,7 @@ Part: TypeAlias = Literal["all", "steps", "states", "ir"]
 
 
 def dump(compiled: Compiled, part: Part = "all") -> str:
-    """The text of `part`. It depends on nothing but the specification and the system's grid."""
+    """Return the text of `part`, a function of the specification and the time grid alone."""
     blocks = ["\n".join(_head(compiled))]
     if part == "all":
         blocks += list(_beside(compiled))
@@ -55,19 +55,19 @@ def _head(compiled: Compiled) -> Iterator[str]:
 
 
 def _both(steps: int, grid: Grid) -> str:
-    """In seconds and in steps."""
+    """Text of a time in seconds and in steps."""
     count = f"{steps} step{'' if steps == 1 else 's'}"
     return count if grid.dt is None else f"{in_words(Fraction(steps), grid)} = {count}"
 
 
 def _rules(compiled: Compiled) -> Iterator[tuple[CompiledRequirement, str]]:
-    """Every requirement and every assumption, with a word for what it is."""
+    """Yield each requirement and assumption, with its kind."""
     yield from ((rule, "") for rule in compiled.requirements)
     yield from ((rule, "assume") for rule in compiled.assumptions)
 
 
 def _beside(compiled: Compiled) -> Iterator[str]:
-    """The requirements as written on the left, as compiled on the right."""
+    """Requirements in two columns: as written and as compiled."""
     written = [show(rule.typed.written) for rule, _ in _rules(compiled)]
     left = min(max(map(len, [*written, "written"])), LEFT)
     yield f"    {'written':<{left}}  compiled"
@@ -80,7 +80,7 @@ def _beside(compiled: Compiled) -> Iterator[str]:
 
 
 def _became(rule: CompiledRequirement, compiled: Compiled) -> Iterator[str]:
-    """The formula, the states that the compiler adds for it, and its intervals."""
+    """Compiled form of a requirement: formula, added states, intervals."""
     yield show_formula(rule.formula)
     read = columns(rule.formula)
     added = [timer for timer in compiled.timers if timer.name in read]
@@ -92,14 +92,14 @@ def _became(rule: CompiledRequirement, compiled: Compiled) -> Iterator[str]:
 
 
 def _wrapped(text: str, width: int, hanging: str = "") -> list[str]:
-    """Lines of a formula; comparisons and the like are not torn apart."""
+    """Wrapped lines of a formula; comparisons and sums are not broken."""
     tied = _TIED.sub("\N{NO-BREAK SPACE}", text)
     lines = wrap(tied, width, subsequent_indent=hanging, break_long_words=False, break_on_hyphens=False)
     return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines]
 
 
 def _cut(lines: list[str]) -> list[str]:
-    """The beginning of a formula that fills pages, such as of what moves between samples."""
+    """First lines of a very long formula."""
     if len(lines) <= LONG:
         return lines
     return [*lines[:SHOWN], f"  … {len(lines) - SHOWN} more lines: --show ir"]
@@ -125,7 +125,7 @@ def _rule(rule: CompiledRequirement, kind: str, compiled: Compiled, part: Part) 
 
 
 def _added(timer: Timer) -> str:
-    """A state that the compiler adds, and what it says."""
+    """Line for an added state: its name and meaning."""
     return f"  + {timer.kind:<6}  {shown(timer.name)}  {timer.about}".rstrip()
 
 
@@ -134,7 +134,7 @@ def _instants(rule: CompiledRequirement, grid: Grid) -> list[str]:
 
 
 def _times(rule: CompiledRequirement, grid: Grid) -> Iterator[str]:
-    """Every interval once: operator, seconds, samples."""
+    """Distinct intervals: operator, seconds, samples."""
     seen: set[str] = set()
     for node in nodes(rule.formula):
         if isinstance(node, (ir.Temporal, ir.PastTemporal, ir.Until, ir.Since)):

@@ -1,15 +1,15 @@
-"""The stages of the compiler, in order. Read first.
+"""Compiler pipeline: the stages, in order. Read this module first.
 
     resolve   ast.Spec      -> typed.Spec                 names, sorts, units; time in seconds
-    place     typed.Formula -> typed.Formula              delays in samples: here the grid of time comes in
+    place     typed.Formula -> typed.Formula              delays in samples, from here on for one time grid
     augment   typed.Formula -> typed.Formula, Timer…      absolute intervals and the past become states
     lower     typed.Formula -> ir.Formula                 negation normal form; time in steps
     simplify  ir.Formula    -> ir.Formula                 fewer nodes, no constants
-    horizon   ir.Formula    -> int                        how far it looks
+    horizon   ir.Formula    -> int                        lookahead
 
-A text goes down these stages once. `resolve_for` is the first one, `compile_resolved` runs all others, so
-that a monitor that learns the grid of time later, or meets several grids, resolves once.
-`stlc.compile.backends.array.graph` evaluates what comes out. torch is not needed for any of this.
+`resolve_for` is the first stage, `compile_resolved` runs the others, so that a monitor that learns the time
+grid later, or uses several grids, resolves once. `stlc.compile.backends.array.graph` evaluates the result.
+No stage needs torch.
 """
 
 from __future__ import annotations
@@ -45,31 +45,31 @@ from stlc.source import Span
 Purpose: TypeAlias = Literal["train", "check"]
 """Purpose of a compilation.
 
-`train`: for plans over the horizon; absolute intervals and the past become states, and no window may leave
-the plan (E306).
-`check`: for recorded traces; absolute intervals are judged on the mission clock.
+`train`: plans over the horizon; absolute intervals and past operators become states, and no window may extend
+beyond the plan (E306).
+`check`: recorded traces; absolute intervals are evaluated on the mission clock.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class CompiledRequirement:
-    """A compiled requirement.
+    """Compiled requirement.
 
     Attributes:
         name: of the requirement.
         doc: its `##` comment.
         tags: bare tag names.
-        weight: factor of its robustness in the whole.
-        scale: divisor of its robustness in the whole.
+        weight: factor of its robustness in the overall minimum.
+        scale: divisor of its robustness in the overall minimum.
         formula: in negation normal form and steps.
-        lowered: the same before laws were applied that may hold for exact minima and maxima only.
-        reach: how many steps of the future it needs.
-        windowed: it mentions `T`, and so speaks about every planning window.
-        uses_end: a window of it runs to the end of the trace.
+        lowered: formula before simplification, valid under every semantics.
+        reach: lookahead in steps.
+        windowed: it mentions `T`, and so applies to every planning window.
+        uses_end: it has a window to the end of the trace.
         absolute: it has an interval on the mission clock.
-        alive: for training, whether the mission so far leaves a way to satisfy it; about the state at hand.
+        alive: for training, state formula: the requirement can still be satisfied after the mission so far.
         span: of the declaration.
-        typed: what it was lowered from.
+        typed: formula before lowering.
     """
 
     name: str
@@ -89,32 +89,32 @@ class CompiledRequirement:
 
     @property
     def unit(self) -> str:
-        """Of its robustness; "" where its predicates are not all of one."""
+        """Unit of the robustness; "" if its predicates have different units."""
         return margin_unit(self.typed.formula)
 
     def under(self, semantics: Semantics) -> ir.Formula:
-        """The formula with the robustness of `semantics`: shortened by the laws that hold there."""
+        """Return the formula simplified by the laws of `semantics`."""
         return self.formula if semantics.exact else simplify(self.lowered, semantics)
 
 
 @dataclass(frozen=True, slots=True)
 class Compiled:
-    """A compiled specification.
+    """Compiled specification.
 
     Attributes:
         name: of the specification.
-        spec: what was written.
-        signature: the columns that requirements and assumptions read, then the timers.
+        spec: syntax tree.
+        signature: columns that requirements and assumptions read, then the timers.
         requirements: in order.
-        assumptions: the `assume`s, in order; never part of the whole.
-        timers: states that the requirements need beyond those of the system.
-        parameters: what is drawn for every trajectory and the system does not carry, for training.
-        pull: for training, how far the next goal of the mission is at one sample; None without such goals.
-        mission: the last step of the mission that a requirement names; None where none does.
-        recurring: of a mission that is never over, the steps that its timers remember: it comes round after
-            about so many. None where all missions end.
-        grid: of time.
-        warnings: what is worth saying although it compiles.
+        assumptions: `assume`s, in order; not part of the overall robustness.
+        timers: states that the requirements add to those of the system.
+        parameters: for training, values drawn per trajectory that are not states of the system.
+        pull: for training, guidance cost at one sample; None without goals beyond the horizon.
+        mission: last step of the mission that a requirement refers to; None without one.
+        recurring: for an unbounded mission, the steps that its timers count, about one period; None if all
+            missions are bounded.
+        grid: time step and horizon.
+        warnings: findings that are not errors.
         typed: the resolved specification.
     """
 
@@ -139,7 +139,7 @@ class Compiled:
 
     @property
     def reach(self) -> int:
-        """Lookahead of the whole, in steps."""
+        """Lookahead of all requirements, in steps."""
         return max((rule.reach for rule in self.requirements), default=0)
 
 
@@ -151,17 +151,17 @@ def compile_spec(
     overrides: Mapping[str, str] | None = None,
     purpose: Purpose = "train",
 ) -> Compiled:
-    """All stages.
+    """Run all stages.
 
     Args:
         spec: as parsed.
-        grid: the step and the horizon, as far as they are known.
-        interface: what a system offers; None leaves the signals of the file as they are declared.
+        grid: time step and horizon, as far as known.
+        interface: of a system; None leaves the signals as declared in the file.
         overrides: constant -> its value, as text.
         purpose: training or judging recorded traces.
 
     Raises:
-        SpecError: with all errors of a stage.
+        SpecError: all errors of a stage.
     """
     return compile_resolved(resolve_for(spec, interface, overrides, purpose), grid, purpose)
 
@@ -169,7 +169,7 @@ def compile_spec(
 def resolve_for(
     spec: ast.Spec, interface: Interface | None, overrides: Mapping[str, str] | None, purpose: Purpose
 ) -> typed.Spec:
-    """The first stage: all that does not depend on the grid of time. Arguments as of `compile_spec`."""
+    """Run the first stage, which is independent of the time grid. Arguments as of `compile_spec`."""
     overrides = overrides or {}
     if interface is not None and purpose == "check":
         given = {item.name for item in spec.items if isinstance(item, ast.Param)} & overrides.keys()
@@ -178,10 +178,10 @@ def resolve_for(
 
 
 def compile_resolved(spec: typed.Spec, grid: Grid, purpose: Purpose = "train") -> Compiled:
-    """All stages but the first, for one grid of time.
+    """Run all stages but the first, for one time grid.
 
     Raises:
-        SpecError: with all errors of a stage.
+        SpecError: all errors of a stage.
     """
     sink = list(spec.warnings)
     if purpose == "check":
@@ -219,7 +219,7 @@ def compile_resolved(spec: typed.Spec, grid: Grid, purpose: Purpose = "train") -
 @final
 @dataclass(frozen=True, slots=True)
 class _Stage:
-    """From resolved requirements to compiled ones; timers, goals and findings gather on the way."""
+    """Compilation of resolved requirements, collecting timers, goals and findings."""
 
     grid: Grid
     purpose: Purpose
@@ -229,7 +229,7 @@ class _Stage:
     goals: list[Goal] = field(default_factory=list)
 
     def rule(self, requirement: typed.Requirement) -> CompiledRequirement:
-        """One requirement, compiled."""
+        """Compile one requirement."""
         written = in_samples(requirement.formula, self.grid, self.sink)
         requirement = replace(requirement, formula=written)
         if self.purpose == "train":
@@ -268,12 +268,12 @@ class _Stage:
 
 
 def _remembered(timers: Iterable[Timer]) -> int:
-    """The most steps that a timer counts; 0 where there is none."""
+    """Return the greatest count of a timer in steps; 0 without timers."""
     return max((int(timer.high) for timer in timers if timer.kind == "timer"), default=0)
 
 
 def _without(interface: Interface, names: Iterable[str]) -> Interface:
-    """An interface that leaves states whose value is given to the specification: its parameters."""
+    """Return the interface without states that become parameters of the specification."""
     kept = [column for column in interface.signature.columns if column.name.partition("[")[0] not in names]
     return replace(interface, signature=Signature(tuple(kept)))
 

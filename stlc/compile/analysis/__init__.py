@@ -1,1 +1,1 @@
-"""Static analysis of a specification: what its ranges imply before it is used."""
+"""Static analysis of a specification: warnings that follow from its declared ranges."""

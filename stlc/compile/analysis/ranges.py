@@ -1,4 +1,4 @@
-"""Interval arithmetic over numbers, and the usual range of random draws."""
+"""Interval arithmetic over numbers, and the typical range of random draws."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _DEVIATIONS = 3.0
 _CHANGES: Mapping[str, Callable[[float, float], float]] = MappingProxyType(
     {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv}
 )
-"""Units of random draws: points are shifted, deviations are scaled."""
+"""Unit conversion of sampler arguments: locations are shifted and scaled, deviations only scaled."""
 
 
 def usual_range(num: ir.Num) -> tuple[float, float] | None:
-    """Range of nearly all draws of a sampler with known arguments; None where nothing is known."""
+    """Range that holds nearly all draws of a sampler with constant arguments; None where unknown."""
     match num:
         case ir.Const(value):
             return value, value
@@ -52,7 +52,7 @@ KnownRanges: TypeAlias = Mapping[str, Bounds]
 
 
 def bounds(num: ir.Num, facts: KnownRanges) -> Bounds | None:
-    """The least interval that interval arithmetic finds for `num`, or None where the facts do not say.
+    """Return the tightest interval for `num` by interval arithmetic, or None where `facts` do not bound it.
 
     Args:
         num: a number in SI units.

@@ -1,4 +1,4 @@
-"""Warnings about requirements: contradictions, requirements that say nothing, and jumps of a modulo."""
+"""Warnings about requirements: contradictions, vacuous requirements, and discontinuities of a modulo."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _TOLERANCE = 1e-6
 
 
 def contradictions(formula: typed.Formula) -> Iterator[Diagnostic]:
-    """W505 for each conjunction in a formula that is false whatever the signals are."""
+    """Return W505 for each conjunction in a formula that is unsatisfiable for all signal values."""
     told: set[Span] = set()
     for node in nodes(formula):
         if isinstance(node, typed.Logic) and node.op == "and" and node.span not in told:
@@ -32,7 +32,7 @@ def contradictions(formula: typed.Formula) -> Iterator[Diagnostic]:
 
 @dataclass(slots=True)
 class _Room:
-    """Bounds that predicates leave of a quantity, and which of them bind."""
+    """Bounds of a quantity that predicates impose, with the predicates that attain them."""
 
     low: float = -math.inf
     high: float = math.inf
@@ -42,7 +42,7 @@ class _Room:
 
 @dataclass(frozen=True, slots=True)
 class _Linear:
-    """A number as a sum of parts with factors, and a constant."""
+    """Linear form of a number: terms with coefficients, and a constant."""
 
     parts: dict[ir.Num, float] = field(default_factory=dict)
     constant: float = 0.0
@@ -84,7 +84,7 @@ def _contradiction(node: typed.Logic) -> Diagnostic | None:
 
 
 def _conjuncts(formula: typed.Formula) -> Iterator[typed.Predicate]:
-    """The predicates that all have to hold at one instant."""
+    """Predicates that must all hold at one instant."""
     match formula:
         case typed.Predicate():
             yield formula
@@ -114,7 +114,7 @@ def _linear(num: ir.Num) -> _Linear:
 
 
 def jumps(formula: typed.Formula, ranges: KnownRanges) -> Iterator[Diagnostic]:
-    """One warning for every predicate with a modulo that jumps within the ranges of its signals.
+    """Return a warning for each predicate with a modulo that is discontinuous within its signals' ranges.
 
     Args:
         formula: as resolved.
@@ -135,7 +135,7 @@ def jumps(formula: typed.Formula, ranges: KnownRanges) -> Iterator[Diagnostic]:
 
 
 def _jumps(num: ir.Num, ranges: KnownRanges) -> bool:
-    """True if `num` is a modulo whose left side may pass a multiple of its right side."""
+    """True if `num` is a modulo whose left side may cross a multiple of its right side."""
     if not isinstance(num, ir.Op) or num.name != "mod":
         return False
     value, period = (bounds(arg, ranges) for arg in num.args)
@@ -148,9 +148,9 @@ _DECIDED = 1e-6
 
 
 def vacuous(formula: typed.Formula, signature: Signature, facts: KnownRanges) -> Iterator[Diagnostic]:
-    """W503 for implications whose left side is never true, and for a formula that is never false.
+    """Return W503 for implications whose left side is never true, and for a formula that is never false.
 
-    Only enforced ranges count: a nominal range says where a signal should be, not where it is.
+    Only enforced ranges are used: a nominal range does not constrain the signal.
     """
     found = False
     for left in _antecedents(formula):
@@ -167,7 +167,7 @@ def vacuous(formula: typed.Formula, signature: Signature, facts: KnownRanges) ->
 
 
 def truth(formula: typed.Formula, facts: KnownRanges) -> bool | None:
-    """The truth that enforced ranges decide, at every instant of every trace; None: they do not."""
+    """Truth value at every instant of every trace, by enforced ranges; None where they leave it open."""
     return _truth(normal(formula), facts)
 
 
@@ -193,7 +193,7 @@ def _truth(formula: typed.Formula, facts: KnownRanges) -> bool | None:
 
 
 def _antecedents(formula: typed.Formula) -> Iterator[typed.Formula]:
-    """Left sides of implications that are required (not under a negation)."""
+    """Left sides of required implications (those under no negation)."""
     match formula:
         case typed.Logic(_, "->", (left, right)):
             yield left
@@ -208,7 +208,7 @@ def _antecedents(formula: typed.Formula) -> Iterator[typed.Formula]:
 
 
 def _because(formula: typed.Formula, signature: Signature, facts: KnownRanges) -> str:
-    """`: x is in [0, 5]`, for the columns with an enforced range that decide it."""
+    """Text `: x is in [0, 5]` for the columns whose enforced range decides the formula."""
     parts = []
     read = (leaf for num in numbers(formula) for leaf in leaves(num))
     for name in dict.fromkeys(leaf.name for leaf in read if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))):
@@ -223,7 +223,7 @@ def _because(formula: typed.Formula, signature: Signature, facts: KnownRanges) -
 
 
 def safety_never_violated(requirement: typed.Requirement, tag: ast.Tag | None) -> Diagnostic | None:
-    """W502 for a `@safety` requirement that no finite prefix can violate."""
+    """Return W502 for a `@safety` requirement that no finite prefix can violate."""
     formula = normal(requirement.formula)
     if "safety" not in requirement.tags or _constrains(formula):
         return None
@@ -261,12 +261,12 @@ def _constrains(formula: typed.Formula) -> bool:
 
 
 def _open(window: typed.Interval) -> bool:
-    """True if a window reaches the horizon or the end."""
+    """True if a window extends to the planning horizon or to the end of the trace."""
     return window.hi is None or window.hi.horizons > 0
 
 
 def _promise(formula: typed.Formula) -> Span:
-    """The place of the part that only promises."""
+    """Span of the part that no finite prefix can violate."""
     if isinstance(formula, typed.Freeze):
         return _promise(formula.body)
     if isinstance(formula, typed.Logic):

@@ -1,1 +1,1 @@
-"""States that a plan needs to know what was before it: timers, statuses, missions."""
+"""State augmentation: timers, latches and statuses that carry the past into a plan."""

@@ -1,4 +1,4 @@
-"""A requirement for training: what it asks of every plan, and the states that a plan needs for that."""
+"""Requirements for training: the formula that every plan must satisfy, and the states added for it."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from stlc.source import Span
 
 @dataclass(frozen=True, slots=True)
 class Augmented:
-    """A requirement for training.
+    """Requirement rewritten for training.
 
     Attributes:
-        formula: what every plan has to satisfy.
-        alive: whether the mission so far leaves a way to satisfy the requirement.
-        goal: its absolute formulas; None where it has none.
+        formula: that every plan has to satisfy.
+        alive: whether the requirement can still be satisfied after the mission so far.
+        goal: absolute formulas of the requirement; None where it has none.
     """
 
     formula: typed.Formula
@@ -47,11 +47,11 @@ class Augmented:
 def augment(
     requirement: typed.Requirement, grid: Grid, table: TimerTable, sink: list[Diagnostic]
 ) -> Augmented:
-    """Rewrite the formula of a requirement; the states that it needs go to `table`.
+    """Rewrite the formula of a requirement; append the states that it needs to `table`.
 
-    Findings go to `sink`: E307 for an absolute interval that cannot be moved out of the operators around
-    it, E309 for a past operator without a timer, E310 for an absolute operator whose body looks ahead, E312
-    for one without a deadline, E311 without a horizon.
+    Findings are appended to `sink`: E307 for an absolute interval that cannot be hoisted out of the enclosing
+    operators, E309 for a past operator that no timer represents, E310 for an absolute operator whose body has
+    future operators, E312 for one without a deadline, E311 for a missing horizon.
     """
     formula = requirement.formula
     always = typed.Truth(formula.span, True)
@@ -76,7 +76,7 @@ def augment(
 @final
 @dataclass(frozen=True, slots=True)
 class _Goals:
-    """The absolute formulas of a requirement that is judged at the start of the mission."""
+    """Absolute formulas of a requirement, evaluated at the start of the mission."""
 
     grid: Grid
     table: TimerTable
@@ -84,9 +84,9 @@ class _Goals:
     name: str
 
     def of(self, node: typed.Formula) -> Goal:
-        """The goals of a formula without operators of the past.
+        """Goals of a formula without past operators.
 
-        What is not absolute is asked of the start of the mission: there now and the mission clock agree.
+        Relative operators are evaluated at the start of the mission, where relative and mission time agree.
         """
         if is_state(node, augmented=True):
             return self._leaf(node, "always", ir.Window(0, 0), (typed.Truth(node.span, True), node))
@@ -132,10 +132,10 @@ _LATCHED: dict[AbsoluteOp, str] = {
 
 
 def _about(formula: Absolute) -> str:
-    """`open | true | false`, and when it is latched."""
+    """Description of a status: `open | true | false`, and the condition that latches it."""
     left, right = (f"`{' '.join(body.span.text.split())}`" for body in (formula.left, formula.right))
     window = formula.window
-    if formula.right.span == formula.left.span:  # written otherwise
+    if formula.right.span == formula.left.span:  # rewritten, with no text of its own
         return f"open | true | false  what is known of {right}"
     if window == ir.Window(0, 0):
         return f"open | true | false  {right} at the start of the mission"

@@ -1,8 +1,8 @@
-"""Guidance cost: a performance term that leads plans towards deadlines beyond their horizon.
+"""Guidance cost: a performance term that drives plans towards deadlines beyond their horizon.
 
-Within the horizon robustness says what to do; beyond it nothing does, and a plan could go anywhere. So the
-next open goal, the one that is due first, adds how far its formula is from holding, sample by sample: the
-plan that is closer sooner is the cheaper one, and once a goal is met the next one draws.
+Robustness sees only the horizon. The open goal with the earliest deadline therefore adds the violation of its
+formula, `max(-margin, 0)`, at every sample, so plans that approach it sooner cost less. Once it is met, the
+goal with the next deadline takes over.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from stlc.compile.augment.timers import at_least
 from stlc.compile.ir import nodes as ir
 
 _DONE, _LOST = 1e6, 2e6
-"""Steps left of a goal that needs nothing any more, and of one that is lost."""
+"""Values of `left` for a goal that is already met, and for one that can no longer be met."""
 _ZERO = ir.Const(0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class _Draw:
-    """Distance of a goal from being met, and the steps that it has left."""
+    """Violation of a goal, and the steps left until its deadline."""
 
     gap: ir.Num
     left: ir.Num
 
 
 def guidance_cost(goals: Sequence[Goal]) -> ir.Num | None:
-    """The gap of the goal that is due first, at one sample; None where no goal ever draws."""
+    """Return the violation of the goal with the earliest deadline, at one sample; None without such goals."""
     draws = [draw for goal in goals if (draw := _draw(goal)) is not None]
     if not draws:
         return None
@@ -55,7 +55,7 @@ def _draw(goal: Goal) -> _Draw | None:
 
 
 def _leaf(leaf: GoalLeaf) -> _Draw | None:
-    """Promises draw until they are met, `always` until its window begins."""
+    """Guidance of `eventually` and `until` while pending, and of `always` before its window begins."""
     formula, window = leaf.formula, leaf.formula.window
     if formula.op == "always" and window.hi is None and (rounds := _rounds(leaf)):
         return rounds
@@ -76,7 +76,7 @@ def _leaf(leaf: GoalLeaf) -> _Draw | None:
 
 
 def _rounds(leaf: GoalLeaf) -> _Draw | None:
-    """Recurring goals, `always@[a, end] once[0, c] p`: p draws, and is due c after it was last there."""
+    """Guidance of a recurring goal, `always@[a, end] once[0, c] p`: p is due c after it last held."""
     margin = leaf.formula.margin
     parts = margin.items if isinstance(margin, ir.BoolOp) and margin.op == "and" else (margin,)
     draws = [draw for part in parts if (draw := _round(part, leaf)) is not None]
@@ -84,7 +84,7 @@ def _rounds(leaf: GoalLeaf) -> _Draw | None:
 
 
 def _round(part: ir.Formula, leaf: GoalLeaf) -> _Draw | None:
-    """Of `p or c - since >= 0`."""
+    """Guidance of one recurring part, `p or c - since >= 0`."""
     if not isinstance(part, ir.BoolOp) or part.op != "or":
         return None
     tests = [
@@ -101,7 +101,7 @@ def _round(part: ir.Formula, leaf: GoalLeaf) -> _Draw | None:
 
 
 def _first_due(draws: Sequence[_Draw]) -> _Draw:
-    """Together: the gaps of those that are due first."""
+    """Guidance of a conjunction: the summed violations of the goals with the earliest deadline."""
     if len(draws) == 1:
         return draws[0]
     first = reduce(lambda a, b: ir.Op("min", (a, b)), [draw.left for draw in draws])
@@ -110,7 +110,7 @@ def _first_due(draws: Sequence[_Draw]) -> _Draw:
 
 
 def _nearer(one: _Draw, other: _Draw) -> _Draw:
-    """Of two ways the one that is met, else the nearer one that is not lost."""
+    """Guidance of a disjunction: the goal that is met, else the less violated one that can still be met."""
     first = ir.BoolOp(
         "or",
         (
@@ -134,7 +134,7 @@ def _where(condition: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
 
 
 def _margin(formula: ir.Formula) -> ir.Num | None:
-    """Robustness of a state formula as a number; None where only tests of time decide it."""
+    """Robustness of a state formula as a number; None where it consists of time tests alone."""
     match formula:
         case ir.Predicate(_, _, _, True) | ir.Truth():
             return None

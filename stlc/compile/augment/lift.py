@@ -1,7 +1,7 @@
-"""Absolute intervals are moved out of the operators around them: their truth does not depend on now.
+"""Hoisting of absolute intervals out of enclosing operators: their truth is the same at every instant.
 
-`always[0, T] (q -> always@[a, b] p)` is `eventually[0, T] q -> always@[a, b] p`. What cannot is E307 in
-training; on recorded traces every one is judged where it stands.
+`always[0, T] (q -> always@[a, b] p)` is `eventually[0, T] q -> always@[a, b] p`. Where this is impossible,
+training reports E307; on recorded traces absolute intervals are evaluated in place.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from stlc.source import Span
 
 
 def hoist_absolute(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
-    """A formula in negation normal form with no absolute interval under another temporal operator."""
+    """Move absolute intervals of a formula in negation normal form out of other temporal operators."""
     if not absolute(formula):
         return formula
     match formula:
@@ -34,12 +34,12 @@ def hoist_absolute(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Form
 
 
 def _reaches_now(interval: typed.Interval, node: typed.Temporal) -> bool:
-    """A window of the past that does not start now may be empty; what is constant in it is not the whole."""
+    """True if the window includes now; a past window that does not may be empty, whatever its body."""
     return node.op in ("always", "eventually") or (interval.lo == typed.Time() and not interval.lo_open)
 
 
 def _out_of(node: typed.Temporal, body: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
-    """`op body` with what is constant in `body` beside the operator."""
+    """Return `op body` with the constant parts of `body` moved out of the operator."""
     if _constant(body):
         return body
     if isinstance(body, typed.Logic) and body.op in ("and", "or"):
@@ -66,7 +66,7 @@ def _constant(formula: typed.Formula) -> bool:
 
 
 def _stuck(outer: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:
-    """E307 for the first absolute interval below `outer`."""
+    """Report E307 for the first absolute interval below `outer`."""
     inner = next(node for node in nodes(outer) if on_clock(node) and node is not outer)
     report(sink, _nested(inner.span, outer.span))
     return typed.Truth(outer.span, True)
@@ -82,10 +82,10 @@ def _nested(span: Span, outer: Span) -> Diagnostic:
 
 
 def from_first_sample(formula: typed.Formula) -> typed.Formula:
-    """The formula of a requirement for a recorded trace that is judged at its first sample alone.
+    """Formula of a requirement that is evaluated only at the first sample of a recorded trace.
 
-    There the mission clock and the time from now agree, so absolute intervals become relative ones. Those
-    under another temporal operator stay: they are judged at the first sample, whenever they are asked for.
+    At that sample mission time and relative time agree, so absolute intervals become relative ones. Those
+    under another temporal operator stay absolute and are evaluated at the first sample.
     """
     if isinstance(formula, (typed.Temporal, typed.Until)):
         return from_now(formula)

@@ -1,9 +1,9 @@
-"""Absolute formulas, each with a status: what the mission so far says, and what is left to plans.
+"""Absolute formulas with a latched status, and their progression over a plan.
 
-A status is open, true or false, latched by the clock and the state. A plan satisfies an absolute formula
-unless what is known by its end falsifies it: an open one is judged by its remainder within the horizon, and
-what lies beyond is taken to go well. Whatever `and`, `or`, `not` and `->` stand above, requiring that of
-every plan of an executed trace is requiring the formula of the trace.
+A status is open, true or false, latched by the mission clock and the state. A plan satisfies an absolute
+formula unless the samples up to the plan's end falsify it: an open formula is evaluated over the horizon and
+assumed satisfiable beyond it. Under any combination of `and`, `or`, `not` and `->`, an executed trace whose
+plans all satisfy the progressed formula satisfies the formula.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ _KNOWN = ir.Const(0.5)
 
 @dataclass(frozen=True, slots=True)
 class Absolute:
-    """An absolute operator over state formulas, in negation normal form.
+    """Absolute operator over state formulas, in negation normal form.
 
     Attributes:
         op: the operator.
         window: samples of the mission.
         span: where it was written.
-        left: left operand of `until` and `release`, as typed; a constant for the other two.
+        left: left operand of `until` and `release`, as typed; a constant for `always` and `eventually`.
         right: the other operand, or the only one.
-        left_now: `left` as a condition on the state, ties counted.
-        right_now: the same of `right`.
+        left_now: `left` as a condition on the state; ties count as satisfied.
+        right_now: `right` as a condition on the state; ties count as satisfied.
         margin: `right` as a formula of the IR.
     """
 
@@ -52,7 +52,7 @@ class Absolute:
 
 @dataclass(frozen=True, slots=True)
 class GoalLeaf:
-    """An absolute formula with its columns."""
+    """Absolute formula with its status and clock columns."""
 
     formula: Absolute
     status: ir.Signal
@@ -61,7 +61,7 @@ class GoalLeaf:
 
 @dataclass(frozen=True, slots=True)
 class GoalBranch:
-    """`and` or `or` of goals."""
+    """Conjunction or disjunction of goals."""
 
     op: Literal["and", "or"]
     items: tuple[Goal, ...]
@@ -73,19 +73,19 @@ Goal: TypeAlias = GoalLeaf | GoalBranch
 
 
 def last_step(formula: Absolute) -> int:
-    """The last step of the mission of which this speaks by name."""
+    """Last finite step of the mission that the formula refers to."""
     return formula.window.lo if formula.window.hi is None else formula.window.hi
 
 
 def mission_steps(goal: Goal) -> int:
-    """The last step of which any of its formulas speaks by name."""
+    """Last finite step of the mission that any formula of the goal refers to."""
     if isinstance(goal, GoalLeaf):
         return last_step(goal.formula)
     return max(map(mission_steps, goal.items))
 
 
 def never_over(goal: Goal) -> bool:
-    """True where a mission is never over: one of its formulas has no end."""
+    """True if a formula of the goal has an unbounded window, so that the mission never ends."""
     if isinstance(goal, GoalLeaf):
         return goal.formula.window.hi is None
     return any(map(never_over, goal.items))
@@ -95,13 +95,13 @@ def never_over(goal: Goal) -> bool:
 
 
 def update(formula: Absolute, clock: ir.Signal) -> Callable[[ir.Signal], ir.Num]:
-    """The status one step later, from its own column: once it is known it stays."""
+    """Return the update of a status from its own column; a status that is not open stays."""
     later = _decided(formula, clock)
     return lambda own: choose(at_least(_KNOWN, ir.Op("abs", (own,))), later, own)
 
 
 def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
-    """Next value of an open status, after the sample at hand."""
+    """Next value of an open status, after the current sample."""
     inside, left, right = _inside(formula.window, clock), formula.left_now, formula.right_now
     over = _passed(formula.window, clock)
     match formula.op:
@@ -128,7 +128,7 @@ def _inside(window: ir.Window, clock: ir.Signal) -> ir.Formula:
 
 
 def _passed(window: ir.Window, clock: ir.Signal) -> ir.Formula:
-    """True if the sample at hand is the last one of the window."""
+    """True if the current sample is at or after the end of the window."""
     return ir.Truth(False) if window.hi is None else at_least(clock, ir.Const(float(window.hi)))
 
 
@@ -136,7 +136,7 @@ def _passed(window: ir.Window, clock: ir.Signal) -> ir.Formula:
 
 
 def progress(goal: Goal, horizon: int) -> typed.Formula:
-    """Progressed formula: what a plan has to satisfy from its start, true unless falsified by its end."""
+    """Progressed formula for a plan from its first sample on: true unless falsified by the plan's end."""
     match goal:
         case GoalBranch(op, items, span):
             return typed.Logic(span, op, tuple(progress(item, horizon) for item in items))
@@ -175,7 +175,7 @@ def _remainder(leaf: GoalLeaf, formula: Absolute, horizon: int) -> typed.Formula
 
 
 def possible(goal: Goal) -> typed.Formula:
-    """True if the mission so far leaves a way to satisfy it; a guard on the state at hand."""
+    """Time test on the current state: true if the mission so far has not falsified the goal."""
     match goal:
         case GoalBranch(op, items, span):
             return typed.Logic(span, op, tuple(map(possible, items)))
@@ -186,7 +186,7 @@ def possible(goal: Goal) -> typed.Formula:
 
 
 def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formula:
-    """True if the sample at hand is in a window of the mission."""
+    """Time test: true if the current sample is within a window on the mission clock."""
     begun = time_test(clock, ir.Const(float(window.lo)), span)
     if window.hi is None:
         return begun

@@ -1,11 +1,11 @@
-"""Absolute operators over formulas that look ahead, as absolute operators over the past.
+"""Absolute operators over future formulas, rewritten as absolute operators over past formulas.
 
-`eventually@[a, b] always[0, c] p` says that at some sample from a + c to b + c p has held for c. All of it is
-said of the moment at which it is known, so that what is not known yet needs no memory but that of the past:
-a timer a window. Where parts are known at different moments the earlier ones wait in a register.
+`eventually@[a, b] always[0, c] p` holds iff at some sample from a + c to b + c p has held for c. Each part is
+stated at the instant at which it is decided, so it needs only memory of the past: one timer per window. Where
+parts are decided at different instants, the earlier ones are delayed in a register.
 
-A promise that begins at b at the latest is lost as soon as p fails later than that: `left until@ right` says
-so at once, and not when its last moment has passed. (Past for future: Maler, Nickovic and Pnueli 2005.)
+An obligation that must begin by b is violated as soon as p fails after b; `left until@ right` detects that
+at once, not only when its last instant has passed. (Past for future: Maler, Nickovic and Pnueli 2005.)
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
 _MOST_TURNS = 32
-"""Samples of an `until` below other operators: it is written out."""
+"""Maximum length in samples of an `until` below other operators, which is expanded."""
 
 _Wide: TypeAlias = Literal["always", "eventually", "once", "historically"]
 Formulas: TypeAlias = tuple[typed.Formula, ...]
 
 
 class TooFarError(Exception):
-    """A formula looks ahead without end, or in a way that no state holds; the message says how."""
+    """A formula has unbounded lookahead, or cannot be represented by a finite state; the message says why."""
 
     def __init__(self, span: Span, why: str) -> None:
         super().__init__(why)
@@ -41,7 +41,7 @@ class TooFarError(Exception):
 
 
 def looks_ahead(formula: typed.Formula) -> bool:
-    """True if `formula` has an operator of the future."""
+    """True if `formula` has a future operator."""
     return any(map(_forwards, nodes(formula)))
 
 
@@ -60,16 +60,16 @@ def _forwards(node: typed.Formula) -> bool:
 def in_past_form(
     formula: typed.Formula, grid: Grid, table: TimerTable, sink: list[Diagnostic]
 ) -> typed.Formula:
-    """A formula in negation normal form, judged at the start of the mission, of operators that look back.
+    """Rewrite a formula in negation normal form, evaluated at the start of the mission, with past operators.
 
     Args:
-        formula: absolute operators, and others that begin at the start, under `and` and `or`.
-        grid: of time.
-        table: takes the mission clock where latest moments are asked for.
-        sink: takes findings about bounds.
+        formula: absolute operators, and relative ones evaluated at the start, under `and` and `or`.
+        grid: time step and horizon.
+        table: receives the mission clock where deadlines need it.
+        sink: receives findings about bounds.
 
     Raises:
-        TooFarError: what stands below an operator looks ahead without end, or is not understood.
+        TooFarError: an operand has unbounded lookahead, or an unsupported operator.
     """
     match formula:
         case typed.Logic(_, _, items):
@@ -100,7 +100,7 @@ def in_past_form(
 def _on_grid(
     formula: typed.Formula, grid: Grid, sink: list[Diagnostic], *, denied: bool = False
 ) -> typed.Formula:
-    """The formula with bounds in whole samples, rounded for the operator that was written."""
+    """The formula with bounds in whole samples, rounded according to the operator as written."""
     match formula:
         case typed.Logic(_, _, items):
             return replace(formula, items=tuple(_on_grid(item, grid, sink) for item in items))
@@ -122,7 +122,7 @@ def _on_grid(
 
 
 def _next(span: Span, body: typed.Formula) -> typed.Formula:
-    """`next(p)`: a mission has a next sample."""
+    """Window of `next(p)`; a mission always has a next sample."""
     return typed.Temporal(span, "always", _steps(ir.Window(1, 1), span), body)
 
 
@@ -143,7 +143,7 @@ def _sum(window: ir.Window, lo: int, hi: int | None) -> ir.Window:
 
 
 def _ahead(formula: typed.Formula) -> int:
-    """The samples that a formula looks ahead. Raises TooFarError where it has no end."""
+    """Lookahead of a formula in samples. Raises TooFarError where it is unbounded."""
     if isinstance(formula, _OPAQUE):
         return 0
     inner = max(map(_ahead, operands(formula)), default=0)
@@ -151,7 +151,7 @@ def _ahead(formula: typed.Formula) -> int:
 
 
 _OPAQUE = (typed.Shift, typed.Edge, typed.Freeze, typed.Recalled)
-"""Formulas whose operands are not looked into: the past tells nothing of them."""
+"""Formulas that have no form over the past; their operands are not visited."""
 
 
 def _end(node: typed.Temporal | typed.Until) -> int:
@@ -166,19 +166,19 @@ def _end(node: typed.Temporal | typed.Until) -> int:
 
 @final
 class _Writer:
-    """Writes what is known of a promise in terms of the past.
+    """Rewriter of future operators as past operators.
 
     Args:
-        table: takes the mission clock.
+        table: receives the mission clock.
         span: of the absolute operator.
-        soon: whether it is worth a state to know at once that the promise is lost.
+        soon: whether to add a state that detects a violation at once.
     """
 
     def __init__(self, table: TimerTable, span: Span, *, soon: bool) -> None:
         self._ledger, self._span, self._soon = table, span, soon
 
     def met(self, window: ir.Window, when: Formulas, what: typed.Formula) -> typed.Formula:
-        """At some sample of `window` there is all of `when`, which looks back, and from it on `what`."""
+        """At some sample of `window` all of `when` (past formulas) hold, and from that sample on `what`."""
         if not looks_ahead(what):
             return self._on_clock("eventually", window, self._and(*when, what))
         match what:
@@ -201,13 +201,13 @@ class _Writer:
                 raise TooFarError(what.span, "not something that the past can tell")
 
     def until(self, window: ir.Window, left: typed.Formula, right: typed.Formula) -> typed.Formula:
-        """`left until@ right`, said when both are known."""
+        """`left until@ right`, stated at the instant at which both operands are decided."""
         late = max(_ahead(left), _ahead(right))
         known = self._or(self._until_step(late - 1), self.delayed(left, late))
         return self._on_clock_until(_sum(window, late, late), known, self.delayed(right, late))
 
     def _all(self, window: ir.Window, when: Formulas, items: Formulas) -> typed.Formula:
-        """Conditions that are known at once, and the others."""
+        """Conjunction at a sample of `window`: items decided at once, and items with lookahead."""
         later = [item for item in items if looks_ahead(item)]
         known = (*when, *(item for item in items if not looks_ahead(item)))
         if len(later) == 1:
@@ -272,7 +272,7 @@ class _Writer:
     # ---------------------------------------------------------------- later, by a fixed time
 
     def delayed(self, formula: typed.Formula, steps: int) -> typed.Formula:
-        """Truth of a formula `steps` samples ago, by when it is known."""
+        """Truth of a formula `steps` samples ago, when it is decided."""
         if not looks_ahead(formula):
             return self._ago(formula, steps)
         match formula:
@@ -291,7 +291,7 @@ class _Writer:
     def _written_out(
         self, node: typed.Until, left: typed.Formula, right: typed.Formula, steps: int
     ) -> typed.Formula:
-        """`left until[l, u] right`, or `release`, turn by turn."""
+        """`left until[l, u] right`, or `release`, expanded sample by sample."""
         window, end, strong = _window(node), _end(node), node.op == "until"
         if end > _MOST_TURNS:
             raise TooFarError(
@@ -315,14 +315,14 @@ class _Writer:
         return kept[0] if len(kept) == 1 else typed.Logic(self._span, "or", kept)
 
     def _begun(self, window: ir.Window, when: Formulas) -> typed.Formula:
-        """All of `when`, at a sample of `window`."""
+        """All of `when`, while the mission clock is in `window`."""
         if window == ir.Window(0, None):
             return self._and(*when)
         clock = self._ledger.clock((window.lo if window.hi is None else window.hi) + 1)
         return self._and(*when, typed_inside(window, clock, self._span))
 
     def _until_step(self, step: int | None) -> typed.Formula:
-        """True if the mission is at most so many samples old; always where None is said."""
+        """True if the mission clock is at most `step`; always true for None."""
         if step is None or step < 0:
             return typed.Truth(self._span, step is None)
         return time_test(ir.Const(float(step)), self._ledger.clock(step + 1), self._span)

@@ -1,11 +1,11 @@
-"""Operators of the past become timers, so that a plan knows what was before it.
+"""Past operators as timers, so that a plan carries the history before its first sample.
 
-A timer holds the time up to the sample before: `historically[0, c] p` is `p and held >= c`, `once[0, c] p` is
-`p or since_p <= c`. At the start of a mission nothing was before: windows of the past are cut there.
+A timer counts up to the previous sample: `historically[0, c] p` is `p and held >= c`, `once[0, c] p` is
+`p or since_p <= c`. Windows of the past are cut at the start of the mission.
 
-That decides at an instant, and has no slope. Along a plan the samples since its start are looked at as they
-were written about, and only what was before the start is left to the timer: after k steps it lacks the
-`c - held - k` steps that it lacked of c when the plan began.
+This decides truth at one instant, without a gradient. Along a plan the formula is evaluated on the plan's own
+samples, and the timer at the plan's first sample covers only those before it: after k steps
+`c - held - k` steps are missing.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
 REGISTER = 64
-"""Samples ago up to which states hold what a formula said then, one a sample."""
+"""Maximum delay in samples that a register holds, one state per sample."""
 
 _ZERO, _ONE = ir.Const(0.0), ir.Const(1.0)
 _Op: TypeAlias = Literal["and", "or"]
@@ -42,13 +42,13 @@ _Op: TypeAlias = Literal["and", "or"]
 
 @dataclass(frozen=True, slots=True)
 class _Test:
-    """`left >= right`, where one is a timer and the other a number.
+    """Test `left >= right` between a timer and a number.
 
     Attributes:
-        left: the greater one.
-        right: the other one.
+        left: left side.
+        right: right side.
         span: of the operator.
-        later: how much a timer has gone on one step later, if nothing else happened.
+        later: increment of the timer per step while it is not reset.
     """
 
     left: ir.Num
@@ -57,20 +57,20 @@ class _Test:
     later: int = 0
 
     def decides(self) -> typed.Recalled:
-        """As one of several ways: it decides, or has no say."""
+        """Return the test as a disjunct: robustness +inf or -inf."""
         return typed.Recalled(
             self.span, time_test(self.left, self.right, self.span), time_test(*self._then, self.span)
         )
 
     def lacks(self) -> typed.Recalled:
-        """As one of several conditions: what is missing counts."""
+        """Return the test as a conjunct: where it fails, the missing steps are its robustness."""
         return typed.Recalled(
             self.span, time_test(self.left, self.right, self.span), timer_test(*self._then, self.span)
         )
 
     @property
     def _then(self) -> tuple[ir.Num, ir.Num]:
-        """Both sides some samples after the timer was read at the first one."""
+        """Both sides at a later sample of the plan, extrapolated from the timer at the first sample."""
         return self._since_first(self.left), self._since_first(self.right)
 
     def _since_first(self, side: ir.Num) -> ir.Num:
@@ -83,13 +83,13 @@ class _Test:
 @final
 @dataclass(frozen=True, slots=True)
 class Past:
-    """Rewrites operators of the past for one requirement.
+    """Rewriter of past operators for one requirement.
 
     Attributes:
-        grid: of time.
-        table: takes the timers.
-        sink: takes the findings, E309 for what no timer can hold.
-        name: of the requirement; timers are named after it.
+        grid: time step and horizon.
+        table: receives the timers.
+        sink: receives the findings, E309 for operators that no timer represents.
+        name: of the requirement; prefix of the timers' names.
     """
 
     grid: Grid
@@ -98,7 +98,7 @@ class Past:
     name: str
 
     def rewrite(self, formula: typed.Formula) -> typed.Formula:
-        """A formula in negation normal form without operators of the past."""
+        """Return a formula in negation normal form without past operators."""
         if not looks_back(formula):
             return formula
         match formula:
@@ -145,7 +145,7 @@ class Past:
         )
 
     def _seen(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
-        """True if `body` held at one of the `most` samples before."""
+        """True if `body` held at one of the previous `most` samples (None: all)."""
         condition = self._condition(body)
         if most is None:
             draft = self._draft("latch", "seen", 0.0, 1.0, f"whether {_short(node.body)} ever held")
@@ -157,7 +157,7 @@ class Past:
         return _Test(ir.Const(float(most)), since, node.span, later=1).decides()
 
     def _held(self, node: typed.Temporal, body: typed.Formula, most: int | None) -> typed.Recalled:
-        """True if `body` held at all of the `most` samples before."""
+        """True if `body` held at each of the previous `most` samples (None: all)."""
         condition = self._condition(body)
         if most is None:
             draft = self._draft("latch", "kept", 1.0, 1.0, f"whether {_short(node.body)} always held")
@@ -171,7 +171,7 @@ class Past:
     # ------------------------------------------------------------------------------ since
 
     def _since(self, node: typed.Until, *, positive: bool) -> typed.Formula:
-        """`p since[0, c] q`: p now, and q now or so lately that p has held from there on; or its dual."""
+        """`p since[0, c] q`: p now, and q now or at most c ago with p holding ever since; or its dual."""
         sign: Sign = 1 if positive else -1
         left, right = self._body(normal(node.left, sign)), self._body(normal(node.right, sign))
         if left is None or right is None:
@@ -203,7 +203,7 @@ class Past:
     def _recent(
         self, node: typed.Until, left: ir.Formula, right: ir.Formula, most: int | None, *, positive: bool
     ) -> typed.Recalled:
-        """True if q held at one of the samples before, and p from there on up to now; or its contrary."""
+        """True if q held at a previous sample and p from it on until the previous sample; or its negation."""
         held, met = (left, right) if positive else (negate(left), negate(right))
         about = f"{_short(node.right)}, and {_short(node.left)} from there on"
         if most is None:
@@ -241,7 +241,7 @@ class Past:
         *,
         before: bool,
     ) -> typed.Formula:
-        """Truth of `body` some samples ago, in a register; `before` stands for it before the start."""
+        """Truth of `body` `steps` samples ago, kept in a register; `before` is its value before the start."""
         if steps > REGISTER:
             return self._refused(node.span, f"that asks what was more than {REGISTER} samples ago")
         condition = self._condition(body)
@@ -264,7 +264,7 @@ class Past:
         )
 
     def _since_before(self, node: typed.Until, window: ir.Window, *, positive: bool) -> typed.Formula:
-        """`p since[a, b] q`: p for the last a, and a ago `p since[0, b - a] q`; or its dual."""
+        """`p since[a, b] q`: p throughout [0, a], and `p since[0, b - a] q` a ago; or its dual."""
         lo, hi = window.lo, window.hi or 0
         recent = replace(node, interval=_back(ir.Window(0, hi - lo), node.span))
         ago = self._delayed(node, self._since(recent, positive=positive), lo, before=not positive)
@@ -279,7 +279,7 @@ class Past:
     def _lasting(
         self, node: typed.Until, left: typed.Formula, right: typed.Formula, least: int, *, positive: bool
     ) -> typed.Formula:
-        """`p since[a, end] q`: how long ago the first q was from which on p has held; or its dual."""
+        """`p since[a, end] q` by a timer of the earliest q since which p has held; or its dual."""
         p, q = self._condition(left), self._condition(right)
         held, met = (p, q) if positive else (negate(p), negate(q))
         from_there = f"{_short(node.right)} with {_short(node.left)} from there on"
@@ -334,7 +334,7 @@ class Past:
         return tolerant(condition(at_hand(body), flat=True))
 
     def _body(self, body: typed.Formula) -> typed.Formula | None:
-        """A body without operators of the past, if it is about one instant alone by then."""
+        """Return the body without past operators if that is a state formula; else None, and E309."""
         rewritten = self.rewrite(body)
         if is_state(rewritten, augmented=True):
             return rewritten
@@ -362,13 +362,13 @@ def _counted(own: ir.Num, most: int) -> ir.Num:
 
 
 def _short(formula: typed.Formula) -> str:
-    """A formula as it was written, cut where it is long."""
+    """Source text of a formula, truncated where it is long."""
     text = " ".join(formula.span.text.split())
     return f"`{text}`" if len(text) <= 40 else f"`{text[:37]}...`"
 
 
 def _back(window: ir.Window, span: Span) -> typed.Interval:
-    """A window of the past."""
+    """Window of a past operator as an interval."""
     hi = None if window.hi is None else typed.Time(steps=Fraction(window.hi), span=span)
     return typed.Interval(typed.Time(steps=Fraction(window.lo), span=span), hi, span=span)
 
@@ -376,7 +376,7 @@ def _back(window: ir.Window, span: Span) -> typed.Interval:
 def _since_inside(
     node: typed.Until, left: typed.Formula, right: typed.Formula, window: ir.Window, *, positive: bool
 ) -> typed.Formula:
-    """`since` or its dual over the samples since the first one; the operands of the dual are negated."""
+    """`since` over the plan's samples, or its dual, whose operands are negated."""
     interval = _back(window, node.span)
     if positive:
         return replace(node, interval=interval, left=left, right=right)

@@ -1,8 +1,8 @@
-"""States that the compiler adds, because a plan must know what was before it: their values and how they move.
+"""States that the compiler adds to carry the history before a plan: initial values and updates.
 
-`clock`: how many steps the mission is old. `status`: what is known of an absolute formula. `latch`: whether a
-formula held at the sample before, or ever. `timer`: for how long it has, or has not. All of them are whole
-numbers, and one step later each is a function of the state at the start of the step.
+`clock`: steps since the start of the mission. `status`: truth of an absolute formula so far. `latch`: whether
+a formula held at the previous sample, or ever. `timer`: for how long a formula has held, or has not. All are
+integers, updated from the state at the start of a step.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ OPEN, TRUE, FALSE = 0.0, 1.0, -1.0
 """Values of a status."""
 
 MISSING = 1000.0
-"""Robustness that a step lacks which a timer asks for, and which lies before a plan."""
+"""Robustness lost per missing step before a plan, as counted by a timer."""
 
 
 @dataclass(frozen=True, slots=True)
 class Timer:
-    """A state that the compiler adds.
+    """State that the compiler adds.
 
     Attributes:
         name: of its column.
-        kind: what it holds.
-        initial: its value at the start of a mission.
-        update: its value one step later, read from the state at the start of the step.
-        low: its least value.
-        high: its greatest value; beyond it no formula tells instants apart.
-        about: what it says, in words.
+        kind: clock, status, latch or timer.
+        initial: value at the start of a mission.
+        update: value one step later, as a function of the state at the start of the step.
+        low: least value.
+        high: greatest value, where the count saturates; larger ones make no difference to any formula.
+        about: meaning in words.
     """
 
     name: str
@@ -52,21 +52,21 @@ class Timer:
 
     @property
     def column(self) -> Column:
-        """The column that it adds to a state."""
+        """Column that the timer adds to the state."""
         return Column(self.name, kind="int", role="timer", low=self.low, high=self.high, fact=True)
 
 
 def clock_of(name: str, high: int) -> Timer:
-    """The mission clock: it counts steps, so that no rounding enters, and stops at `high`."""
+    """Mission clock in integer steps, free of rounding, saturating at `high`."""
     later = ir.Op("min", (ir.Op("add", (ir.Signal(name), ir.Const(1.0))), ir.Const(float(high))))
     return Timer(name, "clock", 0.0, later, 0.0, float(high), "counts the samples of the mission")
 
 
 class TimerTable:
-    """The timers of a specification, gathered requirement by requirement; equal ones are kept once."""
+    """Timers of a specification, collected over its requirements; equal ones are shared."""
 
     def __init__(self, taken: frozenset[str]) -> None:
-        """Timers get names that are not among `taken`."""
+        """Create an empty table; names in `taken` are not used for timers."""
         self._taken = set(taken)
         self._known: dict[tuple[object, ...], Timer] = {}
         self._clock: str | None = None
@@ -74,19 +74,19 @@ class TimerTable:
 
     @property
     def timers(self) -> tuple[Timer, ...]:
-        """The clock first, if there is one, then the others in order."""
+        """Timers in order, the clock first if there is one."""
         clocks = () if self._clock is None else (clock_of(self._clock, self._latest),)
         return (*clocks, *self._known.values())
 
     def clock(self, latest: int) -> ir.Signal:
-        """The mission clock, which tells instants apart up to step `latest`."""
+        """Return the mission clock, extended to count up to step `latest`."""
         self._latest = max(self._latest, latest)
         if self._clock is None:
             self._clock = self.fresh("clock")
         return ir.Signal(self._clock)
 
     def add(self, draft: Timer, update: Callable[[ir.Signal], ir.Num]) -> ir.Signal:
-        """A timer like `draft`, whose own column `update` is given; of equal ones there is one."""
+        """Add a timer like `draft`, with `update` applied to its own column, or return an equal one."""
         key = (draft.kind, draft.initial, draft.high, update(ir.Signal("")))
         if key not in self._known:
             name = self.fresh(draft.name)
@@ -94,7 +94,7 @@ class TimerTable:
         return ir.Signal(self._known[key].name)
 
     def fresh(self, wanted: str) -> str:
-        """`wanted`, or with a number behind it where that is the name of something else."""
+        """Return `wanted`, with a number appended where that name is taken."""
         name, number = wanted, 1
         while name in self._taken:
             number += 1
@@ -107,20 +107,20 @@ class TimerTable:
 
 
 def at_least(left: ir.Num, right: ir.Num) -> ir.Predicate:
-    """`left >= right`, between whole numbers."""
+    """Predicate `left >= right` between integers."""
     return ir.Predicate(ir.Op("sub", (left, right)))
 
 
 def time_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Predicate:
-    """`left >= right` as a test of time: it decides truth and never limits the margin."""
+    """Time test `left >= right`: robustness +inf or -inf, so that it never limits the margin."""
     return typed.Predicate(span, ir.Op("sub", (left, right)), strict=False, guard=True)
 
 
 def timer_test(left: ir.Num, right: ir.Num, span: Span) -> typed.Formula:
-    """`left >= right` as a test of what no plan changes any more: where it fails, what is missing counts.
+    """Test `left >= right` of a fact before the plan; where it fails, it costs `MISSING` per missing step.
 
-    Each missing step counts as much as no predicate reaches, so that of several instants those are preferred
-    at which a plan can do something; and it is finite, so that there is a best of plans that all fail.
+    A missing step costs more than any predicate, so that instants that the plan can influence are preferred;
+    it is finite, so that plans that all fail can still be ranked.
     """
     gap = ir.Op("mul", (ir.Op("sub", (left, right)), ir.Const(MISSING)))
     return typed.Logic(span, "or", (time_test(left, right, span), typed.Predicate(span, gap, strict=False)))
@@ -134,12 +134,12 @@ def choose(condition: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
 
 
 def tolerant(formula: ir.Formula) -> ir.Formula:
-    """A state formula that is true exactly where the monitor calls it satisfied: ties count."""
+    """State formula that is true where the monitor reports satisfaction: ties within `TOLERANCE` count."""
     if isinstance(formula, ir.Predicate) and not formula.guard:
         return ir.Predicate(ir.Op("add", (formula.num, ir.Const(formula.sign * TOLERANCE))), formula.sign)
     return map_children(formula, formulas=tolerant)
 
 
 def both(*items: ir.Formula) -> ir.Formula:
-    """The conjunction of formulas, constants folded."""
+    """Conjunction of formulas, constants folded."""
     return joined("and", items, ir.Truth(True))

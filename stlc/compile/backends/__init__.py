@@ -1,1 +1,1 @@
-"""From the intermediate representation to code that computes."""
+"""Back ends: from the intermediate representation to NumPy, torch, C and ONNX."""

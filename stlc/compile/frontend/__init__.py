@@ -1,1 +1,1 @@
-"""From the syntax tree to a typed specification: names, units, sorts, times."""
+"""Front end: from the syntax tree to a typed specification, with names, units, sorts and times checked."""

@@ -1,8 +1,8 @@
-"""Arithmetic on numbers and vectors: units agree, constants fold, vectors broadcast.
+"""Arithmetic on numbers and vectors: unit checks, constant folding, broadcasting.
 
-A number in a unit with a zero of its own (`degC`) is a point. Points are compared, chosen from and
-subtracted, which gives a difference in kelvin; a point and kelvin are a point; `abs` and its like refuse
-points, and any other function takes them in kelvin.
+A number in a unit with an offset (`degC`) is a point of a scale. Points can be compared and selected; their
+difference is in kelvin; a point plus kelvin is a point. `abs` and other magnitudes reject points, all other
+functions take them in kelvin.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from stlc.units import DIMENSIONLESS, SYMBOLS, Unit, nearest, same_dims
 
 _MAX_BITS = 512
 _QUANTITY = re.compile(r"(-? *[\d.]+(?:[eE][+-]?\d+)?) *(?:[^\W\d]|°)\S*")
-"""A number with its unit, as written."""
+"""Source text of a number with its unit."""
 _OF_POINTS = ("min", "max", "clip", "choice", "uniform")
-"""Functions that choose from points, or draw between them."""
+"""Functions that select among points, or draw between them."""
 
 _LENGTHS = ("abs", "norm", "norm1", "norminf")
 _TEMPERATURE = (0, 0, 0, 0, 1)
@@ -41,13 +41,13 @@ _MISSING = {
 
 
 def apply(name: str, args: Sequence[Number], span: Span, scope: Scope) -> Number:
-    """`name(args)`, checked and folded.
+    """Return `name(args)`, with units checked and constants folded.
 
     Args:
         name: of an entry of `FUNCTIONS`.
-        args: as many as the function takes.
-        span: of the whole, for findings.
-        scope: where findings go.
+        args: arguments, in a valid number.
+        span: of the whole expression, for findings.
+        scope: receives findings.
 
     Raises:
         Failed: units do not agree (E203), a division by zero (E401), or a value that does not exist (E205).
@@ -67,13 +67,13 @@ def apply(name: str, args: Sequence[Number], span: Span, scope: Scope) -> Number
 
 
 def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[tuple[Number, ...], Number]:
-    """The arguments with bare numbers in the unit that is needed, and a blank of that unit.
+    """Convert bare numbers to the common unit; return the arguments and a template number of that unit.
 
     Args:
         args: numbers that must have one unit.
-        what: the headline's verb: "compare", "add", or `norm`.
+        what: verb of the message: "compare", "add", or `norm`.
         span: of the finding.
-        scope: where findings go.
+        scope: receives findings.
     """
     rigid = [arg for arg in args if not arg.flexible]
     for other in rigid[1:]:
@@ -93,7 +93,7 @@ def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[
 
 
 def gap(left: Number, right: Number, span: Span, scope: Scope) -> Number:
-    """`left - right` of what is compared: two points, or two numbers. Raises Failed (E203)."""
+    """Return `left - right` for a comparison of two points or two numbers. Raises Failed (E203)."""
     if not (left.unit.offset or right.unit.offset):
         return apply("sub", (left, right), span, scope)
     sides, _ = agree((left, right), "subtract", span, scope)
@@ -102,7 +102,7 @@ def gap(left: Number, right: Number, span: Span, scope: Scope) -> Number:
 
 
 def rebased(number: Number, unit: Unit) -> Number:
-    """The same number, counted from the zero of `unit`, which it takes."""
+    """Convert a number to the offset of `unit`, which becomes its unit."""
     shift = number.unit.offset - unit.offset
     if not shift:
         return replace(number, unit=unit)
@@ -123,26 +123,26 @@ def rebased(number: Number, unit: Unit) -> Number:
 
 
 def absolute(number: Number) -> Number:
-    """The number in SI units from their zero: 20 degC is 293.15 K."""
+    """Convert to SI units without an offset: 20 degC is 293.15 K."""
     return rebased(number, number.unit.interval)
 
 
 def on_scale(number: Number, unit: Unit, place: Span | None, scope: Scope) -> Number:
-    """A number of the dimensions of `unit` as one in it. Raises Failed (E203): a difference is no point."""
+    """Convert a number to `unit`, of equal dimensions. Raises Failed (E203): a difference is no point."""
     if unit.offset and number.sense == "difference":
         scope.fail(difference_for_point(number, unit, place))
     return rebased(number, unit)
 
 
 def difference_for_point(number: Number, unit: Unit, place: Span | None) -> Diagnostic:
-    """E203: a difference where a point of a scale is needed."""
+    """Return E203 for a difference where a point of a scale is needed."""
     message = f"a difference of temperatures, in [{unit.interval}], is no temperature in [{unit}]"
     help_ = (f"declare it in [{unit.interval}], or add it to a temperature: `20 {unit} + …`",)
     return Diagnostic("E203", message, number.span or place, "a difference", help=help_)
 
 
 def too_large(span: Span | None) -> Diagnostic:
-    """E005: a number that no double holds."""
+    """Return E005 for a number beyond double precision."""
     return Diagnostic(
         "E005",
         "this number is beyond double precision",
@@ -152,7 +152,7 @@ def too_large(span: Span | None) -> Diagnostic:
 
 
 def in_unit(number: Number, unit: Unit, scope: Scope) -> Number:
-    """A bare number read in `unit`: 30 becomes 30 deg. Raises Failed (E005 beyond double precision)."""
+    """Interpret a bare number in `unit`: 30 becomes 30 deg. Raises Failed (E005 beyond double precision)."""
     if unit.ratio == 1:
         return replace(number, unit=unit, bare=False, flexible=False)
     exact = None if number.exact is None else number.exact * unit.ratio
@@ -177,7 +177,7 @@ def _refuse_enum(function: Function, arg: Number, span: Span, scope: Scope) -> N
 def _units(
     function: Function, args: Sequence[Number], span: Span, scope: Scope
 ) -> tuple[tuple[Number, ...], Number]:
-    """The arguments in the units that the rule asks for, and a blank with the result's unit."""
+    """Convert the arguments by the function's unit rule; return them and a template of the result."""
     flexible, bare = any(arg.flexible for arg in args), all(arg.bare for arg in args)
     if function.rule == "same":
         return _alike(function, args, span, scope)
@@ -212,7 +212,7 @@ Agreed = tuple[tuple[Number, ...], Number]
 
 
 def _alike(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> Agreed:
-    """Arguments of one unit."""
+    """Unit rule `same`: convert all arguments to one unit."""
     name, verb = function.name, _verb(function)
     if name in ("normal", "truncnorm"):
         return _spread(function, args, span, scope)
@@ -240,7 +240,7 @@ def _sense(args: Sequence[Number]) -> Sense:
 
 
 def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) -> bool:
-    """True if this is a plain number times a difference, or the root of squares: differences again."""
+    """True if the result is a difference: a plain number times a difference, or a root of squares."""
     if function.rule in ("sqrt", "pow"):
         return unit.dims == _TEMPERATURE != args[0].unit.dims
     if function.rule not in ("mul", "div"):
@@ -252,7 +252,7 @@ def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) 
 
 
 def _scaled_point(function: Function, args: Sequence[Number]) -> bool:
-    """True if this is a plain number times a point: a part of a mean, or of a conversion to another scale."""
+    """True for a plain number times a point, as in a mean or in a conversion between scales."""
     told = [arg for arg in args if arg.unit.offset or arg.sense == "open"]
     rest = [arg for arg in args if arg not in told]
     plain = all(arg.bare or (arg.unit.dimensionless and not arg.flexible) for arg in rest)
@@ -261,7 +261,7 @@ def _scaled_point(function: Function, args: Sequence[Number]) -> bool:
 
 
 def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -> Agreed:
-    """Numbers, some of them points, from one zero: that of a point that varies, if there is one."""
+    """Convert numbers, some of them points, to one offset: that of a varying point if there is one."""
     points = [arg for arg in args if arg.unit.offset]
     told = [arg for arg in args if not arg.bare]
     bare = next((arg for arg in args if arg.bare), None)
@@ -284,7 +284,7 @@ def _on_one_scale(args: Sequence[Number], what: str, span: Span, scope: Scope) -
 
 
 def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Scope) -> Agreed:
-    """A sum or difference with a point in it."""
+    """Unit rule of a sum or difference with a point."""
     left, right = args
     first = left.unit.offset and (not right.unit.offset or left.sense != "open")
     point, other = (left, right) if first else (right, left)
@@ -306,7 +306,7 @@ def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Sco
 
 
 def _less_point(left: Number, right: Number, span: Span, scope: Scope) -> Agreed:
-    """`left - right` of a point: a difference of two; undecided where the point is."""
+    """Unit rule of `left - right` with a point on the right: a difference, or `open` where the point is."""
     if right.sense == "open" and not left.bare and left.sense != "difference":
         sense: Sense = "open" if left.unit.offset else ""
         return (left, absolute(right)), Number(
@@ -317,7 +317,7 @@ def _less_point(left: Number, right: Number, span: Span, scope: Scope) -> Agreed
 
 
 def _spread(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> Agreed:
-    """A middle, a deviation, and perhaps ends: the deviation is a difference."""
+    """Unit rule of `normal` and `truncnorm`: mean and bounds are points, the deviation is a difference."""
     middle, deviation, *ends = args
     places = [middle, *ends]
     if deviation.unit.offset:
@@ -337,7 +337,7 @@ def _spread(function: Function, args: Sequence[Number], span: Span, scope: Scope
 
 
 def _length(function: Function, arg: Number, span: Span, scope: Scope) -> Number:
-    """The argument of `abs` and its like, which take no point: an undecided one is a difference to them."""
+    """Check the argument of `abs` and other magnitudes: no point; an `open` one counts as a difference."""
     if not arg.unit.offset:
         return arg
     if arg.sense == "open":
@@ -347,13 +347,13 @@ def _length(function: Function, arg: Number, span: Span, scope: Scope) -> Number
 
 
 def refuse_point(what: str, number: Number, span: Span, scope: Scope) -> None:
-    """Fail (E203) for a point where an amount is needed: `what` names the place."""
+    """Raise Failed (E203) for a point where an amount is needed; `what` names the place."""
     if number.unit.offset:
         scope.fail(point_for_amount(what, number, span))
 
 
 def point_for_amount(what: str, number: Number, span: Span) -> Diagnostic:
-    """E203: a point of a scale where an amount is needed; `what` names the place."""
+    """Return E203 for a point of a scale where an amount is needed; `what` names the place."""
     unit = number.unit
     text = (number.span or span).text
     written = _QUANTITY.fullmatch(text)
@@ -367,7 +367,7 @@ def point_for_amount(what: str, number: Number, span: Span) -> Diagnostic:
 
 
 def _compared_with_point(difference: Number, point: Number, what: str, span: Span) -> Diagnostic:
-    """E203: `abs(temp - 21 degC) <= 0.5 degC`."""
+    """Return E203 for a difference compared with a point: `abs(temp - 21 degC) <= 0.5 degC`."""
     unit = point.unit
     text = (point.span or span).text
     if point.constant is not None:
@@ -402,7 +402,7 @@ def _sum_of_points(left: Number, right: Number, span: Span) -> Diagnostic:
 
 
 def _which(bare: Number, unit: Unit, span: Span) -> Diagnostic:
-    """E203: a bare number that may count from the zero of a scale, or be in SI units."""
+    """Return E203 for an ambiguous bare number: on the scale with an offset, or in SI units."""
     text, kelvin = (bare.span or span).text, unit.interval
     help_ = (f"`{text} {unit}` is a temperature, `{text} {kelvin}` a difference or a temperature in kelvin",)
     message = f"`{text}` may be in [{unit}] or in [{kelvin}] here"
@@ -468,7 +468,7 @@ def _check_divisor(function: Function, divisor: Number, span: Span, scope: Scope
 
 
 def _op(name: str, args: Sequence[Number]) -> ir.Num:
-    """The node, with neutral elements left out."""
+    """Build the node of a function, with neutral elements removed."""
     nums = tuple(arg.num for arg in args)
     match name, nums:
         case ("add", (num, ir.Const(0.0))) | ("add", (ir.Const(0.0), num)) | ("sub", (num, ir.Const(0.0))):
@@ -484,7 +484,7 @@ def _op(name: str, args: Sequence[Number]) -> ir.Num:
 
 
 def _fold(function: Function, args: Sequence[Number], shell: Number, scope: Scope) -> Number:
-    """The value of a function of constants; exact where all of them are and the function allows it."""
+    """Fold a function of constants; exact where all are exact and the function preserves it."""
     assert function.fold is not None
     exacts = [arg.exact for arg in args]
     rational = function.exact and all(exact is not None for exact in exacts)
@@ -506,9 +506,9 @@ def _fold(function: Function, args: Sequence[Number], shell: Number, scope: Scop
 
 
 def _whole(function: Function, args: Sequence[Number], shell: Number) -> bool:
-    """True if the result is a whole number, whatever the arguments are at the moment.
+    """True if the result is an integer for all values of the arguments.
 
-    `floor` and its like make whole numbers of SI units: in kilometres these need not be whole.
+    `floor` and other roundings act on SI values, which in kilometres need not be integers.
     """
     if function.integral:
         return shell.unit.ratio == 1
@@ -524,7 +524,7 @@ def _verb(function: Function) -> str:
 
 
 def _mismatch(left: Number, right: Number, what: str, span: Span) -> Diagnostic:
-    """E203, with both places and what would make the units agree."""
+    """Return E203 with both places, and a repair that makes the units agree."""
     preposition = {"add": "and", "subtract": "and", "take the modulo of": "and"}.get(what, "with")
     verb = f"cannot {what}" if not what.startswith("`") else f"{what} cannot combine"
     labels = tuple(
@@ -565,7 +565,7 @@ def _repair(left: Number, right: Number, span: Span) -> tuple[str, ...]:
 
 
 def negated(number: Number, span: Span) -> Number:
-    """The number with its sign flipped."""
+    """Return the negated number."""
     value = number.constant
     num: ir.Num = ir.Const(-value) if value is not None else ir.Op("neg", (number.num,))
     exact = None if number.exact is None else -number.exact
@@ -573,12 +573,12 @@ def negated(number: Number, span: Span) -> Number:
 
 
 def half(span: Span) -> Number:
-    """The margin of a truth value: 1/2."""
+    """Return the margin of a truth value, 1/2."""
     return literal(Fraction(1, 2), span)
 
 
 def broadcast(name: str, args: Sequence[Number | Vector], span: Span, scope: Scope) -> Number | Vector:
-    """`name` applied component by component; numbers stand for vectors of themselves."""
+    """Apply `name` component by component; numbers broadcast to vectors."""
     lengths = {len(arg.items) for arg in args if isinstance(arg, Vector)}
     if not lengths:
         return apply(name, [arg for arg in args if isinstance(arg, Number)], span, scope)
@@ -589,7 +589,7 @@ def broadcast(name: str, args: Sequence[Number | Vector], span: Span, scope: Sco
 
 
 def check_lengths(lengths: set[int], span: Span, scope: Scope) -> None:
-    """Refuse vectors of different lengths (E205)."""
+    """Raise Failed (E205) for vectors of different lengths."""
     if len(lengths) > 1:
         long, short = sorted(lengths, reverse=True)[:2]
         scope.fail(Diagnostic("E205", f"vectors of {short} and {long} components do not go together", span))
@@ -603,31 +603,31 @@ def negate(value: Number | Vector, span: Span) -> Number | Vector:
 
 
 def minus(left: Vector, right: Vector, span: Span, scope: Scope) -> Vector:
-    """From one point to another, both of so many components. Raises Failed (E203, E205)."""
+    """Return the difference of two points of equal dimension. Raises Failed (E203, E205)."""
     check_lengths({len(left.items), len(right.items)}, span, scope)
     pairs = zip(left.items, right.items, strict=True)
     return Vector(tuple(gap(a, b, span, scope) for a, b in pairs), span)
 
 
 def norm(vector: Vector, span: Span, scope: Scope) -> Number:
-    """The Euclidean length."""
+    """Return the Euclidean length."""
     return apply("norm", vector.items, span, scope)
 
 
 def total(items: Sequence[Number], span: Span, scope: Scope) -> Number:
-    """The sum of at least one number."""
+    """Return the sum of at least one number."""
     return reduce(lambda a, b: apply("add", (a, b), span, scope), items)
 
 
 def dot(left: Vector, right: Vector, span: Span, scope: Scope) -> Number:
-    """The inner product."""
+    """Return the inner product."""
     products = broadcast("mul", (left, right), span, scope)
     assert isinstance(products, Vector)
     return total(products.items, span, scope)
 
 
 def cross(left: Vector, right: Vector, span: Span, scope: Scope) -> Number | Vector:
-    """The cross product: a number in the plane, a vector in space."""
+    """Return the cross product: a number in 2D, a vector in 3D."""
 
     def minor(i: int, j: int) -> Number:
         ahead = apply("mul", (left.items[i], right.items[j]), span, scope)

@@ -1,4 +1,4 @@
-"""Calls of functions: built-in ones, regions, neighbouring samples, functions of the system."""
+"""Function calls: built-in functions, regions, neighbouring samples, functions of the system."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ FORMALS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 
 def region(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Region:
-    """The region that a call makes. Raises Failed (E105 arguments, E205 sorts)."""
+    """Return the region that a call constructs. Raises Failed (E105 arguments, E205 sorts)."""
     if name not in FORMALS:
         for arg in call.args:
             if arg.name is not None:
@@ -93,7 +93,7 @@ def region(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> 
 def _bound(
     name: str, call: ast.Call, values: Sequence[Value], scope: Scope
 ) -> tuple[tuple[ast.Expr, Value], ...]:
-    """Arguments in the order of the formals, whether they were named or not."""
+    """Return positional and named arguments in the order of the formals."""
     formals = FORMALS[name]
     found: dict[str, tuple[ast.Expr, Value]] = {}
     shape = f"{name}({', '.join(formals)})"
@@ -136,7 +136,7 @@ def _box_of(call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scop
         scope.fail(Diagnostic("E205", message, call.span))
     for low, high in zip(lower.items, upper.items, strict=True):
         if low.bare is not high.bare:
-            continue  # the point that is asked for says the unit of the bare one
+            continue  # a bare centre takes the unit of the tested point
         if not low.bare:
             low, high = absolute(low), absolute(high)
         if low.constant is not None and high.constant is not None and low.constant > high.constant:
@@ -177,7 +177,7 @@ _SECOND = SYMBOLS["s"]
 
 
 def stepping(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
-    """`name(values)`, with as many values as it takes. Raises Failed (E201, E205)."""
+    """Evaluate a `STEPPING` function with a valid number of arguments. Raises Failed (E201, E205)."""
     value, expr = values[0], call.args[0].value
     match name:
         case "rise":
@@ -195,7 +195,7 @@ def stepping(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -
 
 
 def _shifted(value: Value, delay: typed.Time, expr: ast.Expr, span: Span, name: str, scope: Scope) -> Value:
-    """A number, a vector or a formula some time later."""
+    """Return a number, a vector or a formula shifted in time."""
     match value:
         case Number() if value.kind != "bool":
             return replace(value, num=_delayed_number(value.num, delay), origin=None)
@@ -218,13 +218,13 @@ def _delayed_formula(formula: typed.Formula, delay: typed.Time, span: Span) -> t
 
 
 def _later(number: Number, delay: typed.Time, span: Span) -> Number:
-    """A component some time later; of a choice between bools the formula as well."""
+    """Shift one component; for a choice between bools also its formula."""
     formula = None if number.formula is None else _delayed_formula(number.formula, delay, span)
     return replace(number, num=_delayed_number(number.num, delay), formula=formula)
 
 
 def _delta(value: Value, expr: ast.Expr, span: Span, scope: Scope) -> Value:
-    """Difference from the sample before."""
+    """Return the difference from the previous sample."""
     now = (
         value
         if isinstance(value, Vector)
@@ -242,9 +242,9 @@ def _swept_point(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) 
 
 
 def _delay(value: Value, expr: ast.Expr, scope: Scope) -> typed.Time:
-    """A number of samples, `3`, `-1`, `3 steps`, or a time, which the grid will count in samples: `0.1 s`.
+    """Delay as a number of samples (`3`, `-1`, `3 steps`), or as a time (`0.1 s`), before discretization.
 
-    Raises Failed: E205 where it is none.
+    Raises Failed: E205 where it is neither.
     """
     match value:
         case TimeExpr(end=False):
@@ -267,7 +267,7 @@ def _delay(value: Value, expr: ast.Expr, scope: Scope) -> typed.Time:
 
 
 def outside(entry: External, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
-    """A call. Raises Failed (E105, E202, E205)."""
+    """Return a call of a function of the system. Raises Failed (E105, E202, E205)."""
     _check_arguments(entry, call, scope)
     flat: list[ir.Num] = []
     for arg, value, size in zip(call.args, values, entry.arguments, strict=True):
@@ -307,7 +307,7 @@ def _check_arguments(entry: External, call: ast.Call, scope: Scope) -> None:
 
 
 def builtin(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
-    """`name(values)` for a built-in function. Raises Failed; E101 where there is no such function."""
+    """Return `name(values)` for a built-in function. Raises Failed; E101 for an unknown function."""
     if name in REGIONS:
         return region(name, call, values, scope)
     if name == "ind":
@@ -331,14 +331,14 @@ def builtin(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) ->
 
 
 def unsupported(what: str, span: Span, scope: Scope) -> Diagnostic:
-    """A part of the language that is not compiled here."""
+    """Return the diagnostic for a part of the language that is not supported in this context."""
     if not scope.in_spec:
         return Diagnostic("S201", f"{what} is not part of the expression language of system files", span)
     return Diagnostic("E015", f"{what} is not compiled by this version", span)
 
 
 def count_arguments(name: str, call: ast.Call, least: int, most: int | None, scope: Scope) -> None:
-    """Refuse a wrong number of arguments (E105)."""
+    """Raise Failed (E105) for a wrong number of arguments."""
     given = len(call.args)
     if least <= given and (most is None or given <= most):
         return
@@ -364,7 +364,7 @@ def _no_samplers(name: str, call: ast.Call, scope: Scope) -> Diagnostic:
 
 
 def _function(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
-    """A function of the table: component by component, or over all components at once."""
+    """Apply a function of the table component by component, or over all components at once."""
     items: list[Number | Vector] = []
     for index, (arg, value) in enumerate(zip(call.args, values, strict=True), start=1):
         need = Expectation(f"`{name}` takes numbers", f"argument {index}")
@@ -405,7 +405,7 @@ def _rewritten(name: str, call: ast.Call, values: Sequence[Value], scope: Scope)
 
 
 def _convert(name: str, angle: Number, span: Span, scope: Scope) -> Number:
-    """`deg(x)`: how many degrees an angle is; `rad(x)`: the angle of so many degrees."""
+    """`deg(x)`: an angle as a number of degrees; `rad(x)`: a number of degrees as an angle."""
     ratio = Fraction(math.pi) / 180
     factor = literal(1 / ratio if name == "deg" else ratio, span)
     (angle, _), _ = agree((angle, Number(ir.Const(1.0))), f"`{name}`", span, scope)

@@ -1,4 +1,4 @@
-"""Values as numbers, formulas or vectors: the sort that a place in an expression needs."""
+"""Coercion of values to the sort that their place in an expression requires."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from stlc.source import Span
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """Sort that a place expects, for messages.
+    """Expected sort of a place in an expression, for messages.
 
     Attributes:
         who: the operator or function, with its verb: "`+` adds numbers", "`always` needs a formula".
-        which: what the value is to it: "the right side", "argument 2"; "" for "this".
-        span: of the operator, where a second label says what it wants.
+        which: role of the value: "the right side", "argument 2"; "" for "this".
+        span: of the operator, for a second label.
     """
 
     who: str
@@ -34,7 +34,7 @@ class Expectation:
 
 
 def as_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> Number:
-    """The value as a real or whole number or an enum. Raises Failed (E202, E205)."""
+    """Return the value as a real, an integer or an enum. Raises Failed (E202, E205)."""
     match value:
         case Number(kind="bool"):
             help_ = (f"`ind({expr.span.text})` is 1 where it holds and 0 elsewhere",)
@@ -54,7 +54,7 @@ def as_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> 
 
 
 def loose_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> Number:
-    """Like `as_number`, but a bool stands for its 0 or 1: where a value is stored or compared."""
+    """Like `as_number`, but a bool counts as 0 or 1, for values that are stored or compared."""
     match value:
         case Number():
             return value
@@ -65,7 +65,7 @@ def loose_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) 
 
 
 def as_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> typed.Formula:
-    """The value as a formula; a bool signal holds where it is above 1/2. Raises Failed (E201)."""
+    """Return the value as a formula; a bool signal holds above 1/2. Raises Failed (E201)."""
     match value:
         case Number(formula=formula) if formula is not None:
             return formula
@@ -79,7 +79,7 @@ def as_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) ->
 
 
 def as_state_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> ir.Formula:
-    """The value as a formula over one instant, in negation normal form. Raises Failed (E201, E202)."""
+    """Return the value as a state formula in negation normal form. Raises Failed (E201, E202)."""
     formula = as_formula(value, expr, need, scope)
     if not is_state(formula):
         message = f"{need.who}, but this looks at other times"
@@ -89,7 +89,7 @@ def as_state_formula(value: Value, expr: ast.Expr, need: Expectation, scope: Sco
 
 
 def as_vector(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> Vector:
-    """The value as a vector of numbers. Raises Failed (E205)."""
+    """Return the value as a vector of numbers. Raises Failed (E205)."""
     if isinstance(value, Vector):
         return value
     message = f"{need.who}; {need.which} is {noun(value)}"
@@ -97,7 +97,7 @@ def as_vector(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> 
 
 
 def member_number(member: Member, span: Span, scope: Scope) -> Number:
-    """A member of an enum as its number, where all enums that have it agree."""
+    """Return the number of an enum member, where all enums that contain it agree."""
     values = {dict(labels)[member.name] for labels in member.options}
     if len(values) > 1:
         message = f"`{member.name}` is a member of several enums, with different values"

@@ -33,7 +33,7 @@ from stlc.units import Unit
 
 
 def comparison(expr: ast.Compare, values: Sequence[Value], scope: Scope) -> typed.Formula:
-    """A chain `a <= b < c`: the conjunction of its neighbours."""
+    """Return the conjunction of adjacent comparisons in a chain `a <= b < c`."""
     pairs = []
     for index, op in enumerate(expr.ops):
         left, right = expr.operands[index], expr.operands[index + 1]
@@ -85,10 +85,10 @@ def _pair(
 
 
 def _above(big: Number, small: Number, strict: bool, span: Span, scope: Scope) -> typed.Predicate:
-    """`big > small` (`strict`) or `big >= small`; between whole numbers with half a step of margin.
+    """Return `big > small` (`strict`) or `big >= small`; between integers with a margin of 1/2.
 
-    Whole numbers differ by one step or not at all: halfway, no rounding and no tie decides, and the margin is
-    that of `==`.
+    Integers differ by 0 or at least 1: with the threshold halfway, neither rounding nor ties matter, and the
+    margin agrees with that of `==`.
     """
     written = _compared(big, small)
     if (big.kind, small.kind) == ("int", "int"):
@@ -106,7 +106,7 @@ def _pred(
 
 
 def _compared(*sides: Number) -> Unit:
-    """The unit of what is compared: that of what varies, which constants are measured against."""
+    """Unit of a comparison: that of the side that is not constant."""
     told = [side for side in sides if side.unit.text] or list(sides)
     return next((side.unit for side in told if side.constant is None), told[0].unit)
 
@@ -121,7 +121,7 @@ def _refuse_vectors(left: Operand, right: Operand, op: str, scope: Scope) -> Non
 
 
 def _equality(left: Operand, right: Operand, whole: Span, place: Span, scope: Scope) -> typed.Formula:
-    """`==` on whole numbers, truth values and enums; its margin is 1/2 - |a - b|."""
+    """Return `==` between integers, truth values or enums, with margin 1/2 - |a - b|."""
     _refuse_vectors(left, right, "==", scope)
     if any(is_formula(value) for _, value in (left, right)):
         need = Expectation("`==` between truth values", "the other side")
@@ -137,7 +137,7 @@ def _equality(left: Operand, right: Operand, whole: Span, place: Span, scope: Sc
 
 
 def _meet(side: Operand, other: Operand, scope: Scope) -> Number:
-    """A side as a number; a member of an enum is read in the enum of the other side."""
+    """Return a side as a number; an enum member is resolved in the enum of the other side."""
     expr, value = side
     labels = other.value.labels if isinstance(other.value, Number) else ()
     if isinstance(value, Member) and labels:
@@ -169,7 +169,7 @@ def _real_equality(a: Number, b: Number, left: ast.Expr, right: ast.Expr, place:
 
 
 def _check_labels(a: Number, b: Number, place: Span, scope: Scope) -> None:
-    """Enums meet their own kind, or a number that one of their members has."""
+    """Check that an enum is compared with the same enum, or with the number of one of its members."""
     if a.labels and b.labels:
         if a.labels != b.labels:
             scope.fail(Diagnostic("E205", "these are members of different enums", place))
@@ -187,13 +187,13 @@ def _check_labels(a: Number, b: Number, place: Span, scope: Scope) -> None:
 
 
 def in_set(item: Operand, members: Sequence[Operand], span: Span, scope: Scope) -> typed.Formula:
-    """`s in {1, 2}`: equal to one of them."""
+    """Return `s in {1, 2}`: equality with one of the members."""
     equals = tuple(_equality(item, member, span, span, scope) for member in members)
     return equals[0] if len(equals) == 1 else typed.Logic(span, "or", equals)
 
 
 def in_range(item: Operand, ends: Sequence[Operand], span: Span, scope: Scope) -> typed.Formula:
-    """`x in [lo, hi]`: min(x - lo, hi - x), or under `@product` the paper's (x - lo) (hi - x)."""
+    """Return `x in [lo, hi]`: min(x - lo, hi - x), or under `@product` the paper's (x - lo) (hi - x)."""
     need = "`in [lo, hi]` compares numbers"
     x = as_number(item.value, item.expr, Expectation(need, "the left side"), scope)
     low, high = (as_number(value, expr, Expectation(need, "a bound"), scope) for expr, value in ends)
@@ -215,7 +215,7 @@ def in_range(item: Operand, ends: Sequence[Operand], span: Span, scope: Scope) -
 
 
 def sweeps(expr: ast.Member, segment: Swept, region: Sequence[Operand], scope: Scope) -> typed.Formula:
-    """`sweep(p) in R`: all of the segment; `not in`: none of it, which is no negation."""
+    """Return `sweep(p) in R`, the whole segment, or `not in`, no part of it (which is not its negation)."""
     if isinstance(expr.region, ast.SetLiteral):
         help_ = ("write a range `[lo, hi]`, or a region like `circle(center, radius)`",)
         scope.fail(
@@ -237,7 +237,7 @@ def sweeps(expr: ast.Member, segment: Swept, region: Sequence[Operand], scope: S
 
 
 def in_region(item: Operand, region: Operand, span: Span, scope: Scope) -> typed.Formula:
-    """`p in R`: the signed distance is not negative."""
+    """Return `p in R`: signed distance >= 0."""
     (point_expr, point), (region_expr, place) = item, region
     if not isinstance(place, REGION_TYPES):
         help_ = ("write a range `[lo, hi]`, a set `{a, b}`, or a region like `circle(center, radius)`",)

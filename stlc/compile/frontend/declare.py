@@ -1,4 +1,4 @@
-"""Declarations: the names of a file, the columns of its signals, the functions that the system provides."""
+"""Declarations of a file: names, columns of signals, and functions of the system."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def check_names(entry: Definition, scope: Scope) -> None:
 
 
 def _free(node: object, bound: frozenset[str]) -> Iterator[tuple[ast.Name, bool]]:
-    """Names that no formal, quantifier or freeze binds, and whether they are called."""
+    """Yield free names, and whether each is called."""
     if isinstance(node, ast.Name):
         if node.name not in bound:
             yield node, False
@@ -70,7 +70,7 @@ def _binds(node: object) -> frozenset[str]:
 
 
 def _parts(node: object) -> Iterator[object]:
-    """Children of a node, without the functions that it calls and the modules that it names."""
+    """Children of a node, without called functions and module names."""
     if isinstance(node, tuple):
         yield from node
     elif isinstance(node, ast.Node) and not isinstance(node, ast.Attr):
@@ -82,7 +82,7 @@ _EXTERN_KINDS: dict[str, Kind] = {"real": "real", "int": "int", "bool": "bool"}
 
 
 def external(item: ast.Extern, interface: Interface | None, about: str, scope: Scope) -> External:
-    """The function that `item` declares. Raises Failed (E005, E101, E107)."""
+    """Return the function that `item` declares. Raises Failed (E005, E101, E107)."""
     types = [formal.type for formal in item.formals]
     for written in (*types, item.type):
         if written is not None:
@@ -136,7 +136,7 @@ _TEMPERATURE = re.compile("temp|therm|celsius|heat|cool|oven|ambient", re.IGNORE
 
 
 def declared_unit(text: str, decl: ast.Declaration, scope: Scope) -> Unit:
-    """The unit in the brackets of a declaration. Raises Failed (E203)."""
+    """Return the bracketed unit of a declaration. Raises Failed (E203)."""
     if not text:
         return DIMENSIONLESS
     try:
@@ -152,7 +152,7 @@ def declared_unit(text: str, decl: ast.Declaration, scope: Scope) -> Unit:
 
 
 def check_type(type_: ast.TypeRef | None, enums: Mapping[str, Labels], scope: Scope) -> None:
-    """Refuse the name of a type that nothing declares (E101), and a size out of bounds (E005)."""
+    """Raise Failed for an undeclared type (E101), or a size out of bounds (E005)."""
     if type_ is None:
         return
     if type_.name not in _KINDS and type_.name not in enums and type_.name != "formula":
@@ -167,10 +167,10 @@ def check_type(type_: ast.TypeRef | None, enums: Mapping[str, Labels], scope: Sc
 def columns_of(
     decl: ast.Signal | ast.Param, enums: Mapping[str, Labels], interface: Interface | None, scope: Scope
 ) -> tuple[Column, ...]:
-    """The columns of a declaration, ranges not yet known; matched with the system's where there is one.
+    """Return the columns of a declaration without ranges, matched with those of the system if there is one.
 
     Raises:
-        Failed: E101 an unknown type, E103 a signal that the system lacks, E104 or E203 one that differs.
+        Failed: E101 unknown type, E103 signal missing in the system, E104 or E203 signal that differs there.
     """
     check_type(decl.type, enums, scope)
     name = decl.column or decl.name if isinstance(decl, ast.Signal) else decl.name
@@ -187,7 +187,7 @@ def columns_of(
 
 
 def _matched(column: Column, decl: ast.Signal | ast.Param, interface: Interface, scope: Scope) -> Column:
-    """The column as the system stores it."""
+    """Return the column as stored by the system."""
     if column.name not in interface.signature:
         if isinstance(decl, ast.Param):
             return column
@@ -221,7 +221,7 @@ def _members(labels: Labels) -> str:
 
 
 def _absent_signal(column: Column, decl: ast.Signal | ast.Param, interface: Interface) -> Diagnostic:
-    """E103, with the signal that was probably meant."""
+    """Return E103 with the closest signal name."""
     names = interface.signature.names
     near = closest(column.name, names)
     alike = [c.name for c in interface.signature.columns if c.unit.text and c.unit == column.unit]
@@ -248,10 +248,10 @@ def _absent_signal(column: Column, decl: ast.Signal | ast.Param, interface: Inte
 def ranged(
     columns: Sequence[Column], unit: Unit, decl: ast.Signal | ast.Param, scope: Scope
 ) -> tuple[Column, ...]:
-    """The columns with their range, in stored units; ranges of the environment are facts, others are nominal.
+    """Return the columns with ranges in stored units; ranges of env signals are enforced, others nominal.
 
     Raises:
-        Failed: an end that is not a constant number (E205), of another unit (E203), or an empty range (E205).
+        Failed: a bound that is not constant (E205) or has another unit (E203), or an empty range (E205).
     """
     ends = None if decl.domain is None else _ends(decl.domain, columns[0], unit, scope)
     found = []
@@ -270,7 +270,7 @@ def ranged(
 def _ends(
     domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral | ast.Expr, column: Column, unit: Unit, scope: Scope
 ) -> tuple[float | None, float | None] | None:
-    """Least and largest value that a domain allows; None for a distribution, and for an end that is `inf`."""
+    """Least and greatest value of a domain; None for a distribution, and for a bound `inf`."""
     if isinstance(domain, tuple):
         low, high = _stored(domain, column, unit, scope)
         if low is not None and high is not None and low > high:
@@ -287,12 +287,12 @@ def _ends(
 def ends_of(
     domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral, column: Column, unit: Unit, scope: Scope
 ) -> Iterator[float | None]:
-    """The ends of a range or the members of a set, in the unit of the column; None for `inf`."""
+    """Return the bounds of a range or the members of a set, in the unit of the column; None for `inf`."""
     return _stored(domain if isinstance(domain, tuple) else domain.items, column, unit, scope)
 
 
 def _stored(exprs: Sequence[ast.Expr], column: Column, unit: Unit, scope: Scope) -> Iterator[float | None]:
-    """Constants in the unit of the column; bare numbers are read in the unit that was declared."""
+    """Evaluate constants in the unit of the column; bare numbers take the declared unit."""
     for expr, value in zip(exprs, evaluate_all(exprs, scope), strict=True):
         if isinstance(value, TimeExpr) and value.end:
             yield None
@@ -320,8 +320,8 @@ class Declared:
     Attributes:
         entries: value namespace.
         enums: type namespace.
-        columns: of signals and parameters, ranges not yet known, with the unit that was declared.
-        broken: names whose declaration has been reported; their uses are not reported again.
+        columns: of signals and parameters, without ranges, with the declared unit.
+        broken: names with an invalid declaration, whose uses are not reported again.
     """
 
     entries: dict[str, Entry] = field(default_factory=dict)
@@ -333,13 +333,13 @@ class Declared:
 def declare(
     spec: ast.Spec, interface: Interface | None, overrides: Mapping[str, ast.Expr], scope: Scope
 ) -> Declared:
-    """Every name of the file, with findings in the scope (E101, E102, E103, E104, E203, E501).
+    """Return the declarations of the file; findings go to the scope (E101, E102, E103, E104, E203, E501).
 
     Args:
         spec: as parsed.
-        interface: of the system, if there is one.
-        overrides: values that replace those of constants.
-        scope: where findings go; its names are not read.
+        interface: of the system, or None.
+        overrides: constant -> replacing value.
+        scope: receives findings; its names are not read.
     """
     found = Declared()
     _check_twice(spec, scope)
@@ -368,7 +368,7 @@ def _keyword(item: ast.Item) -> str:
 
 
 def _check_twice(spec: ast.Spec, scope: Scope) -> None:
-    """E102, for values, for types, for requirements, and for imported files."""
+    """Report E102 for duplicate values, types, requirements and imports."""
     spaces: dict[str, dict[str, tuple[Span, str]]] = {"value": {}, "type": {}, "rule": {}, "file": {}}
     for written in spec.imports:
         if written.alias is not None:
@@ -386,7 +386,7 @@ def _check_twice(spec: ast.Spec, scope: Scope) -> None:
 
 
 def _claim(name: str, span: Span, enum: str, space: dict[str, tuple[Span, str]], scope: Scope) -> None:
-    """Take a name, or report who has it; enums may share members with each other."""
+    """Register a name, or report E102 with its first declaration; enums may share members."""
     if name not in space:
         space[name] = (span, enum)
         return
@@ -462,7 +462,7 @@ def _column_entry(
 
 
 def _read_in(value: Value, unit: Unit) -> Value:
-    """A signal whose bare numbers are in the unit that the file declares, whatever the system stores."""
+    """Return a signal with the unit that the file declares, independent of the system's stored unit."""
     if isinstance(value, Vector):
         return replace(value, items=tuple(rebased(item, unit) for item in value.items))
     return rebased(value, unit) if isinstance(value, Number) else value

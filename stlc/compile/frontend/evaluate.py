@@ -1,7 +1,7 @@
-"""Evaluation: from syntax to values, the one recursion over expressions.
+"""Evaluation of syntax to values: the only recursion over expressions.
 
-Everything else in the front end works on values; here names are looked up, macros expand (an argument is a
-value, so nothing is captured), quantifiers unroll, and independent findings are gathered.
+Other modules of the front end work on values. This one resolves names, expands macros (hygienically:
+arguments are values), unrolls quantifiers and collects independent findings.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from stlc.units import nearest, parse_unit
 
 
 def member_of(expr: ast.Attr, scope: Scope) -> tuple[ast.Name, Scope]:
-    """`m.name`: the name, and the scope in which it means something. Raises Failed (E101)."""
+    """Return the name of `m.name` and the scope that declares it. Raises Failed (E101)."""
     if not scope.in_spec:
         scope.fail(unsupported(f"`{expr.span.text}`", expr.span, scope))
     place = expr.span.source.span(expr.span.end - len(expr.name), expr.span.end)
@@ -73,16 +73,16 @@ Branches = tuple[Value, Value, Value]
 
 
 def choose(expr: ast.IfThenElse, values: Branches, scope: Scope) -> Value:
-    """A choice between formulas, or between numbers or vectors. One between bools is both.
+    """Return a choice between formulas, numbers or vectors; between bools, a number and a formula.
 
     Args:
         expr: as written.
         values: of the condition and of both branches.
-        scope: where findings go.
+        scope: receives findings.
 
     Raises:
-        Failed: the condition is not a formula (E201), for numbers not one about a single instant (E202), or
-            the branches do not go together (E203, E205).
+        Failed: the condition is not a formula (E201), or for numbers not a state formula (E202), or the
+            branches disagree (E203, E205).
     """
     cond = as_formula(values[0], expr.cond, Expectation("`if`"), scope)
     yes, no = values[1:]
@@ -115,7 +115,7 @@ def _choice_of_formulas(
 
 
 def _choose(expr: ast.IfThenElse, cond: typed.Formula, branches: tuple[Value, Value], scope: Scope) -> Number:
-    """One of two numbers, by a state formula; of two bools the choice between formulas as well."""
+    """Return a choice between numbers by a state formula; between bools also as a formula."""
     decides = as_state_formula(cond, expr.cond, Expectation("`if`"), scope)
     need = Expectation("the branches of `if` are of one sort", "this")
     yes = loose_number(branches[0], expr.yes, need, scope)
@@ -136,7 +136,7 @@ _VERBS = {"+": "adds", "-": "subtracts", "*": "multiplies", "/": "divides", "%":
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    """Evaluation rule of a kind of node: its parts, in order, and the value that follows from theirs."""
+    """Evaluation rule of a node class: its operands in order, and its value as a function of theirs."""
 
     parts: Callable[[Any], Sequence[ast.Expr]]
     value: Callable[[Any, Sequence[Value], Scope], Value]
@@ -160,7 +160,7 @@ def _quantity(expr: ast.Quantity, _values: Sequence[Value], scope: Scope) -> Val
 
 @lru_cache(maxsize=256)
 def _measured(value: Fraction, unit_text: str) -> Number | None:
-    """A number with a unit, from its zero; None: too large for a float. Raises ValueError: no such unit."""
+    """Return a number with a unit; None if beyond double precision. Raises ValueError for an unknown unit."""
     unit = parse_unit(unit_text)
     exact = value * unit.ratio
     if not math.isfinite(nearest(exact)):
@@ -208,7 +208,7 @@ def _neg(expr: ast.Neg, values: Sequence[Value], scope: Scope) -> Value:
         return moments.negative(value, expr.span, scope)
     if not isinstance(value, Vector):
         value = as_number(value, expr.operand, Expectation("`-` takes a number"), scope)
-    if not isinstance(expr.operand, ast.Quantity):  # -5 degC is below zero; a temperature has no negation
+    if not isinstance(expr.operand, ast.Quantity):  # -5 degC is a literal: a temperature cannot be negated
         for item in value.items if isinstance(value, Vector) else (value,):
             refuse_point("`-`", item, expr.operand.span, scope)
     return negate(value, expr.span)
@@ -233,7 +233,7 @@ def _binary(expr: ast.Binary, values: Sequence[Value], scope: Scope) -> Value:
 
 
 def _refuse_products(expr: ast.Binary, sides: Sequence[Number | Vector], place: Span, scope: Scope) -> None:
-    """Sums are made of two vectors or of two numbers; a product takes at most one vector."""
+    """Reject sums of a vector and a number, and products of two vectors."""
     vectors = [isinstance(side, Vector) for side in sides]
     if expr.op in "+-" and any(vectors) and not all(vectors):
         scope.fail(Diagnostic("E205", f"`{expr.op}` does not mix a vector and a number", place))
@@ -294,11 +294,11 @@ OPERATIONS: Mapping[type[ast.Node], Operation] = MappingProxyType(
         ast.IfThenElse: Operation(lambda expr: (expr.cond, expr.yes, expr.no), _if),
     }
 )
-"""Kind of node -> how it is valued."""
+"""Node class -> evaluation rule."""
 
 
 def evaluate(expr: ast.Expr, scope: Scope) -> Value:
-    """The value of an expression. Raises Failed, with all independent findings in the sink."""
+    """Return the value of an expression. Raises Failed, with all independent findings in the sink."""
     meter = scope.meter
     meter.enter()
     before = meter.nodes
@@ -313,7 +313,7 @@ def evaluate(expr: ast.Expr, scope: Scope) -> Value:
 
 
 def _is_written_twice(expr: ast.Expr, value: Value) -> bool:
-    """True if parts of a formula appear twice in what it means: `a <-> b` is `a -> b` and `b -> a`."""
+    """True if an expansion duplicates operands: `a <-> b` is `a -> b` and `b -> a`."""
     match expr:
         case ast.Logic(op="<->" | "xor") | ast.Until(op="unless"):
             return True
@@ -335,7 +335,7 @@ def _value(expr: ast.Expr, scope: Scope) -> Value:
 
 
 def evaluate_all(exprs: Sequence[ast.Expr], scope: Scope) -> list[Value]:
-    """The values of independent expressions; each is looked at even where another one failed."""
+    """Return the values of independent expressions, each evaluated even if another failed."""
     values: list[Value] = []
     for expr in exprs:
         try:
@@ -348,12 +348,12 @@ def evaluate_all(exprs: Sequence[ast.Expr], scope: Scope) -> list[Value]:
 
 
 def formula(expr: ast.Expr, need: Expectation, scope: Scope) -> typed.Formula:
-    """The expression as a formula. Raises Failed."""
+    """Return the expression as a formula. Raises Failed."""
     return as_formula(evaluate(expr, scope), expr, need, scope)
 
 
 def formulas(exprs: Sequence[tuple[ast.Expr, Expectation]], scope: Scope) -> list[typed.Formula]:
-    """Independent expressions as formulas. Raises Failed."""
+    """Return independent expressions as formulas. Raises Failed."""
     found: list[typed.Formula] = []
     for expr, need in exprs:
         try:
@@ -379,13 +379,13 @@ def _name(expr: ast.Name, scope: Scope) -> Value:
 
 
 def _attr(expr: ast.Attr, scope: Scope) -> Value:
-    """A name of an imported file."""
+    """Return the value of a name of an imported file."""
     name, home = member_of(expr, scope)
     return _named(name, home, scope)
 
 
 def _named(expr: ast.Name, home: Scope, scope: Scope) -> Value:
-    """Value of a name of `home` in `scope`."""
+    """Return the value of a name declared in `home`, used in `scope`."""
     entry = home.entries.get(expr.name)
     if entry is None:
         return home.unknown(expr)
@@ -407,7 +407,7 @@ def _named(expr: ast.Name, home: Scope, scope: Scope) -> Value:
 
 
 def _defined(entry: Definition, place: Span, scope: Scope) -> Value:
-    """The value of a definition without arguments: found once, charged at every use."""
+    """Return the value of a definition without arguments, cached; its cost is charged at every use."""
     if entry.name not in scope.cache:
         if entry.name in scope.open:
             scope.fail(cycle(entry, scope))
@@ -426,7 +426,7 @@ def _defined(entry: Definition, place: Span, scope: Scope) -> Value:
 
 
 def _expanded(entry: Definition, call: ast.Call, scope: Scope, home: Scope) -> Value:
-    """A macro of `home` with its arguments put in."""
+    """Expand a macro declared in `home`."""
     if home.cache.get(entry.name, entry) is None:
         raise Failed
     if entry.name in home.open:
@@ -449,7 +449,7 @@ def _expanded(entry: Definition, call: ast.Call, scope: Scope, home: Scope) -> V
 
 @contextmanager
 def _traced(entry: Definition, call: ast.Call, scope: Scope) -> Iterator[None]:
-    """Findings inside a macro also show the use that brought them up."""
+    """Evaluate a macro; findings inside it also show the call."""
     before = len(scope.sink)
     try:
         yield
@@ -470,7 +470,7 @@ def _charge(cost: Cost, place: Span, scope: Scope) -> None:
 
 
 def _refuse_excess(place: Span, scope: Scope) -> None:
-    """E005, once for a declaration."""
+    """Raise Failed above the size limit, reporting E005 once per declaration."""
     meter = scope.meter
     if not meter.over:
         return
@@ -494,7 +494,7 @@ def _call(expr: ast.Call, scope: Scope) -> Value:
 
 
 def _called(expr: ast.Call, name: ast.Name, home: Scope, scope: Scope) -> Value:
-    """A call of something that `home` declares, or of a built-in function."""
+    """Return a call of a name declared in `home`, or of a built-in function."""
     entry = home.entries.get(name.name)
     if isinstance(entry, Definition) and entry.formals:
         return _expanded(entry, expr, scope, home)
@@ -520,7 +520,7 @@ def _not(expr: ast.Not, scope: Scope) -> Value:
 
 
 def _logic(expr: ast.Logic, scope: Scope) -> Value:
-    """Chains of `and` and of `or` become one node, without recursion along the chain."""
+    """Return a connective; chains of `and` or `or` become one node, without recursion along the chain."""
     operands: list[ast.Expr] = [expr.right]
     left = expr.left
     while expr.op in ("and", "or") and isinstance(left, ast.Logic) and left.op == expr.op:
@@ -554,7 +554,7 @@ def _timed(
     place: Span,
     scope: Scope,
 ) -> typed.Formula:
-    """Operands and interval of a temporal operator, each looked at even where the other failed."""
+    """Evaluate operands and interval of a temporal operator, each even if the other failed."""
     if not scope.temporal:
         scope.fail(unsupported(f"`{expr.op}`", expr.span, scope))
     window: typed.Interval | None = None
@@ -572,14 +572,14 @@ def _timed(
 
 
 def _head(span: Span, inner: ast.Node, length: int | None = None) -> Span:
-    """The operator that stands before its operand."""
+    """Span of a prefix operator, without its operand."""
     end = min(inner.span.start, span.start + length) if length is not None else inner.span.start
     text = span.source.text[span.start : end].rstrip(" \t\n(")
     return span.source.span(span.start, span.start + max(1, len(text)))
 
 
 def _quantifier(expr: ast.Quantifier, scope: Scope) -> Value:
-    """The conjunction or disjunction over a finite domain."""
+    """Return the conjunction or disjunction over a finite domain."""
     items: list[typed.Formula] = []
     need = Expectation(f"`{expr.kind}`")
     for value in _domain(expr, scope):
@@ -593,7 +593,7 @@ def _quantifier(expr: ast.Quantifier, scope: Scope) -> Value:
 
 
 def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
-    """The body, where the names stand for the values of the instant at which it is judged."""
+    """Return the body with the bound names as values at the instant of evaluation."""
     if not scope.temporal:
         scope.fail(unsupported("`freeze`", expr.span, scope))
     names = [name for name, _ in expr.bindings]
@@ -615,7 +615,7 @@ def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
 
 
 def _held(number: Number, name: str, expr: ast.Freeze, bindings: list[tuple[str, ir.Num]]) -> Number:
-    """The number as the body reads it; its key tells it apart from those of other `freeze`s."""
+    """Return the bound number as a frozen value with a unique name."""
     if number.constant is not None:
         return number
     key = f"{name}#{expr.span.start}@{expr.span.source.name}"

@@ -1,4 +1,4 @@
-"""Expressions of system files and declarations, as numbers, state formulas and regions."""
+"""Resolution of expressions in system files and declarations to numbers, state formulas and regions."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from stlc.units import Unit, nearest, same_dims
 
 
 def resolve_state_formula(expr: ast.Expr, scope: Scope, *, what: str = "a condition") -> ir.Formula:
-    """The expression as a formula over one instant, in negation normal form.
+    """Return the expression as a state formula in negation normal form.
 
     Args:
         expr: as parsed.
-        scope: what names mean; findings are appended to its sink.
-        what: what the formula is, for messages: "a guard".
+        scope: names; findings are appended to its sink.
+        what: role of the formula, for messages: "a guard".
 
     Raises:
-        StlcError: `scope.error`, with what was found.
+        StlcError: `scope.error`, with the findings.
     """
     before = len(scope.sink)
     try:
@@ -52,10 +52,10 @@ def resolve_state_formula(expr: ast.Expr, scope: Scope, *, what: str = "a condit
 
 
 def resolve_region(expr: ast.Expr, scope: Scope) -> Region:
-    """The expression as a region.
+    """Return the expression as a region.
 
     Raises:
-        StlcError: `scope.error`, with what was found.
+        StlcError: `scope.error`, with the findings.
     """
     before = len(scope.sink)
     try:
@@ -69,7 +69,7 @@ def resolve_region(expr: ast.Expr, scope: Scope) -> Region:
 
 
 def resolve_formula(expr: ast.Expr, scope: Scope, *, what: str = "a requirement") -> typed.Formula:
-    """The expression as a formula, temporal operators included where `scope.temporal`.
+    """Return the expression as a formula, with temporal operators if `scope.temporal`.
 
     Raises:
         Failed: the findings are in the sink.
@@ -93,17 +93,17 @@ __all__ = ["Number", "resolve_number", "resolve_numbers", "stored"]
 def resolve_number(
     expr: ast.Expr, scope: Scope, *, expected: Column | None = None, what: str = "a value"
 ) -> Number:
-    """The expression as one number, in SI units from the zero of its unit.
+    """Return the expression as one number, in SI units relative to the offset of its unit.
 
     Args:
         expr: as parsed.
-        scope: what names mean; findings are appended to its sink.
-        expected: the column that the number is for: its enum members are names, `true` is 1, a formula is
-            1 where it holds, a bare number takes its unit, another unit is E203.
-        what: what the number is, for messages: "the flow of `x`".
+        scope: names; findings are appended to its sink.
+        expected: column of the number: its enum members are in scope, `true` is 1, a formula is 1 where it
+            holds, a bare number takes its unit, other units are E203.
+        what: role of the number, for messages: "the flow of `x`".
 
     Raises:
-        StlcError: `scope.error`, with what was found.
+        StlcError: `scope.error`, with the findings.
     """
     numbers = resolve_numbers(expr, scope, expected=expected, what=what)
     if len(numbers) == 1:
@@ -116,7 +116,7 @@ def resolve_number(
 def resolve_numbers(
     expr: ast.Expr, scope: Scope, *, expected: Column | None = None, what: str = "a value"
 ) -> tuple[Number, ...]:
-    """The expression as the components of a vector; a number is a vector of one. See `resolve_number`."""
+    """Return the components of a vector expression; a number is a vector of one. See `resolve_number`."""
     before = len(scope.sink)
     try:
         with scope.meter.fresh():
@@ -128,7 +128,7 @@ def resolve_numbers(
 
 
 def stored(number: Number, unit: Unit) -> ir.Num:
-    """The number as a column of `unit` stores it: SI from the zero of the unit, divided by its scale."""
+    """Convert a number to the stored form of a column in `unit`: the SI value divided by the unit's scale."""
     number = rebased(number, unit)
     if unit.ratio == 1:
         return number.num
@@ -143,7 +143,7 @@ def _code(scope: Scope) -> str:
 
 
 def _stored_value(value: Value, expr: ast.Expr, column: Column | None, what: str, scope: Scope) -> Number:
-    """A value as the number that a column stores."""
+    """Convert a value to the number that a column stores."""
     if column is not None and column.kind == "bool" and isinstance(value, typed.Node) and is_state(value):
         cond = condition(value)
         truth = ir.Const(float(cond.value)) if isinstance(cond, ir.Truth) else ir.Indicator(cond)
@@ -171,7 +171,7 @@ def _member_of_column(value: EnumMember, expr: ast.Expr, column: Column, scope: 
 
 
 def _fitted(number: Number, expr: ast.Expr, column: Column, scope: Scope) -> Number:
-    """Kind and unit agree with the column; a bare number takes its unit."""
+    """Check kind and unit against the column; a bare number takes its unit."""
     values = [value for _, value in column.labels] if column.labels else [0.0, 1.0]
     if column.kind in ("bool", "enum"):
         fits = (number.kind == column.kind and number.labels == column.labels) or number.constant in values

@@ -1,4 +1,4 @@
-"""Interface of a system: the facts that the compiler knows without loading it."""
+"""Interface of a system: the data that the compiler needs without loading it."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from stlc.units import Unit
 
 
 class Function(Protocol):
-    """A function from outside, such as forward kinematics."""
+    """Function of the system, such as forward kinematics."""
 
     def bound(
         self, arguments: tuple[int | None, ...], result: int | None
     ) -> Callable[..., Sequence[Any]] | Body:
-        """The function on components.
+        """Return the function on components.
 
         Args:
-            arguments: the size of each vector that it takes; None for a number.
-            result: the size of the vector that it gives; None for a number.
+            arguments: size of each vector argument; None for a number.
+            result: size of the result; None for a number.
 
         Returns:
-            Takes all components as arrays that broadcast, and gives the components of the result; or what
-            these are in the IR.
+            Function from all components, as broadcastable arrays, to those of the result; or its body in the
+            IR.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class Interface:
-    """States, constants and functions that a system offers to a specification.
+    """States, constants and functions that a system provides to a specification.
 
     Attributes:
         name: of the system.
-        signature: its states, in order, with the units that are stored.
+        signature: states in order, with stored units.
         constants: name -> (value in SI units, unit).
         externs: names of the functions that the system provides.
-        functions: those that have been loaded, by name.
-        path: of the system file, as messages show it.
-        places: name of a state or constant -> where the system file declares it.
+        functions: loaded functions, by name.
+        path: of the system file, for messages.
+        places: name of a state or constant -> its declaration in the system file.
     """
 
     name: str
@@ -54,5 +54,5 @@ class Interface:
 
     @property
     def where(self) -> str:
-        """Name in messages: the path of its file, else its name."""
+        """Name for messages: the path of the file, else the system's name."""
         return self.path or self.name

@@ -20,7 +20,7 @@ _MIRROR = {"always": "historically", "eventually": "once"}
 
 
 def time_word(name: str, span: Span) -> TimeExpr:
-    """`T`, `dt` or `end`."""
+    """Return the time `T`, `dt` or `end`."""
     match name:
         case "T":
             return TimeExpr(horizons=Fraction(1), span=span)
@@ -31,7 +31,7 @@ def time_word(name: str, span: Span) -> TimeExpr:
 
 
 def combine(op: str, left: Operand, right: Operand, span: Span, scope: Scope) -> TimeExpr:
-    """Arithmetic where at least one side is a time on the grid: sums, and multiples by plain numbers."""
+    """Return a sum with, or a multiple of, a time on the grid."""
     if op in ("+", "-"):
         a, b = moment(*left, scope), moment(*right, scope)
         sign = 1 if op == "+" else -1
@@ -60,7 +60,7 @@ def combine(op: str, left: Operand, right: Operand, span: Span, scope: Scope) ->
 
 
 def out_of_place(span: Span) -> Diagnostic:
-    """E311: `T`, `dt` or a number of steps among other numbers."""
+    """Return E311 for `T`, `dt` or a number of steps in ordinary arithmetic."""
     message = f"`{span.text}` is only known inside the interval of a temporal operator"
     return Diagnostic("E311", message, span, help=("name the time: `const tau = 2 s`",))
 
@@ -85,7 +85,7 @@ def _factor(expr: ast.Expr, value: Value, scope: Scope) -> Fraction:
 
 
 def moment(expr: ast.Expr, value: Value, scope: Scope) -> TimeExpr:
-    """A value as a time. Raises Failed (E303 not constant, E203 not a time)."""
+    """Return a value as a time. Raises Failed (E303 not constant, E203 not a time)."""
     if isinstance(value, TimeExpr):
         return value
     if not isinstance(value, Number) or value.kind in ("bool", "enum"):
@@ -101,7 +101,7 @@ def moment(expr: ast.Expr, value: Value, scope: Scope) -> TimeExpr:
 
 
 def _bare(value: Fraction, expr: ast.Expr, scope: Scope) -> TimeExpr:
-    """A bare number in the unit of the pragma; in seconds, with a warning, where there is none."""
+    """Return a bare number in the unit of the `time` pragma, or in seconds with a warning without one."""
     if scope.time_unit in ("step", "steps"):
         return TimeExpr(steps=value, span=expr.span)
     if not scope.time_unit and value != 0:
@@ -152,15 +152,15 @@ def interval(
     body: ast.Expr,
     scope: Scope,
 ) -> typed.Interval:
-    """The bounds of a temporal operator, checked as far as they are known without a grid.
+    """Return the bounds of a temporal operator, checked as far as possible without a grid.
 
     Args:
-        node: as written; None where nothing is written: from now to the end.
+        node: as written; None for no interval: from now to the end.
         bounds: values of its two bounds.
         op: name of the operator.
-        place: where it stands.
-        body: what it applies to, for the help.
-        scope: where findings go.
+        place: span of the operator.
+        body: span of the operand, for the help.
+        scope: receives findings.
 
     Raises:
         Failed: E301 reversed, E302 negative, E303 not constant, E203 not a time.
@@ -192,7 +192,7 @@ def _difference(left: TimeExpr, right: TimeExpr) -> TimeExpr:
 
 
 def _sign(value: TimeExpr) -> int:
-    """-1 where the time is negative whatever the grid, else 0 or 1."""
+    """-1 if the time is negative on every grid, else 0 or 1."""
     parts = (value.seconds, value.steps, value.horizons)
     if all(part <= 0 for part in parts):
         return -1 if any(parts) else 0
@@ -227,6 +227,6 @@ def _negative(name: str, node: ast.Interval, ends: tuple[TimeExpr, TimeExpr], bo
 
 
 def _shown(value: TimeExpr, expr: ast.Expr) -> str:
-    """A bound as written, without its sign."""
+    """Source text of a bound, without its sign."""
     text = expr.span.text.strip()
     return text.removeprefix("-").strip() if _sign(value) < 0 else text

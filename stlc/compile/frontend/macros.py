@@ -1,4 +1,4 @@
-"""Definitions: what their bodies must be, how arguments bind, and what goes wrong with them."""
+"""Definitions: sorts of bodies, binding of arguments, and their errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from stlc.units import Unit, same_dims
 
 
 def arguments(entry: Definition, call: ast.Call, scope: Scope) -> dict[str, ast.Expr]:
-    """Formal -> expression, by place or by name. Raises Failed (E105)."""
+    """Return formal -> expression for positional and named arguments. Raises Failed (E105)."""
     shape = (f"{entry.name}({', '.join(entry.formals)})",)
     count, given = len(entry.formals), len(call.args)
     if given != count:
@@ -36,7 +36,7 @@ def arguments(entry: Definition, call: ast.Call, scope: Scope) -> dict[str, ast.
 
 
 def finished(entry: Definition, value: Value, scope: Scope) -> Value:
-    """The value of a definition's body in the sort and unit that were declared. Raises Failed."""
+    """Convert the value of a definition's body to the declared sort and unit. Raises Failed."""
     body = entry.body
     match entry.sort:
         case "formula":
@@ -67,7 +67,7 @@ def _check_constant(entry: Definition, value: Value, scope: Scope) -> None:
 
 
 def _in_unit(value: Value, unit: Unit, span: Span, scope: Scope) -> Value:
-    """A bare number takes the declared unit; any other must agree with it."""
+    """Convert to the declared unit: a bare number takes it, any other must agree."""
     if isinstance(value, Vector):
         items = tuple(_number_in(item, unit, span, scope) for item in value.items)
         return replace(value, items=items)
@@ -84,7 +84,7 @@ def _number_in(number: Number, unit: Unit, span: Span, scope: Scope) -> Number:
 
 
 def cycle(entry: Definition, scope: Scope) -> Diagnostic:
-    """E105: a definition that needs itself."""
+    """Return E105 for a recursive definition."""
     start = scope.open.index(entry.name)
     chain = " -> ".join((*scope.open[start:], entry.name))
     note = (f"{chain}",) if len(scope.open) - start > 1 else ()
@@ -92,7 +92,7 @@ def cycle(entry: Definition, scope: Scope) -> Diagnostic:
 
 
 def outgrown(meter: Meter, span: Span) -> Diagnostic:
-    """E005: an expression that outgrows the limits once it is written out."""
+    """Return E005 for an expression beyond the size limits when expanded."""
     if meter.nodes > MAX_NODES:
         message = f"this expands to more than {MAX_NODES:,} operations"
         help_ = ("definitions are written out where they are used, and quantifiers are unrolled",)

@@ -1,7 +1,7 @@
-"""`import`: other specifications, read where they lie, or from the texts that a run or a trace keeps of them.
+"""`import` of other specifications, from files or from the texts stored with a run or a trace.
 
-A file is known by its path from the folder of the importing specification, the library by `@std`. The same
-keys name the kept texts, so that a specification means the same wherever it is read again.
+The key of a file is its path relative to the folder of the root specification, `@std` for the library. Stored
+texts have the same keys, so that a specification keeps its meaning in another place.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from stlc.source import Source
 STD = "@std"
 _STD_FILE = Path(__file__).with_name("std.stl")
 _MOST = 100
-"""Limit on imported files, direct or not; one that is imported twice counts twice."""
+"""Limit on direct and indirect imports; repeated imports count each time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,10 +31,10 @@ class Module:
 
     Attributes:
         key: its path from the folder of the specification that is read first, or `@std`.
-        alias: by which name the importing file knows it.
-        written: the import.
+        alias: name in the importing file.
+        written: import declaration.
         spec: as parsed.
-        imports: what it imports itself.
+        imports: modules that it imports itself.
     """
 
     key: str
@@ -45,16 +45,16 @@ class Module:
 
 
 def load_modules(spec: ast.Spec) -> tuple[Module, ...]:
-    """Everything that `spec` imports, with what those import.
+    """Return all direct and indirect imports of `spec`.
 
     Raises:
-        SpecError: E106, a file that cannot be read or that imports itself; whatever is wrong with its syntax.
+        SpecError: E106, a file that cannot be read or imports itself; its syntax errors.
     """
     return _Loader(spec).imports(spec, "", ())
 
 
 def library_of(spec: ast.Spec) -> dict[str, str]:
-    """The texts of all imported files by key: what makes `spec` independent of where it lies."""
+    """Return the texts of all imported files by key, so that `spec` can be stored without its folder."""
     found: dict[str, str] = {}
     for module in _every(load_modules(spec)):
         found[module.key] = module.spec.source.text
@@ -62,12 +62,12 @@ def library_of(spec: ast.Spec) -> dict[str, str]:
 
 
 def spec_sha256(text: str, library: Mapping[str, str]) -> str:
-    """SHA-256 of a specification and of what it imports, hexadecimal."""
+    """Return the SHA-256 of a specification and its imports, hexadecimal."""
     return sha256(text + dumps(dict(sorted(library.items())))) if library else sha256(text)
 
 
 def file_of(key: str) -> str:
-    """A relative path below one folder for the text of a key."""
+    """Return a relative path within one folder for the text of a key."""
     return "/".join("__" if part == ".." else part for part in key.split("/") if part) + (
         ".stl" if key == STD else ""
     )
@@ -80,7 +80,7 @@ def _every(modules: tuple[Module, ...]) -> Iterator[Module]:
 
 
 class _Loader:
-    """Reads files, each once."""
+    """Loader that reads each file once."""
 
     def __init__(self, spec: ast.Spec) -> None:
         self.library = spec.library
@@ -90,7 +90,7 @@ class _Loader:
         self.found: dict[str, tuple[Module, ...] | SpecError] = {}
 
     def imports(self, spec: ast.Spec, key: str, around: tuple[str, ...]) -> tuple[Module, ...]:
-        """The modules of one file; `around` are the keys of the files that import it."""
+        """Return the modules of one file; `around` are the keys of its importing files."""
         if key not in self.found:
             try:
                 self.found[key] = self._imports(spec, key, around)

@@ -1,4 +1,4 @@
-"""`param`: values that every trajectory has for itself, how they are drawn, and `--set NAME=VALUE`."""
+"""Parameters (`param`), drawn once per trajectory, their distributions, and `--set NAME=VALUE`."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from stlc.units import Unit, same_dims
 def read_overrides(
     overrides: Mapping[str, str], spec: ast.Spec, interface: Interface | None
 ) -> dict[str, ast.Expr]:
-    """Constant or parameter of the specification -> the expression that is its value.
+    """Return constant or parameter of the specification -> expression of its value.
 
-    What the system has alone is left to it: constants, states and parameters that it carries, dotted keys.
+    Names of the system alone (constants, states, its own parameters, dotted keys) are skipped.
 
     Raises:
-        UsageError: U101, a name that neither has, or a value that is not an expression.
+        UsageError: U101, an unknown name, or a value that is not an expression.
     """
     carried = set() if interface is None else {name.partition("[")[0] for name in interface.signature.names}
     systems = set() if interface is None else {*interface.constants, *carried}
@@ -71,17 +71,17 @@ def _unknown(name: str, names: set[str]) -> Diagnostic:
 def parameters(
     decl: ast.Param, columns: Sequence[Column], unit: Unit, interface: Interface | None, scope: Scope
 ) -> tuple[typed.Parameter, ...]:
-    """The components of a `param`.
+    """Return the components of a `param`.
 
     Args:
         decl: as written.
         columns: of its components, with their ranges.
-        unit: that was declared; bare numbers are in it.
-        interface: of the system, which may carry the parameter as a state.
-        scope: what names mean; findings go there.
+        unit: declared unit, also of bare numbers.
+        interface: of the system, which may have the parameter as a state.
+        scope: names; receives findings.
 
     Raises:
-        Failed: E205 or E203, its distribution cannot be drawn from; E104, the system has another one.
+        Failed: E205 or E203, an invalid distribution; E104, the system's distribution differs.
     """
     carried = interface is not None and columns[0].name in interface.signature
     if carried and interface is not None:
@@ -100,7 +100,7 @@ def parameters(
 
 
 def _text(decl: ast.Param) -> str:
-    """Distribution of a parameter, as written."""
+    """Source text of a parameter's distribution."""
     match decl.domain:
         case (low, high):
             return f"in [{low.span.text}, {high.span.text}]"
@@ -113,7 +113,7 @@ def _text(decl: ast.Param) -> str:
 def _even(
     decl: ast.Param, values: Sequence[float | None], columns: Sequence[Column], scope: Scope
 ) -> tuple[ir.Num, ...]:
-    """Every value of the range, or every member of the set, equally often."""
+    """Return the uniform distribution over the range or over the members of the set."""
     if any(value is None for value in values):
         message = f"`{decl.name}` is drawn for every trajectory: its range must have both ends"
         help_ = ("give it a finite range, or a distribution: `param r ~ normal(1, 0.1)`",)
@@ -126,9 +126,9 @@ def _even(
 
 
 def distribution(expr: ast.Expr, columns: Sequence[Column], unit: Unit, scope: Scope) -> tuple[ir.Num, ...]:
-    """Draws of a distribution for each column, in its unit; one number stands for every component.
+    """Return the sampler of each column, in its unit; a single number applies to all components.
 
-    Raises Failed: E203 for another unit, E205 where it reads what is not known before a trajectory begins.
+    Raises Failed: E203 for another unit, E205 for a value unknown before the trajectory begins.
     """
     here = scope.extended({}, samplers=True)
     values = [evaluate(expr, here) for _ in columns]
@@ -146,7 +146,7 @@ def distribution(expr: ast.Expr, columns: Sequence[Column], unit: Unit, scope: S
 
 
 def _in_column(number: Number, expr: ast.Expr, column: Column, unit: Unit, scope: Scope) -> ir.Num:
-    """A drawn number as its column stores it."""
+    """Convert a drawn number to the stored form of its column."""
     if columns_of(number.num):
         message = "a parameter is drawn before anything moves: its distribution reads constants alone"
         scope.fail(Diagnostic("E205", message, expr.span))
@@ -163,7 +163,7 @@ def _in_column(number: Number, expr: ast.Expr, column: Column, unit: Unit, scope
 
 
 def _agree(decl: ast.Param, columns: Sequence[Column], interface: Interface, scope: Scope) -> None:
-    """E104: the system carries the parameter, with other values."""
+    """Report E104 if the system has the parameter with other values."""
     place = interface.places.get(columns[0].name)
     labels = () if place is None else (Label(place, "declared here"),)
     if not isinstance(decl.domain, tuple | ast.SetLiteral):
@@ -180,14 +180,14 @@ def _agree(decl: ast.Param, columns: Sequence[Column], interface: Interface, sco
 
 
 def fixed(parameters: Sequence[typed.Parameter], values: Mapping[str, str]) -> tuple[typed.Parameter, ...]:
-    """The parameters, those in `values` with one value for all trajectories, inside of their range or not.
+    """Return the parameters, with those in `values` fixed for all trajectories, within their range or not.
 
     Args:
         parameters: components.
-        values: name -> its value as text, `0.8 m`; of a vector `[1 m, 2 m]`.
+        values: name -> value as text, `0.8 m`, or `[1 m, 2 m]` for a vector.
 
     Raises:
-        UsageError: U101, a value cannot be read, or does not fit.
+        UsageError: U101, a value is not valid for its parameter.
     """
     groups: dict[str, list[typed.Parameter]] = {}
     for each in parameters:
@@ -199,7 +199,7 @@ def fixed(parameters: Sequence[typed.Parameter], values: Mapping[str, str]) -> t
 
 
 def _given(name: str, group: Sequence[typed.Parameter], text: str) -> list[typed.Parameter]:
-    """The components of one parameter with the value that `text` says."""
+    """Return the components of one parameter with the value in `text`."""
     what = f"`{name}`"
     column = group[0].column
     try:

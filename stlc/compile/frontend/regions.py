@@ -1,7 +1,7 @@
 """Regions and their signed distance, positive inside.
 
-Ball, box, half-space and polygon are exact Euclidean distances. A union is the max of its parts, an
-intersection the min: exact in sign, a lower bound of the distance inside a union or outside an intersection.
+Distances are exact Euclidean for ball, box, half-space and polygon. A union is the max, an intersection the
+min of its parts: exact in sign, and inside a union or outside an intersection a lower bound of the distance.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PlanePoint = tuple[float, float]
 
 
 def points(corners: Sequence[Vector]) -> tuple[PlanePoint, ...] | None:
-    """The corners as floats in SI units, or None where one is not a known point of the plane."""
+    """Return the corners as floats in SI units, or None unless all are constant points in 2D."""
     found: list[PlanePoint] = []
     for corner in corners:
         values = [item.constant for item in corner.items]
@@ -43,18 +43,18 @@ def points(corners: Sequence[Vector]) -> tuple[PlanePoint, ...] | None:
 
 
 def turn(a: PlanePoint, b: PlanePoint, c: PlanePoint) -> float:
-    """Twice the signed area of a triangle: positive where `c` lies left of `a -> b`."""
+    """Return twice the signed area of a triangle: positive where `c` lies left of `a -> b`."""
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
 def area(corners: Sequence[PlanePoint]) -> float:
-    """The signed area: positive where the corners run counter-clockwise."""
+    """Return the signed area: positive for counter-clockwise corners."""
     pairs = zip(corners, (*corners[1:], corners[0]), strict=True)
     return sum(a[0] * b[1] - a[1] * b[0] for a, b in pairs) / 2
 
 
 def simple(corners: Sequence[PlanePoint]) -> bool:
-    """True if no two edges cross and no two neighbours coincide."""
+    """True if no two edges cross and no adjacent corners coincide."""
     edges = list(zip(corners, (*corners[1:], corners[0]), strict=True))
     if any(a == b for a, b in edges):
         return False
@@ -74,7 +74,7 @@ def convex(corners: Sequence[Vector]) -> bool:
 
 
 def triangles(corners: Sequence[Vector]) -> list[tuple[Vector, ...]]:
-    """A convex polygon as it is, any other cut into triangles by clipping ears.
+    """Decompose a polygon into triangles by ear clipping; a convex one is returned whole.
 
     Args:
         corners: of a simple polygon, known, counter-clockwise.
@@ -105,7 +105,7 @@ def _is_ear(plain: Sequence[PlanePoint], left: Sequence[int], k: int) -> bool:
 
 
 def dimension(region: Region) -> int | None:
-    """Dimension of a region; None where any will do."""
+    """Return the dimension of a region; None if it fits any."""
     match region:
         case Ball(center):
             return len(center.items)
@@ -122,7 +122,7 @@ def dimension(region: Region) -> int | None:
 
 
 def signed_distance(point: Vector, region: Region, span: Span, scope: Scope) -> Number:
-    """Signed distance of `point` to the boundary of `region`, in SI units; positive inside.
+    """Return the signed distance of `point` to the boundary of `region`, in SI units; positive inside.
 
     Raises:
         Failed: the point has another number of components, or another unit (E205, E203).
@@ -152,7 +152,7 @@ def signed_distance(point: Vector, region: Region, span: Span, scope: Scope) -> 
 
 
 def _box(point: Vector, lower: Vector, upper: Vector, span: Span, scope: Scope) -> Number:
-    """Min of the room to each face inside; minus the Euclidean distance outside."""
+    """Signed distance to a box: min distance to a face inside; minus the Euclidean distance outside."""
     for p, low, high in zip(point.items, lower.items, upper.items, strict=True):
         if low.bare is not high.bare:
             (_, low, high), _ = agree((p, low, high), "compare", span, scope)
@@ -170,7 +170,7 @@ def _box(point: Vector, lower: Vector, upper: Vector, span: Span, scope: Scope) 
 
 
 def _polygon(point: Vector, corners: Sequence[Vector], span: Span, scope: Scope) -> Number:
-    """The distance to the nearest edge, positive where a triangle of the polygon holds the point."""
+    """Signed distance to a polygon: distance to the nearest edge, positive inside one of its triangles."""
     edges = zip(corners, (*corners[1:], corners[0]), strict=True)
     nearest = apply("min", [to_segment(point, a, b, span, scope) for a, b in edges], span, scope)
     parts = [_left_of_all(point, triangle, span, scope) for triangle in triangles(corners)]
@@ -181,7 +181,7 @@ def _polygon(point: Vector, corners: Sequence[Vector], span: Span, scope: Scope)
 
 
 def to_segment(point: Vector, start: Vector, end: Vector, span: Span, scope: Scope) -> Number:
-    """The distance of a point to the segment between two others."""
+    """Return the distance of a point to a segment."""
     along, ahead = minus(end, start, span, scope), minus(point, start, span, scope)
     share = apply("div", (dot(ahead, along, span, scope), dot(along, along, span, scope)), span, scope)
     share = apply("clip", (share, literal(0, span), literal(1, span)), span, scope)

@@ -1,8 +1,8 @@
-"""Resolution: from syntax to a typed specification, names bound, sorts and units checked.
+"""Resolution of syntax to a typed specification, with names bound, sorts and units checked.
 
     ast.Spec --declare--> entries --evaluate--> typed.Spec
 
-Formulas keep their negations, implications and places; times stay in seconds, steps and horizons.
+Formulas keep negations, implications and spans; times stay in seconds, steps and horizons.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from stlc.units import same_dims
 
 @dataclass(frozen=True, slots=True)
 class File:
-    """One file, declared.
+    """File with its declarations.
 
     Attributes:
         spec: as parsed.
-        found: its names.
-        scope: in which they mean something.
-        files: what it imports.
+        found: its declarations.
+        scope: of its names.
+        files: imported files.
     """
 
     spec: ast.Spec
@@ -61,7 +61,7 @@ def declared(
     overrides: Mapping[str, ast.Expr],
     scope: Scope,
 ) -> File:
-    """A file and all that it imports, findings in the scope."""
+    """Declare the names of a file and of its imports; findings go to the scope."""
     loaded = [(module.alias, _of_module(module, interface, scope)) for module in modules]
     found = declare(spec, interface, overrides, scope)
     scopes = {alias: file.scope for alias, file in loaded}
@@ -75,9 +75,9 @@ def _of_module(module: Module, interface: Interface | None, scope: Scope) -> Fil
 
 
 def signature_of(file: File, interface: Interface | None) -> tuple[Signature, tuple[typed.Parameter, ...]]:
-    """The columns of a file and of what it imports, each once, and those that are parameters.
+    """Return the distinct columns of a file and its imports, and those that are parameters.
 
-    E104 where two files differ about one, or the system has other values for a parameter.
+    Reports E104 where two files differ about a column, or the system about a parameter.
     """
     columns: dict[str, tuple[Column, Span]] = {}
     drawn: dict[str, typed.Parameter] = {}
@@ -123,7 +123,7 @@ def _check_same(column: Column, place: Span, known: Column, span: Span, scope: S
 
 
 def with_facts(file: File, facts: Mapping[str, Bounds]) -> File:
-    """The same file where the enforced ranges of all columns are known."""
+    """Return the file with the enforced ranges of all columns in scope."""
     files = tuple(with_facts(part, facts) for part in file.files)
     after = dict(zip((id(part.scope) for part in file.files), (part.scope for part in files), strict=True))
     modules = {alias: after[id(scope)] for alias, scope in file.scope.modules.items()}
@@ -140,17 +140,17 @@ def resolve(
     overrides: Mapping[str, str] | None = None,
     sink: list[Diagnostic] | None = None,
 ) -> typed.Spec:
-    """Bind names, check sorts and units, expand macros. What comes out holds for every grid of time.
+    """Bind names, check sorts and units, expand macros. The result is independent of the time grid.
 
     Args:
         spec: as parsed.
-        interface: what the system offers; signals and constants are matched with it.
-        overrides: constant -> expression that replaces its value (`--set`).
-        sink: warnings are appended here, where errors are raised too; they are those of the result.
+        interface: of the system; signals and constants are matched with it.
+        overrides: constant -> replacing expression (`--set`).
+        sink: receives warnings, those of the result, even if errors are raised.
 
     Raises:
-        SpecError: with every independent error of the file, in source order, at most `MAX_ERRORS`.
-        UsageError: an override of a constant that does not exist.
+        SpecError: all independent errors of the file in source order, at most `MAX_ERRORS`.
+        UsageError: an override of an unknown constant.
     """
     values = read_overrides(overrides or {}, spec, interface)
     findings = Findings()
@@ -185,7 +185,7 @@ def resolve(
 
 
 def _finish(findings: Sequence[Diagnostic], spec: ast.Spec, sink: list[Diagnostic]) -> None:
-    """Warnings to the sink; errors raised together, in the order of the text."""
+    """Append warnings to the sink; raise errors together, in source order."""
 
     def place(finding: Diagnostic) -> tuple[bool, int]:
         span = finding.span
@@ -205,7 +205,7 @@ def _finish(findings: Sequence[Diagnostic], spec: ast.Spec, sink: list[Diagnosti
 
 
 def _elsewhere(interface: Interface | None) -> dict[str, str]:
-    """Advice for each name that only the system knows."""
+    """Return advice for each name that only the system declares."""
     if interface is None:
         return {}
     found = {}
@@ -222,7 +222,7 @@ def _elsewhere(interface: Interface | None) -> dict[str, str]:
 
 
 def _adopt_units(spec: ast.Spec, overrides: Mapping[str, ast.Expr], found: Declared, scope: Scope) -> None:
-    """An override without a unit takes the unit of the value that it replaces."""
+    """Give overrides without a unit the unit of the replaced value."""
     for item in spec.items:
         entry = found.entries.get(item.name)
         if not isinstance(item, ast.Const) or item.name not in overrides or not isinstance(entry, Definition):
@@ -237,7 +237,7 @@ def _adopt_units(spec: ast.Spec, overrides: Mapping[str, ast.Expr], found: Decla
 
 
 def _constants(spec: ast.Spec, interface: Interface | None, scope: Scope) -> tuple[tuple[str, float], ...]:
-    """Every constant in SI units, vectors by component; compared with those of the system (E104)."""
+    """Return constants in SI units, vectors by component; compare them with the system's (E104)."""
     values: list[tuple[str, float]] = []
     for item in _items(spec, ast.Const):
         try:
@@ -264,7 +264,7 @@ def _scalars(name: str, value: Value) -> list[tuple[str, float]]:
 
 
 def _compare(item: ast.Const, value: Number, interface: Interface, scope: Scope) -> None:
-    """E104: one constant, two values."""
+    """Report E104 if a constant differs from the system's."""
     if item.name not in interface.constants or value.constant is None:
         return
     theirs, unit = interface.constants[item.name]
@@ -289,7 +289,7 @@ def _amount(value: float, unit: str) -> str:
 
 
 def _check_definitions(file: File) -> None:
-    """Look at every definition, used or not, of every file."""
+    """Check all definitions of all files, used or not."""
     for part in file.files:
         _check_definitions(part)
     scope = file.scope
@@ -317,7 +317,7 @@ def _items(spec: ast.Spec, kind: type[Item]) -> list[Item]:
 def _requirements(
     spec: ast.Spec, kind: type[ast.Require | ast.Assume], scope: Scope, ranges: KnownRanges
 ) -> tuple[typed.Requirement, ...]:
-    """The requirements (or assumptions) that can be typed."""
+    """Return the requirements (or assumptions) that resolve without errors."""
     found: list[typed.Requirement] = []
     for item in _items(spec, kind):
         tags = read_tags(item.tags, scope)
@@ -346,7 +346,7 @@ def _requirements(
 
 
 def _scale(tags: Tags, formula: typed.Formula, ranges: KnownRanges, scope: Scope) -> float:
-    """Divisor of the robustness. Raises Failed (E205) where a range is not known."""
+    """Return the divisor of the robustness. Raises Failed (E205) for an unknown range."""
     if isinstance(tags.scale, ir.Const):
         return tags.scale.value
     place = tags.scale_span or formula.span
@@ -358,7 +358,7 @@ def _scale(tags: Tags, formula: typed.Formula, ranges: KnownRanges, scope: Scope
 def _warnings(
     requirement: typed.Requirement, item: ast.Require, signature: Signature, scope: Scope
 ) -> list[Diagnostic]:
-    """W502, W503 and W505."""
+    """Report W502, W503 and W505 of a requirement."""
     tag = next((tag for tag in item.tags if tag.name == "safety"), None)
     found = [*vacuous(requirement.formula, signature, scope.facts), *contradictions(requirement.formula)]
     weak = safety_never_violated(requirement, tag)

@@ -1,4 +1,4 @@
-"""The names of an expression while it is resolved, its findings, and how large it may grow."""
+"""Scope of name resolution: entries, findings, and limits on expression size."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_LEVELS = 120
 
 @dataclass(slots=True)
 class Cost:
-    """Size and depth of an expression, written out in full."""
+    """Size and depth of an expression when fully expanded."""
 
     nodes: int = 0
     levels: int = 0
@@ -33,13 +33,13 @@ class Cost:
 
 @dataclass(slots=True)
 class Meter:
-    """Counts nodes as if every definition were written out, although each is evaluated once.
+    """Counter of nodes in the full expansion, although each definition is evaluated once.
 
     Attributes:
-        nodes: so far.
-        level: of nesting right now.
-        deepest: largest level so far.
-        reported: the excess of the declaration at hand has been reported.
+        nodes: count so far.
+        level: current nesting level.
+        deepest: greatest level so far.
+        reported: whether the current declaration's excess has been reported.
     """
 
     nodes: int = 0
@@ -49,27 +49,27 @@ class Meter:
 
     @property
     def over(self) -> bool:
-        """True if a limit is passed."""
+        """True if a limit is exceeded."""
         return self.nodes > MAX_NODES or self.deepest > MAX_LEVELS
 
     def enter(self) -> None:
-        """One node deeper."""
+        """Enter a child node."""
         self.nodes += 1
         self.level += 1
         self.deepest = max(self.deepest, self.level)
 
     def leave(self) -> None:
-        """Back to the node around it."""
+        """Return to the parent node."""
         self.level -= 1
 
     def charge(self, cost: Cost) -> None:
-        """Count something that was evaluated before as if it were written here."""
+        """Add the cost of a previously evaluated expression."""
         self.nodes += cost.nodes
         self.deepest = max(self.deepest, self.level + cost.levels)
 
     @contextmanager
     def measured(self) -> Iterator[Cost]:
-        """Yields a `Cost` that tells, after the block, what was evaluated inside without being charged."""
+        """Context whose `Cost`, set after the block, is that of evaluations inside, which are not charged."""
         nodes, deepest, level = self.nodes, self.deepest, self.level
         self.nodes, self.deepest = 0, level
         cost = Cost()
@@ -81,7 +81,7 @@ class Meter:
 
     @contextmanager
     def fresh(self) -> Iterator[None]:
-        """A budget of its own: a declaration is not charged for its neighbours."""
+        """Context with a separate budget, for one declaration."""
         saved = self.nodes, self.level, self.deepest
         self.nodes, self.level, self.deepest, self.reported = 0, 0, 0, False
         try:
@@ -92,13 +92,13 @@ class Meter:
 
 TIME_WORDS = ("T", "end", "dt")
 _MAX_PAIRS = 20_000
-"""Of names and candidates that are compared for "did you mean" before the rest goes without."""
+"""Limit on comparisons of unknown names with candidates for "did you mean"."""
 
 _COMPONENT = re.compile(r"(?P<name>.+)\[(?P<index>\d+)\]")
 
 
-class Failed(Exception):  # noqa: N818 - control flow inside this room; the finding is in the sink already
-    """An expression could not be resolved, and its findings have been reported."""
+class Failed(Exception):  # noqa: N818 - control flow inside this package; the finding is in the sink already
+    """Failure to resolve an expression whose findings have been reported."""
 
 
 Sort: TypeAlias = Literal["any", "constant", "region", "number", "formula"]
@@ -106,12 +106,12 @@ Sort: TypeAlias = Literal["any", "constant", "region", "number", "formula"]
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """A name with a value: a signal, a constant, a member of an enum.
+    """Name with a value: a signal, a constant, an enum member.
 
     Attributes:
         value: in SI units.
-        about: what it is, for messages: "env signal, declared at line 14".
-        span: where it was declared.
+        about: description for messages: "env signal, declared at line 14".
+        span: of its declaration.
     """
 
     value: Value
@@ -121,16 +121,16 @@ class Known:
 
 @dataclass(frozen=True, slots=True)
 class Definition:
-    """A name with an expression: a macro, a constant, a region; resolved when it is first used.
+    """Name with an expression (macro, constant, region), resolved on first use.
 
     Attributes:
         name: of the definition.
         body: the expression.
         formals: names of the arguments.
-        unit: unit that the number must have, and that a bare number takes; None for any.
-        sort: what the body must be.
-        about: what it is, for messages.
-        span: where its name was declared.
+        unit: required unit, also of bare numbers; None for any.
+        sort: required sort of the body.
+        about: description, for messages.
+        span: of its declaration.
     """
 
     name: str
@@ -144,18 +144,17 @@ class Definition:
 
 @dataclass(frozen=True, slots=True)
 class External:
-    """A function that the system provides.
+    """Function that the system provides.
 
     Attributes:
         name: of the function.
-        arguments: size of each vector that it takes; None for a number.
-        result: size of the vector that it gives; None for a number.
+        arguments: size of each vector argument; None for a number.
+        result: size of the result; None for a number.
         unit: of the result.
         kind: of the result.
-        function: takes components and gives components, or says in the IR what they are; None where nobody
-            loaded it.
-        about: what it is, for messages.
-        span: where its name was declared.
+        function: from components to components, or its body in the IR; None if not loaded.
+        about: description, for messages.
+        span: of its declaration.
     """
 
     name: str
@@ -176,17 +175,17 @@ class Scope:
     """Names and rules under which expressions are resolved.
 
     Attributes:
-        entries: what the file knows, by name.
-        sink: findings are appended here.
-        error: what a public function raises: `SpecError`, or `SystemFileError` in a system file.
-        samplers: `uniform(…)` and its like are allowed.
+        entries: declarations of the file, by name.
+        sink: receives findings.
+        error: class that public functions raise: `SpecError`, or `SystemFileError` in a system file.
+        samplers: random draws such as `uniform(…)` are allowed.
         temporal: temporal operators are allowed.
-        time_unit: unit of bare numbers in intervals; "" where no pragma says so.
+        time_unit: unit of bare numbers in intervals; "" without a `time` pragma.
         facts: enforced ranges of columns, in stored units.
-        elsewhere: names that only the system knows, with the advice to give.
-        modules: what imported files know, by alias.
+        elsewhere: names that only the system declares, with advice.
+        modules: scopes of imported files, by alias.
         product: `x in [lo, hi]` is `(x - lo) (hi - x)` (`@product`).
-        locals: arguments of the macro and quantifier variables at hand, with what they cost.
+        locals: arguments of the current macro and quantifier variables, with their costs.
     """
 
     entries: Mapping[str, Entry] = field(default_factory=dict)
@@ -206,11 +205,11 @@ class Scope:
 
     @property
     def in_spec(self) -> bool:
-        """True if this is a specification, where `T`, `end` and `dt` are words of the language."""
+        """True in a specification, where `T`, `end` and `dt` are keywords."""
         return not issubclass(self.error, SystemFileError)
 
     def extended(self, entries: Mapping[str, Entry], *, samplers: bool | None = None) -> Scope:
-        """The same scope with more names; `samplers` changes whether random draws are allowed."""
+        """Return the scope with further names; `samplers` sets whether random draws are allowed."""
         return replace(
             self,
             entries={**self.entries, **entries},
@@ -219,22 +218,22 @@ class Scope:
         )
 
     def as_products(self) -> Scope:
-        """The same scope under `@product`, which definitions are looked at anew for."""
+        """Return the scope under `@product`, with an empty cache of definitions."""
         broken = {name: None for name, value in self.cache.items() if value is None}
         modules = {alias: module.as_products() for alias, module in self.modules.items()}
         return replace(self, product=True, cache=dict(broken), modules=modules)
 
     def report(self, finding: Diagnostic) -> None:
-        """Add a finding, once (a macro that is used twice has its faults once)."""
+        """Add a finding unless present (a macro used twice is reported once)."""
         tell(self.sink, finding)
 
     def fail(self, finding: Diagnostic) -> NoReturn:
-        """Report and give up on the expression at hand."""
+        """Report a finding and raise Failed."""
         self.report(finding)
         raise Failed
 
     def unknown(self, name: ast.Name, *, called: bool = False) -> NoReturn:
-        """Report a name that nothing declares (E101)."""
+        """Report an undeclared name (E101)."""
         candidates = [*self.locals, *self.entries]
         if called:
             candidates += [*callable_names(), *(sampler_names() if self.samplers else ())]
@@ -253,7 +252,7 @@ class Scope:
 
 
 def column_value(column: Column, origin: Origin | None = None) -> Number:
-    """The number that a column holds, in SI units from the zero of its unit."""
+    """Return the value of a column, in SI units relative to the offset of its unit."""
     num: ir.Num = ir.Signal(column.name)
     if column.unit.ratio != 1:
         num = ir.Op("mul", (num, ir.Const(column.unit.scale)))
@@ -264,7 +263,7 @@ def column_value(column: Column, origin: Origin | None = None) -> Number:
 def column_entries(
     columns: Iterable[Column], *, about: str = "", span: Span | None = None
 ) -> dict[str, Known]:
-    """Entries for columns; `q[0]`, `q[1]`, … together become the vector `q`."""
+    """Return entries for columns; `q[0]`, `q[1]`, … form the vector `q`."""
     entries: dict[str, Known] = {}
     for column in columns:
         value = column_value(column)
@@ -279,7 +278,7 @@ def column_entries(
 
 
 def member_entries(enums: Iterable[tuple[tuple[str, float], ...]]) -> dict[str, Known]:
-    """Entries for the members of enums; a member of several enums is told apart by what it meets."""
+    """Return entries for enum members; a member of several enums is resolved by the other operand."""
     options: dict[str, list[tuple[tuple[str, float], ...]]] = {}
     for labels in dict.fromkeys(enums):
         for name, _ in labels:
@@ -288,7 +287,7 @@ def member_entries(enums: Iterable[tuple[tuple[str, float], ...]]) -> dict[str, 
 
 
 def constant_value(value: float, unit: Unit = DIMENSIONLESS) -> Number:
-    """A number known in SI units; without a written unit it is as good as a bare one."""
+    """Return a constant given in SI units; without a written unit it counts as bare."""
     bare = not unit.text
     exact = Fraction(repr(value)) - unit.offset
     kind: Literal["int", "real"] = "int" if bare and exact.denominator == 1 else "real"
@@ -298,12 +297,12 @@ def constant_value(value: float, unit: Unit = DIMENSIONLESS) -> Number:
 def constant_entries(
     constants: Mapping[str, tuple[float, Unit]], *, about: str = "constant"
 ) -> dict[str, Known]:
-    """Entries for constants given as (value in SI units, unit)."""
+    """Return entries for constants given as (value in SI units, unit)."""
     return {name: Known(constant_value(value, unit), about) for name, (value, unit) in constants.items()}
 
 
 def enforced(columns: Iterable[Column]) -> dict[str, Bounds]:
-    """Ranges that are facts: clamped columns, booleans, enums, and whatever else is marked so."""
+    """Return the enforced ranges: of clamped columns, booleans, enums, and columns marked as enforced."""
     facts: dict[str, Bounds] = {}
     for column in columns:
         if column.kind == "bool":
@@ -317,5 +316,5 @@ def enforced(columns: Iterable[Column]) -> dict[str, Bounds]:
 
 
 def reserved(name: str) -> bool:
-    """True if a call of `name` means a built-in function."""
+    """True if `name` is a built-in function."""
     return name in (*callable_names(), *sampler_names())

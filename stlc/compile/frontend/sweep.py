@@ -1,11 +1,11 @@
-"""`sweep(p)`: the straight segment from a point to where it is at the next sample, and regions.
+"""`sweep(p)`: signed distances of the straight segment from a point to its position at the next sample.
 
 `sweep(p) in R` is the least signed distance along the segment, `sweep(p) not in R` the least signed distance
 to the complement. Both are exact for balls, boxes, half-spaces and convex polygons; `in` of an intersection
 and `not in` of a union are exact where their parts are, the other two are lower bounds. For a polygon that is
 not convex the sign is exact, and so is the value where it is not negative.
 
-A region that moves is taken to move in a straight line too.
+A moving region is assumed to move in a straight line too.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from stlc.diagnostics import Diagnostic
 from stlc.source import Span
 
 _SHORT = 1e-9
-"""Segments shorter than this, in SI units, count as points."""
+"""Length in SI units below which a segment counts as a point."""
 _AHEAD = 1e-6
-"""Offset behind the start of a piece at which its active faces are determined."""
+"""Parameter offset into a piece at which its active faces are determined."""
 
 Pair = tuple[Number, Number]
 """A number at both ends of the segment; linear in between."""
 
 
 def swept_distance(point: Vector, region: Region, span: Span, scope: Scope) -> Number:
-    """The least signed distance along the segment that starts at `point` now.
+    """Return the least signed distance along the segment that starts at `point` now.
 
     Raises:
         Failed: the point has another number of components, or another unit (E205, E203).
@@ -58,7 +58,7 @@ def swept_distance(point: Vector, region: Region, span: Span, scope: Scope) -> N
 
 
 class _Sweep:
-    """One segment, and what is computed along it."""
+    """Distance computations along one segment."""
 
     def __init__(self, point: Vector, span: Span, scope: Scope) -> None:
         self.ends = (point, _vector_later(point))
@@ -67,7 +67,7 @@ class _Sweep:
     # -------------------------------------------------------------- least and greatest
 
     def least(self, region: Region) -> Number:
-        """The least signed distance: of a convex region, which it is concave in, at one of the ends."""
+        """Least signed distance; for a convex region it is concave along the segment, so least at an end."""
         match region:
             case Combined(op, parts):
                 return self.apply("max" if op == "union" else "min", *map(self.least, parts))
@@ -81,7 +81,7 @@ class _Sweep:
                 return self.apply("min", *self.at_ends(region))
 
     def greatest(self, region: Region) -> Number:
-        """The greatest signed distance."""
+        """Greatest signed distance."""
         match region:
             case Combined(op, parts):
                 return self.apply("max" if op == "union" else "min", *map(self.greatest, parts))
@@ -129,9 +129,9 @@ class _Sweep:
         return self._choose(ir.Predicate(depth.num), depth, close)
 
     def _depth(self, faces: Sequence[Pair]) -> Number:
-        """The greatest, along the segment, of the least distance to a face; negative where there is none.
+        """Max along the segment of the min distance to a face; negative if the segment stays outside.
 
-        By duality the least of: every face at its better end; two faces of opposite slope where they meet.
+        By LP duality the min of: each face at its better end; two faces of opposite slope where they meet.
         """
         best = [self.apply("max", *face) for face in faces]
         slopes = [self.apply("sub", after, before) for before, after in faces]
@@ -150,10 +150,10 @@ class _Sweep:
         return self.apply("min", *best, *meetings)
 
     def _approaches(self, faces: Sequence[Pair]) -> list[Number]:
-        """Minus the distance to a box at every point that may be the closest one.
+        """Minus the distance to a box at each candidate for the closest point.
 
-        The squared distance is convex and piecewise quadratic along the segment: its minimum is that of one
-        of the pieces, each of which starts where the segment passes a face, or at the segment's start.
+        The squared distance is convex and piecewise quadratic along the segment. Its minimum is that of one
+        of the pieces, which start at the segment's start or where it crosses a face.
         """
         slopes = [self.apply("sub", after, before) for before, after in faces]
         starts = [literal(0, self.span), *(self._passing(face) for face in faces)]
@@ -176,7 +176,7 @@ class _Sweep:
         return found
 
     def _passing(self, face: Pair) -> Number:
-        """Share of the segment, from 0 to 1, at which it passes a face; any share if it does not."""
+        """Segment parameter in [0, 1] at which it crosses a face; arbitrary if it does not."""
         before, after = face
         slope = self.apply("sub", after, before)
         product_ = self.apply("mul", self.negative(before), slope)
@@ -202,7 +202,7 @@ class _Sweep:
         return found
 
     def _clearances(self, corners: Sequence[Vector]) -> list[Number]:
-        """The distance of the segment to every edge; where they cross, how far they do, negative."""
+        """Distance of the segment to every edge; negative crossing depth where they cross."""
         past = [self.past(corner) for corner in corners]
         turns = [self._turn(corner) for corner in corners]
         found = []
@@ -219,7 +219,7 @@ class _Sweep:
         return found
 
     def _turn(self, corner: Vector) -> Number:
-        """On which side of the segment a corner lies."""
+        """Side of the segment on which a corner lies, as the sign of a cross product."""
         now, then = self.ends
         along, ahead = minus(then, now, self.span, self.scope), minus(corner, now, self.span, self.scope)
         turn = cross(along, ahead, self.span, self.scope)
@@ -229,7 +229,7 @@ class _Sweep:
     # ---------------------------------------------------------------------- arithmetic
 
     def at_ends(self, region: Region) -> Pair:
-        """The signed distance at both ends."""
+        """Signed distance at both ends."""
         now, then = self.ends
         return (
             signed_distance(now, region, self.span, self.scope),
@@ -237,7 +237,7 @@ class _Sweep:
         )
 
     def past(self, place: Vector) -> Number:
-        """Least distance of the segment to a point, which may move in a straight line too."""
+        """Least distance of the segment to a point that may move in a straight line."""
         now, then = (
             minus(end, there, self.span, self.scope)
             for end, there in zip(self.ends, (place, _vector_later(place)), strict=True)
@@ -252,7 +252,7 @@ class _Sweep:
         return norm(Vector(moved), self.span, self.scope)
 
     def _ratio(self, upper: Number, lower: Number) -> Number:
-        """A quotient of squares; where nothing moves it does not matter, as long as it is finite."""
+        """Quotient of squares, kept finite for a segment of length 0, where its value does not matter."""
         least = literal(_SHORT * _SHORT, self.span)
         return self.apply("div", upper, self.apply("max", lower, least))
 
@@ -269,11 +269,11 @@ class _Sweep:
         return Number(ir.Where(cond, yes.num, no.num), no.unit, no.flexible, span=self.span)
 
     def apply(self, name: str, *args: Number) -> Number:
-        """A function of the table."""
+        """Apply a function of the table."""
         return apply(name, args, self.span, self.scope)
 
     def negative(self, number: Number) -> Number:
-        """Its negation."""
+        """Return the negated number."""
         return negated(number, self.span)
 
 
@@ -282,7 +282,7 @@ def _cycle(corners: Sequence[Vector]) -> list[tuple[Vector, Vector]]:
 
 
 def _both(number: Number) -> tuple[Number, ...]:
-    """A number at both ends."""
+    """Return a number at both ends."""
     return number, _number_later(number)
 
 
@@ -295,7 +295,7 @@ def _vector_later(vector: Vector) -> Vector:
 
 
 def _region_later(region: Region) -> Region:
-    """The region at the next sample; at the last one, there."""
+    """Return the region at the next sample; at the last sample, the region there."""
     match region:
         case Ball(center, radius):
             return replace(region, center=_vector_later(center), radius=_number_later(radius))

@@ -1,4 +1,4 @@
-"""Tags of requirements: `@safety`, `@weight(2)`, `@id("R1")`, and what `@scale(auto)` divides by."""
+"""Tags of requirements: `@safety`, `@weight(2)`, `@id("R1")`, and the divisor of `@scale(auto)`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from stlc.source import Span
 
 
 def nominal(columns: Iterable[Column]) -> dict[str, Bounds]:
-    """Every declared range, enforced or not, in stored units."""
+    """Return every declared range, enforced or not, in stored units."""
     return {
         column.name: (column.low, column.high)
         for column in columns
@@ -33,7 +33,7 @@ def nominal(columns: Iterable[Column]) -> dict[str, Bounds]:
 
 
 def reach_of_formula(formula: typed.Formula, ranges: KnownRanges, place: Span, scope: Scope) -> float:
-    """The greatest magnitude of a predicate in `formula`. Raises Failed (E205) where a range is missing."""
+    """Return the greatest magnitude of a predicate in `formula`. Raises Failed (E205) for a missing range."""
     known = dict(ranges)
     found = [reach_of_number(pred.num, known, place, scope) for pred in _predicates(formula, known)]
     if not found:
@@ -42,7 +42,7 @@ def reach_of_formula(formula: typed.Formula, ranges: KnownRanges, place: Span, s
 
 
 def reach_of_number(num: ir.Num, ranges: KnownRanges, place: Span, scope: Scope) -> float:
-    """The greatest magnitude of a number. Raises Failed (E205) where a range is missing."""
+    """Return the greatest magnitude of a number. Raises Failed (E205) for a missing range."""
     ends = bounds(num, ranges)
     if ends is not None and all(map(math.isfinite, ends)) and ends != (0.0, 0.0):
         return max(map(abs, ends))
@@ -57,7 +57,7 @@ def reach_of_number(num: ir.Num, ranges: KnownRanges, place: Span, scope: Scope)
 
 
 def _predicates(formula: typed.Formula, ranges: dict[str, Bounds]) -> Iterator[typed.Predicate]:
-    """All predicates; the ranges of what `freeze` binds are added on the way."""
+    """Yield all predicates, adding the ranges of frozen values to `ranges`."""
     for node in nodes(formula):
         if isinstance(node, typed.Predicate):
             yield node
@@ -78,9 +78,9 @@ class Tags:
     Attributes:
         marks: bare tag names.
         weight: factor of the robustness.
-        scale: its divisor; a number that varies stands for the reach of its range, None for that of the
-            predicates (`@scale(auto)`).
-        scale_span: where that is written.
+        scale: divisor of the robustness; a varying number stands for the greatest magnitude of its range,
+            None for that of the predicates (`@scale(auto)`).
+        scale_span: of the scale.
         product: `x in [lo, hi]` is `(x - lo) (hi - x)`.
         id: of `@id("…")`.
         group: of `@group(name)`.
@@ -96,7 +96,7 @@ class Tags:
 
 
 def read_tags(tags: Sequence[ast.Tag], scope: Scope) -> Tags:
-    """The tags of a requirement. Findings (E501, E205) go to the scope; a bad tag says nothing."""
+    """Return the tags of a requirement. Findings (E501, E205) go to the scope; invalid tags are ignored."""
     found = Tags()
     seen: set[str] = set()
     for tag in tags:
@@ -111,7 +111,7 @@ def read_tags(tags: Sequence[ast.Tag], scope: Scope) -> Tags:
 
 
 def refuse_tags(tags: Sequence[ast.Tag], what: str, scope: Scope) -> None:
-    """Tags on a declaration that takes none (E501)."""
+    """Report tags on a declaration that takes none (E501)."""
     for tag in tags:
         message = f"`@{tag.name}` says nothing about {what}"
         scope.report(Diagnostic("E501", message, tag.span, help=("tags stand before `require`",)))
@@ -147,7 +147,7 @@ def _unknown(tag: ast.Tag) -> Diagnostic:
 
 
 def _only(tag: ast.Tag) -> ast.Expr | None:
-    """Its one argument, if that is what it has."""
+    """Return the argument of a tag if it has exactly one."""
     return tag.args[0].value if len(tag.args) == 1 and tag.args[0].name is None else None
 
 
@@ -171,7 +171,7 @@ def _positive(tag: ast.Tag, scope: Scope) -> float:
 
 
 def _number(tag: ast.Tag, scope: Scope) -> ir.Num:
-    """The one number that a tag is given, positive where it is a constant."""
+    """Return the number in a tag; a constant must be positive."""
     expr = _only(tag)
     if expr is None:
         scope.fail(Diagnostic("E501", f"`@{tag.name}` takes one number: `@{tag.name}(2)`", tag.span))

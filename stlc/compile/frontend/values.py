@@ -18,7 +18,7 @@ Labels: TypeAlias = tuple[tuple[str, float], ...]
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Declaration of a named value: its span, and the words for it ("line 5")."""
+    """Declaration of a named value: its span, and its description ("line 5")."""
 
     span: Span | None
     text: str
@@ -26,22 +26,22 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A scalar in SI units, counted from the zero of its unit: 20 degC is 20, a point of that scale.
+    """Scalar in SI units relative to the offset of its unit: 20 degC is 20, a point of that scale.
 
     Attributes:
-        num: how it is computed.
-        unit: its physical unit, for checks and messages; `num` is in SI whatever the unit's scale. One with
-            an offset makes the number a point.
-        flexible: of unknown unit (nothing was declared, or a factor is a bare number): agrees with any unit.
-        bare: made of bare numbers alone: takes the unit that is needed, with its scale (`psi < 30`).
-        exact: the value of a constant that is rational.
-        sense: `difference` of two points, which is compared with no point; `open`: a point less something in
-            kelvin that varies, which is a difference where that is a temperature, or a multiple of a point.
-        kind: `bool` stands for 0/1 and is a formula too; `enum` is one of `labels`.
+        num: the number in the IR.
+        unit: physical unit, for checks and messages; `num` is in SI whatever the unit's scale. With an
+            offset the number is a point.
+        flexible: of unknown unit (none declared, or a factor is a bare number): agrees with any unit.
+        bare: made of bare numbers alone: takes the required unit, with its scale (`psi < 30`).
+        exact: exact value of a rational constant.
+        sense: `difference` of two points, not comparable with a point; `open`: a point minus a varying
+            number in kelvin (a difference if that is a temperature), or a multiple of a point.
+        kind: `bool` is 0 or 1 and also a formula; `enum` is one of `labels`.
         labels: (label, value) pairs of an enum.
-        formula: of a choice between bools: the choice between formulas, with their margins.
-        span: where it is written.
-        origin: where its name was declared.
+        formula: for a choice between bools, the choice between formulas, with their margins.
+        span: in the source.
+        origin: declaration of its name.
     """
 
     num: ir.Num
@@ -58,7 +58,7 @@ class Number:
 
     @property
     def constant(self) -> float | None:
-        """Its value in SI units from the zero of its unit, if it is known now."""
+        """Value in SI units relative to the offset of its unit, if constant."""
         return self.num.value if isinstance(self.num, ir.Const) else None
 
 
@@ -72,7 +72,7 @@ class Vector:
 
 @dataclass(frozen=True, slots=True)
 class EnumMember:
-    """A member of one or several enums, told apart by what it is compared with."""
+    """Member of one or several enums, resolved by the other operand of a comparison."""
 
     name: str
     options: tuple[Labels, ...]
@@ -81,7 +81,7 @@ class EnumMember:
 
 @dataclass(frozen=True, slots=True)
 class TimeExpr:
-    """A time that needs the grid: `seconds + steps * dt + horizons * T`, or `end` (and `inf`)."""
+    """Time on the grid: `seconds + steps * dt + horizons * T`, or `end` (and `inf`)."""
 
     seconds: Fraction = Fraction(0)
     steps: Fraction = Fraction(0)
@@ -91,7 +91,7 @@ class TimeExpr:
 
 
 class Operand(NamedTuple):
-    """An operand as it is written, with its value."""
+    """Operand as written, with its value."""
 
     expr: ast.Expr
     value: Value
@@ -99,7 +99,7 @@ class Operand(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Swept:
-    """`sweep(p)`: the segment from a point to where it is at the next sample."""
+    """`sweep(p)`: segment from a point to its position at the next sample."""
 
     point: Vector
     span: Span | None = field(default=None, compare=False, repr=False)
@@ -107,7 +107,7 @@ class Swept:
 
 @dataclass(frozen=True, slots=True)
 class Ball:
-    """Points at most `radius` from `center`; a circle in the plane."""
+    """Points at most `radius` from `center`; a disc in 2D."""
 
     center: Vector
     radius: Number
@@ -125,7 +125,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Polygon:
-    """A simple polygon of the plane, its corners known, in counter-clockwise order."""
+    """Simple polygon in 2D with constant corners in counter-clockwise order."""
 
     corners: tuple[Vector, ...]
     span: Span | None = field(default=None, compare=False, repr=False)
@@ -151,7 +151,7 @@ class Combined:
 
 @dataclass(frozen=True, slots=True)
 class Dilated:
-    """A region grown by `margin` (shrunk where it is negative)."""
+    """Region dilated by `margin` (eroded where it is negative)."""
 
     region: Region
     margin: Number
@@ -160,7 +160,7 @@ class Dilated:
 
 @dataclass(frozen=True, slots=True)
 class Complement:
-    """Everything outside a region."""
+    """Complement of a region."""
 
     region: Region
     span: Span | None = field(default=None, compare=False, repr=False)
@@ -172,7 +172,7 @@ Value: TypeAlias = Number | Vector | Swept | EnumMember | TimeExpr | Region | ty
 
 
 def is_formula(value: Value) -> bool:
-    """True if it has margins of its own (the margin of a bool signal is always a half)."""
+    """True if the value is a formula with margins (not a bool signal, whose margin is always 1/2)."""
     return isinstance(value, typed.Node) or (isinstance(value, Number) and value.formula is not None)
 
 
@@ -184,7 +184,7 @@ def literal(value: Fraction | float | int, span: Span | None = None) -> Number:
 
 
 def at(value: Value, span: Span) -> Value:
-    """The same value, written at `span` (a formula keeps its own places)."""
+    """Return the value with another `span` (a formula keeps its own spans)."""
     return value if isinstance(value, typed.Node) else replace(value, span=span)
 
 
@@ -194,7 +194,7 @@ def unit_text(number: Number) -> str:
 
 
 def describe(value: Value) -> str:
-    """Its sort in words, for messages: `real [m]`, `vector of 3`, `formula`, `region`."""
+    """Return the sort for messages: `real [m]`, `vector of 3`, `formula`, `region`."""
     match value:
         case Number():
             return f"{value.kind} {unit_text(value)}".rstrip()
@@ -214,7 +214,7 @@ def describe(value: Value) -> str:
 
 
 def noun(value: Value) -> str:
-    """With its article: `a number [m]`, `a formula`."""
+    """Return the sort with its article: `a number [m]`, `a formula`."""
     match value:
         case Number():
             return f"a number {unit_text(value)}".rstrip()

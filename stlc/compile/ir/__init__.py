@@ -1,1 +1,1 @@
-"""Typed formulas, the intermediate representation, and what follows from them alone."""
+"""Typed formulas, the intermediate representation (IR), and analyses of both."""

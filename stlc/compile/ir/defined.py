@@ -1,4 +1,4 @@
-"""Definedness of a formula on a finite trace, sample by sample. With NumPy, which `support` does without."""
+"""Definedness of a formula on a finite trace, sample by sample (needs NumPy, unlike `support`)."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _Instants: TypeAlias = NDArray[np.int_]
 
 
 def defined(formula: ir.Formula, samples: int) -> Defined:
-    """For every sample of a trace with `samples` of them: has `formula` a value there? Shape `(samples,)`.
+    """Return where `formula` is defined on a trace of `samples` samples, as a mask `(samples,)`.
 
-    No window of the future is cut: one that reaches beyond the last sample is undefined, and so are `prev`,
+    Windows of the future are not cut: one that extends beyond the last sample is undefined, as are `prev`,
     `next` and `shift` outside the trace. A window "to the end" is defined where it has a sample.
     """
     return fold(formula, _Definedness(samples))
@@ -48,12 +48,12 @@ class _Definedness(Analysis[Defined]):
         return _throughout(body, *self._past(window))
 
     def until(self, left: Defined, right: Defined, window: ir.Window) -> Defined:
-        """The left side is read from now on, and at this very instant in any case."""
+        """Definedness of `until`; the left side is read from now on, and now in any case."""
         (first, last), now = self._future(window), np.arange(self.samples)
         return _throughout(left, now, np.maximum(last, now)) & _throughout(right, first, last)
 
     def since(self, left: Defined, right: Defined, window: ir.Window) -> Defined:
-        """Neither side is read where the window lies before the start of the trace."""
+        """Definedness of `since`; neither side is read where the window lies before the trace."""
         (first, last), now = self._past(window), np.arange(self.samples)
         held = _throughout(left, np.where(last < 0, now + 1, first), now)
         return held & _throughout(right, first, last)
@@ -67,7 +67,7 @@ class _Definedness(Analysis[Defined]):
         return np.full(self.samples, body[0])
 
     def _future(self, window: ir.Window) -> tuple[_Instants, _Instants]:
-        """First and last instant of the window of every sample."""
+        """First and last instant of each sample's future window."""
         now = np.arange(self.samples)
         if window.hi is not None:
             return now + window.lo, now + window.hi
@@ -81,10 +81,10 @@ class _Definedness(Analysis[Defined]):
 
 
 def _throughout(inside: Defined, first: _Instants, last: _Instants) -> Defined:
-    """True if all instants first..last lie within the trace and are defined; true for none at all."""
+    """True if all instants first..last are within the trace and defined; true for an empty range."""
     samples = len(inside)
     known = int(np.argmin(inside)) if not inside.all() else samples
-    if not inside[known:].any():  # a formula that only looks ahead is defined up to some sample
+    if not inside[known:].any():  # a formula without past operators is defined up to some sample
         return np.asarray(((last < known) | (last < first)) & (last < samples))
     missing = np.concatenate([[0], np.cumsum(~inside)])
     low, high = np.clip(first, 0, samples), np.clip(last + 1, 0, samples)

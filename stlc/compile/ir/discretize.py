@@ -1,8 +1,8 @@
-"""Times in seconds -> whole samples: the grid of time, windows, and delays.
+"""Discretization of time: from seconds to whole samples for windows and delays, on a time grid.
 
-An interval covers the samples inside it. A bound that falls between two samples is rounded so that what holds
-on the samples holds as written: `always` and `release` take the neighbour outside as well, `eventually` and
-`until` do not. After negation normal form the operator itself says which; every such bound is W304.
+An interval covers the samples inside it. A bound between two samples is rounded conservatively, so that
+satisfaction on the samples implies the formula as written: outwards for `always` and `release`, inwards for
+`eventually` and `until`, as they stand in negation normal form. Each such bound is W304.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from stlc.source import Span
 from stlc.units import nearest
 
 MAX_STEPS = 10**12
-"""Bounds beyond are longer than any trace, and sums of them would not fit into 64 bits."""
+"""Limit of bounds in steps: longer than any trace, and sums still fit into 64 bits."""
 
 MAX_DELAY = 1_000_000
-"""Samples that `shift` goes at most."""
+"""Limit of `shift` in samples."""
 
 _EMPTY = ir.Window(0, 0)
-"""Stands for a window that could not be made; an error was reported."""
+"""Placeholder window after a reported error."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """The steps of time: `dt` in seconds, `horizon` (what `T` means) in steps; None where unknown."""
+    """Time grid: step `dt` in seconds and horizon (`T`) in steps; None where unknown."""
 
     dt: Fraction | None = None
     horizon: int | None = None
 
 
 def lacks(grid: Grid, formula: typed.Formula) -> bool:
-    """True if a time in a formula needs a step or a horizon that the grid does not say."""
+    """True if a formula needs a step or a horizon that the grid does not define."""
     return any(
         (time.seconds and grid.dt is None) or (time.horizons and grid.horizon is None)
         for time in _times(formula)
@@ -59,13 +59,13 @@ def _times(formula: typed.Formula) -> Iterator[typed.Time]:
 
 
 def to_window(interval: typed.Interval, grid: Grid, sink: list[Diagnostic], *, outward: bool) -> ir.Window:
-    """The window of an interval, in steps.
+    """Return the window of an interval, in steps.
 
     Args:
         interval: in seconds, steps and horizons.
-        grid: of time.
-        sink: takes E005, E301, E302, E305, E311 and W304. After an error the window is a stand-in.
-        outward: round a bound off the grid away from the interval.
+        grid: time step and horizon.
+        sink: receives E005, E301, E302, E305, E311 and W304; after an error the window is a placeholder.
+        outward: round bounds off the grid outwards.
     """
     lo = in_steps(interval.lo, grid, sink, interval.span)
     if lo is None:
@@ -88,7 +88,7 @@ def to_window(interval: typed.Interval, grid: Grid, sink: list[Diagnostic], *, o
 
 
 def in_steps(time: typed.Time, grid: Grid, sink: list[Diagnostic], span: Span | None) -> Fraction | None:
-    """A bound in steps, or None (and E311) where the grid does not say what it needs."""
+    """Return a bound in steps, or None (and E311) where the grid lacks the step or horizon."""
     if time.horizons and grid.horizon is None:
         report(sink, _needs_grid("`T` is the planning horizon of a system", time.span or span))
         return None
@@ -112,7 +112,7 @@ def _last(hi: Fraction, *, outward: bool, excluded: bool) -> int:
 
 
 def report(sink: list[Diagnostic], finding: Diagnostic) -> None:
-    """Append a finding that is not there yet: a formula and its negation may both be lowered."""
+    """Append a finding unless present: a formula and its negation may both be lowered."""
     tell(sink, finding)
 
 
@@ -157,7 +157,7 @@ def _note_rounding(time: typed.Time, exact: Fraction, taken: int, grid: Grid, si
 
 
 def in_words(steps: Fraction, grid: Grid) -> str:
-    """A time as people write it: in seconds where the step is known."""
+    """Return a time for messages: in seconds where the step is known."""
     if grid.dt is None:
         return f"{nearest(steps):g} steps"
     return f"{nearest(steps * grid.dt):g} s"
@@ -190,7 +190,7 @@ def _needs_grid(text: str, span: Span | None) -> Diagnostic:
 
 
 def in_samples(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> typed.Formula:
-    """The formula with delays counted in samples. E205 and E311 go to `sink`; then 1 stands for the delay."""
+    """Convert delays to samples. E205 and E311 go to `sink`, with 1 as placeholder."""
 
     def leaf(num: ir.Num) -> ir.Num:
         if not isinstance(num, typed.DelayedSignal):
@@ -219,7 +219,7 @@ def _samples(delay: typed.Time, grid: Grid, sink: list[Diagnostic]) -> int:
 
 
 def delay_fault(steps: Fraction, span: Span | None, grid: Grid) -> Diagnostic | None:
-    """E205 for a delay between two samples, or too long."""
+    """Return E205 for a delay off the grid, or above `MAX_DELAY`."""
     if steps.denominator != 1 and grid.dt is not None:
         low, high = (in_words(Fraction(n), grid) for n in (math.floor(steps), math.ceil(steps)))
         message = f"{in_words(steps, grid)} is not a whole number of {float(grid.dt):g} s steps"
@@ -233,6 +233,6 @@ def delay_fault(steps: Fraction, span: Span | None, grid: Grid) -> Diagnostic | 
 
 
 def no_delay(message: str, span: Span | None) -> Diagnostic:
-    """E205 for what is no number of samples."""
+    """Return E205 for an invalid number of samples."""
     help_ = ("shift(x, 2) is x two samples later, shift(x, -0.1 s) what it was a tenth of a second before",)
     return Diagnostic("E205", message, span, help=help_)

@@ -1,8 +1,8 @@
-"""The built-in functions: one entry each, with everything that any part of the compiler needs to know of it.
+"""Table of built-in functions: one entry each, read by all parts of the compiler.
 
-An entry says how many arguments a function takes, which units they have, what it means on plain numbers, on
-arrays and in C, its derivative, and its range. A function that is added here is known to the resolver, the
-array back ends, the emitted C with its gradients, interval arithmetic and the editors.
+An entry gives arity, units, implementations for numbers, arrays and C, derivative, and range. A function
+added here is available in the resolver, the array back ends, the C code with its gradients, interval
+arithmetic and the editors.
 
 The names are those of `stlc.compile.ir.nodes.Op`. `dot cross dist deg rad sdist ind` never become an `Op`:
 the front end rewrites them.
@@ -41,23 +41,23 @@ class Function:
             `ratio`: arguments agree, the result has no dimensions; `sign`: any argument, no dimensions.
         kind: operators are written with a sign; samplers are only for initial sets and events.
         doc: one sentence for editors; "" for operators.
-        fold: the value for numbers (`Fraction`s stay exact where `exact`); None for samplers.
-        array: writes the function on a tape of array operations, from the tape and the operands; None calls
-            the kernel of the same name of the array library.
+        fold: value for numbers (`Fraction`s stay exact where `exact`); None for samplers.
+        array: tape and operands -> operand of the result; None calls the kernel of the same name of the array
+            library.
         numpy: name of that kernel in NumPy; "" where `NumpyOps` defines it itself.
         torch: name of that kernel in torch; "" where `TorchOps` defines it itself.
-        c: C expressions of the arguments -> C expression of the result; extrema are taken pair by pair.
+        c: C expressions of the arguments -> C expression of the result; extrema take two arguments.
         slopes: C expression of the result, then those of the arguments -> C expressions of the derivative by
             each argument. `SHARED` for extrema.
-        of_each: two functions, of which the first is applied to every argument and the second joins them;
-            such an entry has no `c` and no `slopes` of its own.
-        bounds: the range of the result, whatever the arguments are, or the rule by which it follows from
-            their ranges; ValueError, OverflowError or ZeroDivisionError where it has none.
+        of_each: two functions, the first applied to every argument, the second reducing the results; such an
+            entry has no `c` and no `slopes`.
+        bounds: constant range of the result, or its rule from the arguments' ranges; ValueError,
+            OverflowError or ZeroDivisionError where undefined.
         exact: rational arguments give a rational result.
-        whole: whole arguments give a whole result.
-        integral: every argument gives a whole result.
+        whole: integer arguments give an integer result.
+        integral: the result is always an integer.
         linear: scaling all arguments by a positive factor scales the result.
-        symbol: how an operator is written.
+        symbol: sign of an operator.
     """
 
     name: str
@@ -93,7 +93,7 @@ def _norm(*xs: Any) -> float:
 
 
 def _pow(base: Any, exponent: Any) -> Any:
-    """Rational to a small whole power stays rational."""
+    """Return the power; a rational base with a small integer exponent stays rational."""
     if isinstance(base, Fraction) and isinstance(exponent, Fraction):
         if exponent.denominator == 1 and abs(exponent) <= 64:
             return base ** int(exponent)
@@ -105,7 +105,7 @@ def _pow(base: Any, exponent: Any) -> Any:
 
 
 def _corners(fold: Callable[..., Any]) -> RangeRule:
-    """The range of a function that is monotone in each argument: the extremes lie at corners."""
+    """Return the range rule of a function monotone in each argument: extremes are at the corners."""
 
     def rule(args: Sequence[Bounds]) -> Bounds:
         values = [float(fold(*corner)) for corner in product(*args)]
@@ -138,7 +138,7 @@ def _modulo(args: Sequence[Bounds]) -> Bounds:
 
 
 def _lengths(combine: Callable[[Sequence[float]], float]) -> RangeRule:
-    """The range of a norm, from the least and the greatest size of every component."""
+    """Return the range rule of a norm, from the least and the greatest magnitude of each component."""
 
     def rule(args: Sequence[Bounds]) -> Bounds:
         sides = [_even([arg]) for arg in args]
@@ -148,7 +148,7 @@ def _lengths(combine: Callable[[Sequence[float]], float]) -> RangeRule:
 
 
 def _powers(args: Sequence[Bounds]) -> Bounds:
-    """Of positive numbers, whose powers are monotone in both arguments."""
+    """Range of a power of positive numbers, monotone in both arguments."""
     if args[0][0] <= 0:
         raise ValueError("not monotone")
     return _corners(math.pow)(args)
@@ -158,7 +158,7 @@ def _powers(args: Sequence[Bounds]) -> Bounds:
 
 
 def _flat(_result: str, *args: str) -> list[str]:
-    """The derivative of a step function: 0 wherever there is one."""
+    """Derivative of a step function: 0 where it exists."""
     return ["0.0"] * len(args)
 
 
@@ -167,7 +167,7 @@ def _operator(name: str, symbol: str, arity: int, rule: UnitRule, **rest: Any) -
 
 
 def _step(name: str, doc: str, fold: Callable[..., Any], kernel: str, c: str, rule: UnitRule) -> Function:
-    """A function whose values are whole numbers."""
+    """Return the entry of an integer-valued step function."""
     return Function(
         name,
         1,
@@ -187,7 +187,7 @@ def _step(name: str, doc: str, fold: Callable[..., Any], kernel: str, c: str, ru
 
 
 def _smooth(name: str, doc: str, slope: str, bounds: Bounds | None, kernel: str = "") -> Function:
-    """A smooth function of a plain number; `slope` is its derivative in C, of `{0}` and the result `{r}`."""
+    """Return the entry of a smooth scalar function; `slope`: derivative in C, of `{0}` and result `{r}`."""
     fold = getattr(math, name)
     return Function(
         name,
@@ -492,7 +492,7 @@ REWRITTEN: Mapping[str, tuple[int, int | None]] = MappingProxyType(
         "ind": (1, 2),
     }
 )
-"""Functions that calls may name and that become arithmetic: least and largest number of arguments."""
+"""Functions rewritten to arithmetic -> least and largest number of arguments."""
 
 REGIONS: tuple[str, ...] = (
     "circle",
@@ -505,7 +505,7 @@ REGIONS: tuple[str, ...] = (
     "complement",
     "dilate",
 )
-"""Functions that make regions."""
+"""Functions that construct regions."""
 
 OPERATORS: Mapping[str, str] = MappingProxyType(
     {"+": "add", "-": "sub", "*": "mul", "/": "div", "%": "mod", "^": "pow"}
@@ -523,15 +523,15 @@ STEPPING: Mapping[str, tuple[int, int]] = MappingProxyType(
         "sweep": (1, 1),
     }
 )
-"""Calls that look at other samples: least and largest number of arguments."""
+"""Functions of other samples -> least and largest number of arguments."""
 
 
 def callable_names() -> tuple[str, ...]:
-    """Every built-in name that can stand before `(`, samplers apart."""
+    """Return all callable built-in names except samplers."""
     table = (name for name, function in FUNCTIONS.items() if function.kind == "function")
     return (*table, *REWRITTEN, *REGIONS, *STEPPING)
 
 
 def sampler_names() -> tuple[str, ...]:
-    """The samplers."""
+    """Return the names of the samplers."""
     return tuple(name for name, function in FUNCTIONS.items() if function.kind == "sampler")

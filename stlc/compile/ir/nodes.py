@@ -1,7 +1,7 @@
-"""The one intermediate representation: numbers, and formulas in negation normal form and whole steps.
+"""Intermediate representation (IR): numbers, and formulas in negation normal form with time in steps.
 
-Everything that computes reads it: the NumPy and torch evaluators, the dynamics, later the C emitter.
-Nodes are immutable and compare by structure, so a common sub-expression is found by equality.
+The evaluators, the dynamics and all back ends read it. Nodes are immutable and compare by structure, so
+common sub-expressions are found by equality.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from stlc.source import Span
 
 @dataclass(frozen=True, slots=True)
 class Const:
-    """A constant, in SI units."""
+    """Constant in SI units."""
 
     value: float
 
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """An entry of the environment: a state, a control, `t`, or a value drawn earlier."""
+    """Column of the environment: a state, a control, `t`, or a sampled value."""
 
     name: str
 
@@ -33,8 +33,8 @@ class Signal:
 class ShiftedSignal:
     """A column `steps` samples later (negative: earlier).
 
-    Outside the trace it is undefined, and so is a predicate that reads it; a `clamped` one reads the first or
-    the last sample instead.
+    Undefined outside the trace, as is a predicate that reads it; a `clamped` one repeats the first or last
+    sample.
     """
 
     name: str
@@ -44,14 +44,14 @@ class ShiftedSignal:
 
 @dataclass(frozen=True, slots=True)
 class FrozenVar:
-    """A value that a `Freeze` around binds; its name is unique among those."""
+    """Value bound by an enclosing `Freeze`, under a unique name."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class Op:
-    """A function of the table `stlc.compile.ir.functions.FUNCTIONS`, e.g. `add`, `clip`, `norm`."""
+    """Application of a function in `stlc.compile.ir.functions.FUNCTIONS`, e.g. `add`, `clip`, `norm`."""
 
     name: str
     args: tuple[Num, ...]
@@ -59,7 +59,7 @@ class Op:
 
 @dataclass(frozen=True, slots=True)
 class Indicator:
-    """1 where a state formula holds, else 0; `stlc.compile.semantics.switch` says how in training.
+    """1 where a state formula holds, else 0; smoothed in training by `stlc.compile.semantics.switch`.
 
     `sharpness` is the paper's w (Eq. 6) for this indicator; None takes the default of the switch.
     """
@@ -81,8 +81,7 @@ class Where:
 class Extern:
     """Component `output` of a function that the system provides.
 
-    `function` takes the arguments as arrays and gives all components, or says in the IR what they are; None
-    where nobody loaded it.
+    `function` maps arrays to all components, or is their body in the IR; None if not loaded.
     """
 
     name: str
@@ -93,12 +92,12 @@ class Extern:
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """Body of a function: straight-line code.
+    """Body of a function as straight-line code.
 
     Attributes:
-        formals: columns that stand for its arguments, component by component.
-        lets: (name, number), in order; each reads arguments and earlier ones.
-        outputs: the components of the result.
+        formals: columns of the arguments, component by component.
+        lets: (name, number), in order; each may read arguments and earlier ones.
+        outputs: components of the result.
     """
 
     formals: tuple[str, ...]
@@ -109,13 +108,13 @@ class Body:
 Num: TypeAlias = Const | Signal | ShiftedSignal | FrozenVar | Op | Indicator | Where | Extern
 
 ELAPSED = "#elapsed"
-"""The column that every evaluator knows by itself: how many samples came before the one at hand."""
+"""Column that every evaluator provides: index of the current sample."""
 
 _LONG = 1 << 30
 
 
 def at_first(column: Signal) -> ShiftedSignal:
-    """Value of a signal at the first sample, wherever it is read."""
+    """Return the value of a signal at the first sample, at any instant."""
     return ShiftedSignal(column.name, -_LONG, clamped=True)
 
 
@@ -124,7 +123,7 @@ def at_first(column: Signal) -> ShiftedSignal:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Steps lo..hi, both ends included, relative to now; `hi` None: to the end of the trace.
+    """Window of steps lo..hi, both included, relative to now; `hi` None: to the end of the trace.
 
     For past operators the steps count backwards.
     """
@@ -135,7 +134,7 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """A constant: robustness +inf or -inf. Folded away before a graph is built."""
+    """Truth constant: robustness +inf or -inf. Folded before evaluation."""
 
     value: bool
     span: Span | None = field(default=None, compare=False, repr=False)
@@ -143,10 +142,10 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class Predicate:
-    """A predicate: robustness `sign * num`; true iff that is > 0 (`strict`) or >= 0.
+    """Predicate with robustness `sign * num`; true iff that is > 0 (`strict`) or >= 0.
 
-    Negation sinks into `sign` (and flips `strict`), so `num` is evaluated as it was written.
-    A `guard` is a time test: it decides truth and never limits the margin (robustness +-inf).
+    Negation flips `sign` and `strict`, so `num` is evaluated as written. A `guard` is a time test: it decides
+    truth and never limits the margin (robustness +-inf).
     """
 
     num: Num
@@ -198,7 +197,7 @@ class Until:
 
 @dataclass(frozen=True, slots=True)
 class Since:
-    """The mirror of `Until` in the past, `left` required at both ends; `trigger` is its dual."""
+    """Mirror of `Until` in the past, with `left` required at both ends; `trigger` is its dual."""
 
     op: Literal["since", "trigger"]
     window: Window
@@ -209,11 +208,11 @@ class Since:
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """The value `steps` later (negative: earlier).
+    """Value `steps` later (negative: earlier).
 
-    `outside` says what stands beyond the ends of the trace: None leaves it undefined like any window;
-    False is what `rise` and `fall` need at the first sample. Where windows are cut to the trace an undefined
-    value is false, or true for a `weak` one, which is what the negation of the other kind is.
+    `outside` is the value beyond the ends of the trace: None is undefined, as for windows; False is used by
+    `rise` and `fall` at the first sample. Where windows are cut, an undefined value is false, or true for a
+    `weak` node, the negation of a strong one.
     """
 
     steps: int
@@ -225,9 +224,9 @@ class Shift:
 
 @dataclass(frozen=True, slots=True)
 class Freeze:
-    """`body` now, where each `FrozenVar` name stands for its number's value of now, whenever it is read.
+    """`body` with each bound `FrozenVar` equal to the value of its number now, at any instant of `body`.
 
-    Where a number is undefined, so are the predicates that read its name.
+    Where a bound number is undefined, so are the predicates that read it.
     """
 
     bindings: tuple[tuple[str, Num], ...]
@@ -237,7 +236,7 @@ class Freeze:
 
 @dataclass(frozen=True, slots=True)
 class AtStart:
-    """The value at the first sample, whenever it is asked for: what is on the mission clock."""
+    """Value at the first sample, at any instant: for operators on the mission clock."""
 
     body: Formula
     span: Span | None = field(default=None, compare=False, repr=False)

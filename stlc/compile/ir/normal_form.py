@@ -1,4 +1,4 @@
-"""Negation normal form: the one expansion of `not`, `->`, `<->`, `xor` and `unless`.
+"""Negation normal form: the expansion of `not`, `->`, `<->`, `xor` and `unless`.
 
 De Morgan's laws push a negation down to the leaves: it swaps `and` with `or`, `always` with `eventually`,
 `once` with `historically`, `until` with `release`, `since` with `trigger`.
@@ -29,14 +29,14 @@ DUAL |= {dual: op for op, dual in DUAL.items()}
 
 
 def flip(sign: Sign) -> Sign:
-    """The other sign."""
+    """Return the opposite sign."""
     return -1 if sign > 0 else 1
 
 
 def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
-    """`formula` for `sign` 1, its negation for -1, made of `and`, `or` and temporal operators.
+    """Return `formula` for `sign` 1, its negation for -1, in terms of `and`, `or` and temporal operators.
 
-    `not` is left before predicates, `since`, `rise`, `fall`, `prev`, `next` and what is recalled.
+    `not` remains before predicates, `since`, `rise`, `fall`, `prev`, `next` and `Recalled` nodes.
     """
     match formula:
         case typed.Truth(_, value):
@@ -83,12 +83,12 @@ def _unless(node: typed.Until) -> typed.Formula:
 
 
 def condition(formula: typed.Formula, *, negated: bool = False, flat: bool = False) -> ir.Formula:
-    """A state formula as a condition of the IR, constants folded.
+    """Return a state formula as a condition of the IR, constants folded.
 
     Args:
-        formula: one for which `is_state` holds.
-        negated: take its negation.
-        flat: nested `and`s and nested `or`s become one, without repetitions.
+        formula: a state formula (`is_state`).
+        negated: return the negation.
+        flat: merge nested `and`s and nested `or`s, without repetitions.
     """
     return _folded(normal(formula, -1 if negated else 1), flat)
 
@@ -107,13 +107,13 @@ def _folded(formula: typed.Formula, flat: bool) -> ir.Formula:
 
 
 def flattened(op: Literal["and", "or"], items: Iterable[ir.Formula]) -> list[ir.Formula]:
-    """The items of an `and` or `or`, those of nested ones in their places, each once."""
+    """Return the distinct items of an `and` or `or`, with nested ones of the same kind expanded."""
     nested = ((item.items if isinstance(item, ir.BoolOp) and item.op == op else (item,)) for item in items)
     return list(dict.fromkeys(chain.from_iterable(nested)))
 
 
 def literal(formula: typed.Predicate | typed.Not) -> ir.Predicate:
-    """A predicate, or its negation, in the IR."""
+    """Return a predicate or its negation in the IR."""
     if isinstance(formula, typed.Predicate):
         return ir.Predicate(formula.num, 1, formula.strict, formula.guard, formula.span)
     assert isinstance(formula.body, typed.Predicate)
@@ -122,7 +122,7 @@ def literal(formula: typed.Predicate | typed.Not) -> ir.Predicate:
 
 
 def joined(op: Literal["and", "or"], items: Iterable[ir.Formula], neutral: ir.Truth) -> ir.Formula:
-    """`and` or `or` of formulas without constants; `neutral` is its value where nothing is left."""
+    """Return the `and` or `or` of formulas, constants removed; `neutral` is the value of an empty one."""
     kept: list[ir.Formula] = []
     for item in items:
         if not isinstance(item, ir.Truth):
@@ -135,7 +135,7 @@ def joined(op: Literal["and", "or"], items: Iterable[ir.Formula], neutral: ir.Tr
 
 
 def negate(formula: Any) -> Any:
-    """The exact complement of a state formula of the IR."""
+    """Return the negation of a state formula of the IR."""
     match formula:
         case ir.Truth(value):
             return replace(formula, value=not value)

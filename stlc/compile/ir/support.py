@@ -1,8 +1,8 @@
 """The support of a formula: lookback, lookahead and signals.
 
-All of them follow a formula from its predicates up. `Analysis` says what the value of a node is, given those
-of its operands; `fold` walks. Windows of the past are cut at the start of the trace, so they never ask for
-samples that do not exist; a window "to the end" takes what there is from its start on.
+All are bottom-up analyses: `Analysis` gives the value of a node from those of its operands, `fold` traverses.
+Windows of the past are cut at the start of the trace, so they never require missing samples; a window "to the
+end" requires only its start.
 """
 
 from __future__ import annotations
@@ -19,51 +19,51 @@ V = TypeVar("V")
 
 
 class Analysis(ABC, Generic[V]):
-    """The value of every kind of node, from the values of its operands."""
+    """Bottom-up analysis: the value of each kind of node, from the values of its operands."""
 
     @abstractmethod
     def predicate(self, num: ir.Num) -> V:
-        """Of a predicate, or of a number that `freeze` binds."""
+        """Value of a predicate, or of a number bound by `freeze`."""
 
     @abstractmethod
     def constant(self) -> V:
-        """Of `true` and `false`."""
+        """Value of `true` and `false`."""
 
     @abstractmethod
     def all_of(self, parts: Sequence[V]) -> V:
-        """Of one or more formulas at the same instant."""
+        """Value of one or more formulas at the same instant."""
 
     @abstractmethod
     def ahead(self, body: V, window: ir.Window) -> V:
-        """Of a window of the future."""
+        """Value of a future window."""
 
     @abstractmethod
     def back(self, body: V, window: ir.Window) -> V:
-        """Of a window of the past."""
+        """Value of a past window."""
 
     @abstractmethod
     def shift(self, body: V, node: ir.Shift) -> V:
-        """Of the value some samples later."""
+        """Value of a shifted formula."""
 
     @abstractmethod
     def at_start(self, body: V) -> V:
-        """Of the value at the first sample."""
+        """Value of a formula at the first sample."""
 
     def until(self, left: V, right: V, window: ir.Window) -> V:
-        """`until` reads its right side in the window, its left one from now on."""
+        """Value of `until`: the right side is read in the window, the left one from now on."""
         return self.all_of((self.ahead(right, window), self.ahead(left, ir.Window(0, window.hi))))
 
     def since(self, left: V, right: V, window: ir.Window) -> V:
-        """`since` is the mirror of `until`."""
+        """Value of `since`, the mirror of `until`."""
         return self.all_of((self.back(right, window), self.back(left, ir.Window(0, window.hi))))
 
     def freeze(self, bound: Sequence[V], body: V) -> V:
-        """Of values that are frozen for a formula."""
+        """Value of a `freeze` with its bound numbers."""
         return self.all_of((body, *bound))
 
 
 def fold(formula: ir.Formula, analysis: Analysis[V]) -> V:
-    """The value of a formula under an analysis."""
+    """Return the value of a formula under an analysis."""
 
     def of(part: ir.Formula) -> V:
         return fold(part, analysis)
@@ -95,34 +95,34 @@ def fold(formula: ir.Formula, analysis: Analysis[V]) -> V:
 
 
 class Reach(NamedTuple):
-    """Samples before and after the one at hand: lookback and lookahead."""
+    """Lookback and lookahead in samples."""
 
     past: int
     future: int
 
 
 def reach(formula: ir.Formula) -> Reach:
-    """The lookback and the lookahead of a formula: the samples that have to exist around its instant.
+    """Return lookback and lookahead of a formula: the samples required around its instant.
 
-    A window to the end of the trace counts with its start alone. What is on the mission clock counts from the
-    first sample on, whatever stands around it.
+    A window to the end of the trace counts with its start alone. Operators on the mission clock count from
+    the first sample, regardless of enclosing operators.
     """
     past, future, clocked = fold(formula, _REQUIRED)
     return Reach(past, max(future, clocked))
 
 
 def reach_of(num: ir.Num) -> Reach:
-    """The lookback and the lookahead of a number: the samples that have to exist for it to have a value."""
+    """Return lookback and lookahead of a number: the samples required for it to be defined."""
     return _offsets([leaf.steps for leaf in _shifts(num) if not leaf.clamped])
 
 
 def farthest(num: ir.Num) -> Reach:
-    """The samples before and after the one at hand that a number reads where they exist."""
+    """Return the samples before and after now that a number reads where they exist."""
     return _offsets([leaf.steps for leaf in _shifts(num)])
 
 
 def history(formula: ir.Formula) -> int:
-    """The samples before its instant that a formula reads where they exist; 2^40 stands for all of them."""
+    """Return the samples before its instant that a formula reads where they exist; 2^40 means all."""
     return fold(formula, _HISTORY)
 
 
@@ -135,12 +135,12 @@ def _offsets(steps: Sequence[int]) -> Reach:
 
 
 _Needs: TypeAlias = tuple[int, int, int]
-"""Lookback, lookahead, and the lookahead of what is on the mission clock."""
+"""Lookback, lookahead, and lookahead of operators on the mission clock."""
 
 
 @final
 class _Required(Analysis[_Needs]):
-    """Samples that have to exist: windows of the past are cut at the start, which they do not need."""
+    """Required samples; windows of the past are cut at the start of the trace and require none."""
 
     def predicate(self, num: ir.Num) -> _Needs:
         return (*reach_of(num), 0)
@@ -192,7 +192,7 @@ class _History(Analysis[int]):
 
 
 _EVERYTHING = 1 << 40
-"""More samples than any record has."""
+"""More samples than any trace has."""
 _REQUIRED, _HISTORY = _Required(), _History()
 
 
@@ -204,28 +204,28 @@ def _last(window: ir.Window) -> int:
 
 
 def columns_of(num: ir.Num) -> frozenset[str]:
-    """Names of the signals that a number reads, at whatever sample."""
+    """Return the names of the signals that a number reads, at any sample."""
     read = {leaf.name for leaf in leaves(num) if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))}
     return frozenset(read - {ir.ELAPSED})
 
 
 def columns(formula: ir.Formula) -> frozenset[str]:
-    """Names of the signals that a formula reads."""
+    """Return the names of the signals that a formula reads."""
     return frozenset(name for num in numbers(formula) for name in columns_of(num))
 
 
 def looks_at_ends(num: ir.Num) -> bool:
-    """True if the value of a number depends on where the trace begins, or on where it ends."""
+    """True if a number depends on where the trace begins or ends."""
     return any(leaf.clamped for leaf in _shifts(num))
 
 
 def looks_on(num: ir.Num) -> bool:
-    """True if the value of a number depends on where the trace ends."""
+    """True if a number depends on where the trace ends."""
     return any(leaf.clamped and leaf.steps > 0 for leaf in _shifts(num))
 
 
 def uses_end(formula: ir.Formula) -> bool:
-    """True if a window of the future runs to the end of the trace, or a segment would leave it (`sweep`)."""
+    """True if a future window extends to the end of the trace, or a `sweep` is clamped there."""
     ahead = (node.window for node in nodes(formula) if isinstance(node, (ir.Temporal, ir.Until)))
     return any(window.hi is None for window in ahead) or any(map(looks_on, numbers(formula)))
 
@@ -234,15 +234,15 @@ def uses_end(formula: ir.Formula) -> bool:
 
 
 def tail(formula: ir.Formula, samples: int, length: int) -> int | None:
-    """An instant from which on a formula has one value, +inf or -inf, on a trace that goes on; None: unknown.
+    """Return an instant from which a formula is constant, +inf or -inf, on an open trace; None: unknown.
 
-    Beyond the last sample every predicate is unknown, and so is what is made of nothing else: a window that
-    looks far beyond a short trace needs one such instant, and not all of them.
+    Beyond the last sample all predicates are unknown and so are formulas of them alone: a window far beyond a
+    short trace needs one such instant instead of all.
 
     Args:
         formula: in negation normal form.
-        samples: how many are known.
-        length: where windows to the end of the trace end.
+        samples: number of known samples.
+        length: end of windows to the end of the trace.
     """
     return fold(formula, _Tail(samples, length))
 
@@ -264,13 +264,13 @@ class _Tail(Analysis[int | None]):
         return max(known) if len(known) == len(parts) else None
 
     def ahead(self, body: int | None, window: ir.Window) -> int | None:
-        """A window to the end is unknown where it starts beyond the end."""
+        """Tail of a future window; one to the end is unknown where it starts beyond the end."""
         if body is None:
             return None
         return max(body - window.lo, 0 if window.hi is not None else self.length - window.lo, 0)
 
     def back(self, body: int | None, window: ir.Window) -> int | None:
-        """A window from the start on has seen everything that is known."""
+        """Tail of a past window; one from the start covers all known samples."""
         return None if body is None else body + (window.hi if window.hi is not None else window.lo + 1)
 
     def until(self, left: int | None, right: int | None, window: ir.Window) -> int | None:

@@ -1,4 +1,4 @@
-"""IR -> text for people: predicates as comparisons, windows in samples."""
+"""Readable text of the IR: predicates as comparisons, windows in samples."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _FLIPPED = {">": "<", ">=": "<=", "<": ">", "<=": ">="}
 
 
 def show_window(window: ir.Window, end: str = "end") -> str:
-    """Samples from now on, or back to the `end` "start": `[0..25]`, `[5..end]`."""
+    """Return a window in samples, `[0..25]`, `[5..end]`; past ones run back to `end` "start"."""
     return f"[{window.lo}..{end if window.hi is None else window.hi}]"
 
 
 def show_formula(formula: ir.Formula) -> str:
-    """A formula with the parentheses that it needs."""
+    """Return the text of a formula with minimal parentheses."""
     match formula:
         case ir.Truth(value):
             return "true" if value else "false"
@@ -58,7 +58,7 @@ def show_formula(formula: ir.Formula) -> str:
 
 
 def _operand(formula: ir.Formula) -> str:
-    """In parentheses where it holds two formulas."""
+    """Return an operand, in parentheses if it has several operands itself."""
     text = show_formula(formula)
     several = isinstance(formula, (ir.Until, ir.Since))
     several |= isinstance(formula, ir.BoolOp) and len(_without_lacks(formula.items)) > 1
@@ -66,7 +66,7 @@ def _operand(formula: ir.Formula) -> str:
 
 
 def _without_lacks(items: tuple[ir.Formula, ...]) -> list[ir.Formula]:
-    """Without what only says by how much a test of time beside it fails (`timers.recalled`)."""
+    """Drop predicates that only quantify the failure of an adjacent time test (`timers.timer_test`)."""
     tests = {item.num for item in items if isinstance(item, ir.Predicate) and item.guard}
     return [
         item
@@ -81,7 +81,7 @@ def _without_lacks(items: tuple[ir.Formula, ...]) -> list[ir.Formula]:
 
 
 def _atom(atom: ir.Predicate) -> str:
-    """A comparison; `0.5 >= abs(s - 1)` is written from the side that varies."""
+    """Return a comparison, with the varying side first: `0.5 >= abs(s - 1)` is reversed."""
     sign = {(1, True): ">", (1, False): ">=", (-1, True): "<", (-1, False): "<="}[atom.sign, atom.strict]
     left, right = _sides(atom.num)
     if isinstance(left, ir.Const) and not isinstance(right, ir.Const):
@@ -98,14 +98,14 @@ def _sides(num: ir.Num) -> tuple[ir.Num, ir.Num]:
 
 
 def shown(name: str) -> str:
-    """A name as it was written: frozen values have a place behind theirs, components a number."""
+    """Return a name as written, without the unique suffix of a frozen value."""
     name = _FROZEN.sub("", name)
     part = _COMPONENT.search(name)
     return show_name(name) if part is None else show_name(name[: part.start()]) + part[0]
 
 
 def show_number(num: ir.Num, level: int = 0) -> str:
-    """A number in infix notation; `level` is how tightly its surroundings bind."""
+    """Return a number in infix notation; `level` is the precedence of its context."""
     text, own = _number(num)
     return f"({text})" if own < level else text
 

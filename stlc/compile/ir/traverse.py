@@ -1,7 +1,7 @@
-"""Traversal and rewriting of formulas and numbers, typed ones and those of the IR alike.
+"""Traversal and rewriting of typed formulas, IR formulas and numbers.
 
-A node's children are those of its fields that are declared as formulas or numbers, so that a class that is
-added to `stlc.compile.ir.nodes` or `stlc.compile.ir.typed` is walked through and rewritten like all others.
+The children of a node are its fields declared as formulas or numbers, so that classes added to
+`stlc.compile.ir.nodes` or `stlc.compile.ir.typed` are traversed and rewritten without further code.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ _SORTS: Mapping[str, _Sort] = {
     "tuple[Num, ...]": "numbers",
     "tuple[tuple[str, Num], ...]": "bindings",
 }
-"""Declared type of a field -> what its value holds."""
+"""Declared type of a field -> sort of its value."""
 
 
 _SHAPES: dict[type, tuple[tuple[str, _Sort], ...]] = {}
 
 
 def _shape(node: Any) -> tuple[tuple[str, _Sort], ...]:
-    """The fields of a node's class that hold children, in order."""
+    """Fields of a node class that hold children, in order."""
     found = _SHAPES.get(type(node))
     if found is None:
         declared = ((part.name, str(part.type).replace("ir.", "")) for part in fields(node))
@@ -48,7 +48,7 @@ def _shape(node: Any) -> tuple[tuple[str, _Sort], ...]:
 
 
 def children(node: Node) -> tuple[Any, ...]:
-    """The formulas and numbers directly below a node, in the order of its fields."""
+    """Return the formulas and numbers directly below a node, in field order."""
     found: tuple[Any, ...] = ()
     for name, sort in _shape(node):
         value = getattr(node, name)
@@ -67,12 +67,12 @@ def map_children(
     formulas: Callable[[Any], Any] | None = None,
     numbers: Callable[[ir.Num], ir.Num] | None = None,
 ) -> N:
-    """A node with its children replaced; the node itself where all of them stay the same objects.
+    """Return a node with its children replaced, or the node itself if none changes.
 
     Args:
         node: a formula or a number.
-        formulas: child -> what stands in its place, for children that are formulas; None leaves them.
-        numbers: the same for children that are numbers.
+        formulas: child formula -> its replacement; None keeps them.
+        numbers: child number -> its replacement; None keeps them.
     """
     changed: dict[str, Any] = {}
     for name, sort in _shape(node):
@@ -99,7 +99,7 @@ def operands(formula: ir.Formula) -> tuple[ir.Formula, ...]: ...
 @overload
 def operands(formula: typed.Formula) -> tuple[typed.Formula, ...]: ...
 def operands(formula: Any) -> tuple[Any, ...]:
-    """The formulas directly below a formula; of what is recalled the one about the instant at hand."""
+    """Return the formulas directly below a formula; of `Recalled` only `now`."""
     if isinstance(formula, typed.Recalled):
         return (formula.now,)
     found: list[Any] = []
@@ -119,20 +119,20 @@ def nodes(formula: ir.Formula) -> Iterator[ir.Formula]: ...
 @overload
 def nodes(formula: typed.Formula) -> Iterator[typed.Formula]: ...
 def nodes(formula: Any) -> Iterator[Any]:
-    """All formulas in a formula, itself first; conditions inside of numbers are not among them."""
+    """Yield all sub-formulas, itself first, except conditions inside numbers."""
     yield formula
     for part in operands(formula):
         yield from nodes(part)
 
 
 def numbers(formula: ir.Formula | typed.Formula) -> Iterator[ir.Num]:
-    """The numbers of predicates, and those that `freeze` binds."""
+    """Yield the numbers of predicates, and those bound by `freeze`."""
     for node in nodes(formula):
         yield from (child for child in children(node) if isinstance(child, _NUMBERS))
 
 
 def subexpressions(num: Node) -> Iterator[ir.Num]:
-    """A number and all numbers in it, those of its conditions too."""
+    """Yield a number and all numbers in it, including those of its conditions."""
     stack: list[Any] = [num]
     while stack:
         part = stack.pop()
@@ -143,7 +143,7 @@ def subexpressions(num: Node) -> Iterator[ir.Num]:
 
 
 def leaves(num: Node) -> Iterator[NumberLeaf]:
-    """The parts of a number without parts of their own, those of its conditions too."""
+    """Yield the leaves of a number, including those of its conditions."""
     stack: list[Any] = [num]
     while stack:
         part = stack.pop()
@@ -154,7 +154,7 @@ def leaves(num: Node) -> Iterator[NumberLeaf]:
 
 
 def map_leaves(node: N, change: Callable[[ir.Num], ir.Num]) -> N:
-    """A number or a formula with every leaf of its numbers replaced."""
+    """Return a number or a formula with each leaf of its numbers replaced."""
     if isinstance(node, LEAVES):
         return change(node)  # type: ignore[return-value]
 
@@ -168,19 +168,19 @@ def map_leaves(node: N, change: Callable[[ir.Num], ir.Num]) -> N:
 
 
 def key_of(leaf: ir.Signal | ir.ShiftedSignal | ir.FrozenVar) -> str:
-    """The name of a leaf among the inputs of a program."""
+    """Return the name of a leaf among the inputs of a program."""
     if isinstance(leaf, ir.ShiftedSignal):
         return f"{leaf.name}\0{leaf.steps}{'!' * leaf.clamped}"
     return leaf.name
 
 
 def frozen_in(num: ir.Num) -> frozenset[str]:
-    """Names of the frozen values that a number reads."""
+    """Return the names of the frozen values that a number reads."""
     return frozenset(leaf.name for leaf in leaves(num) if isinstance(leaf, ir.FrozenVar))
 
 
 def shifted(num: ir.Num, steps: int, *, clamped: bool = False, delay: typed.Time | None = None) -> ir.Num:
-    """The value of a number some samples, or a `delay`, later; `clamped`: beyond the ends that at the end."""
+    """Return a number `steps` and a `delay` later; `clamped` repeats the end samples outside the trace."""
 
     def moved(leaf: ir.Num) -> ir.Num:
         match leaf:
@@ -202,7 +202,7 @@ def shifted(num: ir.Num, steps: int, *, clamped: bool = False, delay: typed.Time
 
 
 def substitute_frozen(node: N, values: Mapping[str, ir.Num]) -> N:
-    """A number or a formula with frozen values replaced; a `freeze` inside keeps the names that it binds."""
+    """Replace free frozen values in a number or a formula; names bound by an inner `freeze` are kept."""
     if isinstance(node, ir.FrozenVar):
         return values.get(node.name, node)  # type: ignore[return-value]
 
@@ -220,7 +220,7 @@ def substitute_frozen(node: N, values: Mapping[str, ir.Num]) -> N:
 
 
 def margin_unit(formula: typed.Formula) -> str:
-    """The unit of a formula's robustness; "" where its predicates are not all of one."""
+    """Return the unit of a formula's robustness; "" if its predicates have different units."""
     found = {
         node.unit.text for node in nodes(formula) if isinstance(node, typed.Predicate) and not node.guard
     }
@@ -233,29 +233,29 @@ def on_clock(node: typed.Formula) -> TypeGuard[typed.Temporal | typed.Until]:
 
 
 def from_now(node: typed.Temporal | typed.Until) -> typed.Temporal | typed.Until:
-    """The operator with its interval measured from now: its meaning at the first sample."""
+    """Return the operator with its interval relative to now, equivalent at the first sample."""
     return replace(node, interval=replace(node.interval, clock="now"))
 
 
 def absolute(formula: typed.Formula) -> bool:
-    """True if an interval of a formula is on the mission clock."""
+    """True if a formula has an interval on the mission clock."""
     return any(map(on_clock, nodes(formula)))
 
 
 def looks_back(formula: typed.Formula) -> bool:
-    """True if a formula has an operator of the past."""
+    """True if a formula has a past operator."""
     past = ("once", "historically", "since")
     timed = (node.op for node in nodes(formula) if isinstance(node, (typed.Temporal, typed.Until)))
     return any(op in past for op in timed) or any(isinstance(node, typed.Edge) for node in nodes(formula))
 
 
 def is_state(formula: typed.Formula, *, augmented: bool = False) -> bool:
-    """True if the truth of a formula depends on one instant alone, with the values that are frozen around it.
+    """True for a state formula, whose truth depends on one instant (and on enclosing frozen values).
 
     Args:
         formula: as typed.
-        augmented: whether it is made for training, where what is recalled is held by timers, and frozen
-            values count as other instants.
+        augmented: whether it is for training, where `Recalled` nodes are state formulas (held by timers),
+            and frozen values count as other instants.
     """
     state: tuple[type, ...] = (typed.Truth, typed.Predicate, typed.Not, typed.Logic)
     elsewhere: tuple[type, ...] = (ir.ShiftedSignal,)
@@ -273,7 +273,7 @@ def mentions_horizon(formula: typed.Formula) -> bool:
 
 
 def at_hand(formula: typed.Formula) -> typed.Formula:
-    """A state formula with what it recalls told by timers alone."""
+    """Return a state formula with each `Recalled` node replaced by its timer form."""
     if isinstance(formula, typed.Recalled):
         return at_hand(formula.now)
     return map_children(formula, formulas=at_hand)

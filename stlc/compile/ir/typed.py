@@ -1,6 +1,6 @@
 """Typed specifications: names bound, sorts and units checked, macros expanded, time in seconds.
 
-Numbers are already those of `stlc.compile.ir.nodes`; formulas keep their negations, implications and spans.
+Numbers are those of `stlc.compile.ir.nodes`; formulas keep their negations, implications and spans.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from stlc.units import DIMENSIONLESS, Unit
 
 @dataclass(frozen=True, slots=True)
 class Time:
-    """A bound: `seconds + steps * dt + horizons * T`."""
+    """Bound of an interval: `seconds + steps * dt + horizons * T`."""
 
     seconds: Fraction = Fraction(0)
     steps: Fraction = Fraction(0)
@@ -40,9 +40,9 @@ class Time:
 
 @dataclass(frozen=True, slots=True)
 class DelayedSignal(ir.ShiftedSignal):
-    """A signal some time away, `shift(x, 0.1 s)`, besides the samples that are known already.
+    """Signal shifted by a time, `shift(x, 0.1 s)`, in addition to `steps` samples.
 
-    The grid of time says how many samples the delay is (`stlc.compile.ir.discretize.in_samples`).
+    `stlc.compile.ir.discretize.in_samples` converts the time to samples on the grid.
     """
 
     delay: Time = field(default_factory=Time)
@@ -50,7 +50,7 @@ class DelayedSignal(ir.ShiftedSignal):
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """Bounds of a temporal operator; `hi` None means to the end of the trace (`end`, `inf` or nothing)."""
+    """Bounds of a temporal operator; `hi` None: to the end of the trace (`end`, `inf` or omitted)."""
 
     lo: Time
     hi: Time | None
@@ -78,8 +78,8 @@ class Truth(Node):
 class Predicate(Node):
     """`num > 0` (`strict`) or `num >= 0`; a `guard` decides truth and never limits the margin.
 
-    `num` and `unit`, that of the margin, are in SI; `written` is the unit of what is compared. Where recorded
-    traces are judged both are in that (`stlc.compile.lowering.lower`).
+    `num` and the margin's `unit` are in SI; `written` is the unit of the comparison in the source. For
+    recorded traces `num` and `unit` are converted to it (`stlc.compile.lowering.lower`).
     """
 
     num: ir.Num
@@ -106,7 +106,7 @@ class Logic(Node):
 
 @dataclass(frozen=True, slots=True)
 class Temporal(Node):
-    """A temporal operator with one operand."""
+    """Temporal operator with one operand."""
 
     op: ast.UnaryTemporal
     interval: Interval
@@ -115,7 +115,7 @@ class Temporal(Node):
 
 @dataclass(frozen=True, slots=True)
 class Until(Node):
-    """A temporal operator with two operands."""
+    """Temporal operator with two operands."""
 
     op: ast.BinaryTemporal
     interval: Interval
@@ -125,7 +125,7 @@ class Until(Node):
 
 @dataclass(frozen=True, slots=True)
 class Shift(Node):
-    """`next(p)` (+1), `prev(p)` (-1); `outside` as in `ir.Shift`; `delay` is a time instead of the steps."""
+    """`next(p)` (+1), `prev(p)` (-1); `outside` as in `ir.Shift`; `delay` is a time in place of steps."""
 
     steps: int
     body: Formula
@@ -143,7 +143,7 @@ class Edge(Node):
 
 @dataclass(frozen=True, slots=True)
 class Freeze(Node):
-    """`freeze p0 = p in body`: each name, of an `ir.FrozenVar`, stands for the value of its number now."""
+    """`freeze p0 = p in body`: each bound `ir.FrozenVar` has the value of its number now."""
 
     bindings: tuple[tuple[str, ir.Num], ...]
     body: Formula
@@ -151,11 +151,11 @@ class Freeze(Node):
 
 @dataclass(frozen=True, slots=True)
 class Recalled(Node):
-    """A past operator rewritten with timers; it is under no negation.
+    """Past operator rewritten with timers, under no negation.
 
     Attributes:
-        now: as a formula about one instant, whose timers decide truth alone.
-        along: with a robustness, along any stretch of a trace from whose first sample the timers are known.
+        now: state formula in which timers decide truth, without a margin.
+        along: formula with a robustness, along any part of a trace with known timers at its first sample.
     """
 
     now: Formula
@@ -167,18 +167,18 @@ Formula: TypeAlias = Truth | Predicate | Not | Logic | Temporal | Until | Shift 
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """One `require`, with what its tags say.
+    """Requirement (`require`) with its evaluated tags.
 
     Attributes:
         name: of the requirement.
         doc: its `##` comment.
         tags: bare tag names (`safety`, `liveness`).
-        weight: factor of its robustness in the whole.
-        scale: divisor of its robustness in the whole.
+        weight: factor of its robustness in the overall minimum.
+        scale: divisor of its robustness in the overall minimum.
         id: of `@id("…")`, or "".
         group: of `@group(name)`, or "".
         formula: as typed.
-        written: the declaration's formula as written, for messages.
+        written: formula as written, for messages.
         span: of the declaration.
     """
 
@@ -196,13 +196,13 @@ class Requirement:
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One component of a `param`: a constant of every trajectory.
+    """Component of a `param`: constant along a trajectory.
 
     Attributes:
         span: of its name.
-        column: that holds it, with its range.
-        draw: how it is drawn, in the unit of the column; a number with samplers.
-        text: the same as written.
+        column: of the value, with its range.
+        draw: distribution as a number with samplers, in the unit of the column.
+        text: distribution as written.
         carried: the system has it as a state, and draws it.
     """
 
@@ -215,18 +215,18 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Spec:
-    """A resolved specification.
+    """Resolved specification.
 
     Attributes:
         name: of the `spec` pragma, else the stem of the file.
-        signature: the signals that the file declares, units as declared.
+        signature: declared signals, with their declared units.
         constants: every `const`, in SI units.
         requirements: in order.
         assumptions: `assume`s, in order.
         source_ast: as parsed.
         parameters: every `param`, by component.
-        taken: names that states added by the compiler must not have.
-        warnings: findings that are no errors.
+        taken: names that states added by the compiler must not use.
+        warnings: findings that are not errors.
     """
 
     name: str

@@ -1,1 +1,1 @@
-"""From typed formulas to the intermediate representation, time in steps."""
+"""Lowering of typed formulas to the intermediate representation, with time in steps."""

@@ -1,9 +1,9 @@
-"""From typed formulas to the IR: margins in the units that were written, and time in whole steps.
+"""Lowering of typed formulas to the IR: margins in the units of the source, and time in whole steps.
 
-In training everything is in SI, so that requirements can be weighed against each other. A person reads `speed
-< 120 km/h` in km/h: for recorded traces each predicate is divided by the scale of its unit, which changes no
-sign. Formulas are brought into negation normal form first, so that bounds are rounded for the operator that
-is judged in the end: `not always[0, b] p` is `eventually[0, b] not p`, which does not reach beyond its bound.
+In training all margins are in SI, so that requirements are comparable. For recorded traces each predicate is
+divided by the scale of its unit, so that the margin of `speed < 120 km/h` is in km/h; signs do not change.
+Negation normal form comes first, so that bounds are rounded for the final operator: `not always[0, b] p` is
+`eventually[0, b] not p`, whose bound is rounded inwards.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from stlc.units import Unit, same_dims
 
 
 def as_written(requirement: typed.Requirement) -> typed.Requirement:
-    """The requirement with margins in the units of what is compared, and `@scale` where there is one unit."""
+    """Return the requirement with margins in the units of the source, `@scale` too if there is one unit."""
     unit = _one_unit(requirement.formula)
     scale = requirement.scale if unit is None or requirement.scale == 1 else requirement.scale / unit.scale
     return replace(requirement, formula=_in_written_units(requirement.formula), scale=scale)
 
 
 def _one_unit(formula: typed.Formula) -> Unit | None:
-    """The unit that all predicates have; None where they differ."""
+    """Return the unit of all predicates; None if they differ."""
     units = [node.written for node in nodes(formula) if isinstance(node, typed.Predicate) and not node.guard]
     first = next(iter(units), None)
     alike = first is not None and all(same_dims(u, first) and u.ratio == first.ratio for u in units)
@@ -46,7 +46,7 @@ def _in_written_units(formula: typed.Formula) -> typed.Formula:
 
 
 def in_unit(num: ir.Num, unit: Unit) -> ir.Num:
-    """A number in SI units as one in `unit`; columns of that unit are read as they are."""
+    """Convert a number from SI to `unit`; columns stored in that unit are read without conversion."""
     if unit.ratio == 1:
         return num
     match num:
@@ -63,22 +63,22 @@ def in_unit(num: ir.Num, unit: Unit) -> ir.Num:
 
 
 def _divided(value: float, unit: Unit) -> float:
-    """A constant in a unit, as it was meant: 120 and not 120.00000000000001."""
+    """Return a constant in a unit, rounded to the intended value: 120, not 120.00000000000001."""
     found = value / unit.scale
     short = float(f"{found:.14g}")
     return short if math.isclose(short, found, rel_tol=1e-15) else found
 
 
 _CAUTIOUS = frozenset({"always", "historically", "release", "trigger"})
-"""Operators that ask something of every sample: a bound off the grid is rounded outwards."""
+"""Universal operators, whose bounds off the grid are rounded outwards."""
 
 
 def lower(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> ir.Formula:
-    """`formula` in negation normal form and steps.
+    """Lower `formula` to negation normal form and steps.
 
-    Absolute intervals are judged from the first sample on; formulas for training have none any more
-    (`stlc.compile.augment.timers`). Findings (E301, E302, E305, E311, W304) go to
-    `sink`; where it holds an error afterwards, the formula is not meant to be used.
+    Absolute intervals are relative to the first sample; formulas for training have none
+    (`stlc.compile.augment`). Findings (E301, E302, E305, E311, W304) go to `sink`; if it then holds an error,
+    the formula must not be used.
     """
     return _Lowering(grid, sink).formula(normal(formula))
 
@@ -90,7 +90,7 @@ class _Lowering:
     sink: list[Diagnostic]
 
     def formula(self, node: typed.Formula) -> ir.Formula:
-        """A formula in negation normal form."""
+        """Lower a formula in negation normal form."""
         match node:
             case typed.Truth(span, value):
                 return ir.Truth(value, span)
@@ -114,7 +114,7 @@ class _Lowering:
                 raise AssertionError("not in negation normal form")
 
     def _negated(self, node: typed.Formula) -> ir.Formula:
-        """The negation of an operator that `normal` leaves a `not` before."""
+        """Lower the negation of an operator before which `normal` keeps `not`."""
         match node:
             case typed.Until(_, op):
                 return self._timed(
@@ -131,7 +131,7 @@ class _Lowering:
                 raise AssertionError("not in negation normal form")
 
     def _timed(self, node: typed.Temporal | typed.Until, op: str) -> ir.Formula:
-        """A temporal operator as `op`."""
+        """Lower a temporal operator as `op`."""
         if on_clock(node):
             return ir.AtStart(self._timed(from_now(node), op), node.span)
         parts = [self.formula(part) for part in operands(node)]
@@ -139,7 +139,7 @@ class _Lowering:
         return _MAKE[op](op, window, *parts, node.span)
 
     def _edge(self, node: typed.Edge, *, holds: bool) -> ir.Formula:
-        """`rise`: now and not before; `fall`: before and not now; false at the first sample."""
+        """Lower `rise` (now and not before) or `fall` (before and not now); false at the first sample."""
         now: Sign = 1 if (node.op == "rise") is holds else -1
         before = ir.Shift(-1, self.formula(normal(node.body, flip(now))), not holds, node.span)
         parts = (self.formula(normal(node.body, now)), before)
@@ -154,4 +154,4 @@ _MAKE: Mapping[str, Callable[..., ir.Formula]] = MappingProxyType(
         **dict.fromkeys(("since", "trigger"), ir.Since),
     }
 )
-"""Operator -> its class of nodes."""
+"""Operator -> node class."""

@@ -1,9 +1,9 @@
-"""Local laws on the IR. Each preserves the robustness of a semantics wherever both sides are defined.
+"""Local simplification laws on the IR; each preserves robustness wherever both sides are defined.
 
-Under every semantics windows of the present alone vanish, `G[a,a] G[c,d] p` is `G[a+c, a+d] p`,
-`true until q` is `eventually q`, and constants are folded, so that no infinity reaches a gradient. Nested
-`and`s become one where the semantics is associative, without repetitions where it is idempotent; where it is
-both, `G[a,b] G[c,d] p` is `G[a+c, b+d] p`, and so for `F`, `H` and `O`.
+Under every semantics windows [0, 0] are removed, `G[a,a] G[c,d] p` is `G[a+c, a+d] p`, `true until q` is
+`eventually q`, and constants are folded, so that gradients stay finite. Nested `and`s merge where the
+semantics is associative, without repetitions where it is idempotent; where it is both,
+`G[a,b] G[c,d] p` is `G[a+c, b+d] p`, and likewise for `F`, `H` and `O`.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ _NOW = ir.Window(0, 0)
 
 
 def simplify(formula: ir.Formula, semantics: Semantics = _EXACT) -> ir.Formula:
-    """An equivalent formula with fewer nodes; simplifying again changes nothing.
+    """Return an equivalent formula with fewer nodes; the result is a fixed point.
 
     Args:
         formula: in negation normal form.
-        semantics: under which it has the same robustness; the exact one allows all laws.
+        semantics: whose robustness is preserved; the exact one allows all laws.
     """
     whole = map_children(formula, formulas=lambda part: simplify(part, semantics))
     law = _LAWS.get(type(whole))
@@ -67,7 +67,7 @@ def _at_start(node: ir.AtStart, _semantics: Semantics) -> ir.Formula:
 
 
 def _freeze(node: ir.Freeze, _semantics: Semantics) -> ir.Formula:
-    """Without what nobody reads; a predicate of this very instant reads the number itself."""
+    """Drop unused bindings; substitute the number in predicates at the instant of the `freeze`."""
     read = frozenset().union(*map(frozen_in, numbers(node.body)))
     kept = tuple((name, num) for name, num in node.bindings if name in read)
     if not kept:
@@ -78,9 +78,9 @@ def _freeze(node: ir.Freeze, _semantics: Semantics) -> ir.Formula:
 
 
 def _sum(outer: ir.Window, inner: ir.Window, semantics: Semantics) -> ir.Window | None:
-    """The window of both, one after the other, if it asks for no less of the trace than they did.
+    """Return the sum of two nested windows, if it requires the same samples; else None.
 
-    It counts a sample once that they may count several times, and has one extremum where they have two.
+    Two wide windows count samples repeatedly, so they need an idempotent and associative semantics.
     """
     lattice = semantics.associative and semantics.idempotent
     if outer.hi is not None and inner.hi is not None:
@@ -92,7 +92,7 @@ def _sum(outer: ir.Window, inner: ir.Window, semantics: Semantics) -> ir.Window 
 
 
 def _binary(node: ir.Until | ir.Since, semantics: Semantics) -> ir.Formula:
-    """`true until q` is `eventually q`, and the like for the other three."""
+    """Simplify `true until q` to `eventually q`, and likewise `release`, `since` and `trigger`."""
     strong = node.op in ("until", "since")
     if not (isinstance(node.left, ir.Truth) and node.left.value is strong):
         return node
@@ -114,4 +114,4 @@ _LAWS: Mapping[type, Callable[[Any, Semantics], ir.Formula]] = MappingProxyType(
         ir.AtStart: _at_start,
     }
 )
-"""Class of nodes -> what becomes of it, its operands simplified."""
+"""Node class -> law, for nodes with simplified operands."""

@@ -1,1 +1,1 @@
-"""Which value of a formula is needed at which instant."""
+"""Schedule: values of sub-formulas and the instants at which they are needed."""

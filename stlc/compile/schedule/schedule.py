@@ -1,9 +1,8 @@
-"""Which values a formula needs at which instants: formulas and a trace length -> steps in order.
+"""Schedule of the values that formulas need, by instant: from formulas and a trace length to ordered steps.
 
-Nothing is computed where nobody asks: a state predicate at the root is read at one instant, the body of
-`always[0, T]` at T + 1. Equal sub-formulas at equal instants are one step. Every back end reads the same
-steps and matches on the node of each. Instants are whole numbers, or inside of a loop that a back end writes
-(`LoopIndex`) expressions in its index.
+Only needed values are computed: a state predicate at the root at one instant, the body of `always[0, T]` at
+T + 1. Equal sub-formulas at equal instants are one step. All back ends read the same steps and match on their
+nodes. Instants are integers, or expressions in a loop index of the back end (`LoopIndex`).
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import Reach, farthest, reach_of, tail
 
 Boundary: TypeAlias = Literal["strict", "truncate", "lower", "upper", "both"]
-"""What stands beyond the last sample.
+"""Treatment of instants beyond the last sample.
 
-`strict`: nothing, and whoever asks is told. `truncate`: nothing, windows are cut. `lower` and `upper`: the
-trace may go on, and unknown predicates are -inf or +inf there; windows to the end of the trace end at the
-last known sample all the same. `both` (NumPy, without `freeze`): two traces, of which the first is taken at
-its least and the second at its greatest.
+`strict`: they do not exist, needing one is an error. `truncate`: windows are cut. `lower` and `upper`: the
+trace is open, with unknown predicates -inf or +inf; windows to the end of the trace still end at the last
+known sample. `both` (NumPy, without `freeze`): two traces, the first with lower, the second with upper
+bounds.
 """
 
 Pick: TypeAlias = Literal["min", "max"]
@@ -31,19 +30,19 @@ PICKS: Mapping[str, Pick] = {
     **dict.fromkeys(("and", "always", "historically", "release", "trigger"), "min"),
     **dict.fromkeys(("or", "eventually", "once", "until", "since"), "max"),
 }
-"""Operator -> the extremum that it takes, `until` and the like over its window."""
+"""Operator -> its extremum (of `until`, `since` and their duals, that over the window)."""
 
 _FAR = 256
-"""Instants beyond the last sample that are computed without asking whether they are all alike."""
+"""Instants beyond the last sample up to which no test for a constant tail is made."""
 
 
 def dual(pick: Pick) -> Pick:
-    """The other extremum."""
+    """Return the dual extremum."""
     return "max" if pick == "min" else "min"
 
 
 def neutral(pick: Pick) -> float:
-    """The extremum of nothing."""
+    """Return the extremum of no operands."""
     return math.inf if pick == "min" else -math.inf
 
 
@@ -52,12 +51,12 @@ def neutral(pick: Pick) -> float:
 
 @dataclass(frozen=True, slots=True)
 class LoopIndex:
-    """An instant that follows from the loops around it.
+    """Instant as a function of enclosing loop indices.
 
     Attributes:
         text: expression in the language of the back end.
-        low: the least value it takes.
-        high: the greatest.
+        low: least value.
+        high: greatest value.
     """
 
     text: str
@@ -65,7 +64,7 @@ class LoopIndex:
     high: int
 
     def __add__(self, steps: int) -> Instant:
-        """The instant so many samples later."""
+        """Return the instant `steps` samples later."""
         if self.low == self.high:
             return self.low + steps
         if not steps:
@@ -73,7 +72,7 @@ class LoopIndex:
         return LoopIndex(f"({self.text} + {steps})", self.low + steps, self.high + steps)
 
     def __sub__(self, steps: int) -> Instant:
-        """The instant so many samples before."""
+        """Return the instant `steps` samples earlier."""
         return self + -steps
 
     def __str__(self) -> str:
@@ -81,21 +80,21 @@ class LoopIndex:
 
 
 Instant: TypeAlias = Any
-"""A whole number, or a `LoopIndex`."""
+"""An integer, or a `LoopIndex`."""
 
 
 def earliest(instant: Instant) -> int:
-    """The least value of an instant."""
+    """Return the least value of an instant."""
     return instant.low if isinstance(instant, LoopIndex) else int(instant)
 
 
 def latest(instant: Instant) -> int:
-    """The greatest value of an instant."""
+    """Return the greatest value of an instant."""
     return instant.high if isinstance(instant, LoopIndex) else int(instant)
 
 
 def at_least(instant: Instant, least: int) -> Instant:
-    """The later one of an instant and `least`."""
+    """Return the later of an instant and `least`."""
     if isinstance(instant, int):
         return max(instant, least)
     if instant.low >= least:
@@ -105,7 +104,7 @@ def at_least(instant: Instant, least: int) -> Instant:
 
 
 def at_most(instant: Instant, most: int) -> Instant:
-    """An instant; `most` where it may lie beyond that."""
+    """Return an instant, or `most` where it may exceed it."""
     if isinstance(instant, int):
         return min(instant, most)
     return most if instant.high > most else instant
@@ -113,44 +112,44 @@ def at_most(instant: Instant, most: int) -> Instant:
 
 @dataclass(frozen=True, slots=True)
 class IndexRange:
-    """Consecutive instants, both ends included; none where `last` is before `start`."""
+    """Consecutive instants, both ends included; empty if `last` is before `start`."""
 
     start: Instant
     last: Instant
 
     @property
     def count(self) -> int:
-        """Instants between the earliest start and the latest end; none if this is 0 or less."""
+        """Number of instants from the earliest start to the latest end; empty if <= 0."""
         if isinstance(self.start, int) and isinstance(self.last, int):
             return self.last - self.start + 1
         return latest(self.last) - earliest(self.start) + 1
 
     @property
     def single(self) -> bool:
-        """Whether it is one instant, wherever."""
+        """True for a single instant."""
         return bool(self.start == self.last)
 
     @property
     def settled(self) -> IndexRange:
-        """All instants that it covers in any turn of the loops around."""
+        """Range of all instants over all iterations of enclosing loops."""
         return IndexRange(earliest(self.start), latest(self.last))
 
 
 def spanning(start: int, count: int) -> IndexRange:
-    """`count` instants from `start` on."""
+    """Return the range of `count` instants from `start` on."""
     return IndexRange(start, start + count - 1)
 
 
 @dataclass(frozen=True, slots=True)
 class TraceDomain:
-    """Length of a trace, and whether it may go on.
+    """Length of a trace, and its continuation.
 
     Attributes:
-        samples: how many are known.
-        end: what stands beyond them.
-        stop: final length where the trace goes on; windows to its end end there, and not with the last known
+        samples: number of known samples.
+        end: treatment of instants beyond them.
+        stop: final length of an open trace, at which windows to the end are clipped; None: at the last known
             sample.
-        counted: every instant counts, unknown ones as well: the semantics is a mean.
+        counted: every instant counts, unknown ones too, as the semantics is a mean.
     """
 
     samples: int
@@ -160,7 +159,7 @@ class TraceDomain:
 
     @property
     def open(self) -> bool:
-        """Whether instants beyond the last sample exist, with unknown predicates."""
+        """True if instants beyond the last sample exist, with unknown predicates."""
         return self.end in ("lower", "upper", "both")
 
     @property
@@ -169,13 +168,13 @@ class TraceDomain:
         return self.samples if self.stop is None else self.stop
 
     def last(self, window: ir.Window, latest_start: Instant, parts: Sequence[ir.Formula]) -> Instant:
-        """The last instant of `parts` that a window of the future needs.
+        """Return the last instant of `parts` that a future window needs.
 
-        Of the instants beyond the trace at which all parts stay as they are it takes one.
+        Among instants beyond the trace at which all parts are constant, one suffices.
 
         Args:
             window: of the operator.
-            latest_start: the last instant at which the operator is needed.
+            latest_start: last instant at which the operator is needed.
             parts: its operands.
         """
         if window.hi is None:
@@ -198,7 +197,7 @@ class TraceDomain:
 def operands(
     node: ir.Formula, run: IndexRange, domain: TraceDomain
 ) -> tuple[tuple[ir.Formula, IndexRange], ...]:
-    """Operands of a formula that is needed at the instants `run`, each with its own instants, maybe none."""
+    """Return the operands of a formula needed at `run`, each with its instants, possibly none."""
     match node:
         case ir.Truth() | ir.Predicate() | ir.Freeze():
             return ()
@@ -226,7 +225,7 @@ _NEVER = IndexRange(0, -1)
 def _both(
     node: ir.Until | ir.Since, run: IndexRange, domain: TraceDomain
 ) -> tuple[tuple[ir.Formula, IndexRange], tuple[ir.Formula, IndexRange]]:
-    """Operands of `until` and `since`: the right one in the window, the left one from now up to there."""
+    """Operands of `until` and `since`: the right one over the window, the left one from now to its end."""
     window, left, right = node.window, node.left, node.right
     if isinstance(node, ir.Until):
         last = domain.last(window, run.last, (left, right))
@@ -238,21 +237,21 @@ def _both(
 
 
 def _first(window: ir.Window, run: IndexRange) -> Instant:
-    """The first instant that a window of the past reads."""
+    """First instant that a past window reads."""
     return 0 if window.hi is None else at_least(run.start - window.hi, 0)
 
 
 def reads(num: ir.Num, domain: TraceDomain) -> Reach:
-    """Samples that have to exist for a number to have a value.
+    """Return the samples required for a number to be defined.
 
-    What reads the last sample instead of one beyond the trace has to wait for it while the trace goes on.
+    On an open trace a clamped read requires its actual sample.
     """
     past, future = reach_of(num)
     return Reach(past, future if domain.stop is None else max(future, farthest(num).future))
 
 
 def within(reach: Reach, run: IndexRange, domain: TraceDomain) -> IndexRange:
-    """The instants of `run` at which all samples exist that a number of this reach reads."""
+    """Return the instants of `run` at which all samples within a lookback and lookahead exist."""
     first = max(earliest(run.start), reach.past)
     return IndexRange(first, max(min(latest(run.last), domain.samples - 1 - reach.future), first - 1))
 
@@ -262,14 +261,14 @@ def within(reach: Reach, run: IndexRange, domain: TraceDomain) -> IndexRange:
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """Steps that a back end runs again and again: the inside of a `freeze`, or of a table of alike formulas.
+    """Loop body: the steps inside a `freeze`, or of a table of formulas of one shape.
 
     Attributes:
         index: name of the index in the language of the back end.
-        bound: numbers under which the frozen values stand, in the order of their bindings.
-        steps: filled anew in every turn.
-        own: numbers of everything that is, in the order in which they were given out.
-        root: number of the step that is the outcome of a turn.
+        bound: step numbers of the frozen values, in the order of their bindings.
+        steps: recomputed in every iteration.
+        own: step numbers of all values in the loop, in order of allocation.
+        root: step number of an iteration's result.
     """
 
     index: str
@@ -281,16 +280,15 @@ class Loop:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One value to compute.
+    """Value to compute.
 
     Attributes:
-        node: the formula; or what a back end computes beside formulas.
-        run: at which instants.
-        args: numbers of the steps with the values of its operands; None for an operand that is not needed at
-            any instant.
-        inner: what is run for every instant of a `freeze`, or for every row of a table; None where the back
-            end evaluates it itself.
-        number: of this step among all.
+        node: formula, or a computation specific to a back end.
+        run: instants.
+        args: step numbers of the operands; None for an operand that is not needed at any instant.
+        inner: loop body for each instant of a `freeze`, or each row of a table; None where the back end
+            evaluates it itself.
+        number: step number.
     """
 
     node: Any
@@ -301,18 +299,18 @@ class Step:
 
     @property
     def operands(self) -> tuple[int, ...]:
-        """Numbers of the operands that are needed."""
+        """Step numbers of the needed operands."""
         return tuple(number for number in self.args if number is not None)
 
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """Steps in order.
+    """Ordered steps.
 
     Attributes:
         domain: of the trace.
         steps: operands first.
-        roots: numbers of the formulas that were asked for.
+        roots: step numbers of the requested formulas.
     """
 
     domain: TraceDomain
@@ -322,14 +320,14 @@ class Schedule:
 
 @dataclass(slots=True)
 class Scope:
-    """Steps that are run together, and what they compute already."""
+    """Steps of one loop level, with an index of the values that they compute."""
 
     steps: list[Step] = field(default_factory=list)
     known: dict[tuple[ir.Formula, IndexRange], int] = field(default_factory=dict)
 
 
 class Scheduler:
-    """Gives every formula that is needed at some instants one step."""
+    """Scheduler that assigns one step to each formula and range of instants."""
 
     def __init__(self, domain: TraceDomain) -> None:
         self.domain = domain
@@ -337,7 +335,7 @@ class Scheduler:
         self._count = 0
 
     def place(self, node: ir.Formula, run: IndexRange) -> int | None:
-        """The number of the step of a formula; None where it is needed at no instant."""
+        """Return the step number of a formula; None if it is needed at no instant."""
         if run.count <= 0:
             return None
         key, known = (node, run), self.scope.known
@@ -347,23 +345,23 @@ class Scheduler:
         return found
 
     def scheduled(self, node: ir.Formula, run: IndexRange) -> int:
-        """A new step, those of its operands before it."""
+        """Add a step after those of its operands."""
         args = tuple(self.place(part, its) for part, its in operands(node, run, self.domain))
         return self.add(Step(node, run, args, number=self.number(run)))
 
-    def number(self, run: IndexRange) -> int:  # noqa: ARG002 - back ends give memory to it
-        """The next number, of something that has a value at each of these instants."""
+    def number(self, run: IndexRange) -> int:  # noqa: ARG002 - back ends allocate memory for it
+        """Return the next step number, for values at these instants."""
         self._count += 1
         return self._count - 1
 
     def add(self, step: Step) -> int:
-        """Append a step; its number."""
+        """Append a step; return its number."""
         self.scope.steps.append(step)
         return step.number
 
 
 def schedule(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDomain) -> Schedule:
-    """All steps that `formulas` at the instants `run` take; a `freeze` is one of them."""
+    """Return the schedule of `formulas` at the instants `run`; a `freeze` is one step."""
     scheduler = Scheduler(domain)
     placed = (scheduler.place(formula, run) for formula in formulas)
     roots = tuple(number for number in placed if number is not None)

@@ -1,4 +1,4 @@
-"""Protocol of a semantics: extrema of values, at once and piece by piece."""
+"""Protocol of a semantics: extrema of values, at once and by merging partial results."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.schedule.schedule import Pick
 
 Parts: TypeAlias = tuple[Array, ...]
-"""Partial result of an extremum: the extremum itself, or sums that it follows from."""
+"""Partial result of an extremum: the extremum so far, or sums that determine it."""
 
 
 class Semantics(Protocol):
-    """Definition of extrema. Values are `(time, batch)`; infinite ones are neutral and carry no gradient.
+    """Definition of extrema. Values are `(time, batch)`; infinite ones are neutral and have no gradient.
 
-    Windows are put together piece by piece: operands are lifted to `Parts`, the parts of some operands and
-    those of others are merged, and in the end parts become a value.
+    Windows are computed by merging: operands are lifted to `Parts`, parts of disjoint sets are merged, and
+    `finish` converts parts to a value.
 
     Attributes:
-        exact: the value is that of an operand, so that an array library may find it in its own way.
-        idempotent: an operand may be counted twice, so that windows may be covered with overlapping pieces.
+        exact: the value is that of an operand, so that native extrema of the array library apply.
+        idempotent: repeated operands do not matter, so that overlapping blocks may cover a window.
         associative: the extremum of extrema is that of all their operands.
         sound: no value is positive where the exact one is negative, nor negative where it is positive.
-        bounded: an operand that is not known may be put at its ends, infinite ones included, to bound the
-            value. Means leave infinite operands out, and a finite one counts: their value may be beyond.
+        bounded: replacing unknown operands by their bounds, even infinite ones, bounds the value. Means
+            omit infinite operands, so that a finite one may exceed such a bound.
     """
 
     exact: ClassVar[bool]
@@ -34,26 +34,26 @@ class Semantics(Protocol):
     bounded: ClassVar[bool]
 
     def lift(self, x: Array, pick: Pick, ops: Ops) -> Parts:
-        """The parts of every operand alone."""
+        """Return the parts of each single operand."""
 
     def merge(self, a: Parts, b: Parts, pick: Pick, ops: Ops) -> Parts:
-        """The parts of two disjoint sets of operands together, elementwise."""
+        """Merge the parts of two disjoint sets of operands, elementwise."""
 
     def finish(self, parts: Parts, pick: Pick, ops: Ops) -> Array:
-        """The value that the parts stand for."""
+        """Return the value of parts."""
 
     def pair(self, a: Array, b: Array, pick: Pick, ops: Ops) -> Array:
         """The extremum of two values, elementwise."""
 
     def join(self, items: Sequence[Array], pick: Pick, ops: Ops) -> Array:
-        """The extremum of one or more values, elementwise; one alone stands for itself."""
+        """The extremum of one or more values, elementwise; a single one is unchanged."""
 
     def reduce(self, x: Array, pick: Pick, ops: Ops) -> Array:
-        """The extremum over time: `(time, batch)` -> `(1, batch)`; one sample stands for itself."""
+        """The extremum over time: `(time, batch)` -> `(1, batch)`; a single sample is unchanged."""
 
 
 class Associative:
-    """For a semantics of which pairs say everything: the parts are the extremum so far."""
+    """Base of associative semantics: the parts are the extremum so far."""
 
     __slots__ = ()
 

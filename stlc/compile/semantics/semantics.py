@@ -1,8 +1,7 @@
-"""Semantics of robustness: how a maximum and a minimum are taken, exactly or smoothly.
+"""Robustness semantics: exact or smooth definitions of maximum and minimum.
 
-Everything else about formulas is the same for all semantics (`stlc.compile.backends.array.graph`). Verdicts
-do not depend on them: whether a formula holds is decided by the truth of its predicates, and the exact
-robustness has that sign.
+Otherwise evaluation (`stlc.compile.backends.array.graph`) is independent of the semantics, and so are
+verdicts: satisfaction follows from the truth of the predicates, and the exact robustness has that sign.
 
 | name     | class                     | is a positive value satisfied, a negative one violated?       |
 |----------|---------------------------|---------------------------------------------------------------|
@@ -39,18 +38,18 @@ __all__ = [
 ]
 
 TOLERANCE = 1e-6
-"""A robustness of at least minus this, in float64, is satisfied (time and start states lie on grids)."""
+"""Tolerance of satisfaction, robustness >= -TOLERANCE in float64 (times and start states lie on grids)."""
 
 
 def semantics_of(asked: str | Semantics = "exact", smoothing: float | None = None) -> Semantics:
-    """The semantics that somebody asks for.
+    """Return the requested semantics.
 
     Args:
-        asked: a semantics, or the name of one in `SEMANTICS`.
-        smoothing: the scale k of log-sum-exp, which it asks for by itself.
+        asked: a semantics, or a name in `SEMANTICS`.
+        smoothing: scale k of log-sum-exp, which it selects where `asked` is None.
 
     Raises:
-        UsageError: U101, there is no semantics of this name, or it has no such scale.
+        UsageError: U101, an unknown semantics, or `smoothing` for one without a scale.
     """
     chosen: Semantics = SEMANTICS.get(asked)() if isinstance(asked, str) else asked
     if smoothing is None:

@@ -1,7 +1,7 @@
-"""Switches: conditions as numbers, and choices as blends (Eq. 6 of the paper).
+"""Switches: conditions as indicators, and choices as blends (Eq. 6 of the paper).
 
-A system flows where a condition fails and jumps where it holds. `Hard` is that rule; `Tanh` is the paper's
-smooth stand-in; `StraightThrough` steps hard and differentiates as if it were smooth.
+A hybrid system flows where a condition fails and jumps where it holds. `Hard` is exact; `Tanh` is the paper's
+smooth approximation; `StraightThrough` is exact forward, with a smooth gradient backward.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from stlc.compile.backends.array.namespace import Array, Ops
 class Switch(Protocol):
     """Evaluation of conditions in a program.
 
-    `exact` says that only the truth of a condition matters, never its margin; such a switch is evaluated with
-    comparisons and masks, and every atom keeps its own strictness.
+    With `exact` only the truth of a condition matters, not its margin: it is evaluated with comparisons and
+    masks, and each predicate keeps its own strictness.
     """
 
     @property
@@ -24,17 +24,17 @@ class Switch(Protocol):
         """True if only truth matters."""
 
     def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:
-        """A number in 0..1: does a condition of margin `rho` hold?
+        """Return the indicator of a condition with margin `rho`, in [0, 1].
 
         Args:
             rho: margin; true iff > 0 (`strict`) or >= 0.
-            strict: which of the two.
-            sharpness: what the indicator itself asks for; None takes the default of the switch.
+            strict: whether the inequality is strict.
+            sharpness: of this indicator; None takes the default of the switch.
             ops: the array library.
         """
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
-        """The indicator `weight` of a condition whose atoms differ in strictness; `truth` is its mask."""
+        """Adjust the indicator `weight` of a condition of mixed strictness; `truth` is its mask."""
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
         """`yes` where the indicator `weight` is 1, `no` where it is 0."""
@@ -81,7 +81,7 @@ class Tanh:
         return ops.sigmoid(rho * ops.constant(2.0 * width, rho))
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:  # noqa: ARG002
-        """The smooth number: at the edge it is a half whichever atom is strict."""
+        """The smooth weight unchanged: at the boundary it is 1/2 for either strictness."""
         return weight
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
@@ -92,9 +92,9 @@ class Tanh:
 @final
 @dataclass(frozen=True, slots=True)
 class StraightThrough:
-    """Hard forward; backward the slope of `(1 + tanh(slope rho)) / 2`, whatever sharpness was asked for.
+    """Exact forward; backward the slope of `(1 + tanh(slope rho)) / 2`, regardless of `sharpness`.
 
-    A choice has the value of the branch that is taken, its gradient, and the gradient of the condition.
+    A choice has the value and gradient of the taken branch, plus the gradient of the condition.
     """
 
     slope: float = 10.0
@@ -109,7 +109,7 @@ class StraightThrough:
         return ops.straight_through(rho, strict, self.slope)
 
     def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:
-        """0 or 1 as the mask says, with the gradient of `weight`."""
+        """The mask as 0 or 1, with the gradient of `weight`."""
         return ops.settled(weight, truth)
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:

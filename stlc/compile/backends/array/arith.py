@@ -25,21 +25,20 @@ ExternFunction: TypeAlias = Callable[..., Sequence[Array]]
 
 
 _TAKES_FLOATS = frozenset({"pow"})
-"""Kernels that want a constant as the float it is."""
+"""Kernels that take a constant as a Python float."""
 
 
 class Program:
-    """Several numbers computed together from one environment.
+    """Executable form of several numbers over one environment.
 
     Args:
-        outputs: what to compute, by name.
+        outputs: name -> number to compute.
         constants: columns whose value is known when the program is built (`dt`, constants of a system).
         externs: functions of the system that `ir.Extern` names.
 
-    Calling it takes an environment of arrays that broadcast against each other, each of the columns in
-    `columns` (those of another sample under the keys of `shifted`), and returns one array for every output;
-    an output that is a constant takes the shape of the first array of the environment. Common
-    sub-expressions are computed once.
+    A call takes an environment of arrays that broadcast, one for each column in `columns` (shifted ones under
+    the keys of `shifted`), and returns one array per output; a constant output takes the shape of the first
+    array of the environment. Common sub-expressions are computed once.
     """
 
     def __init__(
@@ -62,7 +61,7 @@ class Program:
         self.shifted = {key_of(leaf): leaf for leaf in shifted}
 
     def __call__(self, env: Mapping[str, Array], ops: Ops, switch: Switch | None = None) -> dict[str, Array]:
-        """All outputs. `switch` says how conditions become numbers; None is `Hard()`."""
+        """Return all outputs. `switch` maps conditions to numbers; None is `Hard()`."""
         switch = switch or Hard()
         like = _first(env)
         key = (ops.name, switch, ops.kind(like))
@@ -73,7 +72,7 @@ class Program:
             return bound.run(env, ops)
 
     def operations(self, *, exact: bool = True) -> int:
-        """How many array operations one call takes, with exact or with soft conditions."""
+        """Number of array operations per call, with exact or with soft conditions."""
         tape, outputs = self._tape(exact=exact)
         free = ("input", "pick")
         return sum(tape.code[i].kernel not in free for i in _needed(tape, outputs.values()))
@@ -130,7 +129,7 @@ class Program:
 
 @dataclass(frozen=True, slots=True)
 class _Bound:
-    """A tape whose kernels are functions: fill `registers` from top to bottom."""
+    """Tape bound to functions of an array library; fills `registers` from top to bottom."""
 
     inputs: list[tuple[str, int]]
     code: list[tuple[Callable[..., Any], tuple[int, ...], int]]
@@ -173,9 +172,9 @@ def _needed(tape: Tape, outputs: Any) -> list[int]:
 
 
 class _Writer:
-    """Writes numbers and state formulas on a tape.
+    """Writer of numbers and state formulas to a tape.
 
-    With `exact` conditions are masks; otherwise they are margins handed to the switch.
+    With `exact`, conditions are masks; otherwise margins passed to the switch.
     """
 
     def __init__(self, constants: Mapping[str, float], *, exact: bool, tape: Tape | None = None) -> None:
@@ -186,7 +185,7 @@ class _Writer:
         self._seen: dict[int, Operand] = {}
 
     def number(self, num: ir.Num) -> Operand:
-        """The operand that holds `num`."""
+        """Return the operand that holds `num`."""
         operand = self._seen.get(id(num))
         if operand is None:
             operand = self._seen[id(num)] = self._number(num)
@@ -216,7 +215,7 @@ class _Writer:
                 assert_never(num)
 
     def _inlined(self, body: ir.Body, args: list[Operand], output: int) -> Operand:
-        """A function of which only numbers are known: its lines on the same tape, which knows them again."""
+        """Inline a function given as straight-line code; the tape shares common sub-expressions."""
         inner = _Writer(self._constants, exact=self._exact, tape=self.tape)
         inner.bound.update(zip(body.formals, args, strict=True))
         for name, num in body.lets:
@@ -249,7 +248,7 @@ class _Writer:
         return self.tape.emit("where" if self._exact else "blend", choice, yes, no)
 
     def _truth(self, cond: ir.Formula) -> int | bool:
-        """The mask of a state formula, every atom with its own strictness."""
+        """Mask of a state formula; each predicate keeps its own strictness."""
         match cond:
             case ir.Truth(value):
                 return value
@@ -272,7 +271,7 @@ class _Writer:
         return reduce(lambda a, b: a if a == b else self.tape.emit(kernel, a, b), registers)
 
     def _weight(self, cond: ir.Formula, sharpness: float | None) -> Operand:
-        """The soft indicator of a state formula: of its margin, settled where atoms differ in strictness."""
+        """Soft indicator of a state formula's margin, settled where predicates differ in strictness."""
         kinds = _strictness(cond)
         margin = self.margin(cond)
         truth = self._truth(cond) if len(kinds) > 1 else None
@@ -285,7 +284,7 @@ class _Writer:
         return self.tape.emit("settle", weight, float(truth) if isinstance(truth, bool) else truth)
 
     def margin(self, cond: ir.Formula) -> Operand:
-        """The exact robustness of a state formula."""
+        """Exact robustness of a state formula."""
         match cond:
             case ir.Truth(value):
                 return float("inf") if value else float("-inf")
@@ -313,10 +312,10 @@ def _strictness(cond: ir.Formula) -> set[bool]:
 
 
 def inputs(program: Program, env: Mapping[str, Array], run: IndexRange, ops: Ops) -> dict[str, Array]:
-    """The inputs of `program` at the instants `run`, each `(count, batch)`; at least one column.
+    """Return the inputs of `program` at the instants `run`, each `(count, batch)`; at least one column.
 
     Args:
-        program: at these instants all samples that it reads exist.
+        program: all samples that it reads at these instants must exist.
         env: whole columns, `(time, batch)`.
         run: within the trace.
         ops: the array library of `env`.
@@ -337,7 +336,7 @@ def _cut(column: Array, start: int, count: int) -> Array:
 
 
 def _beside(column: Array, at: ir.ShiftedSignal, run: IndexRange, ops: Ops) -> Array:
-    """The column some samples later; a clamped one repeats its first and last row beyond the ends."""
+    """Return a shifted column; a clamped one repeats its first and last row beyond the ends of the trace."""
     start, count, samples = run.start + at.steps, run.count, len(column)
     before, after = min(max(-start, 0), count), min(max(start + count - samples, 0), count)
     if not before and not after:

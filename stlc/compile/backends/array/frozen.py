@@ -1,7 +1,7 @@
-"""`freeze`: a formula about the values of one instant, judged at many.
+"""Evaluation of `freeze`: a formula that refers to signal values at the instant of its evaluation.
 
-Every instant binds values of its own, so they become an axis of their own: columns `(time, batch)` are laid
-out as `(time, instants * batch)`. Where the body looks at a bounded neighbourhood only that is laid out.
+Each instant binds its own values, so instants become an axis: columns `(time, batch)` are copied to
+`(time, instants * batch)`. Where the body reads a bounded neighbourhood, only that is copied.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ Judge: TypeAlias = Callable[[ir.Formula, Env, IndexRange, TraceDomain], Array]
 """Values `(count, batch)` of a formula on columns `(time, batch)` at the instants of a run."""
 
 _MOST = 1 << 22
-"""Numbers of one column that are laid out at a time."""
+"""Elements of one column that are copied at a time."""
 
 
 @final
 @dataclass(frozen=True, slots=True)
 class Freezer:
-    """Judges `Freeze` nodes on one trace.
+    """Evaluator of `Freeze` nodes on one trace.
 
     Attributes:
         domain: of the trace.
-        env: its columns, and what is frozen around.
-        ops: the array library.
-        judge: the evaluator.
+        env: columns of the trace, and values frozen by enclosing nodes.
+        ops: array library of `env`.
+        judge: evaluator of formulas.
     """
 
     domain: TraceDomain
@@ -48,7 +48,7 @@ class Freezer:
     judge: Judge
 
     def values(self, node: ir.Freeze, run: IndexRange) -> Array:
-        """The node at the instants `run`, `(count, batch)`."""
+        """Robustness of the node at the instants `run`, `(count, batch)`."""
         bound = within(_together(node, self.domain), run, self.domain)
         if bound.count <= 0:
             parts = list(self._unbound(node, run))
@@ -61,7 +61,7 @@ class Freezer:
         return self.ops.cat(parts) if len(parts) > 1 else parts[0]
 
     def _unbound(self, node: ir.Freeze, run: IndexRange) -> Iterator[Array]:
-        """Where a value to freeze does not exist, what reads it is unknown, or false on a cut trace."""
+        """Evaluate instants with undefined bound values: their readers are unknown, false on a cut trace."""
         for missing, instants in groupby(range(run.start, run.start + run.count), partial(self._lost, node)):
             first, *more = instants
             kept = tuple((name, num) for name, num in node.bindings if name not in missing)
@@ -74,7 +74,7 @@ class Freezer:
                 yield self.judge(body, self.env, spanning(first, 1 + len(more)), self.domain)
 
     def _lost(self, node: ir.Freeze, instant: int) -> frozenset[str]:
-        """Names of the values that do not exist at an instant."""
+        """Names of the bound values that are undefined at an instant."""
         domain, run = self.domain, spanning(instant, 1)
         return frozenset(
             name for name, num in node.bindings if within(reads(num, domain), run, domain).count <= 0
@@ -94,7 +94,7 @@ class Freezer:
             yield from self._whole(node, IndexRange(last + 1, run.last), back, ahead)
 
     def _near(self, node: ir.Freeze, run: IndexRange, back: int, ahead: int) -> Iterator[Array]:
-        """Instants whose neighbourhood lies within the trace: it is all that is laid out."""
+        """Evaluate instants whose neighbourhood is within the trace, on copies of the neighbourhood."""
         length = back + ahead + 1
         domain = replace(self.domain, samples=length, stop=None)
         for chunk in _chunks(run, max(_MOST // (length * self._batch), 1)):
@@ -105,7 +105,7 @@ class Freezer:
             yield self.judge(node.body, env, spanning(back, 1), domain).reshape(chunk.count, -1)
 
     def _whole(self, node: ir.Freeze, run: IndexRange, back: float, ahead: float) -> Iterator[Array]:
-        """Any instants: the trace around them is repeated for each, and each judged in its own copy."""
+        """Evaluate arbitrary instants, each on its own copy of the surrounding trace."""
         ops, batch = self.ops, self._batch
         for chunk in _chunks(run, _edge(_MOST // batch, back + ahead, self.domain.samples)):
             start = max(chunk.start - back, 0)
@@ -124,7 +124,7 @@ class Freezer:
             yield there.reshape(chunk.count, chunk.count, batch)[each, each]
 
     def _held(self, node: ir.Freeze, run: IndexRange, length: int) -> dict[str, Array]:
-        """The frozen values of every instant of `run`, the same at all times: `(length, count * batch)`."""
+        """Bound values of each instant of `run`, constant along time: `(length, count * batch)`."""
         program = Program(dict(node.bindings))
         found = program(inputs(program, self.env, run, self.ops), self.ops)
         blank = self.ops.full((length, run.count * self._batch), 0.0, self._like)
@@ -132,7 +132,7 @@ class Freezer:
         return {name: blank + (value + rows).reshape(1, -1) for name, value in found.items()}
 
     def _read(self, node: ir.Freeze) -> dict[str, Array]:
-        """The columns that the body reads, and what is frozen around; at least one."""
+        """Columns and enclosing frozen values that the body reads; at least one."""
         own = {name for name, _ in node.bindings}
         names = set(columns(node.body)).union(*map(frozen_in, numbers(node.body))) - own
         return {name: self.env[name] for name in names & self.env.keys() or list(self.env)[:1]}
@@ -152,7 +152,7 @@ def _together(node: ir.Freeze, domain: TraceDomain) -> Reach:
 
 
 def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
-    """How many samples before and after its instant a formula reads where they exist; inf: all."""
+    """Samples before and after its instant that a formula reads where they exist; inf: all."""
     past, future = reach(body)
     on_clock = any(isinstance(node, ir.AtStart) for node in nodes(body))
     if on_clock or any(map(looks_at_ends, numbers(body))):
@@ -164,7 +164,7 @@ def _neighbourhood(body: ir.Formula) -> tuple[float, float]:
 
 
 def _edge(most: int, width: float, samples: int) -> int:
-    """The largest c, at least 1, with c (c + width) or c * samples numbers below `most`."""
+    """Largest chunk c >= 1 with c (c + width) <= `most`; for infinite width, c * samples <= `most`."""
     if math.isinf(width):
         return max(most // samples, 1)
     return max(int((math.sqrt(width * width + 4.0 * most) - width) / 2.0), 1)
@@ -176,7 +176,7 @@ def _chunks(run: IndexRange, size: int) -> Iterator[IndexRange]:
 
 
 def without(body: ir.Formula, names: frozenset[str], domain: TraceDomain) -> ir.Formula:
-    """The formula where nothing is known of the frozen values `names`."""
+    """Replace predicates that read the undefined frozen values `names` by constants."""
     match body:
         case ir.Predicate(num, sign):
             if not frozen_in(num) & names:

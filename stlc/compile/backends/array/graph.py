@@ -1,7 +1,7 @@
-"""Formulas -> arrays: robustness at the instants that are asked for, on any array library.
+"""Robustness of formulas at requested instants, over any array library.
 
-Columns are `(time, batch)`. A schedule (`stlc.compile.schedule.schedule`) says what to compute,
-`stlc.compile.backends.array.steps` how.
+Columns are `(time, batch)`. `stlc.compile.schedule.schedule` lists the values to compute,
+`stlc.compile.backends.array.steps` computes them.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from stlc.diagnostics import Diagnostic, TraceError
 from stlc.signature import Signature
 
 MAX_BEYOND = 1 << 24
-"""Instants beyond the last sample at which bounds are computed, over all parts of a formula."""
+"""Maximum number of instants beyond the last sample, summed over all sub-formulas."""
 
 MAX_VALUES = 1 << 27
-"""The same over all traces: a gigabyte."""
+"""Maximum number of values beyond the last sample over all traces: a gigabyte."""
 
 
 def evaluate(
@@ -43,25 +43,25 @@ def evaluate(
     end: Boundary = "strict",
     stop: int | None = None,
 ) -> list[Array]:
-    """Robustness of several formulas; common parts are computed once.
+    """Return the robustness of several formulas; common sub-formulas are computed once.
 
     Args:
         formulas: in negation normal form.
         env: columns, `(time, batch)`.
         ops: the array library of `env`.
         semantics: of min and max; None is `Exact()`.
-        start: the first instant that is asked for.
-        count: how many instants from there on.
-        end: what stands beyond the last sample.
-        stop: how many samples there will be where `end` is "lower" or "upper"; None: windows to the end of
-            the trace end with the last one that is known.
+        start: first instant.
+        count: number of instants.
+        end: treatment of instants beyond the last sample.
+        stop: final number of samples where `end` is "lower" or "upper"; None: windows to the end of the trace
+            end with the last known sample.
 
     Returns:
         For each formula an array `(count, batch)`.
 
     Raises:
         ValueError: a window leaves the trace, and `end` is "strict".
-        TraceError: E306, bounds over all continuations of the trace look too far beyond it.
+        TraceError: E306, bounds over all continuations need too many instants beyond the trace.
     """
     windows = Windows(semantics or Exact(), ops)
     domain = _domain(env, end, windows, stop)
@@ -77,12 +77,12 @@ def evaluate_parts(
     end: Boundary,
     stop: int | None = None,
 ) -> Iterator[tuple[ir.Formula, range, Array]]:
-    """Exact robustness of a formula at consecutive instants, and of its parts where it needs them.
+    """Yield the exact robustness of a formula and of its sub-formulas at the instants that it needs.
 
     Where `end` is "lower" or "upper", instants may lie beyond the last sample; `stop` as in `evaluate`.
 
     Yields:
-        Formulas, instants and values `(instants, batch)`, parts first; not what stands in a `Freeze`.
+        Formula, instants and values `(instants, batch)`, operands first; none from inside a `Freeze`.
     """
     windows = Windows(Exact(), ops)
     plan = planned((formula,), spanning(instants.start, len(instants)), _domain(env, end, windows, stop))
@@ -99,7 +99,7 @@ def _domain(
 
 @lru_cache(maxsize=512)
 def planned(formulas: tuple[ir.Formula, ...], run: IndexRange, domain: TraceDomain) -> ArrayPlan:
-    """The schedule for a trace, remembered. Raises ValueError as `evaluate` does."""
+    """Return the cached schedule for a trace. Raises ValueError as `evaluate` does."""
     samples = domain.samples
     if run.start < 0 or (run.last >= samples and not domain.open):
         raise ValueError(f"instants {run.start}..{run.last} of a trace with {samples} samples")
@@ -118,7 +118,7 @@ def robustness_signal(
     semantics: Semantics | None = None,
     end: Boundary = "strict",
 ) -> Array:
-    """Robustness at every sample, `(time, batch)`; NaN where `end` "strict" leaves it undefined."""
+    """Return the robustness at every sample, `(time, batch)`; NaN where undefined under `end` "strict"."""
     windows = Windows(semantics or Exact(), ops)
     domain = _domain(env, "truncate" if end == "strict" else end, windows)
     samples = domain.samples
@@ -129,17 +129,17 @@ def robustness_signal(
 
 
 def execute(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """The values of the roots of a plan, each `(count, batch)`.
+    """Return the values of a plan's roots, each `(count, batch)`.
 
     Raises:
-        TraceError: E306, bounds over all continuations of the trace look too far beyond it.
+        TraceError: E306, bounds over all continuations need too many instants beyond the trace.
     """
     values = _checked(plan, env, windows)
     return [values[root] for root in plan.schedule.roots]
 
 
 def _checked(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """The values of all steps, where they are not too many."""
+    """Return the values of all steps. Raises TraceError (E306) above `MAX_BEYOND` or `MAX_VALUES`."""
     batch = math.prod(next(iter(env.values())).shape[1:])
     if plan.beyond > MAX_BEYOND or (plan.beyond and plan.beyond * batch > MAX_VALUES):
         raise TraceError(_too_far(plan))
@@ -147,7 +147,7 @@ def _checked(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> lis
 
 
 def _too_far(plan: ArrayPlan) -> Diagnostic:
-    """E306 for a formula whose parts would be needed at too many instants beyond the trace."""
+    """Return E306 for a formula whose sub-formulas are needed at too many instants beyond the trace."""
     step = max(plan.schedule.steps, key=lambda step: step.run.last)
     return Diagnostic(
         "E306",
@@ -161,18 +161,18 @@ def _too_far(plan: ArrayPlan) -> Diagnostic:
 
 
 class Weighed(Protocol):
-    """What the graph asks of a requirement; `stlc.compile.pipeline.Rule` has it."""
+    """Protocol of a requirement; `stlc.compile.pipeline.CompiledRequirement` implements it."""
 
     def under(self, semantics: Semantics) -> ir.Formula:
-        """In steps, with what laws of the semantics allow left out."""
+        """Formula in steps, simplified by the laws of the semantics."""
 
     @property
     def weight(self) -> float:
-        """Factor of its robustness in the whole."""
+        """Factor of the robustness in the overall minimum."""
 
     @property
     def scale(self) -> float:
-        """Divisor of its robustness in the whole."""
+        """Divisor of the robustness in the overall minimum."""
 
 
 class RobustnessGraph:
@@ -181,13 +181,13 @@ class RobustnessGraph:
     Args:
         rules: the requirements.
         signature: the columns of a state, in order.
-        semantics: of min and max, or its name in `stlc.compile.semantics.semantics.SEMANTICS`.
+        semantics: of min and max, or a name in `stlc.compile.semantics.semantics.SEMANTICS`.
 
     Trajectories are `(batch, time, dim)`, torch or NumPy, float32 or float64; results keep dtype and device.
-    `smoothing` is the scale k of log-sum-exp, for one call; None is the semantics of the graph.
+    `smoothing` overrides the semantics by log-sum-exp with scale k, for one call.
 
     Raises:
-        UsageError: U101, an unknown semantics, or `smoothing` for one that has no such scale.
+        UsageError: U101, an unknown semantics, or `smoothing` for one without a scale.
     """
 
     def __init__(
@@ -199,21 +199,21 @@ class RobustnessGraph:
         self._formulas: dict[tuple[bool, bool], list[ir.Formula]] = {}
 
     def robustness(self, x: Array, smoothing: float | None = None) -> Array:
-        """Of the whole: min over requirements of `weight * rho / scale`, `(batch,)`."""
+        """Overall robustness, `(batch,)`: min over requirements of `weight * rho / scale`."""
         env, ops = self._columns(x)
         return self.columns(env, ops=ops, smoothing=smoothing)
 
     def per_requirement(self, x: Array, smoothing: float | None = None) -> Array:
-        """Of each requirement before weight and scale, `(batch, rules)`."""
+        """Robustness of each requirement before weight and scale, `(batch, rules)`."""
         env, ops = self._columns(x)
         return self.per_requirement_columns(env, ops=ops, smoothing=smoothing)
 
     def columns(self, env: Mapping[str, Array], *, ops: Ops, smoothing: float | None = None) -> Array:
-        """`robustness` on columns `(time, batch)`; only those that the requirements read are needed."""
+        """`robustness` on columns `(time, batch)`; only the columns that the requirements read are needed."""
         return self.overall(self.per_requirement_columns(env, ops=ops, smoothing=smoothing), smoothing)
 
     def overall(self, each: Array, smoothing: float | None = None) -> Array:
-        """`robustness` from what `per_requirement` gave: (batch, rules) -> (batch,); +inf without rules."""
+        """`robustness` from that of `per_requirement`: (batch, rules) -> (batch,); +inf without rules."""
         ops, rows = ops_of(each), each.T
         if not self.rules:
             return ops.full((each.shape[0],), math.inf, each)
@@ -247,7 +247,7 @@ class RobustnessGraph:
 
 
 def ops_of(x: Array) -> Ops:
-    """The array library of `x`. Torch is imported only when `x` comes from it."""
+    """Return the array library of `x`. Torch is imported only for a torch tensor."""
     if isinstance(x, np.ndarray):
         return NUMPY
     return importlib.import_module("stlc.compile.backends.torch.ops").TORCH  # type: ignore[no-any-return]

@@ -1,8 +1,7 @@
-"""Sliding extrema and `until` with exact subgradients by a kernel in C, for NumPy and torch in any layout.
+"""Sliding extrema and `until` with exact subgradients by a C kernel, for NumPy and torch in any layout.
 
-`windows.c` is built on first use (`stlc.native`), once for a dtype and a width of vectors. Where it cannot be
-built, or the operands are of another kind, there is no kernel, and `stlc.compile.backends.array.windows` does
-the same in array operations.
+`windows.c` is built on first use (`stlc.native`), once per dtype and vector width. Where it cannot be built,
+or for other operands, `stlc.compile.backends.array.windows` computes the same with array operations.
 """
 
 from __future__ import annotations
@@ -23,20 +22,20 @@ _TYPES = {"float32": ("float", "int32_t", 4), "float64": ("double", "int64_t", 8
 """dtype -> its C type, an integer type as wide, and bytes."""
 
 _WIDE, _NARROW = 64, 16
-"""Bytes of a vector, for many traces and for a few."""
+"""Vector widths in bytes, for many traces and for few."""
 
 _FEW_BYTES = 32
-"""Bytes of one instant up to which there are few traces."""
+"""Row size in bytes up to which the narrow vectors are used."""
 
 _ROOM = 1 << 25
-"""Bytes of working memory that are allowed whatever the size of the operands."""
+"""Working memory in bytes that is always allowed."""
 
 _CHUNK = 4096
-"""Windows that are taken at a time, at least; `CHUNK` in C."""
+"""Minimum number of windows per chunk; `CHUNK` in C."""
 
 
 class Strided(NamedTuple):
-    """An array `(time, batch)` in memory: address of its first number, and strides in numbers."""
+    """Memory layout of an array `(time, batch)`: address of its first element, and strides in elements."""
 
     address: int
     time: int
@@ -46,12 +45,12 @@ class Strided(NamedTuple):
 @final
 @dataclass(frozen=True, slots=True)
 class WindowKernel:
-    """The compiled kernel for one kind of extremum over one layout of windows.
+    """Compiled kernel for one kind of extremum and one layout of windows.
 
     Attributes:
-        library: the kernel for the dtype of the operands.
-        pick: "max" is the maximum, and `until`; "min" the minimum, and `release`.
-        window: the windows.
+        library: kernel for the dtype of the operands.
+        pick: "max" for the maximum and `until`; "min" for the minimum and `release`.
+        window: layout of the windows.
         traces: length of the batch axis.
     """
 
@@ -61,15 +60,15 @@ class WindowKernel:
     traces: int
 
     def run(self, arrays: Sequence[Strided], operands: int, *, back: bool) -> None:
-        """Fill values from operands; with `back` the gradients of the operands from that of the values.
+        """Compute values from operands; with `back`, operand gradients from those of the values.
 
         Args:
-            arrays: operands; values, or with `back` their gradient and then those of the operands.
+            arrays: operands, values; with `back` also gradient of the values, gradients of the operands.
             operands: 1 for extrema, 2 for `until` and `release`.
-            back: whether gradients are wanted.
+            back: compute gradients.
 
         Raises:
-            MemoryError: there is no room.
+            MemoryError: working memory cannot be allocated.
         """
         window = self.window
         numbers = [window.rows, window.count, window.width, self.traces]
@@ -83,10 +82,9 @@ class WindowKernel:
 
 
 def window_kernel(dtype: str, traces: int, operands: int, pick: Pick, window: Sliding) -> WindowKernel | None:
-    """The kernel for operands `(time, batch)` of a dtype; None where there is none for them.
+    """Return the kernel for operands `(time, batch)` of a dtype; None where there is none.
 
-    Working memory grows with the width of the windows; beyond `_ROOM` bytes and the size of an operand there
-    is no kernel.
+    Working memory grows with the window width; None if it exceeds both `_ROOM` and the size of an operand.
     """
     if dtype not in _TYPES:
         return None
@@ -104,7 +102,7 @@ def window_kernel(dtype: str, traces: int, operands: int, pick: Pick, window: Sl
 
 @cache
 def _library(dtype: str, vector: int) -> ctypes.CDLL | None:
-    """The kernel for a dtype and a width of vectors in bytes; None where it cannot be built or loaded."""
+    """Return the kernel for a dtype and a vector width in bytes; None where it cannot be built or loaded."""
     real, index, _ = _TYPES[dtype]
     defined = f"#define REAL {real}\n#define INDEX {index}\n#define BYTES {vector}\n#define CHUNK {_CHUNK}\n"
     return native.load(defined + _SOURCE.read_text(encoding="utf-8"))

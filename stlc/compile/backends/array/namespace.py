@@ -1,8 +1,8 @@
-"""The array namespace: everything that the evaluators ask of an array library, and nothing else.
+"""Array namespace: the operations that the evaluators need from an array library.
 
-`stlc.compile.backends.array.numpy_ops` and `stlc.compile.backends.torch.ops` write it once per library.
-Operands named `x`, `a`, `b` are arrays; where a method says so a plain float may stand for one. Operators
-(`a + b`, `a * 2.0`) are used as they are, because both libraries agree on them.
+`stlc.compile.backends.array.numpy_ops` and `stlc.compile.backends.torch.ops` implement it.
+Operands named `x`, `a`, `b` are arrays; a float is allowed where a method says so. Operators (`a + b`,
+`a * 2.0`) are used directly.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ Mask: TypeAlias = Any
 @final
 @dataclass(frozen=True, slots=True)
 class Sliding:
-    """`count` windows of `width` rows over an array of `rows` rows; window `j` starts at row `j`.
+    """Layout of `count` windows of `width` rows over an array of `rows` rows; window `j` starts at row `j`.
 
-    There is at least one window, and at most one a row. Rows beyond the array are absent.
+    There is at least one window, and at most one per row. Rows beyond the array are absent.
     """
 
     rows: int
@@ -71,11 +71,11 @@ class Ops(Protocol):
     round: Callable[[Array], Array]
     square: Callable[[Array], Array]
     minimum: Callable[..., Array]
-    """Of two arrays; `out=` takes the result without a gradient."""
+    """Elementwise minimum of two arrays; `out=` receives the result without a gradient."""
     maximum: Callable[..., Array]
 
     def sqrt(self, x: Array) -> Array:
-        """Square root; its gradient at 0 is 0, so that a distance of 0 does no harm."""
+        """Square root; its gradient at 0 is 0, so that distances of 0 stay finite."""
 
     def pow(self, a: Array | float, b: Array | float) -> Array:
         """`a ^ b`."""
@@ -93,7 +93,7 @@ class Ops(Protocol):
         """`a + factor * b * c`; `a` may be a float."""
 
     def clamp(self, x: Array, low: float | None, high: float | None) -> Array:
-        """`x` cut to [low, high]; None leaves a side open."""
+        """`x` clamped to [low, high]; None leaves a side open."""
 
     def norm(self, *components: Array | float) -> Array:
         """Euclidean length; its gradient at 0 is 0."""
@@ -131,13 +131,13 @@ class Ops(Protocol):
 
     # along time
     def amin(self, x: Array) -> Array:
-        """Minimum over axis 0, which stays with length 1."""
+        """Minimum over axis 0, kept with length 1."""
 
     def amax(self, x: Array) -> Array:
-        """Maximum over axis 0, which stays with length 1."""
+        """Maximum over axis 0, kept with length 1."""
 
     def sum(self, x: Array) -> Array:
-        """Sum over axis 0, which stays with length 1."""
+        """Sum over axis 0, kept with length 1."""
 
     def cummin(self, x: Array) -> Array:
         """Running minimum along axis 0."""
@@ -146,7 +146,7 @@ class Ops(Protocol):
         """Running maximum along axis 0."""
 
     def softmax(self, x: Array, k: float) -> Array:
-        """`log(sum(exp(k x))) / k` over axis 0, which stays with length 1; stable, also with infinities.
+        """`log(sum(exp(k x))) / k` over axis 0, kept with length 1; stable, also with infinities.
 
         A smooth maximum for `k` > 0, a smooth minimum for `k` < 0.
         """
@@ -160,21 +160,21 @@ class Ops(Protocol):
     def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
         """Exact extrema of sliding windows: `(time, batch)` -> `(count, batch)`.
 
-        None where other methods of the library do it faster.
+        None where other methods of the library are faster.
         """
 
     def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array | None:
         """Exact `until` ("max") and `release` ("min"): two of `(time, batch)` -> `(count, batch)`.
 
-        None where other methods of the library do it faster.
+        None where other methods of the library are faster.
         """
 
     # constants and shapes
     def kind(self, like: Array) -> Hashable:
-        """What a constant depends on: arrays of one kind may share it."""
+        """Key of constants: arrays with equal keys may share them."""
 
     def constant(self, value: float, like: Array) -> Array | float:
-        """A number in the form that is fastest beside `like`."""
+        """A number in the form that is fastest in operations with `like`."""
 
     def full(self, shape: tuple[int, ...], value: float, like: Array) -> Array:
         """A constant array with dtype and device of `like`."""
@@ -183,22 +183,22 @@ class Ops(Protocol):
         """`first`, `first + 1`, … along time: (count, batch) with batch, dtype and device of `like`."""
 
     def empty(self, shape: tuple[int, ...], like: Array) -> Array:
-        """Memory with dtype and device of `like`, to be written to."""
+        """Uninitialized array with dtype and device of `like`."""
 
     def cat(self, parts: Sequence[Array]) -> Array:
-        """Joined along axis 0."""
+        """Concatenation along axis 0."""
 
     def stack(self, parts: Sequence[Array]) -> Array:
-        """A new axis 0 in front."""
+        """Arrays stacked along a new axis 0."""
 
     def flip(self, x: Array) -> Array:
         """Reversed along axis 0."""
 
     def rows(self, keep: NDArray[np.bool_], x: Array, value: float) -> Array:
-        """`x` with `value` in the rows (along axis 0) that are not kept."""
+        """`x` with `value` in the rows (axis 0) outside `keep`."""
 
     def columns(self, x: Array) -> Sequence[Array]:
         """`(batch, time, dim)` -> for every column an array `(time, batch)`."""
 
     def quiet(self) -> AbstractContextManager[object]:
-        """Within it, division by zero and the like give inf and NaN without a warning."""
+        """Context in which division by zero and invalid operations give inf and NaN without a warning."""

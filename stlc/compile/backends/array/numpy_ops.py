@@ -1,4 +1,4 @@
-"""The array namespace over NumPy: for recorded traces, and wherever torch must not be imported."""
+"""Array namespace over NumPy, for recorded traces and wherever torch must not be imported."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.schedule.schedule import Pick
 
 _WIDE = 8
-"""From so many columns on the kernel beats putting pairs together,"""
+"""Columns from which the C kernel beats pairwise doubling."""
 
 _LONG = 20_000
-"""and for `until` also from so many rows of a window on;"""
+"""Rows of a window from which it does so for `until`."""
 
 _LARGE_KERNEL = 1 << 16
-"""from so many numbers on it is worth building."""
+"""Elements from which building the kernel pays off."""
 
 
 @final
@@ -59,7 +59,7 @@ class NumpyOps:
         return a + (product if factor == 1.0 else factor * product)
 
     def clamp(self, x: Array, low: float | None, high: float | None) -> Array:
-        """`x` cut to [low, high]."""
+        """`x` clamped to [low, high]."""
         return np.clip(x, low, high)
 
     def norm(self, *components: Array | float) -> Array:
@@ -113,12 +113,12 @@ class NumpyOps:
         return choose(*items) if len(items) == 2 else reduce(choose, items)
 
     def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact extrema of sliding windows of wide rows, by the kernel; None elsewhere."""
+        """Exact extrema of sliding windows by the C kernel, for wide rows; else None."""
         wide = x.ndim == 2 and x.shape[1] >= _WIDE and not window.to_end
         return _by_kernel((x,), pick, window) if wide else None
 
     def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact `until` and `release`, for rows or windows that are long enough, by the kernel; else None."""
+        """Exact `until` and `release` by the C kernel, for wide rows or long windows; else None."""
         wide = left.ndim == 2 and (left.shape[1] >= _WIDE or window.width >= _LONG)
         return _by_kernel((left, right), pick, window) if wide else None
 
@@ -142,7 +142,7 @@ class NumpyOps:
         return 0.5 + 0.5 * np.tanh(0.5 * x)
 
     def kind(self, like: Array) -> Hashable:  # noqa: ARG002
-        """Floats take the dtype of what stands beside them."""
+        """Constant key: floats take the dtype of the other operand."""
         return None
 
     def constant(self, value: float, like: Array) -> Array | float:  # noqa: ARG002
@@ -154,12 +154,12 @@ class NumpyOps:
         return np.full(shape, value, dtype=like.dtype)
 
     def counted(self, first: int, count: int, like: Array) -> Array:
-        """Whole numbers along time."""
+        """Integers along time."""
         numbers = np.arange(first, first + count, dtype=like.dtype)
         return np.broadcast_to(numbers.reshape(-1, *(1,) * (like.ndim - 1)), (count, *like.shape[1:]))
 
     def empty(self, shape: tuple[int, ...], like: Array) -> Array:
-        """Memory to be written to."""
+        """Uninitialized array."""
         return np.empty(shape, dtype=like.dtype)
 
     def flip(self, x: Array) -> Array:
@@ -167,7 +167,7 @@ class NumpyOps:
         return x[::-1]
 
     def rows(self, keep: NDArray[np.bool_], x: Array, value: float) -> Array:
-        """`x` with `value` in the rows that are not kept."""
+        """`x` with `value` in the rows outside `keep`."""
         return np.where(keep.reshape(-1, *(1,) * (x.ndim - 1)), x, np.asarray(value, dtype=x.dtype))
 
     def columns(self, x: Array) -> Sequence[Array]:
@@ -175,7 +175,7 @@ class NumpyOps:
         return list(np.ascontiguousarray(x.transpose(2, 1, 0)))
 
     def quiet(self) -> AbstractContextManager[object]:
-        """Numerical exceptions give inf and NaN."""
+        """Context in which numerical exceptions give inf and NaN without a warning."""
         context: Any = np.errstate(all="ignore")
         return context  # type: ignore[no-any-return]
 

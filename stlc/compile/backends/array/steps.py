@@ -1,6 +1,6 @@
-"""A schedule over arrays: predicates at the same instants are one program, every other step a function.
+"""Execution of a schedule over arrays: one program per group of predicates, one function per other step.
 
-Values are `(count, batch)`. What computes a step is made once for a semantics and an array library, and kept.
+Values are `(count, batch)`. Functions of steps are built once per semantics and array library, and cached.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from stlc.compile.schedule.schedule import (
 )
 
 Kernel: TypeAlias = Callable[[Sequence[Array], Array], Array]
-"""The values of the operands that exist, and any column for shape, dtype and device -> `(count, batch)`."""
+"""Existing operand values, and any column for shape, dtype and device -> `(count, batch)`."""
 
 Runner: TypeAlias = Callable[..., Array]
-"""Computes a step from those before it, the outputs of the programs, the columns, and any one of these."""
+"""Previous values, program outputs, columns, and any column for shape, dtype and device -> a step's value."""
 
 _ENDLESS = 1 << 60
-"""Rows of a window to the end of the trace: more than there are."""
+"""Width of a window to the end of the trace, in rows."""
 
 
 # --------------------------------------------------------------------------- predicates
@@ -47,7 +47,7 @@ _ENDLESS = 1 << 60
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Predicates that are computed together at the same instants, all of them within the trace."""
+    """Predicates computed by one program at the same instants, all within the trace."""
 
     run: IndexRange
     program: Program
@@ -55,12 +55,12 @@ class Batch:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Rows of a predicate: an output of a program, or without one those of a column.
+    """Source of a predicate's values: an output of a program, or a column.
 
     Attributes:
-        batch: number of the program; None for a column.
+        batch: index of the program; None for a column.
         name: of the output, or of the column.
-        inside: the instants at which the predicate has a value.
+        inside: instants at which the predicate is defined.
     """
 
     batch: int | None
@@ -70,14 +70,14 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class ArrayPlan:
-    """A schedule, and how its steps are computed.
+    """A schedule with the programs and functions that compute its steps.
 
     Attributes:
         schedule: the steps.
         batches: programs of the predicates.
-        predicates: number of a step -> where its rows come from; absent where it has no value.
-        beyond: how many values beyond the last sample there are in all.
-        runners: by semantics and array library; made when they are first needed.
+        predicates: step number -> source of its values; absent where it is nowhere defined.
+        beyond: total number of values beyond the last sample.
+        runners: functions by semantics and array library, built on first use.
     """
 
     schedule: Schedule
@@ -88,7 +88,7 @@ class ArrayPlan:
 
 
 def array_plan(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDomain) -> ArrayPlan:
-    """The plan for formulas at the instants `run`."""
+    """Return the plan for formulas at the instants `run`."""
     found = schedule(formulas, run, domain)
     batches, predicates = _batches(found.steps, domain)
     stops = ((step.run.last - domain.samples + 1, step.run.count) for step in found.steps)
@@ -96,7 +96,7 @@ def array_plan(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDom
 
 
 def _batches(steps: Sequence[Step], domain: TraceDomain) -> tuple[tuple[Batch, ...], dict[int, Source]]:
-    """One program for all predicates over the same stretch of the trace; bare columns need none."""
+    """Group predicates over the same instants into programs; predicates that are columns need none."""
     wanted: dict[ir.Num, list[tuple[IndexRange, int]]] = {}
     predicates: dict[int, Source] = {}
     for index, step in enumerate(steps):
@@ -124,7 +124,7 @@ def _signed(atom: ir.Predicate) -> ir.Num:
 
 
 def _stretches(asked: list[tuple[IndexRange, int]]) -> list[tuple[IndexRange, list[tuple[IndexRange, int]]]]:
-    """Runs that touch are put together."""
+    """Merge overlapping and adjacent ranges."""
     out: list[tuple[IndexRange, list[tuple[IndexRange, int]]]] = []
     for run, index in sorted(asked, key=lambda item: (item[0].start, item[0].count)):
         if out and run.start <= out[-1][0].last + 1:
@@ -141,11 +141,11 @@ def _stretches(asked: list[tuple[IndexRange, int]]) -> list[tuple[IndexRange, li
 @final
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Makes functions of steps, for traces of one length.
+    """Builder of step functions, for traces of one length.
 
     Attributes:
         domain: of the traces.
-        windows: the algorithms, with semantics and array library.
+        windows: window algorithms, with semantics and array library.
     """
 
     domain: TraceDomain
@@ -153,16 +153,16 @@ class Machine:
 
     @property
     def unknown(self) -> float:
-        """What stands for what nobody knows yet; a number each where two traces are its two ends."""
+        """Value of unknown predicates; one per trace where two traces hold the lower and the upper bound."""
         if self.domain.end == "both":
             both: Any = np.array([-math.inf, math.inf])
             return both  # type: ignore[no-any-return]
         return math.inf if self.domain.end == "upper" else -math.inf
 
     def predicate(self, node: ir.Predicate, run: IndexRange, inside: IndexRange) -> Kernel:
-        """A predicate; its one part are the rows at the instants `inside`, signed, if there are any.
+        """Return the function of a predicate of its signed values at `inside`, or of none if that is empty.
 
-        Beyond the trace a predicate is unknown, and false where windows are cut.
+        Beyond the trace a predicate is unknown, or false where windows are cut.
         """
         outside = self.unknown if self.domain.open else -node.sign * math.inf
         if inside.count <= 0:
@@ -185,7 +185,7 @@ class Machine:
         return kernel
 
     def bind(self, step: Step) -> Kernel:
-        """Any other node."""
+        """Return the function of any other node."""
         node, run = step.node, step.run
         operands = len(step.operands)
         match node:
@@ -216,7 +216,7 @@ class Machine:
         return lambda parts, like: parts[0] + full((rows, *like.shape[1:]), 0.0, like)
 
     def _future(self, window: ir.Window, run: IndexRange, operands: int, pick: Pick) -> Kernel:
-        """Windows of the future; those "to the end" that start beyond it are unknown on an open trace."""
+        """Future windows; on an open trace, those "to the end" that start beyond it are unknown."""
         rows = run.count
         beyond = neutral(pick)
         if self.domain.open and window.hi is None:
@@ -230,7 +230,7 @@ class Machine:
         return lambda parts, like: padded(inner(parts, like), run.count, beyond)
 
     def _past(self, window: ir.Window, run: IndexRange, operands: int, pick: Pick) -> Kernel:
-        """Windows of the past: the same, with time reversed."""
+        """Past windows: future windows with time reversed."""
         ops, reduce = self.windows.ops, self.windows.semantics.reduce
         if not operands:
             return self._constant(run.count, neutral(pick))
@@ -240,7 +240,7 @@ class Machine:
         return lambda parts, like: flip(inner([flip(part) for part in parts], like))
 
     def _windows(self, window: ir.Window, operands: int, pick: Pick, rows: int) -> Kernel:
-        """One operand: its extrema. Two: `until` from `window.lo` on, and the left one holds up to there."""
+        """Extrema of one operand, or `until` of two with window [lo, hi]."""
         extrema, until, lo = self.windows.extrema, self.windows.until, window.lo
         most = _ENDLESS if window.hi is None else window.hi - lo + 1
         if operands == 1:
@@ -274,7 +274,7 @@ class Machine:
 
 
 def all_values(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """The values of all steps over columns `(time, batch)`."""
+    """Return the values of all steps over columns `(time, batch)`."""
     ops, like = windows.ops, next(iter(env.values()))
     runners = plan.runners.get(windows)
     if runners is None:
@@ -301,7 +301,7 @@ def _runner(plan: ArrayPlan, step: Step, machine: Machine) -> Runner:
 
 
 def _predicate(plan: ArrayPlan, step: Step, machine: Machine) -> Runner:
-    """Its rows come from a program, or are those of a column."""
+    """Return the function of a predicate over the outputs of its program, or over its column."""
     source, domain = plan.predicates.get(step.number), plan.schedule.domain
     if source is None:
         kernel = machine.predicate(step.node, step.run, spanning(step.run.start, 0))
@@ -329,7 +329,7 @@ def _frozen(node: ir.Freeze, run: IndexRange, machine: Machine) -> Runner:
 def _judge(
     formula: ir.Formula, env: Mapping[str, Array], run: IndexRange, domain: TraceDomain, *, windows: Windows
 ) -> Array:
-    """One formula at consecutive instants, on the trace or beyond it: `(count, batch)`."""
+    """Robustness of one formula at consecutive instants, on the trace or beyond it: `(count, batch)`."""
     plan = _scheduled(formula, run, domain)
     return all_values(plan, env, windows)[plan.schedule.roots[0]]
 

@@ -1,8 +1,8 @@
-"""Numbers -> a straight line of array operations: common parts once, constants folded, few operations.
+"""Tape of array operations: common sub-expressions shared, constants folded, operations fused.
 
-In training an array operation costs microseconds before it touches a number, so the aim here is their count:
-`a * 0.1 + b` is one `axpy`, a product that is added is one `addcmul`, `min` and `max` with literals are one
-`clamp`, an indicator that multiplies is one `where`. Every rule returns the same number, up to rounding.
+In training each array operation has microseconds of overhead, so the tape minimizes their number:
+`a * 0.1 + b` is one `axpy`, an added product one `addcmul`, `min` and `max` with literals one `clamp`, an
+indicator as a factor one `where`. Each rule preserves the value up to rounding.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ Operand: TypeAlias = int | float
 
 @dataclass(frozen=True, slots=True)
 class Instr:
-    """One operation.
+    """Array operation.
 
     Attributes:
         kernel: a method of `Ops` or of the switch, or `input`, `extern`, `pick`.
         args: operands.
-        params: what else the kernel takes, after the operands.
+        params: further arguments of the kernel, after the operands.
     """
 
     kernel: str
@@ -35,14 +35,14 @@ class Instr:
 
 
 class Tape:
-    """A growing list of instructions; asking for one that is there already returns its register."""
+    """List of instructions; emitting an existing one returns its register."""
 
     def __init__(self) -> None:
         self.code: list[Instr] = []
         self._known: dict[tuple[object, ...], int] = {}
 
     def emit(self, kernel: str, *args: Operand, params: tuple[object, ...] = ()) -> int:
-        """The register of that instruction."""
+        """Return the register of that instruction, appended if new."""
         key = (kernel, params, *((type(arg), arg) for arg in args))
         register = self._known.get(key)
         if register is None:
@@ -51,7 +51,7 @@ class Tape:
         return register
 
     def parts(self, operand: Operand, kernel: str) -> tuple[Operand, ...] | None:
-        """Operands of the instruction behind `operand` if that is a `kernel`."""
+        """Operands of the instruction that computes `operand`, if it is a `kernel`."""
         if isinstance(operand, float) or self.code[operand].kernel != kernel:
             return None
         return self.code[operand].args
@@ -139,7 +139,7 @@ class Tape:
         return self.call("div", a, b)
 
     def pow(self, a: Operand, b: Operand) -> Operand:
-        """`a ^ b`; small powers without a logarithm."""
+        """`a ^ b`; small integer powers as products."""
         if isinstance(b, int):
             return self.call("pow", a, b)
         match b:
@@ -199,7 +199,7 @@ class Tape:
     # ---------------------------------------------------------------- choice
 
     def compare(self, margin: Operand, strict: bool) -> int | bool:
-        """The mask `margin > 0` (`strict`) or `margin >= 0`; a difference is not computed for it."""
+        """Mask `margin > 0` (`strict`) or `margin >= 0`; a difference is compared without computing it."""
         if isinstance(margin, float):
             return margin > 0 if strict else margin >= 0
         kernel = "gt" if strict else "ge"
@@ -212,7 +212,7 @@ class Tape:
         return self.emit(kernel, margin, 0.0)
 
     def number(self, mask: int) -> int:
-        """1 where `mask`, else 0, in the dtype of what the mask compares."""
+        """1 where `mask`, else 0, in the dtype of the compared operands."""
         return self.emit("number", mask, self._compared(mask))
 
     def _compared(self, mask: int) -> int:
@@ -223,7 +223,7 @@ class Tape:
 
 
 def _constant_last(a: Operand, b: Operand) -> tuple[Operand, Operand]:
-    """Operands of a commutative operation in one order: registers first, in order."""
+    """Canonical order of commutative operands: registers first, ascending."""
     if isinstance(a, float):
         return (a, b) if isinstance(b, float) else (b, a)
     return (b, a) if isinstance(b, int) and b < a else (a, b)

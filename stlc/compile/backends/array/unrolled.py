@@ -1,4 +1,4 @@
-"""Robustness as a graph: formulas over symbolic columns, `freeze` instant by instant."""
+"""Robustness as an operation graph: formulas over symbolic columns, `freeze` unrolled over instants."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ Columns = dict[str, Value]
 
 
 def written(formulas: Sequence[ir.Formula], columns: Mapping[str, Value], *, count: int = 1) -> list[Value]:
-    """Exact robustness at the first samples.
+    """Return the exact robustness at the first `count` samples.
 
     Args:
         formulas: in negation normal form.
         columns: `(samples, batch)` each.
-        count: at how many samples from the first on.
+        count: number of samples, from the first on.
 
     Returns:
-        For each formula a value (count, batch), or of one trajectory where it is a constant.
+        For each formula a value (count, batch), or (count, 1) where it is a constant.
 
     Raises:
-        Untranslatable: a formula looks beyond the samples, or calls a function of Python.
+        Untranslatable: a formula needs samples beyond the last, or calls a Python function.
     """
     env = dict(columns)
     samples = len(next(iter(env.values())))
@@ -44,7 +44,7 @@ def written(formulas: Sequence[ir.Formula], columns: Mapping[str, Value], *, cou
 
 
 def require_numbers(nums: Iterator[ir.Num] | Sequence[ir.Num]) -> None:
-    """Raise Untranslatable where a number calls a function of which only Python knows what it computes."""
+    """Raise Untranslatable where a number calls a function that is known in Python only."""
     for num in nums:
         for part in subexpressions(num):
             if isinstance(part, ir.Extern) and not isinstance(part.function, ir.Body):
@@ -52,7 +52,7 @@ def require_numbers(nums: Iterator[ir.Num] | Sequence[ir.Num]) -> None:
 
 
 def _thawed(formula: ir.Formula, env: Columns) -> ir.Formula:
-    """The formula with a new column of `env` in the place of every `freeze`."""
+    """Return the formula with each `freeze` replaced by a new column of `env`."""
     if isinstance(formula, ir.Freeze):
         name = f"#frozen{len(env)}"
         env[name] = _frozen(formula, env)
@@ -61,7 +61,7 @@ def _thawed(formula: ir.Formula, env: Columns) -> ir.Formula:
 
 
 def _frozen(node: ir.Freeze, env: Columns) -> Value:
-    """The values of a `freeze` at all samples, `(samples, batch)`; NaN where it has none."""
+    """Robustness of a `freeze` at all samples, `(samples, batch)`; NaN where undefined."""
     like = next(iter(env.values()))
     program, samples = Program(dict(node.bindings)), len(like)
     rows = []

@@ -1,4 +1,4 @@
-"""Extrema over windows of time: reductions, the C kernel, and in its place running extrema and doubling.
+"""Extrema over time windows: reductions, the C kernel, or running extrema and doubling.
 
 All arrays are `(time, batch)`. Window `j` of `count` starts at row `j` and has `width` rows; rows beyond the
 array are absent, and a window without rows has the neutral value (+inf for a minimum, -inf for a maximum).
@@ -15,32 +15,32 @@ from stlc.compile.schedule.schedule import Pick, dual, neutral
 from stlc.compile.semantics.protocol import Parts, Semantics
 
 _SCAN_BATCH = 64
-"""From this batch size on a sequential scan beats the log-depth one."""
+"""Batch size from which a sequential scan beats the log-depth one."""
 
 _TILE = 1 << 17
-"""Numbers of a long trace that are dealt with at a time: what is made of them stays near the processor."""
+"""Elements per tile of a long trace, so that intermediate results stay in cache."""
 
 _OVERLAP = 8
-"""How many times as long as a window such a stretch is at least."""
+"""Minimum tile length, in window widths."""
 
 
 @final
 @dataclass(frozen=True, slots=True)
 class Windows:
-    """Windowed extrema under one semantics, on one array library."""
+    """Windowed extrema under one semantics and array library."""
 
     semantics: Semantics
     ops: Ops
 
     def padded(self, x: Array, rows: int, value: float) -> Array:
-        """The first `rows` rows of `x`, with rows of `value` behind it where it is shorter."""
+        """First `rows` rows of `x`, padded with `value` where it is shorter."""
         if x.shape[0] >= rows:
             return x[:rows] if x.shape[0] > rows else x
         missing = self.ops.full((rows - x.shape[0], *x.shape[1:]), value, x)
         return self.ops.cat([x, missing]) if x.shape[0] else missing
 
     def extrema(self, x: Array, pick: Pick, *, count: int, width: int) -> Array:
-        """`count` windows of `width` rows: `(time, batch)` -> `(count, batch)`."""
+        """Extrema of `count` windows of `width` rows: `(time, batch)` -> `(count, batch)`."""
         rows = x.shape[0]
         width = min(width, max(rows, 1))
         if tiles := self._tiles(x, count, width):
@@ -59,10 +59,7 @@ class Windows:
         return self._doubling(self.padded(x, count + width - 1, neutral(pick)), pick, width)
 
     def _tiles(self, x: Array, count: int, width: int) -> list[tuple[slice, slice]]:
-        """Windows of a long recorded trace that are computed together, and the rows that they see.
-
-        Nothing where all of them are.
-        """
+        """Tiles of a long recorded trace: windows, and the rows that they read; empty for one tile."""
         if self.ops.name != "numpy" or not self.semantics.exact:
             return []
         size = max(_TILE // max(math.prod(x.shape[1:]), 1), _OVERLAP * width)
@@ -72,12 +69,12 @@ class Windows:
         return [(some, slice(some.start, some.stop + width - 1)) for some in asked]
 
     def _to_end(self, x: Array, pick: Pick) -> Array:
-        """Every window reaches the last row: a running extremum from behind."""
+        """Extrema of windows that all extend to the last row: a running extremum backward in time."""
         running = self.ops.cummin if pick == "min" else self.ops.cummax
         return self.ops.flip(running(self.ops.flip(x)))
 
     def _doubling(self, x: Array, pick: Pick, width: int) -> Array:
-        """Full windows only, in about log2(width) operations: pieces of 1, 2, 4, … rows are put together."""
+        """Extrema of full windows in about log2(width) operations, by merging blocks of 1, 2, 4, … rows."""
         if width == 1:
             return x
         piece, size, done = self.semantics.lift(x, pick, self.ops), 1, 0
@@ -97,7 +94,7 @@ class Windows:
         return self.semantics.finish(total, pick, self.ops)
 
     def _merged(self, a: Parts, b: Parts, shift: int, pick: Pick) -> Parts:
-        """The pieces that start at a row, and `shift` rows later."""
+        """Merge the block at each row with the block `shift` rows later."""
         rows = min(a[0].shape[0], b[0].shape[0] - shift)
         return self.semantics.merge(
             tuple(part[:rows] for part in a), tuple(part[shift : shift + rows] for part in b), pick, self.ops
@@ -110,8 +107,8 @@ class Windows:
         `left[j..lo + t]`.
 
         Args:
-            left: what must hold up to and including `t`; `(time, batch)`.
-            right: what must hold at `t`, from `lo` rows later on.
+            left: operand that must hold up to and including `t`; `(time, batch)`.
+            right: operand that must hold at `t`; its row 0 is row `lo` of `left`.
             pick: "max" or "min".
             count: number of windows.
             width: rows of a window.
@@ -156,9 +153,9 @@ class Windows:
     def _until_by_definition(
         self, left: Array, right: Array, pick: Pick, sizes: tuple[int, int, int]
     ) -> Array:
-        """One distance of `t` after the other: `lo + width` operations on `count` rows.
+        """`until` by a loop over the offset of `t`: `lo + width` operations on `count` rows.
 
-        Minima do not distribute over maxima unless both are exact, so there is no shorter way for many rows.
+        Faster methods need minima that distribute over maxima, which only exact extrema do.
         """
         semantics, ops, other = self.semantics, self.ops, dual(pick)
         count, width, lo = sizes
@@ -184,7 +181,7 @@ class Windows:
         return semantics.finish(found, pick, ops)
 
     def _from_first(self, x: Array, pick: Pick) -> Array:
-        """The extremum of all rows up to each one, in about log2(rows) operations."""
+        """Running extremum in about log2(rows) operations."""
         size = 1
         while size < x.shape[0]:
             later = self.semantics.pair(x[size:], x[:-size], pick, self.ops)
@@ -192,7 +189,7 @@ class Windows:
         return x
 
     def _until_to_end(self, left: Array, right: Array, pick: Pick, count: int) -> Array:
-        """The recursion `u(t) = min(left(t), max(right(t), u(t + 1)))`, from behind."""
+        """`until` to the last row, by recursion `u(t) = min(left(t), max(right(t), u(t + 1)))`."""
         pair, other = self.semantics.pair, dual(pick)
         row = pair(left[-1:], right[-1:], other, self.ops)
         out = [row]
@@ -206,7 +203,7 @@ class Windows:
     def _until_from_behind(
         self, left: Array, right: Array, pick: Pick, tiles: list[tuple[slice, slice]]
     ) -> Array:
-        """To the end of a long recorded trace: a stretch, and what the stretch behind it comes to."""
+        """`until` to the end of a long recorded trace, tile by tile backward in time."""
         out = self.ops.empty((tiles[-1][0].stop, *left.shape[1:]), left)
         behind = self.until(left[len(out) :], right[len(out) :], pick, count=1, width=len(left))
         for rows, _ in reversed(tiles):
@@ -220,7 +217,7 @@ class Windows:
         return out
 
     def _until_doubling(self, held: Array, met: Array, pick: Pick, width: int) -> Array:
-        """Full windows, in about log2(width) compositions of (`left` holds throughout, met within).
+        """`until` of full windows in about log2(width) compositions of (`left` throughout, met within).
 
         `total` covers the first `done` rows of every window, `met` the `size` rows from every row on.
         """
@@ -237,7 +234,7 @@ class Windows:
             size *= 2
 
     def _composed(self, a: tuple[Array, Array], b: tuple[Array, Array], pick: Pick) -> tuple[Array, Array]:
-        """First window `a`, then window `b`: `left` holds through both, or it is met in one of them."""
+        """Composition of window `a` followed by window `b`: (`left` throughout both, met in one of them)."""
         rows = min(a[0].shape[0], b[0].shape[0])
         pair, other = self.semantics.pair, dual(pick)
         later = pair(a[0][:rows], b[1][:rows], other, self.ops)

@@ -1,1 +1,1 @@
-"""Dynamics and requirements as C, forwards and backwards."""
+"""C back end: dynamics and requirements, forward pass and adjoint."""

@@ -1,7 +1,7 @@
-"""Dynamics and requirements -> C that differentiates robustness and states by plans.
+"""C code for the gradient of robustness and states with respect to plans.
 
-Reverse mode through the exact minima and maxima (the first of equal ones gets the gradient) and through the
-steps of the system, sixteen trajectories at a time. The forward pass is that of `emit_c`.
+Reverse mode through exact minima and maxima (the first of equal operands gets the gradient) and through the
+steps of the system, sixteen trajectories at a time. The forward pass is that of `emit`.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ static inline double bump(double z, double slope) {
 
 
 def emit_adjoint(motion: Motion, formulas: Sequence[ir.Formula], *, fixed: Collection[str] = ()) -> str:
-    """The C text of `pull`; see `stlc.native` for its signature.
+    """Return the C source of `pull`; see `stlc.native` for its signature.
 
     Args:
         motion: one step of the system.
         formulas: the requirements.
-        fixed: states that no gradient goes through on their way through time.
+        fixed: states whose update carries no gradient.
 
     Raises:
-        Untranslatable: the IR holds something that has no C form.
+        Untranslatable: the IR has a node without a C form.
     """
     plan = plan_of(formulas, motion.steps + 1)
     printer = StepPrinter(plan, state_index(motion))
@@ -73,7 +73,7 @@ def emit_adjoint(motion: Motion, formulas: Sequence[ir.Formula], *, fixed: Colle
 
 
 def _step_back(motion: Motion, fixed: Collection[str]) -> list[str]:
-    """The gradient by sample k + 1 taken to sample k and to the controls, one lane."""
+    """Adjoint of a step for one lane: from the gradient at sample k + 1 to sample k and the controls."""
     index = {name: i for i, name in enumerate(motion.states)}
     writer = SlopeWriter(place_in_step(motion), soft=True)
     for name, num in motion.lets:

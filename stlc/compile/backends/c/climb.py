@@ -1,7 +1,7 @@
-"""Hill climbing over plans as C: a batch of changed plans a generation, the best is kept.
+"""Local search over plans in C: per generation a batch of perturbed plans, of which the best is kept.
 
-Appended to what `emit_c` writes; `roll` and `check` are those of the task. Each row has its own random
-numbers, so the result does not depend on how rows are shared among threads.
+Appended to the source of `emit`; `roll` and `check` are those of the task. Each row has its own random
+stream, so the result does not depend on the number of threads.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Dynamics and requirements -> one C translation unit: rollout, exact robustness, performance.
+"""C translation unit of dynamics and requirements: rollout, exact robustness, performance.
 
 The same IR as the torch graph, exact switching, double precision, `LANES` trajectories at a time.
 """
@@ -52,15 +52,15 @@ static inline double floored_mod(double a, double b) {{
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """One step of a system, straight-line code that reads states, controls and earlier assignments.
+    """One step of a system as straight-line code over states, controls and earlier assignments.
 
     Attributes:
         states: names of the state columns, in order.
         controls: names of the inputs, in order.
         lets: (name, number), in order.
-        next: name of a state that moves -> what it is one step later.
-        steps: of a plan.
-        dt: seconds of a step.
+        next: state name -> its value one step later; states that do not change are absent.
+        steps: number of steps of a plan.
+        dt: time step in seconds.
     """
 
     states: tuple[str, ...]
@@ -72,10 +72,10 @@ class Motion:
 
 
 def emit(motion: Motion, formulas: Sequence[ir.Formula]) -> str:
-    """The C text of `judge` and `climb`; see `stlc.native` for their signatures.
+    """Return the C source of `judge` and `climb`; see `stlc.native` for their signatures.
 
     Raises:
-        Untranslatable: the IR holds something that has no C form.
+        Untranslatable: the IR has a node without a C form.
     """
     plan = plan_of(formulas, motion.steps + 1)
     states, rules, steps = len(motion.states), len(formulas), motion.steps
@@ -95,12 +95,12 @@ def emit(motion: Motion, formulas: Sequence[ir.Formula]) -> str:
 
 
 def state_index(motion: Motion) -> dict[str, int]:
-    """The place of each state among the columns."""
+    """Return the index of each state among the columns."""
     return {name: i for i, name in enumerate(motion.states)}
 
 
 def passes(motion: Motion, plan: Plan) -> list[str]:
-    """The two passes forward: `roll` fills the states, `check` gives the robustness of each requirement."""
+    """Return the forward passes: `roll` fills the states, `check` gives each requirement's robustness."""
     blocks = forward_blocks(plan, state_index(motion))
     return [
         "typedef double lane[LANES];",
@@ -116,23 +116,23 @@ def passes(motion: Motion, plan: Plan) -> list[str]:
 
 
 def forward_blocks(plan: Plan, index: Mapping[str, int]) -> list[list[str]]:
-    """Statements that fill the buffers of a plan and give the outcome of each formula."""
+    """Return statements that fill the buffers of a plan and output the robustness of each formula."""
     printer = StepPrinter(plan, index)
     return [*(printer.forward([step], {}) for step in plan.schedule.steps), _roots_out(plan)]
 
 
 def _roots_out(plan: Plan) -> list[str]:
-    """What the requirements come to, in their order."""
+    """Statements that copy the robustness of each requirement to the output, in order."""
     return [_along(i, root, rows, "LANE out[{i}][j] = {value};") for i, root, rows in _side_by_side(plan)]
 
 
 def roots_in(plan: Plan) -> list[str]:
-    """The gradients by them, in their order."""
+    """Return statements that add the gradient of each requirement to its buffer, in order."""
     return [_along(i, root, rows, "LANE g{value} += g[{i}][j];") for i, root, rows in _side_by_side(plan)]
 
 
 def _side_by_side(plan: Plan) -> list[tuple[int, Place, int]]:
-    """Requirements whose values follow each other: number of the first, where it stands, how many."""
+    """Requirements with values in consecutive rows: index of the first, its place, and their number."""
     runs: list[tuple[int, Place, int]] = []
     for i, root in enumerate(plan.roots):
         if runs and root == Place(runs[-1][1].buffer, runs[-1][1].row + runs[-1][2]):
@@ -161,7 +161,7 @@ CHECK = Frame(
 
 
 def place_in_step(motion: Motion) -> Callable[[Leaf], str | None]:
-    """Where states and inputs stand in a step, of lane `j`."""
+    """Return the C expressions of states and inputs in a step, of lane `j`."""
     index = state_index(motion)
 
     def place(leaf: Leaf) -> str | None:
@@ -175,7 +175,7 @@ def place_in_step(motion: Motion) -> Callable[[Leaf], str | None]:
 
 
 def _step(motion: Motion) -> list[str]:
-    """The body of a step: sample k to sample k + 1 of one lane."""
+    """Body of a step for one lane: from sample k to sample k + 1."""
     index = state_index(motion)
     writer = NumberWriter(place_in_step(motion))
     for name, num in motion.lets:

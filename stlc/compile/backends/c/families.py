@@ -1,7 +1,7 @@
-"""Formulas of equal shape -> one shape and a table of what they differ in: obstacles are data.
+"""Families of formulas of equal shape, as one shape and a table of parameters: obstacles are data.
 
-A hundred boxes are one loop over a hundred rows of numbers, not a hundred times the same text. Constants and
-the columns that are read may differ; operators, windows and calls of functions are the shape.
+A hundred boxes become one loop over a hundred rows, not a hundred copies of the same code. Constants and
+column names may differ; operators, windows and function calls are part of the shape.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from stlc.compile.backends.c.numbers import LISTED
 from stlc.compile.ir import nodes as ir
 
 LEAST = 8
-"""Formulas from which on a loop over a table takes the place of their text."""
+"""Minimum number of members of a family."""
 
 Entry: TypeAlias = ir.Const | ir.Signal | ir.ShiftedSignal
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Constants and columns of each row that has a shape.
+    """Constants and columns that distinguish the members of a family, one row per member.
 
     Attributes:
-        rows: how many there are.
-        constants: C name -> the number in each row.
-        columns: C name -> the column in each row.
+        rows: number of members.
+        constants: C name -> constant of each row.
+        columns: C name -> column of each row.
     """
 
     rows: int
@@ -35,7 +35,7 @@ class Table:
 
     @property
     def names(self) -> frozenset[str]:
-        """What stands in the shape for its entries, as names of frozen values and of columns."""
+        """Names of the table's entries in the shape, as frozen values and columns."""
         return frozenset(f"{LISTED}{name}" for name in (*self.constants, *self.columns))
 
 
@@ -44,9 +44,9 @@ class Family:
     """Formulas that differ in constants and columns.
 
     Attributes:
-        members: their places among the formulas that were looked at.
-        shape: one of them, names of the table in the place of what differs.
-        table: what stands for these names in each of them.
+        members: indices of the formulas.
+        shape: common formula, with names of table entries where the members differ.
+        table: values of these names for each member.
     """
 
     members: tuple[int, ...]
@@ -55,11 +55,11 @@ class Family:
 
 
 def families(formulas: Sequence[ir.Formula], first: int) -> list[Family]:
-    """The families of at least `LEAST` among some formulas.
+    """Return the families of at least `LEAST` members.
 
     Args:
-        formulas: to look at.
-        first: number of the first table, part of the names in it; the others follow.
+        formulas: candidates.
+        first: number of the first table, part of the names in it; further tables count on.
     """
     if len(formulas) < LEAST:
         return []
@@ -104,7 +104,7 @@ def _family(formulas: Sequence[ir.Formula], members: Sequence[int], number: int)
 
 
 def _entries(formula: ir.Formula) -> list[Entry]:
-    """What may differ among formulas of one shape, in the order of `_changed`."""
+    """Leaves that may differ among formulas of one shape, in the order of `_changed`."""
     found: list[Entry] = []
 
     def note(leaf: Entry) -> ir.Num:
@@ -116,9 +116,9 @@ def _entries(formula: ir.Formula) -> list[Entry]:
 
 
 def _changed(formula: ir.Formula, change: Callable[[Entry], ir.Num]) -> ir.Formula:
-    """The formula with everything changed that may differ."""
+    """Return the formula with each leaf that may differ replaced by `change(leaf)`."""
     match formula:
-        case ir.Truth() | ir.Freeze():  # frozen values have names of their own: no other has this shape
+        case ir.Truth() | ir.Freeze():  # names of frozen values are unique: no other has this shape
             return formula
         case ir.Predicate(num):
             return replace(formula, num=_number(num, change))
@@ -136,15 +136,15 @@ def _number(num: ir.Num, change: Callable[[Entry], ir.Num]) -> ir.Num:
     match num:
         case ir.Signal(name) | ir.ShiftedSignal(name) if name.startswith(
             LISTED
-        ):  # an entry of the table around
+        ):  # an entry of the enclosing table
             return num
         case ir.Signal(ir.ELAPSED):
             return num
         case ir.Const() | ir.Signal() | ir.ShiftedSignal():
             return change(num)
-        case ir.FrozenVar() | ir.Extern():  # a call is computed once, for the columns that it names
+        case ir.FrozenVar() | ir.Extern():  # a call is computed once for its columns
             return num
-        case ir.Op("pow", (base, exponent)):  # compilers know some exponents, and round otherwise for them
+        case ir.Op("pow", (base, exponent)):  # compilers round some constant exponents differently
             return ir.Op("pow", (_number(base, change), exponent))
         case ir.Op(_, args):
             return replace(num, args=tuple(_number(arg, change) for arg in args))

@@ -1,7 +1,7 @@
-"""Numbers and state formulas of the IR as C expressions, common parts once.
+"""Numbers and state formulas of the IR as C expressions, with common sub-expressions shared.
 
-A writer turns `ir.Num` into statements `const double r7 = …;` on scalars, free of branches, so that a
-compiler can run a loop over trajectories around them as vector code.
+A writer turns `ir.Num` into branch-free scalar statements `const double r7 = …;`, so that the compiler can
+vectorize the enclosing loop over trajectories.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS, SHARED
 
 LISTED = "\0"
-"""How names of frozen values and columns begin that are entries of a table; their C names follow."""
+"""Prefix of frozen values and columns that are table entries, followed by their C name."""
 
 
-class Untranslatable(Exception):  # noqa: N818 - not an error: another back end takes over
-    """The IR holds something that a back end has no form for, such as a function that the system provides."""
+class Untranslatable(Exception):  # noqa: N818 - not an error: another back end is used
+    """The IR has a node that a back end cannot express, such as a Python function of the system."""
 
 
 Leaf: TypeAlias = ir.Signal | ir.ShiftedSignal | ir.FrozenVar | ir.Extern
 
 
 class NumberWriter:
-    """Writes numbers as C statements; equal numbers get one register.
+    """Writer of numbers as C statements; equal numbers share a register.
 
     Args:
-        place: C expression of where a column, a frozen value or a function's result stands already; None for
-            a function that is to be written out.
+        place: C expression of a column, a frozen value or an available function result; None for a function
+            that must be inlined.
     """
 
     def __init__(self, place: Callable[[Leaf], str | None]) -> None:
@@ -41,18 +41,18 @@ class NumberWriter:
         self._calls: dict[tuple[str, ...], list[str]] = {}
 
     def number(self, num: ir.Num) -> str:
-        """The C name of a number, its statements written."""
+        """Write the statements of a number; return its C name."""
         known = self._known.get(num)
         if known is None:
             known = self._known[num] = self._number(num)
         return known
 
     def assign(self, name: str, value: str) -> None:
-        """From now on the environment entry `name` is the C expression `value`."""
+        """Bind the environment entry `name` to the C expression `value`."""
         self._known[ir.Signal(name)] = value
 
     def truth(self, cond: ir.Formula) -> str:
-        """A C condition, 0 or 1: exact, every atom with its own strictness."""
+        """Exact truth of a condition as a C expression, 0 or 1; each predicate keeps its own strictness."""
         match cond:
             case ir.Truth(value):
                 return "1" if value else "0"
@@ -98,7 +98,7 @@ class NumberWriter:
         return self._register(f"{self.truth(cond)} ? {yes} : {no}")
 
     def _inlined(self, name: str, body: ir.Body, args: list[str]) -> list[str]:
-        """The components of a function that is known as numbers, its statements written."""
+        """Write the statements of a function given as straight-line code; return its components."""
         outputs = self._calls.get((name, *args))
         if outputs is None:
             inner = self._inside()
@@ -110,7 +110,7 @@ class NumberWriter:
         return outputs
 
     def _inside(self) -> NumberWriter:
-        """A writer with names of its own into the same registers."""
+        """Return a writer with its own bindings that shares the registers."""
         inner = NumberWriter(self._place)
         inner.lines, inner._texts = self.lines, self._texts
         return inner
@@ -125,7 +125,7 @@ class NumberWriter:
         return self._apply(name, args)
 
     def _apply(self, name: str, args: list[str]) -> str:
-        """One function of the table, in a register; of an extremum, two arguments."""
+        """Write one function of the table into a register; extrema take two arguments at a time."""
         form = FUNCTIONS[name].c
         if form is None:
             raise Untranslatable(name)
@@ -140,7 +140,7 @@ class NumberWriter:
 
 
 def literal(value: float) -> str:
-    """A double as C reads it back, bit for bit."""
+    """Return a C literal that reads back to the same double, bit for bit."""
     if math.isnan(value):
         return "NAN"
     if math.isinf(value):

@@ -1,4 +1,4 @@
-"""Blocks of statements -> C functions of a moderate size: a compiler takes long over long ones."""
+"""Split of statements into C functions of moderate size: compile time grows fast with function length."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from dataclasses import dataclass
 from stlc.compile.backends.c.plan import Plan
 
 LONG = 4_000
-"""Characters from which on a function ends with the block that it has."""
+"""Length in characters from which a part is closed after its current block."""
 
 _NAME = re.compile(r"\bg?b\d+\b")
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A function that is written in parts.
+    """Function that is split into parts.
 
     Attributes:
         name: of the function; its parts are numbered.
         formals: C declarations of its arguments.
-        locals: statements that every part begins with.
+        locals: statements at the start of every part.
     """
 
     name: str
@@ -30,12 +30,12 @@ class Frame:
 
 
 def in_parts(frame: Frame, blocks: Sequence[Sequence[str]], buffers: Mapping[str, str]) -> list[str]:
-    """The function that runs all blocks, and its parts before it.
+    """Return the parts, then the function that calls them.
 
     Args:
-        frame: of the function.
-        blocks: statements that stay together.
-        buffers: C name of a buffer -> its declaration; those that a part reads or writes are declared in it.
+        frame: name, arguments and local statements.
+        blocks: groups of statements that stay together.
+        buffers: C name of a buffer -> its declaration, written into the parts that use it.
     """
     lines, calls = [], []
     names = [formal.rpartition(" ")[2] for formal in frame.formals]
@@ -62,7 +62,7 @@ def _parts(blocks: Sequence[Sequence[str]]) -> Iterator[list[str]]:
 
 
 def declared(plan: Plan, *, room: str = "room", prefix: str = "") -> dict[str, str]:
-    """The buffers of a plan, as C names with their declarations."""
+    """Return C name -> declaration for the buffers of a plan."""
     return {
         f"{prefix}{buffer.name}": f"double (*restrict {prefix}{buffer.name})[LANES] ="
         f" (double (*)[LANES])({room} + {buffer.place} * LANES);"

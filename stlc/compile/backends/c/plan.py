@@ -1,7 +1,7 @@
-"""Formulas of the IR -> a schedule of steps with buffers, which becomes C forwards and backwards.
+"""Schedule of formulas with buffers, from which the forward and adjoint C code is printed.
 
-`freeze` is a loop over its instants; what does not read a frozen value is computed outside of it. Operands
-and requirements of equal shape are a loop over a table (`families`). Functions of columns are computed once.
+`freeze` is a loop over its instants; sub-formulas without frozen values are hoisted out of it. Operands and
+requirements of equal shape are a loop over a table (`families`). Functions of columns are computed once.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ CallKey: TypeAlias = tuple[str, tuple[ir.Signal, ...]]
 
 @dataclass(frozen=True, slots=True)
 class Buffer:
-    """The values of a sub-formula at consecutive instants, `LANES` trajectories each.
+    """Buffer for the values of a sub-formula at consecutive instants, `LANES` trajectories each.
 
     Attributes:
         name: of the C array.
-        origin: the instant of its first row.
-        rows: instants that there is room for.
-        place: doubles per lane that stand before it in the room.
+        origin: instant of the first row.
+        rows: number of instants.
+        place: offset in the working memory, in doubles per lane.
     """
 
     name: str
@@ -53,14 +53,14 @@ class Buffer:
     place: int
 
     def __getitem__(self, instant: Instant | str) -> str:
-        """C expression of the value at an instant, of lane `j`."""
+        """Return the C expression of the value at an instant, of lane `j`."""
         offset = f" - {self.origin}" if self.origin > 0 else f" + {-self.origin}" if self.origin else ""
         return f"{self.name}[{instant}{offset}][j]"
 
 
 @dataclass(frozen=True, slots=True)
 class Called:
-    """A step that gives all components of a function of columns, at all samples, numbered in turn."""
+    """Step that computes all components of a function of columns at all samples, numbered consecutively."""
 
     function: ir.Extern
 
@@ -74,11 +74,11 @@ class Called:
 
 @dataclass(frozen=True, slots=True)
 class Tabled:
-    """A step whose inside is run for every row of a table.
+    """Step whose inner steps run for every row of a table.
 
     Attributes:
-        table: what differs from row to row.
-        pick: the extremum of all rows is the value, instant by instant; None: the first value of each row.
+        table: parameters of each row.
+        pick: extremum over the rows at each instant; None: the first value of each row is kept.
     """
 
     table: Table
@@ -87,7 +87,7 @@ class Tabled:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where one value stands: a row of a buffer."""
+    """Location of one value: a row of a buffer."""
 
     buffer: Buffer
     row: int
@@ -95,14 +95,14 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A schedule, and where the values of its steps stand.
+    """Schedule with the buffers of its steps.
 
     Attributes:
-        schedule: the steps; its roots are formulas at the first sample.
-        roots: where the robustness of each formula stands.
-        buffers: by number of the step, all of them.
-        size: doubles that they take per lane.
-        calls: functions of columns that are computed once -> number of the first component.
+        schedule: steps; its roots are formulas at the first sample.
+        roots: location of each formula's robustness.
+        buffers: by step number.
+        size: working memory in doubles per lane.
+        calls: function call on columns -> step number of its first component.
     """
 
     schedule: Schedule
@@ -113,12 +113,12 @@ class Plan:
 
     @property
     def samples(self) -> int:
-        """Of a trajectory, T + 1."""
+        """Samples of a trajectory, T + 1."""
         return self.schedule.domain.samples
 
 
 def plan_of(formulas: Sequence[ir.Formula], samples: int) -> Plan:
-    """The steps that give formulas at the first sample.
+    """Return the plan that evaluates formulas at the first sample.
 
     Raises:
         Untranslatable: a window leaves the trajectory.
@@ -133,7 +133,7 @@ def plan_of(formulas: Sequence[ir.Formula], samples: int) -> Plan:
 
 @dataclass(slots=True)
 class _Scope(Scope):
-    """Everything, the inside of one `freeze`, or that of the loop over a table."""
+    """Scope of steps: the whole plan, the body of a `freeze`, or the body of a loop over a table."""
 
     read: frozenset[str] = frozenset()
     table: bool = False
@@ -154,7 +154,7 @@ class _Planner(Scheduler):
         self._loops = 0
 
     def place(self, node: ir.Formula, run: IndexRange) -> int | None:
-        """The number of a formula, computed outside of the loops on which it does not depend."""
+        """Return the step number of a formula, hoisted out of loops on which it does not depend."""
         node = _split(node)
         depth = self._depth(node)
         around = self.scopes[depth + 1 :]
@@ -165,7 +165,7 @@ class _Planner(Scheduler):
             return self.place(node, run.settled if frozen else run)
 
     def number(self, run: IndexRange) -> int:
-        """The next number, and a buffer for it."""
+        """Return the next step number and allocate its buffer."""
         buffer = Buffer(f"b{len(self.buffers)}", earliest(run.start), run.count, self.size)
         self.buffers.append(buffer)
         self.size += buffer.rows
@@ -174,7 +174,7 @@ class _Planner(Scheduler):
 
     @contextmanager
     def _inside(self, scopes: list[_Scope]) -> Iterator[_Scope]:
-        """Other scopes for a while."""
+        """Context in which steps go to other scopes."""
         before = self.scopes
         self.scopes, self.scope = scopes, scopes[-1]
         try:
@@ -183,14 +183,14 @@ class _Planner(Scheduler):
             self.scopes, self.scope = before, before[-1]
 
     def _depth(self, formula: ir.Formula) -> int:
-        """How many of the loops around a formula it depends on."""
+        """Depth of the innermost enclosing loop on which a formula depends."""
         if len(self.scopes) == 1:
             return 0
         read = _frozen_names(formula)
         return max((depth for depth, scope in enumerate(self.scopes) if read & scope.read), default=0)
 
     def scheduled(self, node: ir.Formula, run: IndexRange) -> int:
-        """A new step; what would leave the plan is refused."""
+        """Add a step. Raises Untranslatable where it needs samples outside of the plan."""
         match node:
             case ir.Predicate(num):
                 self._check(num, run)
@@ -208,7 +208,7 @@ class _Planner(Scheduler):
         return super().scheduled(node, run)
 
     def roots(self, formulas: Sequence[ir.Formula]) -> list[tuple[int, int]]:
-        """Number and row of formulas at the first sample; those of equal shape stand side by side."""
+        """Return step number and row of formulas at the first sample; a family has consecutive rows."""
         places: dict[int, tuple[int, int]] = {}
         for family in self._families(list(map(_split, formulas))):
             number = self._tabled(family, _FIRST, None)
@@ -224,7 +224,7 @@ class _Planner(Scheduler):
         return number
 
     def _join(self, node: ir.BoolOp, pick: Pick, items: Sequence[ir.Formula], run: IndexRange) -> int:
-        """The extremum of formulas, those of equal shape first made one."""
+        """Add the extremum of formulas, with each family as one operand."""
         found = self._families(items)
         loops = {family.members[0]: family for family in found}
         taken = {member for family in found for member in family.members[1:]}
@@ -262,7 +262,7 @@ class _Planner(Scheduler):
         return self.add(Step(node, run, (), loop, number))
 
     def _check(self, num: ir.Num, run: IndexRange) -> None:
-        """Refuse what reads beyond the plan; see to the functions that a number calls."""
+        """Schedule the calls of a number. Raises Untranslatable for samples outside of the plan."""
         past, future = reach_of(num)
         if earliest(run.start) < past or latest(run.last) + future >= self.domain.samples:
             raise Untranslatable("a sample outside of the plan")
@@ -280,7 +280,7 @@ class _Planner(Scheduler):
 
 
 def call_of(num: ir.Num) -> CallKey | None:
-    """Under which key a number is a call whose components are computed once, at all samples."""
+    """Key of a function call on columns, which is computed once at all samples; None for other numbers."""
     if not isinstance(num, ir.Extern) or not isinstance(num.function, ir.Body):
         return None
     leaves = [arg for arg in num.args if isinstance(arg, (ir.Signal, ir.ShiftedSignal))]
@@ -294,7 +294,7 @@ def _moved(leaf: ir.Signal | ir.ShiftedSignal) -> tuple[int, bool]:
 
 
 def _frozen_names(formula: ir.Formula) -> frozenset[str]:
-    """The frozen values that a formula reads and does not bind, and its columns."""
+    """Free frozen values and columns of a formula."""
     match formula:
         case ir.Predicate(num):
             return frozen_in(num) | columns_of(num)
@@ -306,11 +306,11 @@ def _frozen_names(formula: ir.Formula) -> frozenset[str]:
 
 
 LARGE = 64
-"""Nodes of a number from which on its extrema are computed apart: compilers take long over long loops."""
+"""Size in nodes from which the operands of an extremum are separate steps, to limit compile time."""
 
 
 def _split(formula: ir.Formula) -> ir.Formula:
-    """A predicate over the extremum of large numbers as a formula over predicates; anything else as it is."""
+    """Rewrite a predicate over a large extremum as a formula over predicates; others are unchanged."""
     if not isinstance(formula, ir.Predicate) or formula.guard or not isinstance(formula.num, ir.Op):
         return formula
     if not _large(formula.num):
@@ -328,7 +328,7 @@ def _split(formula: ir.Formula) -> ir.Formula:
 
 
 def _raised(num: ir.Op) -> ir.Op:
-    """An extremum plus or minus a number as the extremum of sums: bit for bit, since rounding is monotone."""
+    """Distribute a sum over an extremum, bit for bit the same, since rounding is monotone."""
     if num.name not in ("add", "sub") or len(num.args) != 2:
         return num
     for i, part in enumerate(num.args):
@@ -347,7 +347,7 @@ def _raised(num: ir.Op) -> ir.Op:
 
 
 def _operands(op: str, items: Sequence[ir.Formula]) -> list[ir.Formula]:
-    """The operands of a join, those of joins of the same kind among them."""
+    """Operands of an `and` or `or`, with nested ones of the same kind flattened."""
     found: list[ir.Formula] = []
     for item in map(_split, items):
         found += _operands(op, item.items) if isinstance(item, ir.BoolOp) and item.op == op else [item]

@@ -1,8 +1,8 @@
-"""The steps of a schedule as C, forwards and backwards, over columns that a rollout has filled.
+"""C code of a schedule's steps, forward and adjoint, over columns filled by a rollout.
 
-The innermost loop runs over trajectories, so every line of it becomes vector code. `gb7` holds the gradient
-by the buffer `b7`, and `gx` that by the columns. Of equal minima and maxima the first gets the gradient. What
-stands in a loop is computed anew on the way back, and only for the turns that matter.
+The innermost loop runs over trajectories and is vectorized. `gb7` is the gradient with respect to buffer
+`b7`, `gx` that with respect to the columns. The first of equal extrema gets the gradient. Loop bodies are
+recomputed in the adjoint, only for iterations with a nonzero gradient.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from stlc.compile.schedule.schedule import PICKS, IndexRange, Loop, Pick, Step, 
 _MACRO: Mapping[Pick, Macro] = {"min": "MIN", "max": "MAX"}
 
 Frozen = Mapping[str, Buffer]
-"""Frozen values -> where they stand."""
+"""Name of a frozen value -> its buffer."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """Where the leaves of a number stand at sample `k`, in lane `j`.
+    """C expressions of a number's leaves at sample `k`, in lane `j`.
 
     Attributes:
-        plan: what is computed.
-        index: place of each state among the columns.
+        plan: the plan.
+        index: index of each state among the columns.
         held: buffers of the frozen values.
-        indices: C names of samples within the plan -> what they are; they do not depend on the lane.
+        indices: C name of a clamped sample index -> its C expression; independent of the lane.
     """
 
     plan: Plan
@@ -43,7 +43,7 @@ class Sight:
     indices: dict[str, str] = field(default_factory=dict)
 
     def __call__(self, leaf: Leaf) -> str | None:
-        """C expression of a leaf; None for a function that is to be written out."""
+        """Return the C expression of a leaf; None for a function that must be inlined."""
         match leaf:
             case ir.Signal(name):
                 return column(self.index, name, "k")
@@ -66,7 +66,7 @@ class Sight:
         return self._index(leaf.steps, clamped=leaf.clamped)
 
     def _index(self, steps: int, *, clamped: bool) -> str:
-        """So many samples from here; a clamped one stays within the plan."""
+        """Index of the sample `steps` later; a clamped one stays within the plan."""
         index, last = f"k + ({steps})", self.plan.samples - 1
         if not clamped:
             return index
@@ -75,32 +75,32 @@ class Sight:
         return name
 
     def head(self, run: IndexRange) -> str:
-        """The head of a loop over samples, and the indices that are read in it."""
+        """Head of a loop over samples, with declarations of the indices used in it."""
         return " ".join([f"{loop(run)} {{", self.heads()])
 
     def heads(self) -> str:
-        """The indices."""
+        """Declarations of the clamped indices."""
         return " ".join(f"const int {name} = {value};" for name, value in self.indices.items())
 
 
 @dataclass(frozen=True, slots=True)
 class StepPrinter:
-    """Writes steps.
+    """Printer of steps.
 
     Attributes:
-        plan: that they belong to.
-        index: place of each state among the columns.
+        plan: that the steps belong to.
+        index: index of each state among the columns.
     """
 
     plan: Plan
     index: Mapping[str, int]
 
     def forward(self, steps: Sequence[Step], held: Frozen) -> list[str]:
-        """Statements that fill the buffers of all steps."""
+        """Return statements that fill the buffers of all steps."""
         return [line for step in steps for line in self._forward(step, held)]
 
     def backward(self, steps: Sequence[Step], held: Frozen) -> list[str]:
-        """Statements that take the gradient back through all steps."""
+        """Return statements that propagate the gradient back through all steps."""
         return [line for step in reversed(steps) for line in self._backward(step, held)]
 
     def _forward(self, step: Step, held: Frozen) -> list[str]:
@@ -111,7 +111,7 @@ class StepPrinter:
             case ir.Predicate():
                 return self._margin(step, step.node, held)
             case ir.BoolOp(op):
-                # one operand a statement: a macro in itself doubles its text each time
+                # one operand per statement: nested macros double in length
                 pick = _MACRO[PICKS[op]]
                 rest = " ".join(f"most = {pick}(most, {item['k']});" for item in args[1:])
                 return [f"{loop(run)} LANE {{ double most = {args[0]['k']}; {rest} {out['k']} = most; }}"]
@@ -236,7 +236,7 @@ class StepPrinter:
         ]
 
     def _frozen_inside(self, step: Step, held: Frozen) -> list[str]:
-        """One turn of the loop: values are frozen, and the steps follow."""
+        """Statements of one iteration: bind the frozen values, then run the steps."""
         inner, lines = _loop_of(step), []
         for number, (_, num) in zip(inner.bound, step.node.bindings, strict=True):
             sight = Sight(self.plan, self.index, held)
@@ -271,12 +271,12 @@ class StepPrinter:
         ]
 
     def _blank(self, step: Step) -> list[str]:
-        """The gradients of what is computed anew in each turn, set to nothing."""
+        """Statements that zero the gradients of buffers that each iteration recomputes."""
         own = (self.plan.buffers[number] for number in _loop_of(step).own)
         return [f"memset(g{each.name}, 0, sizeof(double) * {each.rows} * LANES);" for each in own]
 
     def _table_head(self, step: Step, node: Tabled) -> list[str]:
-        """The table, and the head of the loop over its rows; two braces end it."""
+        """The table and the head of the loop over its rows, closed by two braces."""
         table, row = node.table, _loop_of(step).index
         places = {name: [self.index[state] for state in states] for name, states in table.columns.items()}
         return [
@@ -289,7 +289,7 @@ class StepPrinter:
         ]
 
     def _gathered(self, step: Step, node: Tabled) -> list[str]:
-        """What a row of a table gives, added to what the earlier ones gave."""
+        """Accumulate the value of a table row into the step's buffer."""
         out, row, body = self._out(step), _loop_of(step).index, self.plan.buffers[_loop_of(step).root]
         if node.pick is None:
             return [f"LANE {out[row]} = {body[0]};"]
@@ -300,7 +300,7 @@ class StepPrinter:
         ]
 
     def _tabled_back(self, step: Step, node: Tabled, held: Frozen) -> list[str]:
-        """Row by row: computed anew, and taken back where a lane has its value from there."""
+        """Adjoint of a table, row by row: recompute, propagate for lanes whose extremum the row attains."""
         inner, out = _loop_of(step), self._out(step)
         root = self.plan.buffers[inner.root]
         seeds = f"{loop(step.run)} LANE" if node.pick else "LANE"
@@ -330,7 +330,7 @@ def _loop_of(step: Step) -> Loop:
 
 
 def _turns(step: Step) -> str:
-    """The head of the loop over the instants of a `freeze`."""
+    """Head of the loop over the instants of a `freeze`."""
     index, run = _loop_of(step).index, step.run
     return f"for (int {index} = {run.start}; {index} <= {run.last}; ++{index}) {{"
 
@@ -350,14 +350,14 @@ def _joined_back(out: Buffer, run: IndexRange, args: Sequence[Buffer]) -> list[s
 
 
 def _fixed(num: ir.Num) -> bool:
-    """Whether a number follows from the first sample and the count of samples: no plan changes it."""
+    """True if a number depends only on the first sample and the sample count, so that its gradient is 0."""
     return any(isinstance(leaf, ir.Signal) and leaf.name == ir.ELAPSED for leaf in leaves(num))
 
 
 def _pulled(num: ir.Num, seed: str, sight: Sight) -> list[str]:
-    """Gradient by a number at sample `k`, taken to its leaves.
+    """Statements that propagate the gradient of a number at sample `k` to its leaves.
 
-    Two leaves may be the same sample: added apart from the loop that computes, which becomes vector code so.
+    Leaves may alias one sample: they are accumulated apart from the computing loop, which is vectorized.
     """
     writer = SlopeWriter(sight, soft=False)
     lines, gathered = writer.backward({writer.number(num): seed})
@@ -374,7 +374,7 @@ def _pulled(num: ir.Num, seed: str, sight: Sight) -> list[str]:
 
 
 def column(index: Mapping[str, int], name: str, k: str) -> str:
-    """C expression of a state at a sample, of lane `j`; the state may be an entry of a table."""
+    """Return the C expression of a state at a sample, of lane `j`; the state may be a table entry."""
     if name == ir.ELAPSED:
         return f"(double)({k})"
     where = name.removeprefix(LISTED) if name.startswith(LISTED) else index[name]
@@ -382,12 +382,12 @@ def column(index: Mapping[str, int], name: str, k: str) -> str:
 
 
 def columns(index: Mapping[str, int]) -> Callable[[Leaf], str | None]:
-    """Where columns stand at sample `k`; what else there may be is written out."""
+    """Return the C expressions of columns at sample `k`; None for other leaves, which are inlined."""
     return lambda leaf: column(index, leaf.name, "k") if isinstance(leaf, ir.Signal) else None
 
 
 def _listed(kind: str, row: str, entries: Mapping[str, Iterable[str]]) -> list[str]:
-    """The entries of one type as an array, a row a line."""
+    """Table entries of one type as a C array, one row per line."""
     if not entries:
         return []
     rows = [f"{{{', '.join(each)}}}," for each in zip(*entries.values(), strict=True)]

@@ -1,7 +1,7 @@
-"""Derivatives of numbers as C statements: reverse mode over the registers that a `NumberWriter` has filled.
+"""Derivatives of numbers as C statements: reverse mode over the registers of a `NumberWriter`.
 
-Derivatives are those of `ops_torch`, at ties and kinks too. Conditions step hard and have the slope of
-`(1 + tanh(slope margin)) / 2`, as `switch.StraightThrough` has it.
+Derivatives equal those of `backends.torch.ops`, at ties and kinks too. Conditions are 0 or 1, with the slope
+of `(1 + tanh(slope margin)) / 2`, as in `switch.StraightThrough`.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 
 Slope = tuple[str, str]
-"""A register, and the derivative by it."""
+"""Register, and the C expression of the derivative with respect to it."""
 
 FLAT = "0.0"
 """The derivative of a step function."""
 LESS = {"min": "<", "max": ">"}
-"""Of which operand an extremum is."""
+"""Extremum -> comparison that selects an operand."""
 
 
 class SlopeWriter(NumberWriter):
-    """Writes numbers, and remembers how each register changes with those before it.
+    """Number writer that records the partial derivatives of each register.
 
     Args:
-        place: C expression of where a leaf stands.
-        soft: whether conditions have a slope; where not, only the branch that is taken counts.
+        place: C expression of a leaf.
+        soft: whether conditions have a slope; otherwise only the taken branch has a gradient.
     """
 
     def __init__(self, place: Callable[[Leaf], str | None], *, soft: bool) -> None:
@@ -38,14 +38,14 @@ class SlopeWriter(NumberWriter):
         self._constants: set[str] = set()
 
     def backward(self, seeds: Mapping[str, str]) -> tuple[list[str], dict[str, str]]:
-        """Statements that take a gradient back to columns.
+        """Return statements that propagate gradients from registers to columns.
 
         Args:
-            seeds: register -> C expression of the derivative of the outcome by it.
+            seeds: register -> C expression of the derivative of the output with respect to it.
 
         Returns:
-            The statements, and what they give: place where the derivative by a leaf is gathered (that by
-            `x[…]` in `gx[…]`) -> register.
+            The statements, and accumulator of a leaf's derivative (`gx[…]` for `x[…]`) -> register that
+            holds it.
         """
         registers = list(self._texts.values())
         lines = [f"double d{name} = {seeds.get(name, '0.0')};" for name in registers]
@@ -55,7 +55,7 @@ class SlopeWriter(NumberWriter):
         return lines, gathered
 
     def margin(self, cond: ir.Formula) -> str:
-        """The exact robustness of a state formula."""
+        """Write the exact robustness of a state formula; return its C name."""
         match cond:
             case ir.Predicate(num, sign):
                 value = self.number(num)
@@ -107,7 +107,7 @@ class SlopeWriter(NumberWriter):
         return register
 
     def _shares(self, name: str, first: str, second: str) -> tuple[str, str]:
-        """The derivatives of an extremum by its operands: equal ones share it, a constant has none of it."""
+        """Derivatives of an extremum by its operands: equal operands share it, constants are left out."""
         sign = LESS[name]
         if not self._varies(second):
             return f"(double)!({second} {sign} {first})", "0.0"
@@ -117,11 +117,11 @@ class SlopeWriter(NumberWriter):
         return f"(({first} {sign} {second}) + {equal})", f"(({second} {sign} {first}) + {equal})"
 
     def _varies(self, operand: str) -> bool:
-        """Whether an operand depends on a column: literals and functions of literals do not."""
+        """True if an operand depends on a column; literals and functions of literals do not."""
         return operand in self._texts.values() and operand not in self._constants
 
     def _clipped(self, x: str, low: str, high: str) -> list[Slope]:
-        """The derivatives of `min(max(x, low), high)`."""
+        """Derivatives of `min(max(x, low), high)`."""
         raised = super()._apply("max", [x, low])
         of_x, of_low = self._shares("max", x, low)
         of_raised, of_high = self._shares("min", raised, high)

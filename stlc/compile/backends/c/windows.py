@@ -1,7 +1,7 @@
-"""Extrema over windows and `until` as C, forwards and backwards.
+"""C code of window extrema and `until`, forward and adjoint.
 
-Backwards, the gradient of a value goes to the operand that gave it; of equal ones one gets it. `g` before the
-name of a buffer is that of its gradient. Windows that all end with the trace, or begin with it, are one pass.
+In the adjoint the gradient of a value goes to the operand that attains it, to one of equal ones. The prefix
+`g` names the gradient of a buffer. Windows that all end or all begin with the trace are one recursive pass.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ _LESS: Mapping[Macro, str] = {"MIN": "<", "MAX": ">"}
 
 @dataclass(frozen=True, slots=True)
 class WindowStep:
-    """Extrema over windows of one operand; of two, `until` for MAX and `release` for MIN.
+    """Window extremum of one operand; of two operands `until` for MAX and `release` for MIN.
 
     Attributes:
         out: buffer of the values.
-        run: their instants.
-        pick: the extremum.
-        window: from each instant.
-        back: the window lies in the past: `since` and `trigger`.
+        run: instants of the values.
+        pick: MAX or MIN.
+        window: relative to each instant.
+        back: past window (`since` and `trigger`).
         args: buffers of the operands.
-        last: the last sample.
+        last: index of the last sample.
     """
 
     out: Buffer
@@ -45,22 +45,22 @@ class WindowStep:
 
     @property
     def passes(self) -> bool:
-        """Whether every value follows from its neighbour."""
+        """True if each value follows from its neighbour by a recursion."""
         return self.window.hi is None and not self.run.single
 
 
 def windowed(step: WindowStep) -> list[str]:
-    """Statements that give the values."""
+    """Return statements that compute the values."""
     return _extremum(step) if len(step.args) == 1 else _meeting(step)
 
 
 def windowed_back(step: WindowStep) -> list[str]:
-    """Statements that take the gradient by the values to what they came from."""
+    """Return statements that propagate the gradient of the values to the operands."""
     return _extremum_back(step) if len(step.args) == 1 else _meeting_back(step)
 
 
 def loop(run: IndexRange, *, back: bool = False) -> str:
-    """The head of a loop over instants `k`."""
+    """Return the head of a loop over instants `k`."""
     if back:
         return f"for (int k = {run.last}; k >= {run.start}; --k)"
     return f"for (int k = {run.start}; k <= {run.last}; ++k)"
@@ -80,7 +80,7 @@ def _extremum(step: WindowStep) -> list[str]:
 
 
 def _scan(step: WindowStep) -> list[str]:
-    """The value at `k` from all samples of its window."""
+    """Value at `k` by a loop over its window."""
     out, body, pick = step.out["k"], step.args[0], step.pick
     first, stop = _ends(step)
     return [
@@ -90,7 +90,7 @@ def _scan(step: WindowStep) -> list[str]:
 
 
 def _pass(step: WindowStep) -> list[str]:
-    """Every value from its neighbour."""
+    """Values by recursion from the neighbour."""
     out, pick, lo = step.out, step.pick, step.window.lo
     there, before = (f"k - {lo}", "k - 1") if step.back else (f"k + {lo}", "k + 1")
     value = f"{pick}({out[before]}, {step.args[0][there]})"
@@ -178,7 +178,7 @@ def _meeting_back(step: WindowStep) -> list[str]:
 
 
 def _meeting_scan_back(step: WindowStep) -> list[str]:
-    """The first instant that gives the value: there the right side, or the worst of the left one so far."""
+    """Gradient at the first instant that attains the value: to its right or to the worst left side so far."""
     out, left, right, less = step.out["k"], step.args[0], step.args[1], _LESS[_DUAL[step.pick]]
     near, far = _outwards(step)
     worse = f"if ({left['i']} {less} {left['worst']}) worst = i;"
@@ -218,7 +218,7 @@ def _meeting_pass_back(step: WindowStep) -> list[str]:
 
 
 def _ends(step: WindowStep) -> tuple[str, str]:
-    """First and last sample of the window of `k`."""
+    """C expressions of the first and last sample of the window of `k`."""
     lo, hi = step.window.lo, step.window.hi
     if step.back:
         return "0" if hi is None else f"LATER(k - {hi}, 0)", f"k - {lo}"
@@ -226,7 +226,7 @@ def _ends(step: WindowStep) -> tuple[str, str]:
 
 
 def _outwards(step: WindowStep) -> tuple[str, str]:
-    """Heads of loops from `k` to where the window begins, and on to its other end."""
+    """Loop heads from `k` to the near end of the window, and on to its far end."""
     first, stop = _ends(step)
     if step.back:
         return f"for (int i = k; i > LATER({stop}, -1); --i)", f"for (int i = {stop}; i >= {first}; --i)"
@@ -234,7 +234,7 @@ def _outwards(step: WindowStep) -> tuple[str, str]:
 
 
 def _begun(step: WindowStep, lines: list[str], *, reverse: bool = False) -> list[str]:
-    """The head of a pass, and what it begins with; `reverse`: in the other direction."""
+    """Head of a recursive pass with its initial statements; `reverse`: in the opposite direction."""
     run = step.run
     begin = run.start if step.back else run.last
     head = loop(run, back=not step.back if not reverse else step.back)

@@ -1,1 +1,1 @@
-"""ONNX graphs of what is computed."""
+"""ONNX back end: the computation as a graph."""

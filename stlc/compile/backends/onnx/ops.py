@@ -1,8 +1,7 @@
-"""The array namespace over the values of a sheet: what is computed becomes an ONNX graph.
+"""Array namespace over symbolic values: operations are recorded as an ONNX graph.
 
-It holds what exact switching and exact robustness ask for; gradients and smooth extrema have no use there.
-Numbers are float64 throughout. Where the runtime has a function for float32 alone (`atan`) one step of
-Newton's method makes it exact.
+It supports exact switching and exact robustness; gradients and smooth extrema are not needed. Numbers are
+float64. Where the runtime has a function in float32 only (`atan`), one Newton step gives full precision.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ Number: TypeAlias = Value | float
 
 @final
 class OnnxOps:
-    """`stlc.compile.backends.array.namespace.Ops` over symbolic values. Extrema keep NaN, as elsewhere."""
+    """`stlc.compile.backends.array.namespace.Ops` over symbolic values. Extrema propagate NaN."""
 
     name = "onnx"
 
@@ -71,7 +70,7 @@ class OnnxOps:
         return self.where(other, rest + divisor, rest)
 
     def abs(self, x: Value) -> Value:
-        """Size."""
+        """Absolute value."""
         return x.apply("Abs")
 
     def sign(self, x: Value) -> Value:
@@ -79,15 +78,15 @@ class OnnxOps:
         return x.apply("Sign")
 
     def floor(self, x: Value) -> Value:
-        """The next whole number below."""
+        """Largest integer at most `x`."""
         return x.apply("Floor")
 
     def ceil(self, x: Value) -> Value:
-        """The next whole number above."""
+        """Smallest integer at least `x`."""
         return x.apply("Ceil")
 
     def round(self, x: Value) -> Value:
-        """The nearest whole number, halves to the even one."""
+        """Nearest integer, halves to even."""
         return x.apply("Round")
 
     def sqrt(self, x: Value) -> Value:
@@ -126,19 +125,19 @@ class OnnxOps:
         return x.apply("Sin") / x.apply("Cos")
 
     def atan(self, x: Value) -> Value:
-        """The angle of a slope."""
+        """Arc tangent."""
         return self.atan2(x, 1.0)
 
     def asin(self, x: Value) -> Value:
-        """The angle of a sine; NaN beyond 1."""
+        """Arc sine; NaN outside [-1, 1]."""
         return self.atan2(x, ((1.0 - x) * (1.0 + x)).apply("Sqrt"))
 
     def acos(self, x: Value) -> Value:
-        """The angle of a cosine; NaN beyond 1."""
+        """Arc cosine; NaN outside [-1, 1]."""
         return self.atan2(((1.0 - x) * (1.0 + x)).apply("Sqrt"), x)
 
     def atan2(self, a: Number, b: Number) -> Value:
-        """Angle of the point (b, a), from the slope of the flatter of its two coordinates."""
+        """Angle of the point (b, a), from the arc tangent of the smaller coordinate over the larger."""
         like = _like(a, b)
         y, x = like.beside(a), like.beside(b)
         tall, wide = y.apply("Abs"), x.apply("Abs")
@@ -183,7 +182,7 @@ class OnnxOps:
         return self.where(mask, math.inf, -math.inf)
 
     def clamp(self, x: Value, low: float | None, high: float | None) -> Value:
-        """`x` cut to [low, high]."""
+        """`x` clamped to [low, high]."""
         if low is not None and high is not None:
             return x.apply("Clip", low, high)
         x = x if low is None else x.apply("Max", low)
@@ -192,11 +191,11 @@ class OnnxOps:
     # -------------------------------------------------------------- along time
 
     def minimum(self, a: Number, b: Number) -> Value:
-        """The lesser one."""
+        """Elementwise minimum."""
         return _two("Min", a, b)
 
     def maximum(self, a: Number, b: Number) -> Value:
-        """The greater one."""
+        """Elementwise maximum."""
         return _two("Max", a, b)
 
     def join(self, items: Sequence[Value], pick: Pick) -> Value:
@@ -221,15 +220,15 @@ class OnnxOps:
         return _running(x, "Max")
 
     def extrema(self, x: Value, pick: Pick, window: Sliding) -> None:
-        """Windows are put together from pairs."""
+        """None: windows are computed by pairwise doubling."""
 
     def until(self, left: Value, right: Value, pick: Pick, window: Sliding) -> None:
-        """The same for `until`."""
+        """None: `until` is computed by pairwise doubling."""
 
     # ------------------------------------------------------ constants and shapes
 
     def kind(self, like: Value) -> Hashable:
-        """Floats become constants of the sheet where they are used."""
+        """Constant key: floats become graph constants where they are used."""
         return like.kind
 
     def constant(self, value: float, like: Value) -> float:  # noqa: ARG002
@@ -237,17 +236,17 @@ class OnnxOps:
         return value
 
     def full(self, shape: tuple[int, ...], value: float, like: Value) -> Value:
-        """A constant array, of one trajectory where their number is not known: it broadcasts."""
+        """A constant array; an unknown batch size is 1, which broadcasts."""
         known = like.sheet.constant(value, like.kind)
         return known.spread(*(1 if length == BATCH else length for length in shape))
 
     def counted(self, first: int, count: int, like: Value) -> Value:
-        """Whole numbers along time, of one trajectory where their number is not known."""
+        """Integers along time; an unknown batch size is 1, which broadcasts."""
         numbers = like.sheet.constant([[float(k)] for k in range(first, first + count)], like.kind)
         return numbers.spread(count, *(1 if length == BATCH else length for length in like.shape[1:]))
 
     def cat(self, parts: Sequence[Value]) -> Value:
-        """Joined along axis 0."""
+        """Concatenation along axis 0."""
         widest = max(parts, key=lambda part: part.shape[-1])
         return joined([part.spread(part.shape[0], *widest.shape[1:], like=widest) for part in parts])
 
@@ -256,7 +255,7 @@ class OnnxOps:
         return x[::-1] if x.shape[0] > 1 else x
 
     def quiet(self) -> AbstractContextManager[object]:
-        """Nothing is computed here."""
+        """Empty context: nothing is computed while recording."""
         return nullcontext()
 
 
@@ -275,12 +274,12 @@ def _two(op: str, a: Number, b: Number, *, truth: bool = False) -> Value:
 
 
 def _negative(x: Value) -> Value:
-    """Where a number has a minus, -0 too."""
+    """Mask of the sign bit, set for -0 too."""
     return ONNX_OPS.where(x.apply("Equal", 0.0, kind="bool"), 1.0 / x, x).apply("Less", 0.0, kind="bool")
 
 
 def _flat(slope: Value) -> Value:
-    """The arc tangent of a slope in [0, 1]: that of float32, and one step of Newton's method."""
+    """Arc tangent of a slope in [0, 1]: in float32, then one Newton step."""
     near = slope.cast("float32").apply("Atan").cast(slope.kind)
     if slope.kind == "float32":
         return near
@@ -289,7 +288,7 @@ def _flat(slope: Value) -> Value:
 
 
 def _running(x: Value, op: str) -> Value:
-    """The extremum of everything up to each row, in about log2(rows) operations."""
+    """Running extremum in about log2(rows) operations."""
     size = 1
     while size < x.shape[0]:
         x = joined([x[:size], x[size:].apply(op, x[:-size])])

@@ -1,8 +1,8 @@
-"""A graph that is written down while it is computed: symbolic arrays and the ONNX nodes between them.
+"""Recorder of ONNX graphs: symbolic arrays and the nodes between them.
 
-A `Value` looks like an array to the evaluators: it has a shape, can be cut along time, and takes arithmetic.
-Every operation becomes a node of its sheet, equal ones once. `stlc.export.onnx_file` makes files of sheets;
-nothing here needs a library.
+A `Value` behaves like an array in the evaluators: shape, slicing along time, arithmetic. Each operation
+becomes a node of its sheet; equal ones are shared. `stlc.export.onnx_file` writes sheets to files; this
+module does not import ONNX.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ Kind: TypeAlias = Literal["float64", "float32", "int64", "bool"]
 Attribute: TypeAlias = "int | tuple[int, ...] | Body"
 
 BATCH = 1 << 40
-"""The length of an axis that is known only when the graph is run; only equal ones meet in an operation."""
+"""Axis length known only at run time; all such axes in one operation have the same length."""
 
 WRITTEN_OUT = 600
-"""Nodes up to which a loop is written out: a node with a body costs some microseconds a turn."""
+"""Nodes up to which a loop is unrolled: a `Scan` node costs some microseconds per iteration."""
 
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """One operation of ONNX: names of what goes in and comes out."""
+    """ONNX operation, with the names of its inputs and outputs."""
 
     op: str
     inputs: tuple[str, ...]
@@ -36,18 +36,18 @@ class Node:
 
     @property
     def reads(self) -> frozenset[str]:
-        """Everything that has to be there before it, what its body reads of the graph around too."""
+        """Names that the node depends on, including those of the outer graph that its body reads."""
         bodies = (value for _, value in self.attributes if isinstance(value, Body))
         return frozenset(self.inputs).union(*(body.around for body in bodies))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """A graph inside of a node, which runs it again and again.
+    """Loop body: a graph inside a node.
 
     Attributes:
-        sheet: that it stands on; `sheet.inputs` are what each turn is given.
-        outputs: what each turn gives.
+        sheet: its graph; `sheet.inputs` are the inputs of an iteration.
+        outputs: of an iteration.
     """
 
     sheet: Sheet
@@ -55,12 +55,12 @@ class Body:
 
     @property
     def nodes(self) -> list[Node]:
-        """What is computed in a turn, in order."""
+        """Nodes of an iteration, in order."""
         return self.sheet.needed(self.outputs)
 
     @property
     def around(self) -> frozenset[str]:
-        """Names of the graph around that are read."""
+        """Names of the outer graph that the body reads."""
         nodes = self.nodes
         read = {name for node in nodes for name in node.reads} | {value.name for value in self.outputs}
         made = {name for node in nodes for name in node.outputs}
@@ -71,13 +71,13 @@ class Body:
 
 @dataclass(slots=True)
 class Sheet:
-    """A graph.
+    """ONNX graph under construction.
 
     Attributes:
         nodes: in order.
         constants: name -> array.
-        inputs: what is given when the graph is run.
-        prefix: how its names begin; a body has another one than the graph around.
+        inputs: of the graph.
+        prefix: of its names, distinct for a body and its outer graph.
     """
 
     nodes: list[Node] = field(default_factory=list)
@@ -87,12 +87,12 @@ class Sheet:
     _known: dict[tuple[object, ...], tuple[Value, ...]] = field(default_factory=dict)
 
     def input(self, name: str, shape: tuple[int, ...], kind: Kind = "float64") -> Value:
-        """Something that is given."""
+        """Add an input."""
         self.inputs.append(Value(self, name, shape, kind))
         return self.inputs[-1]
 
     def constant(self, value: object, kind: Kind = "float64") -> Value:
-        """A constant of any shape; equal ones are one."""
+        """Return a constant of any shape; equal ones are shared."""
         array = np.asarray(value, dtype=kind)
         key = ("constant", kind, array.shape, array.tobytes())
         if key not in self._known:
@@ -109,7 +109,7 @@ class Sheet:
         kind: Kind,
         attributes: Mapping[str, Attribute] | None = None,
     ) -> tuple[Value, ...]:
-        """The outputs of a node, one a shape."""
+        """Add a node or reuse an equal one; return its outputs, one per shape."""
         facts = tuple(sorted((attributes or {}).items()))
         names = tuple(value.name for value in inputs)
         key = (op, names, facts, len(shapes))
@@ -123,16 +123,16 @@ class Sheet:
         return self._known[key]
 
     def repeated(self, carried: Sequence[Value], rows: Sequence[Value], turn: Turn) -> tuple[Value, ...]:
-        """A loop over rows: as one node with a body, or written out where that is short.
+        """Write a loop over rows: unrolled where short, else as a `Scan` node.
 
         Args:
-            carried: what goes from turn to turn, as it is at first.
-            rows: (count, …) each; every turn is given its own row (1, …) of each.
-            turn: the sheet that it is to be written on, carried values and rows -> carried values of the same
-                shapes, and what is kept, (1, …) each. `Value.on` brings there what stands around.
+            carried: initial values of the loop state.
+            rows: (count, …) each; an iteration gets one row (1, …) of each.
+            turn: loop body: sheet to write to, state and rows -> state of the same shapes, and outputs,
+                (1, …) each. `Value.on` imports values of the outer graph.
 
         Returns:
-            What is kept, (count, …) each.
+            Outputs of all iterations, (count, …) each.
         """
         inner, count = Sheet(prefix=f"{self.prefix}s{len(self.nodes)}."), rows[0].shape[0]
         now = [inner.input(f"{inner.prefix}i{i}", each.shape, each.kind) for i, each in enumerate(carried)]
@@ -154,7 +154,7 @@ class Sheet:
         return tuple(joined(each) for each in zip(*history, strict=True))
 
     def needed(self, outputs: Sequence[Value]) -> list[Node]:
-        """The nodes that outputs depend on, in order."""
+        """Return the nodes that outputs depend on, in order."""
         wanted, kept = {value.name for value in outputs}, []
         for node in reversed(self.nodes):
             if wanted & set(node.outputs):
@@ -165,13 +165,13 @@ class Sheet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Value:
-    """A symbolic array.
+    """Symbolic array.
 
     Attributes:
-        sheet: that it stands on.
-        name: its name there.
+        sheet: graph that it belongs to.
+        name: in the graph.
         shape: `BATCH` where a length is not known.
-        kind: of its numbers.
+        kind: element type.
     """
 
     sheet: Sheet
@@ -180,7 +180,7 @@ class Value:
     kind: Kind
 
     def on(self, sheet: Sheet) -> Value:
-        """The same value as the sheet of a loop reads it."""
+        """Return the value as an input to the sheet of a loop body."""
         return Value(sheet, self.name, self.shape, self.kind)
 
     # ----------------------------------------------------------------- arithmetic
@@ -213,21 +213,21 @@ class Value:
         return self.apply("Neg")
 
     def beside(self, other: Value | float) -> Value:
-        """A number as a constant of the same kind; a value as it is."""
+        """Return a number as a constant of the same kind; a value is returned unchanged."""
         return other if isinstance(other, Value) else self.sheet.constant(other, self.kind)
 
     def apply(self, op: str, *others: Value | float, kind: Kind | None = None) -> Value:
-        """An operation element by element; shapes broadcast as in NumPy."""
+        """Apply an elementwise operation; shapes broadcast as in NumPy."""
         parts = [self.beside(other) for other in others]
         (out,) = self.sheet.emit(op, (self, *parts), [self.broadcast(*parts)], kind or self.kind)
         return out
 
     def broadcast(self, *others: Value) -> tuple[int, ...]:
-        """The shape that these have together."""
+        """Broadcast shape."""
         return reduce(_broadcast, (other.shape for other in others), self.shape)
 
     def cast(self, kind: Kind) -> Value:
-        """The same numbers as another kind."""
+        """Convert to another element type."""
         if kind == self.kind:
             return self
         code = {"float32": 1, "int64": 7, "bool": 9, "float64": 11}[kind]
@@ -241,11 +241,11 @@ class Value:
 
     @property
     def ndim(self) -> int:
-        """How many axes there are."""
+        """Number of axes."""
         return len(self.shape)
 
     def __getitem__(self, rows: slice | int) -> Value:
-        """Rows along axis 0; one row alone has an axis less."""
+        """Slice along axis 0; a single index drops the axis."""
         if isinstance(rows, int):
             index = self.sheet.constant(rows % self.shape[0], "int64")
             (out,) = self.sheet.emit("Gather", (self, index), [self.shape[1:]], self.kind, {"axis": 0})
@@ -260,7 +260,7 @@ class Value:
         return out
 
     def rows(self) -> tuple[Value, ...]:
-        """Every row along axis 0, with the axis kept."""
+        """Return each row along axis 0, with the axis kept."""
         count = self.shape[0]
         if count == 1:
             return (self,)
@@ -269,24 +269,24 @@ class Value:
         return self.sheet.emit("Split", (self, sizes), shapes, self.kind, {"axis": 0})
 
     def reshaped(self, *shape: int) -> Value:
-        """The same numbers in another shape, in which at most one length is `BATCH`."""
+        """Reshape; at most one length of the new shape is `BATCH`."""
         wanted = self.sheet.constant([-1 if length == BATCH else length for length in shape], "int64")
         (out,) = self.sheet.emit("Reshape", (self, wanted), [shape], self.kind)
         return out
 
     def transposed(self, *order: int) -> Value:
-        """The axes in another order."""
+        """Permute the axes."""
         shape = tuple(self.shape[axis] for axis in order)
         (out,) = self.sheet.emit("Transpose", (self,), [shape], self.kind, {"perm": order})
         return out
 
     @property
     def T(self) -> Value:  # noqa: N802 - as arrays call it
-        """Two axes exchanged."""
+        """Transpose of two axes."""
         return self.transposed(1, 0)
 
     def spread(self, *shape: int, like: Value | None = None) -> Value:
-        """Repeated along axes of length 1 to a shape, whose `BATCH` is that of the last axis of `like`."""
+        """Expand axes of length 1 to a shape; its `BATCH` is the last axis of `like`."""
         if self.shape == shape:
             return self
         parts = [self.sheet.constant([1 if length == BATCH else length], "int64") for length in shape]
@@ -297,7 +297,7 @@ class Value:
         return out
 
     def count(self) -> Value:
-        """The length of the last axis, (1,) int64."""
+        """Length of the last axis, (1,) int64."""
         (out,) = self.sheet.emit("Shape", (self,), [(1,)], "int64", {"start": self.ndim - 1})
         return out
 
@@ -306,7 +306,7 @@ Turn: TypeAlias = Callable[[Sheet, Sequence[Value], Sequence[Value]], tuple[Sequ
 
 
 def joined(parts: Sequence[Value], axis: int = 0) -> Value:
-    """One behind the other along an axis; the other axes agree."""
+    """Concatenate along an axis; the other axes must agree."""
     if len(parts) == 1:
         return parts[0]
     first = parts[0]

@@ -1,8 +1,8 @@
 """Extrema in torch with cheap subgradients: of several arrays, along time, over sliding windows, and `until`.
 
-Torch's own backward passes spend most of their time on boolean masks. Here a mask is written as numbers, in
-the memory of the gradient that it becomes. Windows come from the C kernel
-(`stlc.compile.backends.array.kernel`), or for a handful of numbers are laid side by side.
+Torch's own backward passes spend most of their time on boolean masks. Here masks are numbers, stored in the
+memory of the resulting gradient. Windows are computed by the C kernel (`stlc.compile.backends.array.kernel`),
+or for small arrays by gathering all windows.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from stlc.compile.backends.array.namespace import Sliding
 from stlc.compile.schedule.schedule import Pick, dual, neutral
 
 _LARGE = 1 << 12
-"""From so many numbers on a gradient of our own is faster."""
+"""Elements from which the custom gradient is faster."""
 
 _LARGE_COLUMN = 1 << 14
 
 _SEVERAL = 4
-"""From so many small operands on stacking them is faster than one operation a pair."""
+"""Small operands from which stacking is faster than pairwise operations."""
 
 _SMALL = 1 << 12
-"""The most numbers of all windows together that are laid side by side."""
+"""Maximum total elements of gathered windows."""
 
 
 class _Choice(torch.autograd.Function):
@@ -77,7 +77,7 @@ class _Reduction(torch.autograd.Function):
 
 
 def choice(items: Sequence[Tensor], pick: Pick) -> Tensor:
-    """The elementwise extremum of one or more arrays."""
+    """Return the elementwise extremum of one or more arrays."""
     first = items[0]
     if len(items) == 1:
         return first
@@ -92,7 +92,7 @@ def choice(items: Sequence[Tensor], pick: Pick) -> Tensor:
 
 
 def reduction(x: Tensor, pick: Pick) -> Tensor:
-    """The extremum over axis 0, which stays with length 1."""
+    """Return the extremum over axis 0, kept with length 1."""
     if x.requires_grad and x.numel() >= _LARGE_COLUMN:
         out: Tensor = _Reduction.apply(x, pick)  # type: ignore[no-untyped-call]
         return out
@@ -103,7 +103,7 @@ def reduction(x: Tensor, pick: Pick) -> Tensor:
 
 
 class _Windows(torch.autograd.Function):
-    """One operand: its extrema; two: `until` or `release`. One of several equal rows gets the gradient."""
+    """Window extrema of one operand, `until` or `release` of two; one of equal rows gets the gradient."""
 
     @staticmethod
     def forward(ctx: Any, kernel: WindowKernel, *operands: Tensor) -> Tensor:
@@ -123,12 +123,12 @@ class _Windows(torch.autograd.Function):
 
 
 def by_kernel(operands: Sequence[Tensor], pick: Pick, window: Sliding) -> Tensor | None:
-    """Sliding extrema of one array, `until` or `release` of two; None where there is no kernel for them.
+    """Return sliding extrema of one array, `until` or `release` of two; None where there is no kernel.
 
     Args:
         operands: `(time, batch)`, of one dtype.
         pick: "max" for `until`, "min" for `release`.
-        window: the windows.
+        window: layout of the windows.
     """
     first = operands[0]
     alike = all(each.dtype == first.dtype and each.device.type == "cpu" for each in operands)
@@ -145,7 +145,7 @@ def _strided(x: Tensor) -> Strided:
 
 
 def _like(x: Tensor, rows: int) -> Tensor:
-    """Memory for so many rows, laid out as `x`: samples or traces beside each other."""
+    """Uninitialized memory for `rows` rows in the layout of `x`: samples or traces contiguous."""
     batch = x.shape[1]
     return x.new_empty((batch, rows)).T if x.stride(0) == 1 and batch > 1 else x.new_empty((rows, batch))
 
@@ -154,7 +154,7 @@ def _like(x: Tensor, rows: int) -> Tensor:
 
 
 def is_small(x: Tensor, window: Sliding) -> bool:
-    """Whether the windows may be laid side by side, which takes `rows * width` numbers."""
+    """True if all windows may be gathered, which takes `rows * width` elements."""
     return x.numel() * window.width <= _SMALL
 
 
@@ -177,7 +177,7 @@ def small_until(left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Ten
 
 
 def _beside(x: Tensor, fill: float, window: Sliding) -> Tensor:
-    """The windows, `(count, batch, width)`."""
+    """Gathered windows, `(count, batch, width)`."""
     missing = window.count + window.width - 1 - window.rows
     filled = pad(x, (0, 0, 0, missing), value=fill) if missing > 0 else x
     return _first(filled.unfold(0, window.width, 1), window.count)

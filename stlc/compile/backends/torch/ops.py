@@ -1,4 +1,4 @@
-"""The array namespace over torch: gradients, batches, any device. Every method is one or two operations."""
+"""Array namespace over torch: gradients, batches, any device. Every method is one or two operations."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class _SafeSqrt(torch.autograd.Function):
 
 
 class _Kept(torch.autograd.Function):
-    """Some rows as they are, in the others a constant."""
+    """Rows of an array, with a constant in the others."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, keep: NDArray[np.bool_], value: float) -> Tensor:
@@ -67,7 +67,7 @@ def _kept(x: Tensor, runs: list[tuple[slice, bool]], value: float) -> Tensor:
 
 
 class _SmoothMax(torch.autograd.Function):
-    """`log(sum(exp(k x))) / k` over axis 0; infinite values carry no gradient and make no NaN."""
+    """`log(sum(exp(k x))) / k` over axis 0; infinite values have no gradient and cause no NaN."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, k: float) -> Tensor:
@@ -111,7 +111,7 @@ def _constant(value: float, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def _pair(a: Tensor | float, b: Tensor | float) -> tuple[Tensor, Tensor]:
-    """Both as tensors, where torch wants two of them."""
+    """Return both operands as tensors, where torch needs two."""
     if isinstance(a, Tensor):
         return a, b if isinstance(b, Tensor) else _constant(b, a.dtype, a.device)
     assert isinstance(b, Tensor)
@@ -122,8 +122,7 @@ def _pair(a: Tensor | float, b: Tensor | float) -> tuple[Tensor, Tensor]:
 class TorchOps:
     """`stlc.compile.backends.array.namespace.Ops` over torch tensors; dtype and device follow the operands.
 
-    Operands are `(time, batch)`, or of any shapes that broadcast; what runs over axis 0 runs over time, and a
-    reduction over it gives `(1, batch)`.
+    Operands are `(time, batch)`, or of any shapes that broadcast; axis 0 is time, reduced to `(1, batch)`.
     """
 
     name = "torch"
@@ -162,7 +161,7 @@ class TorchOps:
         return torch.addcmul(_pair(a, b)[0], b, c, value=factor)
 
     def clamp(self, x: Tensor, low: float | None, high: float | None) -> Tensor:
-        """`x` cut to [low, high]; the gradient at a bound is 1."""
+        """`x` clamped to [low, high]; the gradient at a bound is 1."""
         return torch.clamp(x, low, high)
 
     def norm(self, *components: Tensor | float) -> Tensor:
@@ -224,7 +223,7 @@ class TorchOps:
 
     def join(self, items: Sequence[Tensor], pick: Pick) -> Tensor:
         """Exact extremum of one or more arrays; one of several equal operands may get all of the gradient."""
-        if torch.compiler.is_exporting():  # it must not depend on the batch
+        if torch.compiler.is_exporting():  # the choice must not depend on the batch size
             return reduce(torch.minimum if pick == "min" else torch.maximum, items)
         return choice(items, pick)
 
@@ -255,11 +254,11 @@ class TorchOps:
         return out
 
     def kind(self, like: Tensor) -> Hashable:
-        """The dtype and the device."""
+        """Constant key: dtype and device."""
         return like.dtype, like.device
 
     def constant(self, value: float, like: Tensor) -> Tensor:
-        """A tensor without dimensions: torch converts a Python number anew in every operation."""
+        """Zero-dimensional tensor: torch would convert a Python number in every operation."""
         return _constant(value, like.dtype, like.device)
 
     def full(self, shape: tuple[int, ...], value: float, like: Tensor) -> Tensor:
@@ -267,20 +266,20 @@ class TorchOps:
         return self.constant(value, like).expand(shape).clone()
 
     def cat(self, parts: Sequence[Tensor]) -> Tensor:
-        """Joined along axis 0."""
+        """Concatenation along axis 0."""
         return torch.cat(list(parts))
 
     def stack(self, parts: Sequence[Tensor]) -> Tensor:
-        """A new axis 0 in front."""
+        """Arrays stacked along a new axis 0."""
         return torch.stack(list(parts))
 
     def counted(self, first: int, count: int, like: Tensor) -> Tensor:
-        """Whole numbers along time."""
+        """Integers along time."""
         numbers = torch.arange(first, first + count, dtype=like.dtype, device=like.device)
         return numbers.view(-1, *(1,) * (like.ndim - 1)).expand(count, *like.shape[1:])
 
     def empty(self, shape: tuple[int, ...], like: Tensor) -> Tensor:
-        """Memory to be written to, also outside of inference mode."""
+        """Uninitialized tensor, writable outside of inference mode too."""
         with torch.inference_mode(False):
             return like.new_empty(shape)
 
@@ -289,7 +288,7 @@ class TorchOps:
         return x.flip(0)
 
     def rows(self, keep: NDArray[np.bool_], x: Tensor, value: float) -> Tensor:
-        """`x` with `value` in the rows that are not kept."""
+        """`x` with `value` in the rows outside `keep`."""
         if keep.all():
             return x
         if torch.compiler.is_exporting():
@@ -299,11 +298,11 @@ class TorchOps:
         return out
 
     def columns(self, x: Tensor) -> Sequence[Tensor]:
-        """One `(time, batch)` tensor for every column of `(batch, time, dim)`: a copy, and views of it."""
+        """One `(time, batch)` tensor for every column of `(batch, time, dim)`, views of one copy."""
         return x.permute(2, 1, 0).contiguous().unbind(0)
 
     def quiet(self) -> AbstractContextManager[object]:
-        """Torch does not warn."""
+        """Empty context: torch does not warn."""
         return nullcontext()
 
 

@@ -1,1 +1,1 @@
-"""The semantics that `--robustness` and `semantics=` name: a file each, its class under `SEMANTICS`."""
+"""Semantics selected by `--robustness` and `semantics=`: one file each, registered in `SEMANTICS`."""

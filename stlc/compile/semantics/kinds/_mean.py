@@ -1,8 +1,8 @@
-"""Semantics in which every operand counts: extrema replaced by means that keep their sign.
+"""Mean-based semantics: extrema replaced by means of all operands with the same sign.
 
-A minimum is positive where all operands are: then it becomes a geometric mean of them, which the smallest
-pull down most. Elsewhere it becomes a power mean of the violated ones, in which satisfied operands count as
-0. A maximum is the mirror, `max(x) = -min(-x)`. Both kinds of mean follow from sums over the operands.
+Where all operands are positive, the minimum becomes their geometric mean, dominated by the smallest.
+Elsewhere it becomes a power mean of the violated ones, with satisfied operands as 0. A maximum is
+`max(x) = -min(-x)`. Both means are functions of sums over the operands.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from stlc.compile.semantics.protocol import Parts
 
 
 class Mean(ABC):
-    """A minimum as a mean: what is summed over the operands, and what follows from the sums.
+    """Minimum as a mean: summands per operand, and the value as a function of the sums.
 
     The parts are the exact minimum, which decides the sign; the sums over satisfied and over violated
     operands; and the number of operands that are finite.
@@ -35,22 +35,22 @@ class Mean(ABC):
 
     @abstractmethod
     def gain(self, x: Array, ops: Ops) -> Array:
-        """Summand of an operand x > 0 where all are satisfied."""
+        """Summand of an operand x > 0, used where all are satisfied."""
 
     @abstractmethod
     def loss(self, x: Array, ops: Ops) -> Array:
-        """Summand of an operand -x, x >= 0, where one is violated; 0 at 0."""
+        """Summand of an operand -x, x >= 0, used where one is violated; 0 at 0."""
 
     @abstractmethod
     def satisfied(self, gains: Array, count: Array, ops: Ops) -> Array:
-        """The value where all operands are positive."""
+        """Value where all operands are positive."""
 
     @abstractmethod
     def violated(self, losses: Array, count: Array, ops: Ops) -> Array:
-        """The value where one is not."""
+        """Value where an operand is not positive."""
 
     def lift(self, x: Array, pick: Pick, ops: Ops) -> Parts:
-        """The sums over every operand alone."""
+        """Sums of each single operand."""
         x = x if pick == "min" else -x
         known = ops.gt(math.inf, ops.abs(x))
         positive = ops.both(known, ops.gt(x, 0.0))
@@ -60,11 +60,11 @@ class Mean(ABC):
         return x, gains, losses, ops.number(known, x)
 
     def merge(self, a: Parts, b: Parts, pick: Pick, ops: Ops) -> Parts:  # noqa: ARG002
-        """The sums over both."""
+        """Sums over both sets of operands."""
         return (ops.minimum(a[0], b[0]), a[1] + b[1], a[2] + b[2], a[3] + b[3])
 
     def finish(self, parts: Parts, pick: Pick, ops: Ops) -> Array:
-        """The mean; one operand stands for itself, and infinitely violated is infinitely violated."""
+        """Mean; a single operand is returned unchanged, and -inf stays -inf."""
         least, gains, losses, known = parts
         several = ops.both(ops.gt(known, 1.0), ops.gt(math.inf, ops.abs(least)))
         count = ops.where(several, known, 1.0)

@@ -14,12 +14,12 @@ from stlc.compile.semantics.kinds._mean import Mean
 class ArithmeticGeometricMean(Mean):
     """AGM robustness (Mehdipour, Vasile and Belta, ACC 2019).
 
-    `min(x)` is the geometric mean of `1 + x`, less 1, where all operands are positive; else the arithmetic
-    mean of the negative ones, the others counting as 0. It rewards satisfying more operands, and by more.
-    Predicates should be of the same size: the paper normalises them to [-1, 1].
+    `min(x)` is the geometric mean of `1 + x`, minus 1, where all operands are positive; else the arithmetic
+    mean of the negative ones, with the others as 0. It rewards more satisfied operands and larger margins.
+    Predicates should be of similar magnitude: the paper normalises them to [-1, 1].
 
-    Sound: the sign is that of the exact robustness. The value does not say how far predicates may change.
-    Its slope jumps where an operand changes its sign.
+    Sound: the sign is that of the exact robustness. The value is no bound on perturbations of predicates.
+    The gradient is discontinuous where an operand changes sign.
     """
 
     def gain(self, x: Array, ops: Ops) -> Array:
@@ -27,7 +27,7 @@ class ArithmeticGeometricMean(Mean):
         return ops.log1p(x)
 
     def loss(self, x: Array, ops: Ops) -> Array:  # noqa: ARG002
-        """Its size."""
+        """Magnitude of the violation."""
         return x
 
     def satisfied(self, gains: Array, count: Array, ops: Ops) -> Array:

@@ -19,12 +19,12 @@ class GeneralizedMean(Mean):
     n operands, `M0(z) = (eps^n + prod z)^(1/n)` and `Mp(z) = (eps^p + mean(z^p))^(1/p)`. Continuously
     differentiable.
 
-    Sound: the sign is that of the exact robustness (in floating point a value may round to 0). The value does
-    not say how far predicates may change.
+    Sound: the sign is that of the exact robustness (in floating point a value may round to 0). The value is
+    no bound on perturbations of predicates.
 
     Attributes:
-        eps: smoothing near 0; distances below its square root count little.
-        p: order of the mean over violated operands; the larger, the more the worst one counts.
+        eps: smoothing near 0; margins below its square root have little weight.
+        p: order of the mean over violated operands; larger values weight the worst one more.
     """
 
     eps: float = 1e-8
@@ -40,7 +40,7 @@ class GeneralizedMean(Mean):
         return square if self.p == 1 else ops.pow(square, float(self.p))
 
     def satisfied(self, gains: Array, count: Array, ops: Ops) -> Array:
-        """sqrt((eps^n + prod x^2)^(1/n)) - sqrt(eps), where gains are large and where they are small."""
+        """sqrt((eps^n + prod x^2)^(1/n)) - sqrt(eps), stable for large and small gains."""
         soft = ops.maximum(gains, gains * 0.0) + ops.log1p(ops.exp(-ops.abs(gains)))
         return ops.expm1(soft / (count * 2.0)) * math.sqrt(self.eps)
 

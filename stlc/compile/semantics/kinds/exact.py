@@ -1,4 +1,4 @@
-"""`exact`: minima and maxima as they are."""
+"""`exact`: exact minima and maxima."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from stlc.compile.semantics.protocol import Associative
 @final
 @dataclass(frozen=True, slots=True)
 class Exact(Associative):
-    """Minimum and maximum as they are (Fainekos and Pappas 2009; Donzé and Maler 2010).
+    """Exact minimum and maximum (Fainekos and Pappas 2009; Donzé and Maler 2010).
 
-    Sound: a positive value means satisfied, a negative one violated, and it stays so while no predicate
-    changes by as much as the value. The gradient is a subgradient: operands that attain the extremum get it.
+    Sound: a positive value means satisfied, a negative one violated, and the verdict is unchanged while no
+    predicate changes by as much as the value. The subgradient is that of operands that attain the extremum.
     """
 
     exact: ClassVar[bool] = True

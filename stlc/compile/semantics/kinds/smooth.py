@@ -19,11 +19,11 @@ class LogSumExp(Associative):
     `max(x) = log(sum(exp(k x))) / k`, which overestimates by at most log(n) / k, and `min(x) = -max(-x)`,
     which underestimates by as much.
 
-    Not sound: a value nearer to 0 than what all operators on the way may be off by says nothing. Where only
-    minima are taken a positive value means satisfied, where only maxima are taken a negative one violated.
+    Not sound: a value within the summed error of all operators from 0 is inconclusive. With minima alone a
+    positive value means satisfied, with maxima alone a negative one means violated.
 
     Attributes:
-        k: the scale; the larger, the nearer to the exact extrema.
+        k: the scale; larger values approach the exact extrema.
     """
 
     k: float = 500.0
