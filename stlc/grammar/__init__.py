@@ -1,1 +1,1 @@
-"""The language: concrete syntax, AST, parser, printer."""
+"""Specification language: concrete syntax, AST, parser, printer."""

@@ -1,6 +1,6 @@
-"""Formulas that mean one thing here and another in other tools for want of parentheses.
+"""Detection of formulas without parentheses that other STL tools parse differently.
 
-What the others do, from their grammars:
+Precedence in other tools, from their grammars:
 
     RTAMT      `or` binds tighter than `and`, temporal words loosest of all, `->` from left
     MoonLight  `->` binds tighter than `or`, that tighter than `and`, temporal words loosest, `->` from left
@@ -25,14 +25,14 @@ AmbiguityKind: TypeAlias = Literal["scope", "mixed", "chain", "until", "implicat
 
 @dataclass(frozen=True, slots=True)
 class Ambiguity:
-    """A part of a formula that should stand in parentheses.
+    """Part of a formula that should be in parentheses.
 
     Attributes:
         span: the part.
-        kind: "scope", a temporal word that elsewhere governs what follows too; "mixed", `and` beside `or`;
-            "chain", implications in a row; "until" beside another connective; "implication", `and` or `or`
-            beside `->`, which most tools read as here.
-        outer: the connective beside it.
+        kind: "scope", a temporal operator whose operand extends further in other tools; "mixed", `and` with
+            `or`; "chain", consecutive implications; "until" with another connective; "implication", `and` or
+            `or` with `->`, which most tools parse as here.
+        outer: the adjacent connective.
     """
 
     span: Span
@@ -41,11 +41,11 @@ class Ambiguity:
 
 
 def ambiguities(spec: ast.Spec, *, implications: bool = False) -> Iterator[Ambiguity]:
-    """All parts that other tools read differently, in the order of the text.
+    """Return all parts that other tools parse differently, in source order.
 
     Args:
         spec: as parsed.
-        implications: also those beside `->`.
+        implications: include kind "implication".
     """
     words = _Words(spec)
     pairs = [node for node in descendants(spec) if isinstance(node, ast.Logic | ast.Until)]
@@ -58,7 +58,7 @@ def ambiguities(spec: ast.Spec, *, implications: bool = False) -> Iterator[Ambig
 
 
 class _Words:
-    """Words beside a part of the text, and parts that will be in parentheses."""
+    """Lexemes of the text, and spans already marked for parentheses."""
 
     def __init__(self, spec: ast.Spec) -> None:
         self.items: list[Lexeme] = list(lexemes(spec.source.text))
@@ -66,7 +66,7 @@ class _Words:
         self.parenthesised: set[tuple[int, int]] = set()
 
     def closed(self, node: ast.Node, *, left: bool) -> bool:
-        """True if an operand stands in parentheses; `left` says on which side of its operator."""
+        """True if an operand is in parentheses; `left` if it is a left operand."""
         if (node.span.start, node.span.end) in self.parenthesised:
             return True
         at = bisect_left(self.starts, node.span.end if left else node.span.start)
@@ -76,7 +76,7 @@ class _Words:
 
 
 def _operands(node: ast.Logic | ast.Until, words: _Words) -> Iterator[Ambiguity]:
-    """Operands that are a connective of their own."""
+    """Yield operands that are connectives without parentheses."""
     for operand, left in ((node.left, True), (node.right, False)):
         if words.closed(operand, left=left):
             continue
@@ -99,7 +99,7 @@ def _clash(node: ast.Logic | ast.Until, operand: ast.Expr, *, left: bool) -> Amb
 
 
 def _scope(node: ast.Logic | ast.Until, words: _Words) -> Iterator[Ambiguity]:
-    """The temporal word at the end of a left operand: elsewhere it goes on behind the connective."""
+    """Yield a temporal operator that ends a left operand: in other tools it extends beyond the connective."""
     part: ast.Expr = node.left
     governed: ast.Expr | None = None
     while not words.closed(part, left=True):

@@ -1,6 +1,6 @@
-"""The syntax as written. One expression grammar: types are found later, in `stlc.compile.frontend.resolve`.
+"""Abstract syntax as written, with one class of expressions; `stlc.compile.frontend.resolve` adds types.
 
-Every node carries a span, which says where and not what: equality ignores it.
+Every node has a span, which equality ignores.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class Quantity(Node):
-    """A number with the unit written after it ("" for a bare number; "steps" is a unit)."""
+    """Number with its unit ("" for a bare number; "steps" is a unit)."""
 
     value: Fraction
     unit: str = ""
@@ -33,7 +33,7 @@ class Quantity(Node):
 
 @dataclass(frozen=True, slots=True)
 class String(Node):
-    """A text in double quotes."""
+    """String in double quotes."""
 
     value: str
 
@@ -52,7 +52,7 @@ class Inf(Node):
 
 @dataclass(frozen=True, slots=True)
 class Name(Node):
-    """A name; backticks are stripped and remembered."""
+    """Name without its backticks, which are recorded."""
 
     name: str
     quoted: bool = field(default=False, compare=False)
@@ -115,7 +115,7 @@ class Binary(Node):
 
 @dataclass(frozen=True, slots=True)
 class Compare(Node):
-    """A chain: `a <= b < c` has three operands and two operators."""
+    """Comparison chain: `a <= b < c` has three operands and two operators."""
 
     operands: tuple[Expr, ...]
     ops: tuple[Literal["<", "<=", ">", ">=", "==", "!="], ...]
@@ -160,9 +160,9 @@ class Interval(Node):
     Attributes:
         lo: lower bound, an expression of sort time.
         hi: upper bound; `Inf` and the name `end` mean "to the end of the trace".
-        lo_open: the lower end is excluded, `(lo, …`.
-        hi_open: the upper end is excluded, `…, hi)`.
-        clock: "now" slides with the time of evaluation; "start" is the mission clock (`@`).
+        lo_open: the lower bound is excluded, `(lo, …`.
+        hi_open: the upper bound is excluded, `…, hi)`.
+        clock: "now" is relative to the time of evaluation; "start" is the mission clock (`@`).
     """
 
     lo: Expr
@@ -178,7 +178,7 @@ BinaryTemporal: TypeAlias = Literal["until", "release", "unless", "since"]
 
 @dataclass(frozen=True, slots=True)
 class Temporal(Node):
-    """`op[interval] body`; `interval` is None when nothing is written (to the end)."""
+    """`op[interval] body`; `interval` None: omitted, to the end of the trace."""
 
     op: UnaryTemporal
     interval: Interval | None
@@ -268,7 +268,7 @@ class TypeRef(Node):
 
 @dataclass(frozen=True, slots=True)
 class Declaration(Node):
-    """Base of declarations: the name, where it stands, its tags and `##` comment."""
+    """Base of declarations: name, its span, tags and `##` comment."""
 
     name: str
     name_span: Span = field(compare=False, repr=False)
@@ -378,13 +378,12 @@ class Spec(Node):
     Attributes:
         name: of the `spec` pragma; "" when there is none.
         system: path of the `system` pragma, as written.
-        system_span: where that path stands.
+        system_span: of that path.
         time_unit: unit of bare numbers in intervals; "" when there is no `time` pragma.
         imports: in order.
         items: declarations in order.
-        source: the text itself.
-        library: texts of what it imports, by key (`stlc.compile.frontend.modules`); None where the files are
-            read.
+        source: the text.
+        library: texts of imports, by key (`stlc.compile.frontend.modules`); None to read the files.
     """
 
     name: str

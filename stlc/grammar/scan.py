@@ -1,7 +1,7 @@
-"""A coarse look at a text: lexemes and where declarations start.
+"""Coarse scanner of a text: lexemes and starts of declarations.
 
-The parser reads one declaration at a time, so that an error in one says nothing about the next. Declaration
-keywords are reserved, hence a cut before one never falls into a valid declaration.
+The parser reads one declaration at a time, so that errors are independent. Declaration keywords are reserved,
+hence a split before one never falls inside a valid declaration.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _TEMPORAL = UNARY_TEMPORAL.keys() | BINARY_TEMPORAL.keys()
 
 @dataclass(frozen=True, slots=True)
 class Lexeme:
-    """A word, number, text in quotes or sign, with its place in the text."""
+    """Word, number, quoted string or sign, with its position in the text."""
 
     kind: LexemeKind
     text: str
@@ -43,7 +43,7 @@ class Lexeme:
 
 @dataclass(frozen=True, slots=True)
 class Bracket:
-    """An opening bracket and, if there is one, what closes it."""
+    """Opening bracket with its closing one, if any."""
 
     opening: Lexeme
     interval: bool
@@ -51,7 +51,7 @@ class Bracket:
 
 
 def lexemes(text: str, start: int = 0, end: int | None = None) -> Iterator[Lexeme]:
-    """The lexemes of a part of a text, without blanks and comments. Never fails."""
+    """Yield the lexemes of a part of a text, without blanks and comments. Never fails."""
     for match in _LEXEME.finditer(text, start, len(text) if end is None else end):
         kind = match.lastgroup
         if kind is not None:
@@ -59,7 +59,7 @@ def lexemes(text: str, start: int = 0, end: int | None = None) -> Iterator[Lexem
 
 
 def declaration_starts(text: str) -> list[int]:
-    """Offsets of the declarations of a text, their tags and roles included; the first one is always 0."""
+    """Return the offsets of the declarations of a text, including tags and roles; the first is always 0."""
     starts = [0]
     tag: int | None = None
     before: Lexeme | None = None
@@ -87,9 +87,9 @@ def _is_pragma(text: str, word: Lexeme, behind: Lexeme) -> bool:
 
 
 def brackets(items: Sequence[Lexeme]) -> list[Bracket]:
-    """All brackets that open in `items`, in order.
+    """Return all brackets opened in `items`, in order.
 
-    An interval may be closed by either of `)` and `]`; any other bracket by its own kind.
+    An interval is closed by either `)` or `]`, any other bracket by its own kind.
     """
     found: list[Bracket] = []
     still_open: list[int] = []
@@ -106,7 +106,7 @@ def brackets(items: Sequence[Lexeme]) -> list[Bracket]:
 
 
 def opens_interval(before: Lexeme) -> bool:
-    """True if a bracket behind this lexeme may hold an interval."""
+    """True if a bracket after this lexeme may be an interval."""
     return before.text == "@" or (before.kind == "word" and before.text.rstrip("_") in _TEMPORAL)
 
 

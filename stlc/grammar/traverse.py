@@ -1,4 +1,4 @@
-"""The nodes of a syntax tree, outermost first, without recursion."""
+"""Traversal of a syntax tree, outermost node first, without recursion."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from stlc.grammar import ast
 
 
 def children(node: ast.Node) -> Iterator[ast.Node]:
-    """The nodes directly below a node, in the order of the text."""
+    """Yield the nodes directly below a node, in source order."""
     for part in fields(node):
         yield from _within(getattr(node, part.name))
 
 
 def descendants(node: ast.Node) -> Iterator[ast.Node]:
-    """A node and everything below it, in the order of the text."""
+    """Yield a node and all its descendants, in source order."""
     stack = [node]
     while stack:
         top = stack.pop()

@@ -1,4 +1,4 @@
-"""The vocabulary of the language: reserved words, aliases, and what tokens are called in messages."""
+"""Vocabulary of the language: reserved words, aliases, and names of tokens in messages."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ UNARY_TEMPORAL = MappingProxyType(
         "hist": "historically",
     }
 )
-"""Every way to write a temporal operator with one operand, and its name."""
+"""Spelling of a temporal operator with one operand -> its name."""
 
 BINARY_TEMPORAL = MappingProxyType(
     {"until": "until", "U": "until", "release": "release", "unless": "unless", "since": "since"}
 )
-"""Every way to write a temporal operator with two operands, and its name."""
+"""Spelling of a temporal operator with two operands -> its name."""
 
 DECLARATIONS = ("require", "assume", "def", "const", "param", "signal", "region", "enum", "extern", "import")
 ROLES = ("input", "output", "state", "env")
@@ -43,12 +43,12 @@ RESERVED = frozenset(
         *DECLARATIONS,
     }
 )
-"""Words that are a name only in backticks."""
+"""Reserved words, usable as names only in backticks."""
 
 BUILT_IN = MappingProxyType(
     {"T": "the planning horizon", "end": "the last sample", "dt": "the time between two samples"}
 )
-"""Names that have a meaning everywhere; as names of one's own they need backticks."""
+"""Built-in names; a user-defined name of this spelling needs backticks."""
 
 UNIT_NAMES = MappingProxyType(
     {
@@ -63,7 +63,7 @@ UNIT_NAMES = MappingProxyType(
         **{"hertz": "Hz", "newton": "N", "volt": "V", "watt": "W", "percent": "%", "sample": "steps"},
     }
 )
-"""Units written out, and what the language calls them."""
+"""Unit written out -> its symbol in the language."""
 
 _BLANK = r"(?:\s|(?:#|\/\/)[^\n]*(?:\n|\Z))"
 

@@ -1,1 +1,1 @@
-"""Malformed texts and what is said of them."""
+"""Syntax errors and their diagnostics."""

@@ -1,6 +1,6 @@
-"""The general syntax error, E010: what could have stood here, in words, and the smallest repair.
+"""General syntax error E010: expected tokens in words, and the smallest repair.
 
-Terminals of the grammar become words and classes of words; a repair is offered only if it parses.
+Terminals of the grammar are named by word or class; a repair is offered only if it parses.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _BEFORE_FORMULA = frozenset(
 
 
 def expected(failure: ParseFailure) -> Diagnostic:
-    """E010 for a failure that no recogniser knows."""
+    """Return E010 for a failure that no recogniser matches."""
     repair = _repair(failure)
     if repair is not None:
         return repair
@@ -62,7 +62,7 @@ def expected(failure: ParseFailure) -> Diagnostic:
 
 
 def point(failure: ParseFailure, lexeme: Lexeme) -> Span:
-    """The first character of a lexeme."""
+    """Return the span of a lexeme's first character."""
     return failure.piece.source.span(lexeme.start, lexeme.start + 1)
 
 
@@ -70,7 +70,7 @@ def point(failure: ParseFailure, lexeme: Lexeme) -> Span:
 
 
 def misspelt_operator(failure: ParseFailure) -> Diagnostic | None:
-    """A word that is nearly an operator, and with that the piece parses: `alwyas[0, T] p`, `p adn q`."""
+    """Recognise a misspelt operator whose correction parses: `alwyas[0, T] p`, `p adn q`."""
     near_by = [x for x in (failure.found, *reversed(failure.before)) if x is not None and x.kind == "word"]
     for lexeme in near_by[:_NEAR_BY]:
         if lexeme.text in RESERVED or len(lexeme.text) < _LEAST_LETTERS:
@@ -94,7 +94,7 @@ _NEAR_BY, _LEAST_LETTERS = 4, 3
 
 
 def unknown_unit(failure: ParseFailure) -> Diagnostic | None:
-    """A word behind a number that is no unit: `5 furlong`, `2 x`."""
+    """Recognise a number followed by a word that is no unit: `5 furlong`, `2 x`."""
     found, previous = failure.found, failure.previous
     if found is None or previous is None or previous.kind != "number" or found.kind != "word":
         return None
@@ -107,7 +107,7 @@ def unknown_unit(failure: ParseFailure) -> Diagnostic | None:
 
 
 def unknown_declaration(failure: ParseFailure) -> Diagnostic | None:
-    """A word at the start of a line that begins no declaration: `requre a: …`."""
+    """Recognise an unknown declaration keyword: `requre a: …`."""
     found = failure.found
     if found is None or found.kind != "word" or found.text in RESERVED or "_REQUIRE" not in failure.accepts:
         return None
@@ -124,7 +124,7 @@ def unknown_declaration(failure: ParseFailure) -> Diagnostic | None:
 
 
 def wrong_name(failure: ParseFailure) -> Diagnostic | None:
-    """A reserved word where a name is due: `def F = …`, `const in = 3`."""
+    """Recognise a reserved word in place of a name: `def F = …`, `const in = 3`."""
     if "NAME" not in failure.accepts or failure.wants_operand:
         return None
     found = failure.found
@@ -146,7 +146,7 @@ def wrong_name(failure: ParseFailure) -> Diagnostic | None:
 
 
 def stray_bracket(failure: ParseFailure) -> Diagnostic | None:
-    """A closing bracket that closes nothing, or something else."""
+    """Recognise a closing bracket without a matching opening one."""
     found = failure.found
     if found is None or found.text not in (")", "]", "}"):
         return None
@@ -173,7 +173,7 @@ def _begins_line(failure: ParseFailure, lexeme: Lexeme) -> bool:
 
 
 def _repair(failure: ParseFailure) -> Diagnostic | None:
-    """The finding that one sign is missing or wrong, if with it the piece parses."""
+    """Return a finding for one missing or wrong sign, if its correction parses."""
     previous, found = failure.previous, failure.found
     if previous is None:
         return None
@@ -196,19 +196,19 @@ def _repair(failure: ParseFailure) -> Diagnostic | None:
 
 
 def _open_interval(failure: ParseFailure) -> bool:
-    """True if an interval is open, which `]` and `)` close with different meanings."""
+    """True inside an unclosed interval, which `]` and `)` close with different meanings."""
     return bool(failure.open_brackets) and failure.open_brackets[-1].interval
 
 
 def _closing(failure: ParseFailure) -> str | None:
-    """The closing bracket of the one that was opened last."""
+    """Return the closing bracket that matches the innermost open one."""
     if not failure.open_brackets:
         return None
     return {"(": ")", "[": "]", "{": "}"}.get(failure.open_brackets[-1].opening.text)
 
 
 def _definition_colon(failure: ParseFailure) -> Diagnostic | None:
-    """`def name: …`, where `=` is due; the parser took what follows for a type."""
+    """Recognise `def name: …` in place of `=`; the parser read the rest as a type."""
     declared = _declared(failure)
     sign = next((lexeme for lexeme in failure.before if lexeme.text == ":"), None)
     if declared is None or sign is None or declared[1] not in ("definition", "constant", "region"):
@@ -221,7 +221,7 @@ def _definition_colon(failure: ParseFailure) -> Diagnostic | None:
 def _missing(
     failure: ParseFailure, sign: str, low: int, high: int, text: str, *, sure: bool = True
 ) -> Diagnostic:
-    """Diagnostic for a missing sign; a repair is offered where it is `sure` that no other one was meant."""
+    """Return the diagnostic for a missing sign; a repair is offered if `sure`."""
     label = f"expected `{sign}` before this" if low == high and failure.found is not None else ""
     return Diagnostic(
         "E010",
@@ -235,7 +235,7 @@ def _missing(
 
 
 def _product(failure: ParseFailure) -> tuple[str, ...]:
-    """`2 (x + 1)`, `x y`: a product without its sign."""
+    """Recognise a product without `*`: `2 (x + 1)`, `x y`."""
     previous, found = failure.previous, failure.found
     if previous is None or found is None or "MULOP" not in failure.accepts or "UNIT" in failure.accepts:
         return ()
@@ -302,7 +302,7 @@ def _context(failure: ParseFailure) -> str:
 
 
 def _declared(failure: ParseFailure) -> tuple[Lexeme, str] | None:
-    """The name that the piece declares, and what it is the name of."""
+    """Return the declared name of the piece, and the kind of declaration."""
     for keyword, name in zip(failure.before, failure.before[1:], strict=False):
         if keyword.text in NOUNS and name.kind in ("word", "quoted"):
             return name, NOUNS[keyword.text]

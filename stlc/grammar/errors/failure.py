@@ -1,4 +1,4 @@
-"""Failures of the parser, with the tokens around them: the input of the hints."""
+"""Parse failures with the surrounding lexemes, as input of the recognisers."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from stlc.source import Source, Span
 
 @dataclass(frozen=True)
 class Piece:
-    """A part of a text that is parsed for itself: a declaration, or an expression.
+    """Part of a text that is parsed separately: a declaration, or an expression.
 
     Attributes:
         source: the whole text.
         start: offset of the first character.
-        end: offset behind the last one.
+        end: offset after the last character.
         rule: start rule of the grammar, `start` or `expr`.
-        accepts: the terminals that may stand where the parser gives up on a text.
-        parses: whether a text can be parsed.
+        accepts: text -> terminals accepted where its parse fails.
+        parses: text -> whether it parses.
     """
 
     source: Source
@@ -32,21 +32,21 @@ class Piece:
 
     @property
     def text(self) -> str:
-        """The characters of the piece."""
+        """Text of the piece."""
         return self.source.text[self.start : self.end]
 
     def edited(self, start: int, end: int, replacement: str) -> str:
-        """The piece with the characters from offset `start` to `end` replaced."""
+        """Return the text of the piece with the characters from `start` to `end` replaced."""
         return self.text[: start - self.start] + replacement + self.text[end - self.start :]
 
     def repaired_by(self, start: int, end: int, replacement: str) -> bool:
-        """True if that edit makes it parse."""
+        """True if the piece parses after that edit."""
         return self.parses(self.edited(start, end, replacement), self.rule)
 
 
 @dataclass(frozen=True)
 class ParseFailure:
-    """The place in a piece at which no rule goes on."""
+    """Position in a piece at which no grammar rule applies."""
 
     piece: Piece
     at: int
@@ -58,44 +58,44 @@ class ParseFailure:
 
     @cached_property
     def before(self) -> tuple[Lexeme, ...]:
-        """The lexemes that the parser took."""
+        """Lexemes before the failure."""
         return tuple(lexeme for lexeme in self.lexemes if lexeme.start < self.at)
 
     @cached_property
     def after(self) -> tuple[Lexeme, ...]:
-        """The lexeme that it did not take, and those behind it."""
+        """Lexemes from the failure on."""
         return self.lexemes[len(self.before) :]
 
     @property
     def previous(self) -> Lexeme | None:
-        """The last lexeme that the parser took."""
+        """Last lexeme before the failure."""
         return self.before[-1] if self.before else None
 
     @property
     def found(self) -> Lexeme | None:
-        """The lexeme that it did not take; None at the end of the piece."""
+        """Lexeme at the failure; None at the end of the piece."""
         return self.after[0] if self.after else None
 
     @cached_property
     def follower(self) -> Lexeme | None:
-        """The text behind the piece: the start of the next declaration."""
+        """Text after the piece: the start of the next declaration."""
         if self.piece.rule != "start":
             return None
         return next(lexemes(self.piece.source.text, self.piece.end), None)
 
     @cached_property
     def accepts(self) -> frozenset[str]:
-        """The terminals that could have stood here."""
+        """Terminals accepted here."""
         return self.piece.accepts(self.piece.text, self.piece.rule)
 
     @property
     def wants_operand(self) -> bool:
-        """True if an expression, or a part of one, should begin here."""
+        """True if an operand is expected here."""
         return "NUMBER" in self.accepts and "NAME" in self.accepts
 
     @property
     def wants_operator(self) -> bool:
-        """True if an expression could go on here."""
+        """True if an operator is accepted here."""
         return "AND" in self.accepts or "CMP" in self.accepts
 
     @cached_property
@@ -105,18 +105,18 @@ class ParseFailure:
 
     @property
     def span(self) -> Span:
-        """The lexeme that the parser did not take, or the place behind the last one it took."""
+        """Span of the lexeme at the failure, or the position after the last lexeme before it."""
         if self.found is not None:
             return self.of(self.found)
         end = self.previous.end if self.previous is not None else self.piece.start
         return self.piece.source.span(end, end)
 
     def of(self, first: Lexeme, last: Lexeme | None = None) -> Span:
-        """The span of a lexeme, or from one to another."""
+        """Return the span of a lexeme, or from one lexeme to another."""
         return self.piece.source.span(first.start, (last or first).end)
 
     def line_with(self, *edits: tuple[int, int, str]) -> str:
-        """The line of the first edit as it reads with all edits done, without its comment."""
+        """Return the line of the first edit after all edits, without its comment."""
         source = self.piece.source
         number = source.position(edits[0][0])[0]
         start = source.line_starts[number - 1]
@@ -138,7 +138,7 @@ class ParseFailure:
         return 0
 
     def operand_after(self, index: int) -> int:
-        """Index behind the last lexeme of the operand that begins with lexeme `index`."""
+        """Index after the last lexeme of the operand that begins with lexeme `index`."""
         depth = 0
         for i in range(index, len(self.lexemes)):
             text = self.lexemes[i].text

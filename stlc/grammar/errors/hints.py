@@ -1,7 +1,7 @@
-"""Malformed texts -> diagnostics: the slips that deserve a word of their own, in a table.
+"""Diagnostics of syntax errors: a table of recognisers of common mistakes.
 
-Each recogniser looks at one `ParseFailure` and returns a finding or None; the first that knows it wins, and
-`expected.py` says something about every other.
+Each recogniser maps a `ParseFailure` to a finding or None; the first match is used, and `expected.py` handles
+all other failures.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _TAKES_LEFT = frozenset({"in", "not", "<", "<=", ">", ">=", "==", "!=", "*", "/"
 
 
 def diagnose(piece: Piece, at: int) -> Diagnostic:
-    """Diagnostics for a piece in which the parser gave up at offset `at`."""
+    """Return the diagnostics of a piece whose parse failed at offset `at`."""
     failure = ParseFailure(piece, at)
     for recognise in RECOGNISERS:
         finding = recognise(failure)
@@ -40,7 +40,7 @@ def diagnose(piece: Piece, at: int) -> Diagnostic:
 
 
 def too_deep(span: Span, limit: int) -> Diagnostic:
-    """A piece that parses, but is nested deeper than the passes behind the parser go."""
+    """Return the diagnostic for a piece nested deeper than later passes support."""
     first_line = span.source.span(span.start, min(span.end, span.start + 40))
     return Diagnostic(
         "E005",
@@ -82,7 +82,7 @@ def _character(failure: ParseFailure) -> Diagnostic | None:
 
 
 def _all_replacements(failure: ParseFailure, found: Lexeme) -> list[tuple[int, int, str]]:
-    """Edits for all characters of this line that have a spelling in the language."""
+    """Return edits for all replaceable characters of this line."""
     source = failure.piece.source
     line = source.position(found.start)[0]
     edits: list[tuple[int, int, str]] = []
@@ -196,7 +196,7 @@ def _until_before(failure: ParseFailure, index: int) -> int | None:
 
 
 def _behind_interval(failure: ParseFailure, index: int) -> int:
-    """Index of what follows the operator at `index` and its interval."""
+    """Return the index after the operator at `index` and its interval."""
     items = failure.lexemes
     last = len(items) - 1
     behind = min(index + 1, last)

@@ -1,5 +1,5 @@
-# ruff: noqa: RUF001 - the characters are the subject
-"""Characters of papers and word processors: what the language writes for them."""
+# ruff: noqa: RUF001 - this module lists such characters
+"""Replacements for characters of papers and word processors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from stlc.grammar.scan import Lexeme, lexemes
 
 @dataclass(frozen=True, slots=True)
 class Replacement:
-    """Advice about a character; `text` is its replacement, None if that depends."""
+    """Advice about a character; `text` is its replacement, None if ambiguous."""
 
     help: str
     text: str | None = None
@@ -63,19 +63,19 @@ _OF_THE_LANGUAGE = frozenset("()[]{}.,:;=<>!&|+-*/%^~@#")
 
 
 def replacement(char: str) -> Replacement | None:
-    """Advice about a character that the language does not have."""
+    """Return advice about a character that is not in the language."""
     return _ADVICE.get(char)
 
 
 def unexpected_character(lexeme: Lexeme) -> bool:
-    """True if a lexeme begins with a character that no token begins with."""
+    """True if no token begins with the first character of a lexeme."""
     if lexeme.kind == "sign":
         return lexeme.text[0] not in _OF_THE_LANGUAGE
     return lexeme.text[0] in _ADVICE and lexeme.kind == "word"
 
 
 def plain_text(text: str) -> str:
-    """The text with `□`, `≤`, `∧` and their like spelled out; comments and names in quotes stay."""
+    """Return the text with symbols such as `□`, `≤`, `∧` replaced, except in comments and quoted names."""
     parts: list[str] = []
     done = 0
     for lexeme in lexemes(text):

@@ -1,1 +1,1 @@
-"""The one layout of a specification."""
+"""Formatter of specifications."""

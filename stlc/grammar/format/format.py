@@ -1,12 +1,12 @@
-"""The one layout of a specification: blanks, line breaks, spellings; never its meaning.
+"""Formatter of specifications: canonical blanks, line breaks and spellings; the meaning is unchanged.
 
-    comments     stay where they are: above a line, behind it, or between the parts of a long formula
-    empty lines  stay, one at a time, so the groups of the author stay
-    spellings    `G`, `&&`, `=>` and their like become the words of the language, tags get their own lines
-    columns      within a group names, formulas and comments stand below each other
-    parentheses  are added where other tools would read a formula differently (W301)
+    comments     keep their place: above a line, at its end, or between the parts of a long formula
+    empty lines  are kept, at most one in a row, so groups of declarations are kept
+    spellings    aliases such as `G`, `&&`, `=>` become the words of the language, tags get their own lines
+    columns      names, formulas and comments are aligned within a group
+    parentheses  are added where other tools would parse a formula differently (W301)
 
-Law: formatting twice changes nothing more, and the tree before and after is the same.
+Invariants: formatting is idempotent, and preserves the syntax tree.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from stlc.grammar.parse.parser import parse
 from stlc.grammar.parse.tokens import Comment, Item, Layout, Token, tokenize
 from stlc.source import Source
 
-# Operators that an expression breaks at, loosest first; those of one row break together.
+# Operators at which an expression may break, loosest first; those of one row break together.
 _ROWS = (
     frozenset({"IFF"}),
     frozenset({"IMPLIES"}),
@@ -51,7 +51,7 @@ _PREFIX = frozenset({*_UNARY, "_NOT", "QUANTIFIER", "_FREEZE", "_IF"})
 
 
 def expression(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """The tokens from `start` to `end` as an expression."""
+    """Return the tokens from `start` to `end` as an expression document."""
     for row in _ROWS:
         splits = _splits(text, start, end, row)
         if splits:
@@ -66,7 +66,7 @@ def expression(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def words(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """The tokens from `start` to `end` on one line."""
+    """Return the tokens from `start` to `end` on one line."""
     parts: list[Doc] = []
     for index in range(start, end):
         if index > start and gap(text, index):
@@ -76,7 +76,7 @@ def words(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def hangs(text: Text, start: int, end: int) -> bool:
-    """True if the tokens are one bracket, perhaps with a name before it, that can stay behind a `=`."""
+    """True if the tokens are one bracket, with an optional name, that may stay on the line of `=`."""
     last = end - 1
     opening = text.partner.get(last, last)
     return start <= opening < last and all(
@@ -90,7 +90,7 @@ def _word(text: Text, index: int) -> Word:
 
 
 def _splits(text: Text, start: int, end: int, row: frozenset[str]) -> list[int]:
-    """Indices of the operators of one row that are not within brackets or between `if` and `else`."""
+    """Return indices of the operators of one row outside of brackets and of `if … else`."""
     found: list[int] = []
     index, conditions = start, 0
     while index < end:
@@ -116,7 +116,7 @@ def _infix(text: Text, start: int, end: int, splits: Sequence[int]) -> Group:
 
 
 def _prefix(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """A word that governs what follows it."""
+    """Return a prefix operator with its operand."""
     kind = text.tokens[start].kind
     if kind == "_IF":
         return (_condition(text, start, end),)
@@ -127,7 +127,7 @@ def _prefix(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def _condition(text: Text, start: int, end: int) -> Group:
-    """`if … then … else …`, the last two in lines of their own where all does not fit."""
+    """Return `if … then … else …`, with the branches on their own lines if it does not fit."""
     marks: list[int] = []
     index, depth = start, 0
     while index < end and depth >= 0:
@@ -149,7 +149,7 @@ def _condition(text: Text, start: int, end: int) -> Group:
 
 
 def _sequence(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """Tokens one behind the other; what a bracket holds may break."""
+    """Return consecutive tokens, with line breaks allowed inside brackets."""
     parts: list[Doc] = []
     index = start
     while index < end:
@@ -165,7 +165,7 @@ def _sequence(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 
 
 def _bracket(text: Text, opening: int) -> Group:
-    """The entries between two brackets, one a line where they do not fit."""
+    """Return the entries between two brackets, one per line if they do not fit."""
     closing = text.partner[opening]
     edge = LINE if text.roles[opening] == "enum" else SOFT
     inside: list[Doc] = [edge]
@@ -190,7 +190,7 @@ def _comma(text: Text, start: int, end: int) -> int:
 
 
 def _entry(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """An expression, a named argument or a formal one."""
+    """Return a bracket entry: an expression, a named argument or a formal argument."""
     if end - start > 2 and text.tokens[start].kind == "NAME" and text.tokens[start + 1].text == "=":
         return (*words(text, start, start + 2), BLANK, *expression(text, start + 2, end))
     return expression(text, start, end)
@@ -203,7 +203,7 @@ _REQUIRED = frozenset({"require_decl", "assume_decl"})
 
 @dataclass(slots=True)
 class _Page:
-    """Lines as they are collected; an entry is one line and what may be aligned in it."""
+    """Collected lines, each with its alignable parts."""
 
     columns: list[Column] = field(default_factory=list)
 
@@ -213,7 +213,7 @@ class _Page:
 
 
 def lay_out(layout: Layout, unclear: Sequence[Ambiguity], *, width: int) -> str:
-    """The text of a layout; `unclear` parts get parentheses."""
+    """Return the text of a layout; `unclear` parts get parentheses."""
     page = _Page()
     spans = sorted((part.span.start, part.span.end) for part in unclear)
     for item in layout.items:
@@ -241,12 +241,12 @@ def _item(item: Item, page: _Page, width: int) -> None:
 
 
 def _bare(tokens: Sequence[Token]) -> tuple[Token, ...]:
-    """The tokens without the comments above the first one, which have lines of their own."""
+    """Return the tokens without the comments above the first one, which have their own lines."""
     return (replace(tokens[0], before=()), *tokens[1:])
 
 
 def _tags(tokens: Sequence[Token]) -> list[Sequence[Token]]:
-    """The tags in front of a declaration, `@name` or `@name(…)` each."""
+    """Return the tags before a declaration, each `@name` or `@name(…)`."""
     found: list[Sequence[Token]] = []
     start = 0
     while tokens[start].text == "@":
@@ -277,7 +277,7 @@ def _declaration(text: Text, rule: str, page: _Page, width: int) -> None:
 
 
 def _document(text: Text, rule: str) -> tuple[Doc, ...]:
-    """A declaration: its head, and behind `=` or `:` what breaks into lines of its own."""
+    """Return a declaration: its head, and after `=` or `:` a body that may break."""
     count = len(text.tokens)
     start = _body(text, rule)
     if start >= count:
@@ -289,7 +289,7 @@ def _document(text: Text, rule: str) -> tuple[Doc, ...]:
 
 
 def _body(text: Text, rule: str) -> int:
-    """Index of the first token behind the `=` or `:` of a declaration."""
+    """Index of the first token after the `=` or `:` of a declaration."""
     sign = "=" if rule in _DEFINED else ":" if rule in _REQUIRED else ""
     index = 0
     while index < len(text.tokens) and sign:
@@ -300,7 +300,7 @@ def _body(text: Text, rule: str) -> int:
 
 
 def _head(text: Text, rule: str) -> int:
-    """Width of the first column of a line; 0 where it has none."""
+    """Width of the first column of a line; 0 without one."""
     if rule == "signal_decl":
         count = 1 if text.tokens[0].kind == "ROLE" else 0
     elif rule in _OWN_COLUMN:
@@ -316,7 +316,7 @@ def _head(text: Text, rule: str) -> int:
 
 
 def _with_parentheses(item: Item, spans: Sequence[tuple[int, int]]) -> Item:
-    """The item with parentheses around the parts at these offsets, which other tools read differently."""
+    """Return the item with parentheses around the parts at these spans."""
     tokens = list(item.tokens)
     for start, end in spans:
         first = next(i for i, token in enumerate(tokens) if token.start >= start)
@@ -333,12 +333,12 @@ WIDTH = 100
 
 
 def format_text(source: Source) -> str:
-    """The text in its one layout, with a line break at the end.
+    """Return the formatted text, ending with a line break.
 
-    Characters of papers (`□`, `≤`, `∧`) become what the language writes for them.
+    Symbols such as `□`, `≤`, `∧` are replaced by their spelling in the language.
 
     Raises:
-        SpecError: the text is no specification.
+        SpecError: the text does not parse.
     """
     source, spec = _read(source)
     formatted = lay_out(tokenize(source), tuple(ambiguities(spec)), width=WIDTH)
@@ -349,7 +349,7 @@ def format_text(source: Source) -> str:
 
 
 def _read(source: Source) -> tuple[Source, ast.Spec]:
-    """A text that can be read, and its tree; the findings are those of the text that was given."""
+    """Return a parsable text and its tree; findings refer to the given text."""
     try:
         return source, parse(source)
     except SpecError as error:

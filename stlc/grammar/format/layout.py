@@ -1,4 +1,4 @@
-"""Documents laid out in lines of a width, and columns that line up below each other."""
+"""Layout of documents in lines of limited width, and alignment of columns."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Nest:
-    """Parts whose new lines are indented one level more."""
+    """Parts whose new lines are indented by one more level."""
 
     parts: tuple[Doc, ...]
 
@@ -56,7 +56,7 @@ _Entry: TypeAlias = tuple[int, bool, Doc]
 
 
 def render(parts: Sequence[Doc], *, width: int, indent: int = 0) -> list[str]:
-    """The lines of a document; only what cannot be broken is wider than `width`."""
+    """Return the lines of a document; only unbreakable parts exceed `width`."""
     page = _Page(indent)
     stack: list[_Entry] = [(indent, False, part) for part in reversed(parts)]
     while stack:
@@ -127,14 +127,14 @@ def _width(doc: Word | Blank | Line) -> int:
 
 
 def _ends_line(doc: Word | Blank | Line, *, flat: bool) -> bool:
-    """True if the line ends before or behind it, whatever follows."""
+    """True if the line must end before or after the document."""
     if isinstance(doc, Word):
         return bool(doc.before) or doc.after is not None
     return isinstance(doc, Line) and not flat
 
 
 class _Page:
-    """Lines as they are written."""
+    """Lines under construction."""
 
     def __init__(self, indent: int) -> None:
         self.lines: list[str] = []
@@ -149,7 +149,7 @@ class _Page:
         return (self.indent if not self.line else len(self.line)) + self.blank
 
     def write(self, word: Word, level: int) -> None:
-        """Append a word; what a comment has ended goes on in a new line."""
+        """Append a word, on a new line after a comment."""
         if word.before or self.commented:
             self.end_line(level)
         for comment in word.before:
@@ -163,7 +163,7 @@ class _Page:
             self.commented = True
 
     def end_line(self, level: int) -> None:
-        """Go on in a new line, unless nothing has been written to this one."""
+        """Begin a new line unless the current one is empty."""
         if self.line:
             self.lines.append(self.line)
         self.line, self.indent, self.blank, self.commented = "", level, False, False
@@ -180,13 +180,13 @@ _COMMENT_SPREAD = 40
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A line.
+    """Line with alignable columns.
 
     Attributes:
         text: without its comment.
         kind: the rule of its declaration; "tag", "comment", or "part" of several lines.
-        head: columns of its first part, which like lines share; 0 for none.
-        comment: behind it.
+        head: width of its first part, shared among lines of one kind; 0 for none.
+        comment: at the end of the line.
         apart: an empty line stands before it.
     """
 
@@ -198,7 +198,7 @@ class Column:
 
 
 def align(lines: Sequence[Column]) -> Iterator[str]:
-    """The lines as text, in order, with the empty lines between them."""
+    """Return the aligned lines as text, including empty lines."""
     padded = _pad_heads(lines)
     for line, text in zip(padded, _with_comments(padded), strict=True):
         if line.apart:
@@ -207,7 +207,7 @@ def align(lines: Sequence[Column]) -> Iterator[str]:
 
 
 def _pad_heads(lines: Sequence[Column]) -> list[Column]:
-    """Like declarations without an empty line or a comment between them share the width of their heads."""
+    """Pad heads to equal width among adjacent declarations of one kind."""
     result = list(lines)
     for group in _groups(lines, by_kind=True):
         heads = [i for i in group if lines[i].head]
@@ -220,7 +220,7 @@ def _pad_heads(lines: Sequence[Column]) -> list[Column]:
 
 
 def _with_comments(lines: Sequence[Column]) -> list[str]:
-    """Comments behind lines that follow each other start in one column."""
+    """Align the trailing comments of adjacent lines."""
     texts = [line.text for line in lines]
     for group in _groups(lines, by_kind=False):
         noted = [i for i in group if lines[i].comment]
@@ -232,7 +232,7 @@ def _with_comments(lines: Sequence[Column]) -> list[str]:
 
 
 def _groups(lines: Sequence[Column], *, by_kind: bool) -> Iterator[list[int]]:
-    """Runs of whole lines without an empty line between them; tags belong to the declaration below them."""
+    """Yield groups of adjacent whole lines; tags belong to the declaration below them."""
     group: list[int] = []
     kind = ""
     for index, line in enumerate(lines):
@@ -248,7 +248,7 @@ def _groups(lines: Sequence[Column], *, by_kind: bool) -> Iterator[list[int]]:
 
 
 def _close(items: Iterable[int], widths: Sequence[int], spread: int) -> Iterator[list[int]]:
-    """Neighbours whose widths differ by no more than `spread`."""
+    """Yield runs of items whose widths differ by at most `spread`."""
     part: list[int] = []
     within: list[int] = []
     for item, width in zip(items, widths, strict=True):

@@ -1,6 +1,6 @@
-"""Tokens for the formatter: their one spelling, matching brackets, blanks between them.
+"""Tokens for the formatter: canonical spelling, matching brackets, blanks between them.
 
-Unary plus and doubled parentheses say nothing and are dropped; the comments at them move to their neighbours.
+Unary plus and doubled parentheses are redundant and dropped, unless a comment is attached.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _OPERAND = frozenset({"NAME", "NUMBER", "UNIT", "STRING", "TYPE_SIZE", "_TRUE", 
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """The tokens of an item as they are to be printed.
+    """Tokens of an item in their printed form.
 
     Attributes:
-        tokens: with their one spelling.
+        tokens: with canonical spelling.
         partner: index of an opening bracket -> index of the closing one, and back.
-        roles: index of an opening bracket -> what it opens.
+        roles: index of an opening bracket -> its role.
     """
 
     tokens: tuple[Token, ...]
@@ -40,7 +40,7 @@ class Text:
     roles: dict[int, Role]
 
     def ends_operand(self, index: int) -> bool:
-        """True if an operand ends with this token, so that `-` behind it subtracts and `(` calls."""
+        """True if an operand ends with this token, so that a following `-` is binary and `(` a call."""
         token = self.tokens[index]
         if token.text in _CLOSING:
             return self.roles[self.partner[index]] != "interval"
@@ -52,10 +52,10 @@ class Text:
 
 
 def prepare(tokens: Sequence[Token]) -> Text:
-    """Spell the tokens of an item (its tags left out), pair its brackets, and drop what says nothing.
+    """Normalise the tokens of an item without its tags: spelling, bracket pairs, no redundant tokens.
 
     Raises:
-        SpecError: E005, its brackets are nested deeper than any tree may be.
+        SpecError: E005, brackets are nested too deeply.
     """
     text = _paired(tuple(map(_spelled, tokens)))
     signs = {i for i, token in enumerate(text.tokens) if token.kind == "PLUS" and text.is_sign(i)}
@@ -66,7 +66,7 @@ def prepare(tokens: Sequence[Token]) -> Text:
 
 
 def spelling(kind: str, text: str) -> str:
-    """The one way to write a token."""
+    """Return the canonical spelling of a token."""
     if kind.startswith(("UNARY", "BINARY")):
         match = _WORD.match(text)
         assert match is not None
@@ -91,7 +91,7 @@ def gap(text: Text, index: int) -> str:
 
 
 def _hugs_right(text: Text, index: int) -> bool:
-    """True if nothing may stand behind this token."""
+    """True if no blank follows this token."""
     token = text.tokens[index]
     if token.text in _OPENING:
         return text.roles[index] != "enum"
@@ -99,7 +99,7 @@ def _hugs_right(text: Text, index: int) -> bool:
 
 
 def _hugs_left(text: Text, index: int) -> bool:
-    """True if nothing may stand before this token."""
+    """True if no blank precedes this token."""
     token = text.tokens[index]
     if token.text in _CLOSING:
         return text.roles[text.partner[index]] != "enum"
@@ -113,7 +113,7 @@ def _typed(text: Text, index: int) -> bool:
 
 
 def _would_join(left: Token, right: Token) -> bool:
-    """True if two tokens without a blank between them would read as others: `1 .x`, `1. ..`, `m ^2`."""
+    """True if two tokens without a blank would be read as other tokens: `1 .x`, `1. ..`, `m ^2`."""
     if right.text == "^":
         return left.kind == "UNIT"
     if left.kind == "NUMBER":
@@ -158,7 +158,7 @@ def _role(text: Text, index: int) -> Role:
 
 
 def _holds_interval(text: Text, opening: int) -> bool:
-    """True if the parenthesis behind a temporal word holds two bounds; any other holds no comma."""
+    """True if the parenthesis after a temporal operator is an interval, that is, holds a comma."""
     closing = text.partner[opening]
     if not opening or text.tokens[opening - 1].kind not in ("UNARY", "BINARY"):
         return False
@@ -176,7 +176,7 @@ def level(text: Text, opening: int) -> list[int]:
 
 
 def behind(text: Text, index: int) -> int:
-    """The token behind this one; behind the bracket that it opens, or the names that it binds."""
+    """Index of the next token, after the bracket that this one opens or the names that it binds."""
     if index in text.roles:
         return text.partner[index] + 1
     last = {"QUANTIFIER": "COLON", "_FREEZE": "_IN"}.get(text.tokens[index].kind, "")
@@ -187,7 +187,7 @@ def behind(text: Text, index: int) -> int:
 
 
 def _doubled(text: Text) -> set[int]:
-    """The outer of two parentheses with nothing between them."""
+    """Indices of the outer of two directly nested parentheses."""
     found: set[int] = set()
     for opening, role in text.roles.items():
         inner = opening + 1
@@ -203,7 +203,7 @@ def _commented(token: Token) -> bool:
 
 
 def _without(text: Text, dropped: set[int]) -> Text:
-    """The tokens that are kept; one with a comment is never dropped."""
+    """Return the text without dropped tokens; those with a comment are kept."""
     kept = tuple(t for i, t in enumerate(text.tokens) if i not in dropped or _commented(t))
     return _paired(kept) if len(kept) < len(text.tokens) else text
 
@@ -217,7 +217,7 @@ def _check_depth(text: Text) -> None:
 
 
 def _with_commas(text: Text) -> Text:
-    """`[0:5]` as `[0, 5]`."""
+    """Return the text with intervals `[0:5]` written `[0, 5]`."""
     tokens = list(text.tokens)
     for opening, role in text.roles.items():
         if role == "interval":

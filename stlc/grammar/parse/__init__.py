@@ -1,1 +1,1 @@
-"""Text to syntax tree, by Lark."""
+"""Parser from text to syntax tree, based on Lark."""

@@ -1,8 +1,8 @@
-"""From the parse tree to expressions of the syntax tree: a function for each rule of `stl.lark`.
+"""Parse tree to AST, expressions: one function per rule of `stl.lark`.
 
-A function takes the children of its node, already built: AST nodes, `TerminalToken`s, None where an optional
-part is not written. A rule without a function is an error. Tokens become names, units and numbers, and faults
-of well-formed text are reported.
+A function takes the built children of its node: AST nodes, `TerminalToken`s, None for an omitted optional
+part. A rule without a function is an error. Tokens become names, units and numbers; errors in well-formed
+text are reported.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _LETTERS = re.compile(r"[A-Za-z]+")
 
 @dataclass(frozen=True, slots=True)
 class TerminalToken:
-    """A token: the name of its terminal, its text and its place."""
+    """Token with its terminal, text and span."""
 
     kind: str
     text: str
@@ -43,8 +43,8 @@ class Context:
 
     Attributes:
         source: the whole text.
-        findings: what is wrong with well-formed text (a number too large, an unknown unit).
-        documented: offset up to which `##` comments are spoken for.
+        findings: errors in well-formed text (a number too large, an unknown unit).
+        documented: offset up to which `##` comments are already assigned.
     """
 
     source: Source
@@ -53,12 +53,12 @@ class Context:
 
 
 def name_of(leaf: TerminalToken) -> str:
-    """The name that a NAME token writes, without its backticks."""
+    """Return the name in a NAME token, without backticks."""
     return leaf.text[1:-1] if leaf.text.startswith("`") else leaf.text
 
 
 def own_name(context: Context, leaf: TerminalToken) -> str:
-    """The name that a declaration gives; `T`, `end` and `dt` only in backticks."""
+    """Return the declared name; `T`, `end` and `dt` need backticks."""
     if leaf.text in BUILT_IN:
         context.findings.append(
             Diagnostic(
@@ -73,7 +73,7 @@ def own_name(context: Context, leaf: TerminalToken) -> str:
 
 
 def unit_of(context: Context, leaf: TerminalToken | None) -> str:
-    """The unit that a UNIT or UNIT_BRACKET token writes; "" if there is none."""
+    """Return the unit in a UNIT or UNIT_BRACKET token; "" without one."""
     if leaf is None:
         return ""
     text = re.sub(r"\s+", "", leaf.text.strip("[]"))
@@ -102,7 +102,7 @@ def _bad_unit(leaf: TerminalToken, text: str, reason: str) -> Diagnostic:
 
 
 def near_unit(word: str) -> str | None:
-    """The unit that somebody means who writes `word`, if it is none."""
+    """Return the unit closest to an unknown unit `word`."""
     return (
         None
         if word in SYMBOLS or means_celsius(word)
@@ -111,7 +111,7 @@ def near_unit(word: str) -> str | None:
 
 
 def number_of(context: Context, leaf: TerminalToken) -> Fraction:
-    """The exact value of a NUMBER token; E005 and 0 if it is beyond double precision."""
+    """Return the exact value of a NUMBER token; 0 and E005 beyond double precision."""
     match = _MANTISSA.fullmatch(leaf.text)
     assert match is not None
     digits, exponent = match[1].replace("_", ""), match[2] or "0"
@@ -256,7 +256,7 @@ def _clocked(operator: TerminalToken, interval: ast.Interval) -> ast.Interval:
 
 
 def _spelled(operator: TerminalToken, table: Mapping[str, str]) -> tuple[Any, str]:
-    """The operator's name, and its alias if it is written as one."""
+    """Return the operator's name, and the alias by which it is written, if any."""
     match = _WORD.match(operator.text)
     assert match is not None
     word = match[0]

@@ -1,4 +1,4 @@
-"""Parse tree -> AST, declarations and pragmas. One function a rule of `stl.lark`, as in `builder.py`."""
+"""Parse tree to AST, declarations and pragmas: one function per rule of `stl.lark`, as in `builder.py`."""
 
 from __future__ import annotations
 
@@ -96,13 +96,13 @@ def _formal(context: Context, span: Span, children: Sequence[Any]) -> ast.Formal
 
 
 def _doc(context: Context, end: int) -> str:
-    """The `##` lines since the last declaration, up to `end`."""
+    """Return the `##` lines from the last declaration up to `end`."""
     lines = [match[1] for match in _DOC.finditer(context.source.text, context.documented, end)]
     return "\n".join(lines)
 
 
 def _head(context: Context, span: Span, leaf: TerminalToken, tags: tuple[ast.Tag, ...]) -> dict[str, Any]:
-    """The fields that all declarations share."""
+    """Return the fields common to all declarations."""
     (head,) = _heads(context, span, (leaf,), tags)
     return head
 
@@ -110,7 +110,7 @@ def _head(context: Context, span: Span, leaf: TerminalToken, tags: tuple[ast.Tag
 def _heads(
     context: Context, span: Span, names: Sequence[TerminalToken], tags: tuple[ast.Tag, ...]
 ) -> list[dict[str, Any]]:
-    """The same for a declaration of several names."""
+    """Return the common fields for each name of a declaration."""
     shared = {"span": span, "tags": tags, "doc": _doc(context, names[0].span.start)}
     return [{**shared, "name": own_name(context, leaf), "name_span": leaf.span} for leaf in names]
 
@@ -232,7 +232,7 @@ DECLARATIONS: Mapping[str, BuildRule] = MappingProxyType(
 
 
 def assemble(source: Source, items: Sequence[Item], findings: list[Diagnostic]) -> ast.Spec:
-    """The specification that these items make up; a pragma that is given twice becomes a finding."""
+    """Return the specification of these items; a repeated pragma is a finding."""
     pragmas: dict[str, Pragma] = {}
     imports: list[ast.Import] = []
     declared: list[ast.Item] = []

@@ -1,7 +1,7 @@
-"""Text -> AST. Only this module and `parser_tables.py` know Lark.
+"""Parser from text to AST. Only the modules of `stlc.grammar.parse` use Lark.
 
-A text is cut before its declarations and each piece is parsed for itself, so that one run reports all
-independent errors. Trees are folded bottom-up without recursion: no text can exhaust the stack.
+A text is split before each declaration and the pieces are parsed separately, so that one run reports all
+independent errors. Trees are folded bottom-up without recursion, so that no text exhausts the stack.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ _RULES: Mapping[str, BuildRule] = MappingProxyType({**EXPRESSIONS, **DECLARATION
 
 
 def parse(source: Source) -> ast.Spec:
-    """The syntax tree of a specification.
+    """Return the syntax tree of a specification.
 
     Raises:
-        SpecError: with all independent errors, at most `MAX_ERRORS`.
+        SpecError: all independent errors, at most `MAX_ERRORS`.
     """
     _check_size(source, 0, len(source.text))
     context = Context(source)
@@ -61,7 +61,7 @@ def parse(source: Source) -> ast.Spec:
 
 
 def parse_expr(source: Source, start: int = 0, end: int | None = None) -> ast.Expr:
-    """The syntax tree of the expression that stands between two offsets of a text.
+    """Return the syntax tree of the expression between two offsets of a text.
 
     Spans point into the whole text. Raises SpecError.
     """
@@ -79,14 +79,14 @@ def parse_expr(source: Source, start: int = 0, end: int | None = None) -> ast.Ex
 
 
 class _PieceError(Exception):
-    """A piece of text that cannot be read."""
+    """Syntax errors of one piece."""
 
     def __init__(self, finding: Diagnostic) -> None:
         self.finding = finding
 
 
 def _check_size(source: Source, start: int, end: int) -> None:
-    """Limit on the length of a text: longer ones are not written by hand, and take minutes to parse."""
+    """Reject texts above the length limit, which would take minutes to parse."""
     if end - start > MAX_TEXT:
         raise SpecError(Diagnostic("E005", f"`{source.name}` is larger than {MAX_TEXT // 1_000_000} MB"))
     if any(islice(lexemes(source.text, start, end), MAX_LEXEMES, None)):
@@ -104,7 +104,7 @@ def _build(piece: Piece, context: Context) -> Any:
 
 
 def _offset(error: UnexpectedInput, piece: Piece) -> int:
-    """Offset in the whole text at which the parser gave up."""
+    """Offset in the whole text at which parsing failed."""
     token = getattr(error, "token", None)
     if token is not None and token.type == "$END":
         return piece.end
@@ -112,7 +112,7 @@ def _offset(error: UnexpectedInput, piece: Piece) -> int:
 
 
 def _fold(tree: Tree[Token], context: Context, base: int) -> Any:
-    """The value of a tree, children first, without recursion."""
+    """Return the value of a tree, bottom-up, without recursion."""
     values: dict[int, Any] = {}
     depths: dict[int, int] = {}
     for node in tree.iter_subtrees():
@@ -148,7 +148,7 @@ def _child(child: Tree[Token] | Token | None, values: Mapping[int, Any], context
 
 
 def _accepts(text: str, rule: str) -> frozenset[str]:
-    """The terminals that may stand where the parser gives up on a text."""
+    """Terminals accepted where the parse of a text fails."""
     interactive = load_parser().parse_interactive(text, start=rule)
     try:
         for _ in interactive.iter_parse():

@@ -1,8 +1,8 @@
-"""The Lark parser of `stl.lark`, once per process, its tables kept between processes.
+"""Lark parser of `stl.lark`, built once per process, with tables cached on disk.
 
-Building the LALR tables takes a tenth of a second, reading them back a fifth of that. They are kept as JSON
-(never a pickle) in the cache folder (`stlc.cache`), under a name that changes with the grammar, with Lark and
-with Python. A cache that is missing, damaged or not writable costs that time and nothing else.
+Building the LALR tables takes a tenth of a second, reading them a fifth of that. They are stored as JSON
+(never a pickle) in the cache folder (`stlc.cache`), under a name that depends on the grammar and on the
+versions of Lark and Python. A missing, damaged or read-only cache only costs that time.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _DAMAGED = (ValueError, TypeError, LookupError, AttributeError, AssertionError, 
 
 @cache
 def load_parser() -> lark.Lark:
-    """The parser of the language, with the start rules `start` and `expr`."""
+    """Return the parser of the language, with the start rules `start` and `expr`."""
     grammar = grammar_text()
     kept, name = lasting(), cache_name(grammar)
     parser = None if kept is None else _read(kept.read(name))
@@ -40,13 +40,13 @@ def load_parser() -> lark.Lark:
 
 
 def grammar_text() -> str:
-    """The grammar with the words of the language in it."""
+    """Return the grammar with the vocabulary of the language inserted."""
     text = (files("stlc.grammar") / "stl.lark").read_text(encoding="utf-8")
     return re.sub(r"\{\{(\w+)\}\}", lambda match: PATTERNS[match[1]], text)
 
 
 def build_parser(grammar: str) -> lark.Lark:
-    """A parser from scratch."""
+    """Build a parser without the cache."""
     return lark.Lark(
         grammar,
         parser="lalr",
@@ -58,7 +58,7 @@ def build_parser(grammar: str) -> lark.Lark:
 
 
 def cache_name(grammar: str) -> str:
-    """Under which name the tables of this grammar are kept."""
+    """Return the cache name of the tables of this grammar."""
     key = f"{lark.__version__} {sys.version_info[:2]} {grammar}"
     return f"grammar-{sha256(key.encode()).hexdigest()[:16]}.json"
 
@@ -80,12 +80,12 @@ def _read(text: bytes | None) -> lark.Lark | None:
 
 
 def _with_numbers(value: dict[str, Any]) -> dict[str | int, Any]:
-    """The tables are keyed by numbers, which JSON writes as texts."""
+    """Restore the integer keys of the tables, which JSON stores as strings."""
     return {int(key) if key.isdigit() else key: item for key, item in value.items()}
 
 
 def acceptable(text: str, rule: str = "start") -> frozenset[str] | None:
-    """The terminals that may follow `text`, or None where `text` itself cannot be read.
+    """Return the terminals that may follow `text`, or None if `text` itself does not parse.
 
     Args:
         text: the beginning of a declaration, or of an expression.

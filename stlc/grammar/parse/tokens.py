@@ -1,7 +1,6 @@
-"""The tokens of a well-formed text with the comments between them: what a formatter needs and a tree drops.
+"""Tokens of a well-formed text with their comments, which the syntax tree omits, for the formatter.
 
-The text is cut as in `parser.parse`, and each piece goes through the same tables, so a token here is the
-token that the tree was built from.
+The text is split as in `parser.parse` and read with the same tables, so tokens are those of the tree.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ _WITH_BLANKS = frozenset({"UNARY_AT", "BINARY_AT", "_NOT_IN"})
 
 @dataclass(frozen=True, slots=True)
 class Comment:
-    """A comment, as it is written, without the blanks at its end.
+    """Comment as written, without trailing blanks.
 
     Attributes:
         text: with its `#` or `//`.
-        own_line: nothing but blanks stands before it on its line.
-        apart: an empty line stands before it.
+        own_line: only blanks precede it on its line.
+        apart: an empty line precedes it.
     """
 
     text: str
@@ -39,16 +38,16 @@ class Comment:
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """A token of the grammar with the comments that belong to it.
+    """Token of the grammar with its comments.
 
     Attributes:
         kind: name of its terminal.
-        text: as it is written.
+        text: as written.
         start: offset of its first character.
-        end: offset behind its last one.
-        before: comments between the token before (or its trailing comment) and this one.
-        after: the comment behind it on its line.
-        apart: an empty line stands before it (behind its comments).
+        end: offset after its last character.
+        before: comments between the previous token (or its trailing comment) and this one.
+        after: trailing comment on its line.
+        apart: an empty line precedes it (after its comments).
     """
 
     kind: str
@@ -62,7 +61,7 @@ class Token:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A pragma, an import or a declaration: the name of its rule and its tokens."""
+    """Pragma, import or declaration, with its rule and tokens."""
 
     rule: str
     tokens: tuple[Token, ...]
@@ -70,14 +69,14 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """A whole text: items in order, and the comments behind the last one."""
+    """Whole text: items in order, and the comments after the last one."""
 
     items: tuple[Item, ...]
     rest: tuple[Comment, ...]
 
 
 def tokenize(source: Source) -> Layout:
-    """The tokens of a text that `parser.parse` accepts.
+    """Return the tokens of a text that `parser.parse` accepts.
 
     Raises:
         SpecError: E010, the text is not well-formed.
@@ -120,7 +119,7 @@ def _at(token: LarkToken) -> int:
 
 
 def _items(tokens: Sequence[Token], places: Sequence[tuple[str, int, int]]) -> Iterator[Item]:
-    """Tokens by item. What stands between two items (`;`) is dropped; its comments go on to the next."""
+    """Group tokens by item. Tokens between items (`;`) are dropped; their comments move to the next item."""
     index = 0
     for rule, start, end in places:
         carried: tuple[Comment, ...] = ()
@@ -138,7 +137,7 @@ def _items(tokens: Sequence[Token], places: Sequence[tuple[str, int, int]]) -> I
 
 
 def _own(token: Token) -> tuple[Comment, ...]:
-    """The comments of a token that is dropped. One that stood behind it must not become documentation."""
+    """Return the comments of a dropped token; a trailing one must not become documentation."""
     if token.after is None:
         return token.before
     text = f"# {token.after.text}" if token.after.text.startswith("##") else token.after.text
@@ -149,7 +148,7 @@ def _own(token: Token) -> tuple[Comment, ...]:
 
 
 def _attach(text: str, tokens: list[Token]) -> tuple[Comment, ...]:
-    """Give every comment to a token, in place; the comments behind the last token are returned."""
+    """Attach every comment to a token, in place; return the comments after the last token."""
     previous, offset = -1, 0
     for index, token in enumerate(tokens):
         found, apart = _comments(text, offset, token.start, first=previous < 0)
@@ -162,14 +161,14 @@ def _attach(text: str, tokens: list[Token]) -> tuple[Comment, ...]:
 
 
 def _inside(token: Token) -> tuple[Comment, ...]:
-    """The comments within `always # … @` or `not # … in`; they move before it."""
+    """Return the comments inside a token such as `always # … @` or `not # … in`, which move before it."""
     if token.kind not in _WITH_BLANKS:
         return ()
     return tuple(Comment(match[0].rstrip(), own_line=True) for match in _COMMENT.finditer(token.text))
 
 
 def _give_trailing(tokens: list[Token], index: int, found: tuple[Comment, ...]) -> tuple[Comment, ...]:
-    """Hand a comment on the line of a token to that token; a `;` hands it back to the token before."""
+    """Attach a trailing comment to the token on its line; after a `;`, to the token before it."""
     if not found or found[0].own_line or index < 0:
         return found
     owner = index
@@ -180,7 +179,7 @@ def _give_trailing(tokens: list[Token], index: int, found: tuple[Comment, ...]) 
 
 
 def _comments(text: str, start: int, end: int, *, first: bool) -> tuple[tuple[Comment, ...], bool]:
-    """The comments of a gap between two tokens, and whether an empty line stands behind them."""
+    """Return the comments between two tokens, and whether an empty line follows them."""
     found: list[Comment] = []
     offset = start
     for match in _COMMENT.finditer(text, start, end):

@@ -1,4 +1,4 @@
-"""Requirements in English: what a person would say who reads a formula aloud."""
+"""Requirements as English sentences."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _EQUAL = {"==": "is", "!=": "is not"}
 
 
 def sentence(item: ast.Require | ast.Assume) -> str:
-    """A requirement as one English sentence."""
+    """Return a requirement as one English sentence."""
     text = say(item.formula)
     begins = text.partition(" ")[0] in _OPENINGS
     return f"{text[0].upper()}{text[1:]}." if begins else f"{text}."
@@ -25,11 +25,11 @@ _NAMED = ast.Def | ast.Region | ast.Const
 
 
 REPEATED = 200_000
-"""Letters of definitions that are told with each requirement that uses them; after that each is told once."""
+"""Limit in characters on definitions repeated with each requirement that uses them."""
 
 
 class Meanings:
-    """The definitions of a specification in words: what they mean is worked out once."""
+    """Definitions of a specification in words, each computed once."""
 
     def __init__(self, spec: ast.Spec) -> None:
         self._known = {entry.name: entry for entry in spec.items if isinstance(entry, _NAMED)}
@@ -38,10 +38,9 @@ class Meanings:
         self._letters = 0
 
     def of(self, item: ast.Require | ast.Assume) -> list[tuple[str, str]]:
-        """The names that a requirement uses, those that they use too, each with its meaning.
+        """Return the names that a requirement uses, directly or indirectly, each with its meaning.
 
-        Where the definitions of a specification come to more than `REPEATED` letters, those that an earlier
-        requirement has told are left out.
+        If the definitions of a specification exceed `REPEATED` characters, each is given only once.
         """
         found: dict[str, str] = {}
         queue = deque(self._used(item.formula))
@@ -78,7 +77,7 @@ def _is_formula(expr: ast.Expr) -> bool:
 
 
 def say(expr: ast.Expr) -> str:
-    """An expression in words."""
+    """Return an expression in words."""
     match expr:
         case ast.Temporal() | ast.Until():
             return _temporal(expr)
@@ -99,7 +98,7 @@ def say(expr: ast.Expr) -> str:
 
 
 def _inner(expr: ast.Expr) -> str:
-    """An expression within a sentence; a connective of its own stands in parentheses."""
+    """Return an expression within a sentence, connectives in parentheses."""
     return f"({say(expr)})" if isinstance(expr, ast.Logic | ast.Until) else say(expr)
 
 
@@ -132,7 +131,7 @@ def _temporal(expr: ast.Temporal | ast.Until) -> str:
 
 
 def _when(interval: ast.Interval | None, *, past: bool) -> str:
-    """The window of a temporal operator."""
+    """Return the window of a temporal operator in words."""
     if interval is None:
         return "so far" if past else "from now on"
     low, high = show_expr(interval.lo), show_expr(interval.hi)
@@ -176,7 +175,7 @@ def _logic(expr: ast.Logic | ast.Not) -> str:
 
 
 def _side(expr: ast.Expr, op: str) -> str:
-    """An operand; one of the same connective needs no parentheses."""
+    """Return an operand; one with the same connective needs no parentheses."""
     return say(expr) if isinstance(expr, ast.Logic) and expr.op == op else _inner(expr)
 
 

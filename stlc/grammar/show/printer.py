@@ -1,7 +1,7 @@
-"""AST -> canonical text, with no parentheses but those that are needed. Law: `parse(show(a)) == a`.
+"""Printer from AST to canonical text with minimal parentheses. Invariant: `parse(show(a)) == a`.
 
-One blank around operators, none inside brackets; aliases and other spellings (`G`, `&&`, `=>`) become the
-names that the language prefers. Names of one's own get backticks where they would be read as something else.
+One blank around operators, none inside brackets; aliases (`G`, `&&`, `=>`) become the preferred spellings.
+User-defined names get backticks where they would be read as something else.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ def _level(expr: ast.Expr) -> Level:
 
 
 def show_at(expr: ast.Expr, least: Level) -> str:
-    """The expression, in parentheses if it binds less tightly than its place needs."""
+    """Return the expression, in parentheses if its precedence is below `least`."""
     text = show_expr(expr)
     return text if _level(expr) >= least else f"({text})"
 
 
 def show_expr(expr: ast.Expr) -> str:
-    """The text of an expression."""
+    """Return the text of an expression."""
     return _SHOWN[type(expr)](expr)
 
 
@@ -94,7 +94,7 @@ def _postfix(expr: ast.Index | ast.Attr | ast.Call) -> str:
 
 
 def _base(expr: ast.Expr) -> str:
-    """The operand before an index, a point or an argument list; a number would swallow them."""
+    """Return the operand before an index, a dot or an argument list; a number needs parentheses."""
     return f"({show_expr(expr)})" if isinstance(expr, ast.Quantity) else show_at(expr, Level.POSTFIX)
 
 
@@ -147,13 +147,13 @@ def _temporal(expr: ast.Temporal | ast.Until) -> str:
 
 
 def _body(expr: ast.Expr, interval: str) -> str:
-    """The operand of a temporal operator; a vector would be read as its interval."""
+    """Return the operand of a temporal operator; a vector, which would be its interval, gets parentheses."""
     text = show_at(expr, Level.PREFIX)
     return f"({text})" if text.startswith("[") and not interval else text
 
 
 def show_interval(interval: ast.Interval) -> str:
-    """The text of an interval, with its `@`."""
+    """Return the text of an interval, with its `@`."""
     clock = "@" if interval.clock == "start" else ""
     opening, closing = "(" if interval.lo_open else "[", ")" if interval.hi_open else "]"
     return f"{clock}{opening}{show_expr(interval.lo)}, {show_expr(interval.hi)}{closing}"
@@ -204,7 +204,7 @@ _LEVELS: Mapping[type, Level] = MappingProxyType(
         **dict.fromkeys((ast.Index, ast.Attr, ast.Call), Level.POSTFIX),
     }
 )
-"""Class of expressions -> how tightly it binds, where all of it bind alike; others are atoms."""
+"""Expression class -> precedence, where it is constant; other classes are atoms."""
 
 _SHOWN: Mapping[type, Callable[[Any], str]] = MappingProxyType(
     {
@@ -224,17 +224,17 @@ _SHOWN: Mapping[type, Callable[[Any], str]] = MappingProxyType(
 
 
 def show_name(name: str) -> str:
-    """A name where `T`, `end` and `dt` mean what they mean everywhere."""
+    """Return a name in an expression, where bare `T`, `end` and `dt` are built in."""
     return f"`{name}`" if name in RESERVED or not _IDENTIFIER.fullmatch(name) else name
 
 
 def own_name(name: str) -> str:
-    """A name where it is declared."""
+    """Return a name in its declaration."""
     return f"`{name}`" if name in BUILT_IN else show_name(name)
 
 
 def _number(value: Fraction) -> str:
-    """The shortest decimal; a fraction that has none is written as a quotient in parentheses."""
+    """Return the shortest decimal; a fraction without one is a quotient in parentheses."""
     twos, fives, rest = 0, 0, value.denominator
     while rest % 2 == 0:
         twos, rest = twos + 1, rest // 2
@@ -260,7 +260,7 @@ def _decimal(digits: str, places: int) -> str:
 
 
 def show(node: ast.Node) -> str:
-    """The text of a node: an expression, a declaration or a whole specification."""
+    """Return the text of a node: an expression, a declaration or a whole specification."""
     if isinstance(node, ast.Declaration):
         return _declaration(node)
     return (_PARTS.get(type(node)) or show_expr)(node)  # type: ignore[arg-type]
