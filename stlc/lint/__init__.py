@@ -1,1 +1,1 @@
-"""Linter: findings in valid specifications, unclear, unused or unusual."""
+"""Linter: findings in valid specifications, such as unclear, unused or unusual parts."""

@@ -1,4 +1,4 @@
-"""The findings of a specification, from the compiler and from the rules, and their repairs."""
+"""Linter of a specification: findings of the compiler and of the lint rules, and their repairs."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ ROUNDS = 20
 
 @dataclass(frozen=True, slots=True)
 class Fixed:
-    """A repaired text.
+    """Repaired text.
 
     Attributes:
-        source: the text as it is now.
-        findings: what is left.
-        count: how many findings were repaired.
+        source: text after the repairs.
+        findings: remaining findings.
+        count: number of repaired findings.
     """
 
     source: Source
@@ -35,13 +35,13 @@ class Fixed:
 
 
 def fix(source: Source, look: Callable[[Source], Sequence[Diagnostic]]) -> Fixed:
-    """Repair a text until nothing is left that can be repaired.
+    """Apply repairs until no repairable finding remains.
 
-    A round that would bring new errors is not taken. Repairs that overlap wait for the next round.
+    A round that would introduce new errors is discarded. Overlapping repairs wait for the next round.
 
     Args:
         source: the text.
-        look: a text -> its findings.
+        look: text -> its findings.
     """
     findings, count = tuple(look(source)), 0
     for _ in range(ROUNDS):
@@ -65,7 +65,7 @@ def _errors(findings: Iterable[Diagnostic]) -> int:
 
 
 def _apart(repairs: Iterable[Fix | None]) -> list[Fix]:
-    """Repairs that do not touch the same part of the text; of two the first."""
+    """Return non-overlapping repairs; of two overlapping ones the first."""
     chosen: list[Fix] = []
     taken: set[tuple[int, int]] = set()
     for repair in repairs:
@@ -91,11 +91,11 @@ def _edited(text: str, repairs: Iterable[Fix]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Which warnings to look for; errors are always told.
+    """Selection of warnings; errors are always reported.
 
     Attributes:
-        select: prefixes of codes; none means the usual ones, "ALL" every one.
-        ignore: prefixes of codes to leave out.
+        select: prefixes of codes; empty for the default ones, "ALL" for every one.
+        ignore: prefixes of codes to omit.
     """
 
     select: tuple[str, ...] = ()
@@ -109,7 +109,7 @@ class Selection:
                 raise UsageError(Diagnostic("U101", f"there is no code `{prefix}`", help=(advice,)))
 
     def wants(self, code: str) -> bool:
-        """True if findings of this code are told."""
+        """True if findings with this code are reported."""
         if not code.startswith("W"):
             return True
         if self.ignore and code.startswith(self.ignore):
@@ -121,7 +121,7 @@ class Selection:
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """The system that a specification is looked at with, and for which purpose."""
+    """System and purpose for which a specification is linted."""
 
     interface: Interface
     grid: Grid
@@ -134,11 +134,11 @@ EVERYTHING_USUAL = Selection()
 def lint(
     source: Source, *, within: Surroundings | None = None, selection: Selection = EVERYTHING_USUAL
 ) -> tuple[Diagnostic, ...]:
-    """All findings in a text, in its order.
+    """Return all findings in a text, in source order.
 
     Args:
         source: the text.
-        within: a system; without one what only a system can say is not looked at.
+        within: system and purpose; without a system, checks that need one are skipped.
         selection: of warnings.
     """
     try:
@@ -169,6 +169,6 @@ def _written(spec: ast.Spec, selection: Selection) -> Iterator[Diagnostic]:
 
 
 def _place(finding: Diagnostic, source: Source) -> tuple[bool, int]:
-    """Findings in the text itself by place, then the others."""
+    """Sort key: findings in the text itself by position, then all others."""
     own = finding.span is not None and finding.span.source is source
     return not own, finding.span.start if own and finding.span else 0

@@ -1,4 +1,4 @@
-"""The rules that look at a text as it is written; sorts, units and times are checked by the compiler."""
+"""Lint rules on the syntax as written; the compiler checks sorts, units and times."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _WHY: dict[AmbiguityKind, str] = {
 
 
 def missing_parentheses(spec: ast.Spec) -> Iterator[Diagnostic]:
-    """W301: a part whose extent depends on the tool."""
+    """Return W301 for parts that other tools parse differently."""
     return (_finding("W301", part) for part in ambiguities(spec))
 
 
 def unclear_implications(spec: ast.Spec) -> Iterator[Diagnostic]:
-    """W302: `and` or `or` beside `->`, which most readers and tools read as it is meant here."""
+    """Return W302 for `and` or `or` with `->`, which most tools parse as here."""
     parts = ambiguities(spec, implications=True)
     return (_finding("W302", part) for part in parts if part.kind == "implication")
 
@@ -62,7 +62,7 @@ _WORDS = {
 
 
 def foreign_spellings(spec: ast.Spec) -> Iterator[Diagnostic]:
-    """W106: `G`, `ev`, `&&`, `=>` and their kin."""
+    """Return W106 for foreign spellings such as `G`, `ev`, `&&`, `=>`."""
     source = spec.source
     end = Lexeme("sign", "", len(source.text), len(source.text))
     for item, following in pairwise([*lexemes(source.text), end]):
@@ -82,7 +82,7 @@ def foreign_spellings(spec: ast.Spec) -> Iterator[Diagnostic]:
 
 
 def _own(item: Lexeme, following: Lexeme) -> str | None:
-    """Spelling in this language of a word or sign of another tool."""
+    """Return the spelling in this language of a word or sign of another tool."""
     if item.kind == "sign":
         return _SIGNS.get(item.text)
     if item.kind != "word":
@@ -93,7 +93,7 @@ def _own(item: Lexeme, following: Lexeme) -> str | None:
 
 
 def _glues(item: Lexeme, following: Lexeme) -> bool:
-    """True if the word behind a sign would become one with the word that replaces it."""
+    """True if the replacement of a sign would merge with the following word."""
     return following.start == item.end and following.kind in ("word", "number")
 
 
@@ -108,7 +108,7 @@ _KINDS: dict[type[ast.Declaration], str] = {
 
 
 def unused_names(spec: ast.Spec) -> Iterator[Diagnostic]:
-    """W105: what is declared and never used. A signal may be there for the system's sake."""
+    """Return W105 for unused declarations, except signals, which the system may need."""
     used = Counter(_uses(spec))
     for item in spec.items:
         kind = _KINDS.get(type(item))
@@ -143,7 +143,7 @@ def _unused_arguments(item: ast.Def) -> Iterator[Diagnostic]:
 
 
 def _uses(root: ast.Node) -> Iterator[str]:
-    """Every name that is read below a node."""
+    """Return all names that are read below a node."""
     for node in descendants(root):
         match node:
             case ast.Name(name=name) | ast.TypeRef(name=name):
@@ -153,7 +153,7 @@ def _uses(root: ast.Node) -> Iterator[str]:
 
 
 def nothing_required(spec: ast.Spec) -> Iterator[Diagnostic]:
-    """W504: signals and definitions, but no requirement. A file to be imported has no signals."""
+    """Return W504 for a file with signals but no requirement (files to be imported have no signals)."""
     kinds = {type(item) for item in spec.items}
     if ast.Require not in kinds and (ast.Signal in kinds or not kinds):
         name = spec.name or spec.source.name
@@ -170,11 +170,11 @@ Check: TypeAlias = Callable[[ast.Spec], Iterator[Diagnostic]]
 
 @dataclass(frozen=True, slots=True)
 class LintRule:
-    """One thing to look for.
+    """Lint rule.
 
     Attributes:
-        check: a well-formed specification -> its findings.
-        usual: looked for unless something else is selected.
+        check: well-formed specification -> findings.
+        usual: active by default.
     """
 
     check: Check
@@ -190,4 +190,4 @@ RULES: Mapping[str, LintRule] = MappingProxyType(
         "W504": LintRule(nothing_required),
     }
 )
-"""Code -> rule; the code's page says why (`stlc explain CODE`)."""
+"""Code -> rule; `stlc explain CODE` gives the rationale."""
