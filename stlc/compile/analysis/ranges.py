@@ -15,7 +15,7 @@ _DEVIATIONS = 3.0
 _CHANGES: Mapping[str, Callable[[float, float], float]] = MappingProxyType(
     {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv}
 )
-"""Unit conversion of sampler arguments: locations are shifted and scaled, deviations only scaled."""
+"""Operations of a draw and a constant, such as unit conversions."""
 
 
 def usual_range(num: ir.Num) -> tuple[float, float] | None:
@@ -52,7 +52,7 @@ KnownRanges: TypeAlias = Mapping[str, Bounds]
 
 
 def bounds(num: ir.Num, facts: KnownRanges) -> Bounds | None:
-    """Return the tightest interval for `num` by interval arithmetic, or None where `facts` do not bound it.
+    """Return an interval that encloses `num`, by interval arithmetic, or None where `facts` do not bound it.
 
     Args:
         num: a number in SI units.

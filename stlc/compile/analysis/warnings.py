@@ -20,7 +20,7 @@ _TOLERANCE = 1e-6
 
 
 def contradictions(formula: typed.Formula) -> Iterator[Diagnostic]:
-    """Return W505 for each conjunction in a formula that is unsatisfiable for all signal values."""
+    """Yield W505 for each conjunction in a formula that is unsatisfiable for all signal values."""
     told: set[Span] = set()
     for node in nodes(formula):
         if isinstance(node, typed.Logic) and node.op == "and" and node.span not in told:
@@ -114,7 +114,7 @@ def _linear(num: ir.Num) -> _Linear:
 
 
 def jumps(formula: typed.Formula, ranges: KnownRanges) -> Iterator[Diagnostic]:
-    """Return a warning for each predicate with a modulo that is discontinuous within its signals' ranges.
+    """Yield a warning for each predicate with a modulo that is discontinuous within its signals' ranges.
 
     Args:
         formula: as resolved.
@@ -148,7 +148,7 @@ _DECIDED = 1e-6
 
 
 def vacuous(formula: typed.Formula, signature: Signature, facts: KnownRanges) -> Iterator[Diagnostic]:
-    """Return W503 for implications whose left side is never true, and for a formula that is never false.
+    """Yield W503 for implications whose left side is never true, and for a formula that is never false.
 
     Only enforced ranges are used: a nominal range does not constrain the signal.
     """

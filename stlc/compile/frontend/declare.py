@@ -287,7 +287,7 @@ def _ends(
 def ends_of(
     domain: tuple[ast.Expr, ast.Expr] | ast.SetLiteral, column: Column, unit: Unit, scope: Scope
 ) -> Iterator[float | None]:
-    """Return the bounds of a range or the members of a set, in the unit of the column; None for `inf`."""
+    """Yield the bounds of a range or the members of a set, in the unit of the column; None for `inf`."""
     return _stored(domain if isinstance(domain, tuple) else domain.items, column, unit, scope)
 
 

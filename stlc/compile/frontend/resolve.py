@@ -358,7 +358,7 @@ def _scale(tags: Tags, formula: typed.Formula, ranges: KnownRanges, scope: Scope
 def _warnings(
     requirement: typed.Requirement, item: ast.Require, signature: Signature, scope: Scope
 ) -> list[Diagnostic]:
-    """Report W502, W503 and W505 of a requirement."""
+    """Return W502, W503 and W505 of a requirement."""
     tag = next((tag for tag in item.tags if tag.name == "safety"), None)
     found = [*vacuous(requirement.formula, signature, scope.facts), *contradictions(requirement.formula)]
     weak = safety_never_violated(requirement, tag)

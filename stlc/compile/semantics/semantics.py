@@ -46,7 +46,7 @@ def semantics_of(asked: str | Semantics = "exact", smoothing: float | None = Non
 
     Args:
         asked: a semantics, or a name in `SEMANTICS`.
-        smoothing: scale k of log-sum-exp, which it selects where `asked` is None.
+        smoothing: scale k; selects log-sum-exp in place of `exact` or `smooth`.
 
     Raises:
         UsageError: U101, an unknown semantics, or `smoothing` for one without a scale.

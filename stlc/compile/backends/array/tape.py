@@ -139,7 +139,7 @@ class Tape:
         return self.call("div", a, b)
 
     def pow(self, a: Operand, b: Operand) -> Operand:
-        """`a ^ b`; small integer powers as products."""
+        """`a ^ b`; common constant exponents without `pow`."""
         if isinstance(b, int):
             return self.call("pow", a, b)
         match b:
