@@ -41,7 +41,7 @@ class Ambiguity:
 
 
 def ambiguities(spec: ast.Spec, *, implications: bool = False) -> Iterator[Ambiguity]:
-    """Return all parts that other tools parse differently, in source order.
+    """Yield all parts that other tools parse differently, in source order.
 
     Args:
         spec: as parsed.

@@ -26,12 +26,12 @@ _WHY: dict[AmbiguityKind, str] = {
 
 
 def missing_parentheses(spec: ast.Spec) -> Iterator[Diagnostic]:
-    """Return W301 for parts that other tools parse differently."""
+    """Yield W301 for parts that other tools parse differently."""
     return (_finding("W301", part) for part in ambiguities(spec))
 
 
 def unclear_implications(spec: ast.Spec) -> Iterator[Diagnostic]:
-    """Return W302 for `and` or `or` with `->`, which most tools parse as here."""
+    """Yield W302 for `and` or `or` with `->`, which most tools parse as here."""
     parts = ambiguities(spec, implications=True)
     return (_finding("W302", part) for part in parts if part.kind == "implication")
 
@@ -62,7 +62,7 @@ _WORDS = {
 
 
 def foreign_spellings(spec: ast.Spec) -> Iterator[Diagnostic]:
-    """Return W106 for foreign spellings such as `G`, `ev`, `&&`, `=>`."""
+    """Yield W106 for foreign spellings such as `G`, `ev`, `&&`, `=>`."""
     source = spec.source
     end = Lexeme("sign", "", len(source.text), len(source.text))
     for item, following in pairwise([*lexemes(source.text), end]):
@@ -108,7 +108,7 @@ _KINDS: dict[type[ast.Declaration], str] = {
 
 
 def unused_names(spec: ast.Spec) -> Iterator[Diagnostic]:
-    """Return W105 for unused declarations, except signals, which the system may need."""
+    """Yield W105 for unused declarations, except signals, which the system may need."""
     used = Counter(_uses(spec))
     for item in spec.items:
         kind = _KINDS.get(type(item))
@@ -143,7 +143,7 @@ def _unused_arguments(item: ast.Def) -> Iterator[Diagnostic]:
 
 
 def _uses(root: ast.Node) -> Iterator[str]:
-    """Return all names that are read below a node."""
+    """Yield all names that are read below a node."""
     for node in descendants(root):
         match node:
             case ast.Name(name=name) | ast.TypeRef(name=name):
@@ -153,7 +153,7 @@ def _uses(root: ast.Node) -> Iterator[str]:
 
 
 def nothing_required(spec: ast.Spec) -> Iterator[Diagnostic]:
-    """Return W504 for a file with signals but no requirement (files to be imported have no signals)."""
+    """Yield W504 for a file with signals but no requirement (files to be imported have no signals)."""
     kinds = {type(item) for item in spec.items}
     if ast.Require not in kinds and (ast.Signal in kinds or not kinds):
         name = spec.name or spec.source.name

@@ -235,7 +235,7 @@ def _missing(
 
 
 def _product(failure: ParseFailure) -> tuple[str, ...]:
-    """Recognise a product without `*`: `2 (x + 1)`, `x y`."""
+    """Return the help for a product without `*`: `2 (x + 1)`, `x y`."""
     previous, found = failure.previous, failure.found
     if previous is None or found is None or "MULOP" not in failure.accepts or "UNIT" in failure.accepts:
         return ()

@@ -187,7 +187,7 @@ class Column:
         kind: the rule of its declaration; "tag", "comment", or "part" of several lines.
         head: width of its first part, shared among lines of one kind; 0 for none.
         comment: at the end of the line.
-        apart: an empty line stands before it.
+        apart: an empty line precedes it.
     """
 
     text: str
@@ -198,7 +198,7 @@ class Column:
 
 
 def align(lines: Sequence[Column]) -> Iterator[str]:
-    """Return the aligned lines as text, including empty lines."""
+    """Yield the aligned lines as text, including empty lines."""
     padded = _pad_heads(lines)
     for line, text in zip(padded, _with_comments(padded), strict=True):
         if line.apart:

@@ -158,7 +158,7 @@ def _role(text: Text, index: int) -> Role:
 
 
 def _holds_interval(text: Text, opening: int) -> bool:
-    """True if the parenthesis after a temporal operator is an interval, that is, holds a comma."""
+    """True if the bracket is an interval: after a temporal operator, with a comma or closed by `]`."""
     closing = text.partner[opening]
     if not opening or text.tokens[opening - 1].kind not in ("UNARY", "BINARY"):
         return False
