@@ -136,7 +136,7 @@ def _box_of(call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scop
         scope.fail(Diagnostic("E205", message, call.span))
     for low, high in zip(lower.items, upper.items, strict=True):
         if low.bare is not high.bare:
-            continue  # a bare centre takes the unit of the tested point
+            continue  # the bare corner takes the unit of the tested point
         if not low.bare:
             low, high = absolute(low), absolute(high)
         if low.constant is not None and high.constant is not None and low.constant > high.constant:
