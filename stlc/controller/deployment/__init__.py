@@ -1,1 +1,1 @@
-"""Closed loop: worlds, disturbances, events, and the agents in them."""
+"""Closed-loop simulation: worlds, disturbances, exogenous events, live monitoring."""

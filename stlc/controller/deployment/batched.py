@@ -1,4 +1,4 @@
-"""The worlds of all seeds of a deployment, as one; what they do wrong is told, and where."""
+"""Batch of the worlds of all seeds; errors in worlds are reported with their source location."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ if TYPE_CHECKING:
 
 
 REDRAWN = 50
-"""Draws of the start of one agent, at most."""
+"""Maximum number of draws of one agent's start."""
 
 SURPRISE = 1e-6
-"""Difference of a state above which it is no rounding."""
+"""Largest state difference that counts as rounding."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A deployment: which seeds, how many agents each, how long, and how often they plan anew.
+    """Options of a deployment: seeds, agents per seed, number of steps, replanning period.
 
-    An agent that the world tells something new (a signal of role `env` has changed) plans at once.
+    An agent plans at once when a signal of role `env` has changed.
 
-    `limit`: seconds that a decision of the full guard may take per agent; None: as long as it takes.
-    `paper_limit`: the same of the paper's guard.
-    `ceiling`: visited states, of all seeds, that are searched for a plan where the followed one fails.
-    `margin`: what a guard asks plans to spare of safety requirements, by their names.
+    `limit`: seconds per agent for a decision of the full guard; None: no limit. `paper_limit`: the same for
+    the paper's guard. `ceiling`: number of visited states, over all seeds, that are searched for a plan where
+    the followed one fails. `margin`: robustness margin that a guard requires of safety requirements, by their
+    names.
     """
 
     seeds: tuple[int, ...]
@@ -54,10 +54,10 @@ class Setting:
 
 
 class Worlds:
-    """The worlds of all seeds, as one.
+    """Batch of the worlds of all seeds.
 
-    Raises SystemFileError, pointing into the world's file, where one fails: S207, or S302 for states that
-    are no numbers. Worlds get states and actions of their own: what they write into them is nobody else's.
+    Raises SystemFileError with a location in the world's file: S207 where a world fails, S302 for non-finite
+    states. Worlds get copies of states and actions, which they may modify.
     """
 
     def __init__(self, task: Task, make: WorldType, setting: Setting) -> None:
@@ -75,14 +75,14 @@ class Worlds:
         self._scene: dict[str, NDArray[Any]] | None = None
 
     def reset(self) -> Tensor:
-        """The first states, (rows, n); parameters are drawn, timers as at the start of a mission.
+        """Return the initial states, (rows, n), with parameters drawn and timers at the start of a mission.
 
-        Where the system takes only starts from which a plan is known (`test: {starts: …}`), the others are
-        drawn again, `redrawn` of them in all.
+        Where the system admits only starts with a known plan (`test: {starts: …}`), the others are redrawn;
+        `redrawn` counts them.
 
         Raises:
-            SystemFileError: S211, a world cannot draw the start of an agent again.
-            RunError: R405, no start that it draws has a known plan.
+            SystemFileError: S211, a world cannot redraw the start of an agent.
+            RunError: R405, none of the drawn starts has a known plan.
         """
         given = []
         for world in self.worlds:
@@ -98,7 +98,7 @@ class Worlds:
         )
 
     def _with_plans(self, world: object, seed: int, x: Tensor) -> Tensor:
-        """The first states of a seed, (agents, n), drawn again wherever no plan is known from them."""
+        """Initial states of a seed, (agents, n), redrawn wherever no plan is known."""
         known = viable if self.task.system.decl.test.starts == "savable" else solvable
         good = known(self.task, x)
         for _ in range(REDRAWN):
@@ -118,10 +118,10 @@ class Worlds:
         raise _hopeless(self.task.system.decl.test.starts, seed, int((~good).sum()))
 
     def advance(self, x: Tensor, action: Tensor, step: int) -> Tensor:
-        """(rows, n), (rows, m) -> the (rows, n) states after step number `step`.
+        """Advance step number `step`: (rows, n), (rows, m) -> (rows, n).
 
-        Worlds know neither parameters nor timers: those stay, these follow from the true states. Who is
-        `quiet` met nothing: its world did what the truth of its dynamics alone does.
+        Worlds do not know parameters and timers: parameters are kept, timers follow from the true states.
+        `quiet` marks the rows without exogenous event: the world moved exactly as the true dynamics.
         """
         known = x[:, : self.size[1]]
         before, given = torch.split(known.clone(), self.parts), []
@@ -137,7 +137,7 @@ class Worlds:
         return torch.cat((moved, self.system.added_later(x)), 1)
 
     def options(self, x: Tensor) -> Tensor | None:
-        """States under every choice that there is, (rows, k, n); None where the worlds leave none."""
+        """States under every option, (rows, k, n); None where the worlds offer no choice."""
         given = []
         for world in self.worlds:
             if isinstance(world, Choosing):
@@ -157,7 +157,7 @@ class Worlds:
         return given.detach().to(torch.float64)
 
     def choose(self, pick: Tensor, x: Tensor) -> Tensor:
-        """The (rows, n) states when every agent has taken an option, (rows,)."""
+        """States after every agent has taken its option of `pick`, (rows,): (rows, n)."""
         given = []
         for world, part in zip(self.worlds, torch.split(pick, self.parts), strict=True):
             if isinstance(world, Choosing):
@@ -166,7 +166,7 @@ class Worlds:
         return torch.cat((self._checked("choose", given, None), x[:, self.size[1] :]), 1)
 
     def _checked(self, method: str, given: list[Tensor], step: int | None) -> Tensor:
-        """All states as one, (rows, n) float64."""
+        """Concatenate the states that worlds returned, (rows, n) float64, and check that they are finite."""
         found = []
         for world, seed, each in zip(self.worlds, self.seeds, given, strict=True):
             x = states_of(world, method, each, self.size)
@@ -175,10 +175,10 @@ class Worlds:
             found.append(x)
         return torch.cat(found)
 
-    # ------------------------------------------------------------- what worlds tell of themselves
+    # ------------------------------------------------------------- reports of the worlds
 
     def progress(self) -> tuple[Mapping[str, float], ...]:
-        """Progress of the task, seed by seed."""
+        """Progress of the task for each seed."""
         found = []
         for world in self.worlds:
             with blamed(world, "progress", "say its progress"):
@@ -186,12 +186,12 @@ class Worlds:
         return tuple(found)
 
     def units(self) -> dict[str, str]:
-        """Units of entries of `progress`."""
+        """Units of the entries of `progress`."""
         with blamed(self.worlds[0], "units", "say its units"):
             return {str(name): str(unit) for name, unit in self.worlds[0].units().items()}
 
     def snapshot(self) -> Mapping[str, NDArray[Any]]:
-        """Arrays for a picture of the first seed, which keep their shapes."""
+        """Arrays for a picture of the first seed; their shapes stay constant."""
         world = self.worlds[0]
         with blamed(world, "snapshot", "give a snapshot"):
             given = world.snapshot()
@@ -200,11 +200,11 @@ class Worlds:
 
     @property
     def charting(self) -> bool:
-        """True where plans can be drawn into the picture of the first seed."""
+        """True if plans can be drawn into the picture of the first seed."""
         return isinstance(self.worlds[0], Charting)
 
     def charted(self, states: Tensor) -> NDArray[np.float64]:
-        """Places of planned states of the first seed, (agents, k, n), in its picture, (agents, k, 2 or 3)."""
+        """Picture coordinates of planned states of the first seed: (agents, k, n) -> (agents, k, 2 or 3)."""
         world = self.worlds[0]
         assert isinstance(world, Charting)
         with blamed(world, "charted", "say where plans are"):

@@ -1,4 +1,4 @@
-"""Exogenous effects of a deployment: events of the system; disturbance, noise and errors of a scenario."""
+"""Exogenous effects of a deployment: the system's events and its scenario's disturbance, noise and errors."""
 
 from __future__ import annotations
 
@@ -29,13 +29,14 @@ if TYPE_CHECKING:
 
 SECOND = parse_unit("s")
 _GAINS, _PUSHES, _BLURS, _NUMBERS = range(4)
-"""Streams of a seed by their use: worlds meet the same, whatever is disturbed."""
+"""Random streams of a seed by their use: worlds draw the same numbers whatever is disturbed."""
 
 
 class Disturbance:
-    """The `disturb`, `noise` and `errors` of the scenario of a system; nothing without one.
+    """Disturbance, noise and errors (`disturb`, `noise`, `errors`) of a system's scenario; none without one.
 
-    The former two read the state at hand and the time `t` of the deployment, and may draw.
+    `disturb` and `noise` read the present state and the time `t` of the deployment, and may draw random
+    numbers.
     """
 
     def __init__(self, system: System, generators: Sequence[torch.Generator], agents: int) -> None:
@@ -56,7 +57,7 @@ class Disturbance:
         self._spread = self._errors.sensor_noise * _ranges(system)
 
     def acted(self, action: Tensor) -> Tensor:
-        """Actions that actuators make of (rows, m) commands at this step."""
+        """Actuator outputs for (rows, m) commands at this step."""
         given = action
         if self._errors.actuator_gain:
             given = given * self._factor.to(given) + self._offset.to(given)
@@ -66,7 +67,7 @@ class Disturbance:
         return given
 
     def truths(self, truth: System) -> list[System]:
-        """The truth of each seed, from what it is where no number is wrong."""
+        """True dynamics of each seed: the system `truth` with the seed's parameter errors."""
         off = self._errors.parameters
         loose = perturbable(truth.decl) if off else None
         if loose is None or not loose.numbers:
@@ -75,32 +76,32 @@ class Disturbance:
         return [PerturbedSystem(loose, each) for each in torch.split(factors, self._agents)]
 
     def _wrong_gains(self) -> tuple[Tensor, Tensor]:
-        """Factors and offsets of controls, (rows, m) each: as much too large as too small, evenly."""
+        """Factors and offsets of controls, (rows, m) each; errors of either sign are equally likely."""
         off, angle = self._errors.actuator_gain, self._angle
         signs = self._signs(_GAINS, len(angle))
         return torch.where(angle, 1.0, 1.0 + off * signs), torch.where(angle, off * signs, 0.0)
 
     def _signs(self, stream: int, count: int) -> Tensor:
-        """(rows, count) numbers that are 1 or -1, those of each seed from its own stream."""
+        """Random signs, 1 or -1, (rows, count), each seed's from its own stream."""
         shape = (self._agents, count)
         drawn = [torch.randint(2, shape, generator=each) for each in self._streams[stream]]
         return 2.0 * torch.cat(drawn).double() - 1.0
 
     def _normal(self, stream: int, count: int) -> Tensor:
-        """(rows, count) standard normal numbers, those of each seed from its own stream."""
+        """Standard normal numbers, (rows, count), each seed's from its own stream."""
         shape = (self._agents, count)
         streams = self._streams[stream]
         return torch.cat([torch.randn(shape, generator=each, dtype=torch.float64) for each in streams])
 
     def pushed(self, x: Tensor, before: Tensor, step: int) -> Tensor:
-        """The (rows, n) states after a step that began in `before` at time `(step - 1) dt`, disturbed."""
+        """Disturbed states, (rows, n), after a step that began in `before` at time `(step - 1) dt`."""
         if not self._pushes:
             return x
         added = self._drawn(self._pushes, before, step - 1)
         return self._changed(x, {name: self._scale * value for name, value in added.items()}, clamped=True)
 
     def seen(self, x: Tensor, step: int) -> Tensor:
-        """Measured (rows, n) states; columns behind those of the system are as they are."""
+        """Measured states, (rows, n); columns beyond the system's own are exact."""
         seen = x
         if self._noises:
             seen = self._changed(x, self._drawn(self._noises, x, step), clamped=False)
@@ -111,7 +112,7 @@ class Disturbance:
         return seen
 
     def _drawn(self, drawings: Sequence[Drawing], x: Tensor, step: int) -> dict[str, Tensor]:
-        """Values for all rows, those of each seed from its own generator."""
+        """Values for all rows, drawn from each seed's own generator."""
         parts = []
         for rows, generator in zip(torch.split(x, self._agents), self._generators, strict=True):
             table = dict(zip(self._names, rows.double().unbind(1), strict=False))
@@ -133,7 +134,7 @@ class Disturbance:
 
 
 def errors_of(truth: System) -> dict[str, Any]:
-    """Errors of the scenario of a system, as shares, and the numbers of its dynamics that they concern."""
+    """Errors of a system's scenario, as shares, and the numbers of its dynamics that they affect."""
     scenario = truth.decl.scenario
     shares = {} if scenario is None else asdict(scenario.errors)
     found: dict[str, Any] = {name: share for name, share in shares.items() if share}
@@ -147,7 +148,7 @@ def _drawings(assigns: Sequence[Assign]) -> tuple[Drawing, ...]:
 
 
 def _ranges(system: System) -> Tensor:
-    """Width of the nominal range of each state, (n,); 0 for clocks and for what is no measure."""
+    """Width of the nominal range of each state, (n,); 0 for clocks and for discrete states."""
     widths = [
         column.high - column.low
         if column.kind == "real"
@@ -164,7 +165,7 @@ _CONDITION = "holds"
 
 
 class _Event:
-    """One declared event, ready to happen."""
+    """A compiled event."""
 
     def __init__(self, decl: EventDecl) -> None:
         self.decl = decl
@@ -173,7 +174,7 @@ class _Event:
         self.held: Tensor | None = None
 
     def fires(self, columns: dict[str, Tensor], step: int) -> Tensor:
-        """For whom it happens now, (agents,) booleans."""
+        """Agents for which the event fires at this step, (agents,) booleans."""
         like = next(iter(columns.values()))
         due = self.decl.at == step if self.decl.at is not None else True
         if self.decl.every is not None:
@@ -193,10 +194,10 @@ class _Event:
 
 
 class Events:
-    """All events of a deployment; keeps what their edges have seen.
+    """The events of a deployment, with the memory that edge triggers need.
 
     Args:
-        declared: in file order; later ones see what earlier ones set.
+        declared: in file order; later events see the effects of earlier ones.
         names: columns of a state.
         dt: step in seconds.
     """
@@ -206,7 +207,7 @@ class Events:
         self._names, self._dt = tuple(names), dt
 
     def apply(self, x: Tensor, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, int]]:
-        """The (agents, n) states after the events of `step`, and how often each with a condition came."""
+        """States (agents, n) after the events of `step`, and the firing count of each conditional event."""
         columns = dict(zip(self._names, x.unbind(1), strict=True))
         counts: dict[str, int] = {}
         for event in self._events:

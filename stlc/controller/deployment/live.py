@@ -1,4 +1,4 @@
-"""A deployment as it goes on: the margins of every agent, who decided, and how long that took."""
+"""Live monitor of a deployment: robustness margins, decision sources and decision times."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 class LiveMonitor:
     """Online margins of all agents during a deployment; requirements are those of `stlc check`.
 
-    Taking a moment in is cheap; what is asked of it costs.
+    `push` is cheap; margins are computed when they are read.
 
     Args:
         task: specification and system.
-        setting: of the deployment.
+        setting: options of the deployment.
     """
 
     def __init__(self, task: Task, setting: Setting) -> None:
@@ -35,7 +35,7 @@ class LiveMonitor:
         self._margins = Margins([as_driven(rule, task) for rule in task.rules], task.horizon)
 
     def push(self, moment: SimulationStep) -> None:
-        """Take the next moment in."""
+        """Append the next step of the deployment."""
         self.moment = moment
         states = moment.x.numpy(force=True)
         self._margins.push(dict(zip(self.task.names, states.T, strict=True)))
@@ -44,12 +44,12 @@ class LiveMonitor:
 
     @property
     def margins(self) -> dict[str, Margin]:
-        """Of every requirement, at the present sample."""
+        """Margin of every requirement at the present sample."""
         return self._margins.look()
 
     @property
     def time(self) -> float:
-        """Of the present sample, in seconds."""
+        """Time of the present sample in seconds."""
         return (self.moment.step if self.moment else 0) * self.task.dt
 
     def decided(self, row: int) -> str | None:
@@ -61,7 +61,7 @@ class LiveMonitor:
         return f"{name} T0={t0}" if name == "backup" else name
 
     def records(self) -> Iterator[dict[str, Any]]:
-        """The present moment, one object an agent: the lines of `--robustness`."""
+        """Records of the present step, one per agent: the lines of `--robustness`."""
         assert self.moment is not None
         margins, decision = self.margins, self.moment.decision
         for row in range(len(self.moment.x)):

@@ -1,4 +1,4 @@
-"""Closed loop: worlds advance seed by seed, decisions are taken for the agents of all seeds in one batch."""
+"""Closed-loop simulator: worlds advance seed by seed, decisions are made in one batch over all seeds."""
 
 from __future__ import annotations
 
@@ -27,27 +27,26 @@ Frame = Mapping[str, NDArray[Any]]
 
 @dataclass(frozen=True, slots=True)
 class DeploymentRecording:
-    """Trajectories of `agents` agents of each seed; rows are those of the first seed, then of the next.
+    """Trajectories of `agents` agents per seed; rows are ordered by seed, then by agent.
 
     Attributes:
-        agents: of one seed.
+        agents: number per seed.
         states: (rows, steps + 1, n).
         actions: (rows, steps, m).
         source: (rows, steps), index into `stlc.controller.guard.guard.SOURCES`.
-        t0: (rows, steps), length of the backup's prefix, 0 for the policy's own plan.
-        rho: (rows, steps), robustness of the plan that was followed.
-        policy_rho: (rows, steps), robustness of what the policy had planned.
-        safe: (rows, steps), whether the plan that was followed satisfies phi_safe.
-        progress: of each seed.
+        t0: (rows, steps), prefix length of the backup policy, 0 for the policy's own plan.
+        rho: (rows, steps), robustness of the followed plan.
+        policy_rho: (rows, steps), robustness of the policy's own plan.
+        safe: (rows, steps), whether the followed plan satisfies phi_safe.
+        progress: task progress of each seed.
         units: of entries of `progress`.
-        scene: snapshots of the first seed, stacked over time, and `decision` (frames, agents). Where a world
-            says where planned states are in its picture also `rejected` and `taken`, float32
-            (frames, agents, horizon + 1, 2 or 3): the policy's plan that a guard replaced, and the plan that
-            was followed; NaN where none was replaced.
-        quiet: (rows, steps), whether the world did nothing but what the truth of the dynamics does; None
-            where nobody has looked.
-        options: (rows, steps, k, n), among which agents chose; None where the world leaves no choice.
-        redrawn: starts that were drawn again because no plan is known from them.
+        scene: snapshots of the first seed, stacked over time, and `decision` (frames, agents). For a world
+            that maps planned states into its picture also `rejected` and `taken`, float32 (frames, agents,
+            horizon + 1, 2 or 3): the policy plan that a guard replaced and the followed plan; NaN without
+            intervention.
+        quiet: (rows, steps), whether there was no exogenous event; None where not recorded.
+        options: (rows, steps, k, n), the options of the agents; None where the world offers none.
+        redrawn: number of starts redrawn because no plan is known from them.
     """
 
     agents: int
@@ -67,15 +66,15 @@ class DeploymentRecording:
 
     @property
     def steps(self) -> int:
-        """Number of steps taken."""
+        """Number of recorded steps."""
         return int(self.actions.shape[1])
 
 
 @dataclass
 class Recorder:
-    """Gathers a recording step by step, so that what happened before a failure is not lost.
+    """Recorder of a deployment, step by step, so that a failure loses nothing that happened before.
 
-    `pictured`: whether the plans that a guard replaces are wanted, for pictures.
+    `pictured`: whether replaced plans are recorded for pictures.
     """
 
     agents: int
@@ -92,23 +91,23 @@ class Recorder:
     redrawn: int = 0
 
     def start(self, x: Tensor, frame: Frame) -> None:
-        """The first sample: `x` (rows, n), agents of all seeds one after the other."""
+        """Record the initial states `x` (rows, n), ordered by seed, then by agent."""
         self.states.append(x)
         self.frames.append(frame)
 
     def step(self, decision: GuardDecision, action: Tensor, x: Tensor, frame: Frame) -> None:
-        """One more step with `action` (rows, m), and the sample `x` (rows, n) behind it."""
+        """Record one step: `action` (rows, m), and the next states `x` (rows, n)."""
         self.decisions.append(decision)
         self.actions.append(action)
         self.start(x, frame)
 
     def chosen(self, x: Tensor, options: Tensor) -> None:
-        """The present sample is `x` (rows, n) by the choice of the agents among `options` (rows, k, n)."""
+        """Record the options (rows, k, n), and the states `x` (rows, n) that the agents chose."""
         self.states[-1] = x
         self.options.append(options)
 
     def recording(self) -> DeploymentRecording | None:
-        """Recording so far, whole steps only; None before the first one."""
+        """The recording so far, complete steps only; None before the first one."""
         steps = min(len(self.actions), len(self.frames) - 1)
         if steps < 1:
             return None
@@ -139,15 +138,15 @@ class Recorder:
 
 @dataclass(frozen=True, slots=True)
 class SimulationStep:
-    """A step of a deployment, as it has been decided.
+    """One step of a deployment after the decision.
 
     Attributes:
-        step: its number, from 0; `steps` at the end, when nothing is decided any more.
-        steps: of the deployment.
+        step: its number, from 0; `steps` at the end, where nothing is decided.
+        steps: total number of steps.
         x: the states, (rows, n).
-        decision: what is followed; None at the end.
-        planned: how many rows planned anew.
-        seconds: that deciding took.
+        decision: the decision; None at the end.
+        planned: number of rows that replanned.
+        seconds: decision time.
     """
 
     step: int
@@ -162,7 +161,7 @@ Watch = Callable[[SimulationStep], None]
 
 
 class _Pilot:
-    """Plans that agents follow, and their ages."""
+    """The agents' current plans and their ages in steps."""
 
     def __init__(self, guard: Guard, setting: Setting) -> None:
         self.guard, self.replan = guard, setting.replan
@@ -172,11 +171,11 @@ class _Pilot:
         self.age = torch.zeros(0, dtype=torch.int64)
 
     def due(self, x: Tensor, seen: Tensor, step: int) -> Tensor:
-        """Rows that plan now, (k,): all every `replan` steps, and those that the world told something.
+        """Rows that replan now, (k,): all every `replan` steps, and those whose exogenous signals changed.
 
-        So does whom the full guard sees run into danger with what is left of its plan. Where a plan is used
-        up before the others plan again, its last action counts until then. The last sample of a plan does
-        not: `sweep` looks from there to where nobody has planned to go.
+        With the full guard also those whose remaining plan violates safety by the model. A plan that ends
+        early is extended by its last action until the next planning instant. The last sample of a plan is not
+        counted: `sweep` would extrapolate from it to states that were not planned.
         """
         if self.decision is None or step % self.replan == 0:
             return torch.arange(len(x))
@@ -185,14 +184,14 @@ class _Pilot:
         return torch.nonzero((x != self.before)[:, self.told].any(1) | danger).squeeze(1)
 
     def prefer(self, options: Tensor, due: Tensor) -> Tensor:
-        """Option of each row, (rows,); rows that do not plan now keep theirs."""
+        """Option of each row, (rows,); rows that do not replan keep theirs."""
         pick = torch.zeros(len(options), dtype=torch.int64)
         if len(due):
             pick[due] = self.guard.prefer(options[due], self._begun(due, options[:, 0]))
         return pick
 
     def decide(self, x: Tensor, seen: Tensor, due: Tensor) -> tuple[GuardDecision, Tensor]:
-        """Decisions, and actions (rows, m), where those in rows `due` plan for what they see of `x`."""
+        """Decisions and actions (rows, m); rows `due` replan from the measured states `seen`."""
         if len(due):
             new = self.guard.decide(seen[due], self._begun(due, seen))
             whole = self.decision is None or len(due) == len(x)
@@ -204,10 +203,10 @@ class _Pilot:
         return self.decision, action
 
     def _begun(self, due: Tensor, seen: Tensor) -> GuardDecision | None:
-        """What is left of the plans of those in rows `due`, who see `seen` (rows, n).
+        """Remainders of the previous plans of rows `due`, from measured states `seen` (rows, n).
 
-        Where several steps of a plan are taken before the next is made, the policy goes on from its end: the
-        last action held for that long may run into a wall, and then nobody would go on with the plan.
+        With `replan` > 1 the policy continues a plan from its end: the last action, held for that long, may
+        hit a wall, and the previous plan would then never be kept.
         """
         if self.decision is None:
             return None
@@ -218,13 +217,11 @@ class _Pilot:
 def drive(
     guard: Guard, make: WorldType, setting: Setting, recorder: Recorder, watch: Watch | None = None
 ) -> None:
-    """Deploy in fresh worlds, one a seed, into `recorder`; `watch` is told every step.
+    """Simulate fresh worlds, one per seed, into `recorder`; `watch` is called at every step.
 
     Raises:
-        SystemFileError: S207, a world fails; S211, it cannot draw a start again; S302, it gives states that
-            are no numbers.
-        RunError: R405, no start with a known plan is drawn; R402, a plan that is no number would have to be
-            executed.
+        SystemFileError: S207, a world fails; S211, it cannot redraw a start; S302, its states are not finite.
+        RunError: R405, no start with a known plan is drawn; R402, an action is not finite.
     """
     worlds, pilot = Worlds(guard.task, make, setting), _Pilot(guard, setting)
     x = worlds.reset()
@@ -257,9 +254,9 @@ def drive(
 def _replaced(
     worlds: Worlds, guard: Guard, decision: GuardDecision, seen: Tensor, due: Tensor
 ) -> dict[str, NDArray[np.float32]] | None:
-    """Places along plans of the first seed that a guard has just replaced, and along those in their place.
+    """Picture coordinates of the first seed's plans that a guard just replaced, and of their replacements.
 
-    None without a guard, and where the world does not say where planned states are in its picture.
+    None without a guard, and where the world does not map planned states into its picture.
     """
     if guard.backup is None or not worlds.charting:
         return None
@@ -278,7 +275,7 @@ def _replaced(
 
 
 def _require_numbers(action: Tensor, x: Tensor, step: int, guard: Guard) -> None:
-    """Raise RunError (R402) where an action (rows, m) that is about to be taken is no number."""
+    """Raise RunError (R402) where an action (rows, m) to be executed is not finite."""
     broken = torch.nonzero(~torch.isfinite(action).all(1)).squeeze(1).tolist()
     if not broken:
         return

@@ -1,4 +1,4 @@
-"""Whatever a world does wrong becomes a finding that points into its file: S207, or S302 for no numbers."""
+"""Errors of a world as findings with a location in its file: S207, or S302 for non-finite states."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def blamed(world: object, method: str, what: str) -> Iterator[None]:
-    """Whatever `method` of a world, a class or one that was made, raises becomes S207: it cannot `what`."""
+    """Turn any exception of a world's (or world class's) `method` into S207: it cannot `what`."""
     try:
         yield
     except StlcError:
@@ -40,7 +40,7 @@ def blamed(world: object, method: str, what: str) -> Iterator[None]:
 
 
 def states_of(world: object, method: str, given: object, size: tuple[int, int]) -> Tensor:
-    """States that a method of a world has given, float64, (agents, n). Raises SystemFileError (S207)."""
+    """Check states from a world's method: float64, (agents, n). Raises SystemFileError (S207)."""
     if not isinstance(given, torch.Tensor):
         raise wrong(world, method, f"gives {_article(given)}, not a tensor of shape {size}")
     if given.shape != size:
@@ -52,7 +52,7 @@ def states_of(world: object, method: str, given: object, size: tuple[int, int]) 
 def require_numbers(world: object, method: str, x: Tensor, names: Sequence[str], when: str) -> None:
     """Raise SystemFileError (S302) where states (agents, n) hold NaN or infinity.
 
-    `names`: of the columns. `when`: of the deployment, for the message.
+    `names`: column names. `when`: the instant, for the message.
     """
     bad = ~torch.isfinite(x)
     if not bool(bad.any()):
@@ -63,7 +63,7 @@ def require_numbers(world: object, method: str, x: Tensor, names: Sequence[str],
 
 
 def scene_of(world: object, given: Scene, before: Mapping[str, NDArray[Any]] | None) -> dict[str, Any]:
-    """A snapshot as plain arrays that have kept their names and shapes. Raises SystemFileError (S207)."""
+    """Snapshot as plain arrays whose names and shapes are unchanged. Raises SystemFileError (S207)."""
     with blamed(world, "snapshot", "give a snapshot"):
         scene = {str(name): np.asarray(value) for name, value in given.items()}
     for name, value in scene.items():
@@ -79,7 +79,7 @@ def scene_of(world: object, given: Scene, before: Mapping[str, NDArray[Any]] | N
 
 
 def wrong(world: object, method: str, what: str) -> SystemFileError:
-    """A method of a world does what it should not."""
+    """S207 for a method of a world that does not keep its contract."""
     message = f"`{method}` of the world {what}"
     return SystemFileError(Diagnostic("S207", message, _defined_at(world, method), "this method"))
 
@@ -93,7 +93,7 @@ def _article(given: object) -> str:
     return "nothing" if given is None else f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
 
 
-# ----------------------------------------------------------------------- places
+# ----------------------------------------------------------------------- source locations
 
 
 def _class_of(world: object) -> type:
@@ -106,13 +106,13 @@ def _file_of(world: object) -> str:
 
 
 def _raised_at(error: BaseException, file: str) -> Span | None:
-    """The line of the world's file from which an error came, the innermost one."""
+    """Innermost line of the world's file in the traceback of an error."""
     lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == file]
     return _line(file, lines[-1]) if lines and lines[-1] else None
 
 
 def _defined_at(world: object, method: str) -> Span | None:
-    """The line of a world's file where a method begins; None where it is not one of its own."""
+    """Line of a world's file where a method begins; None for an inherited method."""
     code = getattr(getattr(_class_of(world), method, None), "__code__", None)
     if not isinstance(code, CodeType) or Path(__file__).parents[1] in Path(code.co_filename).parents:
         return None
@@ -120,7 +120,7 @@ def _defined_at(world: object, method: str) -> Span | None:
 
 
 def _line(file: str, number: int) -> Span | None:
-    """A line of a file without the blanks around it; None where it cannot be read."""
+    """Span of a line of a file without surrounding blanks; None where it cannot be read."""
     try:
         text = read_source(Path(file)).text
     except StlcError:

@@ -1,4 +1,4 @@
-"""A deployment on disk: `trace.npz`, `scene.npz` and `eval/simulate.json` in the folder of its run."""
+"""Files of a deployment in its run folder: `trace.npz`, `scene.npz` and `eval/simulate.json`."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ if TYPE_CHECKING:
 TRACE = "trace.npz"
 SCENE = "scene.npz"
 UNGUARDED = ("eval/unguarded_trace.npz", "eval/unguarded_scene.npz")
-"""Trace and scene of the first seed without the guard, beside those with it."""
+"""Trace and scene of the first seed without guard, stored beside the guarded ones."""
 RESULT = "eval/simulate.json"
 
 
 def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: Rules | None = None) -> Trace:
-    """All agents of all seeds as traces, decisions beside them.
+    """Traces of all agents of all seeds, with the decisions.
 
-    Extras, each (traces, steps): `action.NAME` for every control, `decision` (0 policy, 1 backup, 2 safest,
-    3 polished), `t0`, `plan_rho` of the plan that was followed, `policy_rho` of what the policy proposed,
-    `foreseen` (1 where the world did as the model says); and (traces,): `seed`, `agent`.
+    Extras, each (traces, steps): `action.NAME` for every control, `decision` (0 policy, 1 backup, 2 safest, 3
+    polished), `t0`, `plan_rho` of the followed plan, `policy_rho` of the policy's plan, `foreseen` (1 where
+    the step is model-consistent); and (traces,): `seed`, `agent`.
     """
     system = run.task.system
     states = np.moveaxis(recording.states, -1, 0)
@@ -66,7 +66,7 @@ def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: 
 
 
 def _commanded(system: System, recording: DeploymentRecording) -> NDArray[np.float64]:
-    """Commands to the actuators, (rows, steps, m)."""
+    """Actuator commands, (rows, steps, m)."""
     states = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
     planned = torch.from_numpy(recording.actions)
     return system.commanded(states, planned.flatten(0, 1)).reshape(planned.shape).numpy()
@@ -80,9 +80,9 @@ def save_trace_of(
     *,
     rules: Rules | None = None,
 ) -> list[Path]:
-    """Write the trace into the folder of the run, and to `also`; returns where. Raises MissingError.
+    """Write the trace into the run folder, and to `also`; return the paths. Raises MissingError.
 
-    `rules` travel in the trace, so that whoever checks it judges what was driven by them.
+    `rules` are stored in the trace, so that a later check judges by the same ones.
     """
     trace = trace_of(run, recording, setting, rules)
     paths = [run.dir.path / TRACE, *([also] if also is not None else [])]
@@ -94,7 +94,7 @@ def save_trace_of(
 def save_unguarded(
     run: Run, recording: DeploymentRecording | None, setting: Setting, rules: Rules | None = None
 ) -> None:
-    """Write what the first seed drove without a guard, or remove what an older deployment left of it.
+    """Write the first seed's unguarded trajectories, or remove those of an older deployment.
 
     Raises:
         MissingError: R201, a file cannot be written.
@@ -140,13 +140,13 @@ def _meta(run: Run, setting: Setting, rules: Rules | None) -> TraceMeta:
 
 
 def _set_in(spec: str, run: Run) -> dict[str, str]:
-    """Constants of the specification that the run, its scenario or the deployment changed."""
+    """Specification constants changed by the run, its scenario or the deployment."""
     own = {item.name for item in parse(Source(SPEC, spec)).items if isinstance(item, (ast.Const, ast.Param))}
     changed = run.task.system.decl.overrides.items()
     return {name: text for name, text in changed if name in own and name not in run.task.names}
 
 
 def save_scene(path: Path, scene: Mapping[str, NDArray[Any]]) -> None:
-    """Write stacked snapshots as `.npz`; what is not a plain array is refused. Raises MissingError (R201)."""
+    """Write stacked snapshots as `.npz`; object arrays are refused. Raises MissingError (R201)."""
     with atomic_path(path) as temporary:
         np.savez_compressed(temporary, allow_pickle=False, **scene)

@@ -1,11 +1,11 @@
-"""Closed-loop share of a trained policy: drives in the declared world without and with guards.
+"""Closed-loop satisfaction rate of a trained policy in the declared world, without and with guards.
 
-The accuracy of plans says little of what is driven: a plan is followed for a step and made anew, a guard
-replaces it, and the world is not what training states are drawn from. So a policy is driven, from seeds that
-neither training nor `simulate` uses by itself, and judged as `simulate` judges.
+The accuracy of plans says little about closed-loop behaviour: plans are replaced at every step, a guard
+intervenes, and the visited states differ from the training distribution. So the policy is simulated, with
+seeds that neither training nor `simulate` uses by default, and judged as `simulate` judges.
 
-The dearer guards are driven only where the cheaper one leaves something to do, on the same starts; what time
-is left goes to the guards that may turn out best.
+More expensive guards are simulated only where the cheaper one leaves failures, from the same starts; the
+remaining time goes to the guards that may turn out best.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ if TYPE_CHECKING:
     from stlc.controller.training.run import Run
 
 SEED = 1 << 40
-"""Seed of the first drives; those of `simulate` begin at 0."""
+"""Seed of the first closed-loop runs; those of `simulate` begin at 0."""
 GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
-"""From the cheapest to the dearest."""
+"""Guards by increasing cost."""
 NARROW = 0.005
-"""Half the width of an interval at which a share is known: small, so that drives take the time they have."""
+"""Half-width of the confidence interval at which sampling of a guard stops."""
 NEAR = 0.02
-"""Share by which a cheaper guard may be worse than the best one and still be recommended."""
+"""Largest loss in share at which a cheaper guard is still recommended."""
 LEAST = 20
-"""Drives from which on a share is taken as it is."""
+"""Number of runs from which on a share is trusted as it is."""
 SURE = 0.9
-"""Chance that a guard of fewer drives is better, from which on it is recommended."""
+"""Probability of being better at which a guard with fewer runs is recommended."""
 FEWER = 4
-"""A seed whose drives take too long is driven with so many times fewer agents."""
+"""Factor by which the number of agents is reduced where a seed takes too long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,13 +52,13 @@ class Share:
     """Closed-loop runs under one guard, counted.
 
     Attributes:
-        guard: which.
-        drives: how many, one agent over one seed each.
-        satisfied: that satisfy the mission: the rules of the system (`test: judge`), else the specification.
-        safe: that satisfy what is tagged `@safety` in it; None where nothing is.
-        compared: drives that were made without a guard from the same starts, too.
-        gained: of these, satisfied only with the guard.
-        lost: of these, satisfied only without.
+        guard: its name.
+        drives: number of runs, one agent over one seed each.
+        satisfied: runs that satisfy the mission: the system's rules (`test: judge`), else the specification.
+        safe: runs that satisfy its requirements tagged `@safety`; None where it has none.
+        compared: runs that were also made without a guard from the same starts.
+        gained: compared runs satisfied only with the guard.
+        lost: compared runs satisfied only without.
     """
 
     guard: Mode
@@ -71,21 +71,21 @@ class Share:
 
     @property
     def share(self) -> float:
-        """Of the drives that satisfy the mission."""
+        """Share of runs that satisfy the mission."""
         return self.satisfied / self.drives
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The 95 % Wilson interval of the share."""
+        """95 % Wilson interval of the share."""
         return wilson(self.share, self.drives)
 
     def better_than(self, other: Share) -> bool:
-        """True where it is worth its cost: better by more than `NEAR`, and surely so where drives are few."""
+        """True if this guard is better by more than `NEAR`, with high probability where runs are few."""
         better = self.share > other.share + NEAR
         return better and (self.drives >= LEAST or _superiority(self, other, NEAR) >= SURE)
 
     def summary(self) -> dict[str, object]:
-        """For JSON documents."""
+        """Entry for JSON documents."""
         safe = None if self.safe is None else self.safe / self.drives
         return {
             "guard": self.guard,
@@ -102,13 +102,13 @@ class Share:
 
 @dataclass(frozen=True, slots=True)
 class ClosedLoop:
-    """Closed-loop runs after a training.
+    """Closed-loop results of a trained policy.
 
     Attributes:
-        shares: under each guard that was driven, the cheapest first; none where no drive came to its end.
-        steps: of a drive.
-        judge: the specification that drives were judged by; None for that of the plans.
-        why: what was wrong, where nothing could be driven.
+        shares: result per simulated guard, the cheapest first; empty where no run was completed.
+        steps: length of a run.
+        judge: the specification that judges the runs; None for that of the plans.
+        why: error message, where no run was possible.
     """
 
     shares: tuple[Share, ...]
@@ -118,7 +118,7 @@ class ClosedLoop:
 
     @property
     def recommended(self) -> Share | None:
-        """The cheapest guard that does about as well as the best, few drives of which prove little."""
+        """The cheapest guard about as good as the best; a guard with few runs must be clearly better."""
         best: Share | None = None
         for share in self.shares:
             if best is None or share.better_than(best):
@@ -126,7 +126,7 @@ class ClosedLoop:
         return best
 
     def summary(self) -> dict[str, object]:
-        """For JSON documents."""
+        """Entry for JSON documents."""
         best = self.recommended
         return {
             "recommended": None if best is None else best.guard,
@@ -141,7 +141,7 @@ class ClosedLoop:
 
 
 def _superiority(first: Share, second: Share, by: float) -> float:
-    """Chance that the first share is the larger one by so much, of uniform priors (a beta posterior each)."""
+    """Probability that the first share is larger by more than `by`: beta posteriors from uniform priors."""
     grid = np.linspace(0.0, 1.0, 2001)
     mass = []
     for share in (first, second):
@@ -152,14 +152,14 @@ def _superiority(first: Share, second: Share, by: float) -> float:
 
 
 class _LateError(Exception):
-    """The time is over in the middle of a drive."""
+    """Raised when the time limit is reached during a simulation."""
 
 
 @dataclass(slots=True)
 class _Known:
-    """The drives under one guard: start, as (seed, agent) -> satisfied, and safe.
+    """Runs under one guard: start, as (seed, agent) -> satisfied, and safe.
 
-    `cost`: seconds a seed; 0 before the first. `agents`: of a seed. `given_up`: a seed takes too long.
+    `cost`: seconds per seed; 0 before the first. `agents`: per seed. `given_up`: a seed takes too long.
     """
 
     agents: int
@@ -178,16 +178,16 @@ class _Known:
 
 
 def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES, seed: int = SEED) -> ClosedLoop:
-    """Drive a policy in the world of its system, without and with guards, while there is time.
+    """Simulate a policy in the world of its system, without and with guards, within the time limit.
 
     Args:
-        run: with its policy.
-        left: seconds that are left; nothing is begun, and nothing gone on with, once that is 0.
-        most: drives under one guard.
-        seed: of the first drives; the others follow.
+        run: trained run.
+        left: remaining seconds; simulation stops once it is 0.
+        most: maximum number of runs per guard.
+        seed: first seed; the others follow.
 
     Returns:
-        What was driven to its end. A world that fails, or rules that do not fit, are told as `why`.
+        The completed runs. `why` reports a world that fails, or rules that do not fit.
     """
     test = run.task.system.decl.test
     try:
@@ -200,7 +200,7 @@ def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES, seed: i
 
 
 def fresh_share(run: Run, guard: Mode, drives: int, seed: int = 0) -> Share:
-    """At least so many drives under one guard, however long they take, from the seeds that `simulate` takes.
+    """Simulate at least `drives` runs under one guard without time limit, with the seeds of `simulate`.
 
     Raises:
         SystemFileError: the world fails. SpecError: the rules do not fit.
@@ -213,7 +213,7 @@ def fresh_share(run: Run, guard: Mode, drives: int, seed: int = 0) -> Share:
 
 
 class _Trial:
-    """Drives under all guards."""
+    """Closed-loop runs under all guards."""
 
     def __init__(
         self, run: Run, rules: Rules | None, left: Callable[[], float], most: int, seed: int
@@ -225,12 +225,12 @@ class _Trial:
         self.known: Mapping[Mode, _Known] = {mode: _Known(self.test.agents) for mode in GUARDS}
 
     def drive(self) -> None:
-        """Drive seeds, until every share is known well or the time is over."""
+        """Simulate seeds until every share is known well enough or the time is over."""
         while (mode := self._next()) is not None:
             self._more(mode)
 
     def _next(self) -> Mode | None:
-        """The guard that needs drives the most: the one of the widest interval among those that matter."""
+        """The guard to sample next: the one with the widest interval among those that matter."""
         if self.left() <= 0.0:
             return None
         for mode in GUARDS:
@@ -252,7 +252,7 @@ class _Trial:
         return None if wide[mode] <= 2.0 * NARROW else mode
 
     def _more(self, mode: Mode) -> None:
-        """Drive a seed under a guard, or as many more as there were, if there is time for them."""
+        """Simulate more seeds under a guard, doubling their number, if there is time."""
         known = self.known[mode]
         count = 1
         if known.seeds:
@@ -278,7 +278,7 @@ class _Trial:
         known.seeds += count
 
     def _driven(self, mode: Mode, seeds: Sequence[int], agents: int, share: float) -> DeploymentRecording:
-        """Drives to their end. Raises _LateError where that would take more than a share of what is left."""
+        """Completed runs. Raises _LateError where they would take more than `share` of the remaining time."""
         setting = Setting(tuple(seeds), agents, self.test.steps, self.test.replan)
         guard = Guard(self.task, self.policy, mode, limits=Limits(seconds=setting.limit))
         begun, recorder = self.left(), Recorder(agents, pictured=False)
@@ -295,7 +295,7 @@ class _Trial:
         return recording
 
     def _judged(self, recording: DeploymentRecording) -> tuple[NDArray[np.bool_], NDArray[np.bool_] | None]:
-        """Drives that satisfy the mission, and those that satisfy its requirements tagged `@safety`."""
+        """Masks of runs that satisfy the mission, and of those that satisfy its `@safety` requirements."""
         rows = len(recording.states)
         if self.rules is None:
             executed = judge_executed(self.task, recording, savable=np.ones(rows, dtype=bool))
@@ -308,7 +308,7 @@ class _Trial:
         return obeying(found, rows), safe
 
     def shares(self) -> tuple[Share, ...]:
-        """Counts under each guard."""
+        """Result per guard."""
         free = self.known["none"].found
         shares = []
         for mode, known in self.known.items():

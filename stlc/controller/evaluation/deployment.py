@@ -1,4 +1,4 @@
-"""A deployment over several seeds: what was planned, driven and decided, and how fast."""
+"""Deployment over several seeds: trajectories, metrics, decisions and decision latency."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 
 LATENCY_SAMPLES = 200
 LATENCY_SECONDS = 5.0
-"""After so long the samples that there are have to do."""
+"""Seconds after which latency is estimated from the samples taken so far."""
 
 
 @dataclass(frozen=True, slots=True)
 class DecisionLatency:
-    """Seconds a decision for one agent alone, over states that were visited."""
+    """Seconds per decision for a single agent, over visited states."""
 
     median: float
     p99: float
@@ -43,7 +43,7 @@ class DecisionLatency:
 
 @dataclass(frozen=True, slots=True)
 class Unsafe:
-    """An agent that was not driven safely: its seed (by position), its number, and whether it is savable."""
+    """An agent with an unsafe trajectory: its seed (by position), its number, and whether it is viable."""
 
     seed: int
     agent: int
@@ -52,17 +52,17 @@ class Unsafe:
 
 @dataclass(frozen=True, slots=True)
 class Deployment:
-    """One guard in all seeds.
+    """Results of one guard over all seeds.
 
     Attributes:
-        guard: which.
-        recording: what happened.
-        metrics: name -> mean over seeds with its interval; see `metrics.METRICS`. Further there are
-            `holds.NAME`, the share of starts that satisfy one requirement, and the progress of the world.
-        decisions: share of decisions by source, and those of the backup by T0 ("backup T0=1").
-        latency: of one decision.
-        unsafe: the agents that were not driven safely.
-        drives: who obeyed the rules that drives are judged by.
+        guard: its name.
+        recording: trajectories and decisions.
+        metrics: name -> mean over seeds with its interval; see `metrics.METRICS`. Also `holds.NAME`, the
+            share of starts that satisfy one requirement, and the world's progress.
+        decisions: share of decisions by source; for the backup by T0 ("backup T0=1").
+        latency: time of one decision.
+        unsafe: the agents with an unsafe trajectory.
+        drives: verdicts of the rules for closed-loop runs.
     """
 
     guard: Mode
@@ -75,7 +75,7 @@ class Deployment:
 
 
 class InterruptedDeploymentError(Exception):
-    """A deployment ended early; carries what happened until then."""
+    """Early end of a deployment; carries the recording until then."""
 
     def __init__(self, recording: DeploymentRecording | None) -> None:
         super().__init__("the deployment ended early")
@@ -91,11 +91,11 @@ def deploy(
     watch: Watch | None = None,
     rules: Rules | None = None,
 ) -> Deployment:
-    """Deploy a policy in the world of its system; `watch` is told every step, `rules` judge what was driven.
+    """Simulate a policy in the world of its system; `watch` is called every step, `rules` judge the runs.
 
     Raises:
-        InterruptedDeploymentError: from whatever has ended it early, which is its `__cause__`: a
-            SystemFileError or RunError of `drive`, or an interruption, also one while it is judged.
+        InterruptedDeploymentError: it ended early; `__cause__` is a SystemFileError or RunError of `drive`,
+            or an interruption, also one during judging.
         SystemFileError: S206, the world cannot be loaded.
     """
     make = world_type(task.system.decl)
@@ -114,9 +114,9 @@ def deploy(
 def judged(
     guard: Guard, recording: DeploymentRecording, ceiling: int = 0, rules: Rules | None = None
 ) -> Deployment:
-    """Evaluation of a recorded deployment under a guard; see `feasible_states` for `ceiling`.
+    """Evaluate a recorded deployment under a guard; see `feasible_states` for `ceiling`.
 
-    Without `rules` a drive obeys where it satisfies the specification of plans from every start.
+    Without `rules` a run is judged by the plans' specification from every start.
     """
     executed = judge_executed(guard.task, recording)
     drives = (
@@ -136,7 +136,7 @@ def judged(
 
 
 def unsafe_agents(executed: Executed, agents: int) -> tuple[Unsafe, ...]:
-    """Agents with an unsafe trajectory; `agents`: of one seed."""
+    """Agents with an unsafe trajectory; `agents`: number per seed."""
     rows = np.flatnonzero(~executed.agents(executed.safety)).tolist()
     return tuple(Unsafe(*divmod(row, agents), bool(executed.savable[row])) for row in rows)
 
@@ -144,7 +144,7 @@ def unsafe_agents(executed: Executed, agents: int) -> tuple[Unsafe, ...]:
 def feasible_states(task: Task, recording: DeploymentRecording, count: int) -> NDArray[np.float64]:
     """Feasibility of `count` visited states, evenly spread: (rows, steps).
 
-    1: the plan that was followed does, or a search has found one; 0: neither; NaN: nobody has looked.
+    1: the followed plan satisfies, or a search has found one that does; 0: neither; NaN: not searched.
     """
     known = np.full(recording.rho.shape, math.nan)
     if count:
@@ -155,7 +155,7 @@ def feasible_states(task: Task, recording: DeploymentRecording, count: int) -> N
 
 
 def decided(recording: DeploymentRecording) -> dict[str, float]:
-    """Shares of all decisions by their source."""
+    """Share of decisions by source."""
     found = {name: float((recording.source == index).mean()) for index, name in enumerate(SOURCES)}
     backup = recording.source == SOURCES.index("backup")
     for length in np.unique(recording.t0[backup]).tolist():
@@ -164,9 +164,9 @@ def decided(recording: DeploymentRecording) -> dict[str, float]:
 
 
 def latency(guard: Guard, recording: DeploymentRecording, samples: int = LATENCY_SAMPLES) -> DecisionLatency:
-    """Time decisions for one agent alone in states drawn evenly from those visited, some seconds at most.
+    """Time single-agent decisions in randomly chosen visited states, for some seconds at most.
 
-    Each goes on from a decision in the state before, as in the deployment; that one is not timed.
+    Each decision gets a previous plan from the state before, as in the deployment; that one is not timed.
     """
     rows, steps = recording.actions.shape[:2]
     picked = np.linspace(0, rows * steps - 1, min(samples, rows * steps)).astype(int)

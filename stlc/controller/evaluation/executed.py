@@ -30,15 +30,15 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Executed:
-    """Verdicts on recorded agents. A requirement that mentions T is judged at every start whose window fits.
+    """Verdicts on recorded agents; requirements that mention T are judged at every start with a full window.
 
     Attributes:
-        rules: requirement -> (starts, rows), whether it holds there; one start where it does not mention T.
+        rules: requirement -> satisfaction, (starts, rows); one start where it does not mention T.
         safety: names of the requirements that are tagged `@safety`.
-        foreseen: (starts, rows), whether the world did as the model says all through the window from there.
-        quiet: (starts, rows), whether the world did nothing through the window but what the truth of the
-            dynamics does, however wrong the model is; None where that was not recorded.
-        savable: (rows,), who was driven safely, or could have been from its first state by a known plan.
+        foreseen: (starts, rows), whether the window is model-consistent.
+        quiet: (starts, rows), whether the window has no exogenous event (the true dynamics alone, even if the
+            model is wrong); None where not recorded.
+        savable: (rows,), viable: the run is safe, or a safe plan from its first state is known.
     """
 
     rules: Mapping[str, Mask]
@@ -48,12 +48,12 @@ class Executed:
     quiet: Mask | None = None
 
     def agents(self, names: Sequence[str]) -> Mask:
-        """(rows,), who satisfies all of `names` at all starts."""
+        """Agents that satisfy all of `names` at all starts, (rows,)."""
         held = [self.rules[name].all(0) for name in names]
         return np.logical_and.reduce(held) if held else np.ones(self.foreseen.shape[1], dtype=bool)
 
     def starts(self, names: Sequence[str]) -> Mask:
-        """(starts, rows), where all of `names` hold; those that do not mention T count at every start."""
+        """Starts where all of `names` hold, (starts, rows); requirements without T count at every start."""
         held = np.ones_like(self.foreseen)
         for name in names:
             held &= self.rules[name][: len(held)] if len(self.rules[name]) > 1 else self.rules[name]
@@ -61,9 +61,9 @@ class Executed:
 
 
 def judge_executed(task: Task, recording: DeploymentRecording, *, savable: Mask | None = None) -> Executed:
-    """Judge what happened. Without a window that fits, there are no starts.
+    """Judge a recording. If no window fits, there are no starts.
 
-    `savable`: (rows,) from whose first states a safe plan is known; a search finds them if not given.
+    `savable`: (rows,), starts with a known safe plan; a search finds them if not given.
     """
     columns = dict(zip(task.names, np.moveaxis(recording.states, -1, 0).transpose(0, 2, 1), strict=True))
     starts = max(recording.steps + 1 - task.horizon, 0)
@@ -79,7 +79,7 @@ def judge_executed(task: Task, recording: DeploymentRecording, *, savable: Mask 
 
 
 def as_driven(rule: CompiledRequirement, task: Task) -> CompiledRequirement:
-    """A requirement on the mission clock is judged as it was written, once, on all that was driven."""
+    """Requirement as it judges a whole run: one on the mission clock is evaluated once, as written."""
     if not rule.absolute:
         return rule
     lowered = lower(from_first_sample(rule.typed.formula), task.compiled.grid, [])
@@ -107,7 +107,7 @@ def _margin(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], coun
 
 
 def as_foreseen(task: Task, recording: DeploymentRecording) -> Mask:
-    """Steps at which the world did as the model says, (rows, steps) booleans."""
+    """Model-consistent steps, (rows, steps) booleans."""
     before = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
     action = torch.from_numpy(recording.actions).flatten(0, 1)
     predicted = task.system.step(before, action).numpy(force=True).reshape(recording.states[:, 1:].shape)

@@ -1,4 +1,4 @@
-"""The last word on a policy: exact verdicts in float64 on states that training never drew from."""
+"""Final evaluation of a policy: exact verdicts in float64 on held-out states."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ if TYPE_CHECKING:
     from stlc.native import Stop
 
 CEILING_TRIES = 8000
-"""Plans that are tried for a held-out state before it counts as infeasible."""
+"""Plans tried for a held-out state before it counts as infeasible."""
 MOST_SEARCHED = 1024
-"""Failing states that are searched: they speak for the others, to 1.6 % in one standard error."""
+"""Maximum number of failing states to search; extrapolation has a standard error of 1.6 %."""
 EXPLORED = 4
-"""Failing states that are explored where no plan is known for any."""
+"""Failing states to explore where no plan is known for any."""
 CHUNK = 256
-"""Failing states that are searched together."""
+"""Batch size of the search."""
 TORCH_CHUNK = 32
-"""The same where torch does the work."""
+"""Batch size of the search in torch."""
 JUDGED = 500
-"""States that are judged together; between these groups the judging can be ended."""
+"""Batch size of the evaluation, which can be stopped between batches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +52,14 @@ class Score:
         accuracy: share whose plan satisfies the specification (rho >= -1e-6 in float64).
         interval: its 95 % Wilson interval.
         requirements: share per requirement.
-        feasible: share for which some satisfying plan is known, the policy's or one that search found; where
-            not all failing states were searched, those that were, in random order, speak for the others.
+        feasible: share with a known satisfying plan, the policy's or one found by search; where only a random
+            sample of the failing states was searched, it is extrapolated to the others.
         states: (n, dim), float64.
         rho: (n,).
         each: (n, requirements).
-        known: states for which some satisfying plan is known, (n,) bool.
-        searched: states that the policy solves or that were searched, (n,) bool.
-        endless: of missions without end, the seconds of them that were driven for the states; else None.
+        known: states with a known satisfying plan, (n,) bool.
+        searched: states solved by the policy or searched, (n,) bool.
+        endless: simulated seconds of missions without end; else None.
     """
 
     accuracy: float
@@ -74,7 +74,7 @@ class Score:
     endless: float | None = None
 
     def summary(self) -> dict[str, object]:
-        """The plain numbers, for `run.json`."""
+        """Scalars for `run.json`."""
         return {
             "accuracy": self.accuracy,
             "interval": list(self.interval),
@@ -94,13 +94,13 @@ def score(
     seed: int = HELD_OUT_SEED,
     enough: Stop = never,
 ) -> Score:
-    """Judge a policy on `n` held-out states of seed `seed`; of missions, on states along held-out ones.
+    """Judge a policy on `n` held-out states of seed `seed`; for missions, states along held-out missions.
 
-    The failing states are searched for any satisfying plan, in random order, until `enough` says so, at most
-    `MOST_SEARCHED` of them. A search begins with the plan of the policy. Where that leads nowhere it goes on
-    as if there were no policy (in native code, which is fast enough for it), so that what counts as feasible
-    hardly depends on how well the policy is trained. States that were searched while the time ran out do not
-    count as searched, unless they are the first. Where `enough` is said even before, fewer states are judged.
+    At most `MOST_SEARCHED` failing states are searched for a satisfying plan, in random order, until `enough`
+    returns True. A search starts from the policy's plan; if that fails, it continues independently of the
+    policy (in native code, which is fast enough), so that the feasible share hardly depends on how well the
+    policy is trained. States whose search was cut off do not count as searched, unless they are the first. If
+    `enough` is True before that, fewer states are judged.
     """
     if task.compiled.timers:
         states = visited(task, policy, n, seed, enough)
@@ -146,9 +146,9 @@ def score(
 def _judged(
     task: Task, policy: Policy, states: Tensor, enough: Stop
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """States (k, dim), the plans that are followed from there, their robustness, and that of requirements.
+    """Evaluated states (k, dim), the plans followed from there, their robustness, and that per requirement.
 
-    All states, or as many as are judged before `enough` is said, the first ones in any case.
+    All states, or the first ones, at least one batch, evaluated before `enough` returns True.
     """
     plans: list[Tensor] = []
     rho: list[Tensor] = []
@@ -165,7 +165,7 @@ def _judged(
 
 
 def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough: Stop) -> None:
-    """Mark failing states for which exploration finds a plan; starts of missions are tried first."""
+    """Mark failing states for which exploration finds a plan; mission starts are tried first."""
     clocks = [task.names.index(timer.name) for timer in task.system.timers if timer.kind == "clock"]
     age = states[failing][:, clocks].sum(1)
     first = failing[age.argsort(stable=True)[:EXPLORED]]
@@ -175,7 +175,7 @@ def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough:
 
 
 def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:
-    """The share of states that are known to be feasible; failing ones stand for those not searched."""
+    """Share of states known to be feasible, extrapolated from the searched failing states."""
     found, tried = int(known[failing].sum()), int(searched[failing].sum())
     left = len(failing) - tried
     return (int(known.sum()) + left * found / max(1, tried)) / len(known)
@@ -189,7 +189,7 @@ def wilson(share: float, n: int, z: float = 1.96) -> tuple[float, float]:
 
 
 def save_states(path: Path, task: Task, result: Score) -> None:
-    """Keep the states and their verdicts, so that a picture can show where a policy fails."""
+    """Save the states and their verdicts for pictures of where a policy fails."""
     meta = {"names": list(task.names), "requirements": [rule.name for rule in task.rules]}
     buffer = io.BytesIO()
     np.savez_compressed(

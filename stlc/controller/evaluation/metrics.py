@@ -1,7 +1,6 @@
-"""Metrics of a deployment: shares of plans, agents and starts, each with its words; a table of all of them.
+"""Metrics of a deployment: definition, label, meaning and unit of each.
 
-What is measured, and what a terminal, a report, JSON documents and the tables of the benchmarks show, derives
-from `METRICS`.
+Terminal, report, JSON documents and benchmark tables derive from `METRICS`.
 """
 
 from __future__ import annotations
@@ -26,19 +25,19 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Seed:
-    """One seed of a deployment, as masks: plans are (agents, steps), drives (starts, agents).
+    """Masks of one seed of a deployment: plans are (agents, steps), closed-loop runs (starts, agents).
 
     Attributes:
-        followed: whether the plan that was followed satisfies the specification.
-        proposed: whether the plan that the policy proposed does.
-        plan_safe: whether the plan that was followed satisfies the safety requirements.
-        satisfied: whether what was driven satisfies the specification, from each start.
+        followed: whether the followed plan satisfies the specification.
+        proposed: whether the policy's plan does.
+        plan_safe: whether the followed plan satisfies the safety requirements.
+        satisfied: whether the run satisfies the specification, from each start.
         safe: whether it satisfies the safety requirements.
-        satisfied_agents: (agents,), whether it satisfies every requirement wherever that is judged.
+        satisfied_agents: (agents,), whether every requirement is satisfied at all starts.
         safe_agents: (agents,), the same for the safety requirements.
-        viable: (agents,), driven safely, or a search finds a safe plan from the first instant.
-        consistent: whether the world did as the model says, through the window of each start.
-        quiet: whether there was no exogenous event in it; None where nobody has looked.
+        viable: (agents,), whether the run is safe, or a search finds a safe plan from its first state.
+        consistent: whether the window of each start is model-consistent.
+        quiet: whether there was no exogenous event in it; None where not recorded.
         searched: visited states that were searched for a plan; None where none was.
         feasible: visited states with a known satisfying plan.
     """
@@ -58,22 +57,22 @@ class Seed:
 
     @property
     def of_viable(self) -> Mask:
-        """The starts of viable agents."""
+        """Starts of viable agents."""
         return np.broadcast_to(self.viable, self.safe.shape)
 
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A share: of how many of what counts something holds.
+    """A metric: the share of a population that has a property.
 
     Attributes:
         key: in JSON documents.
         label: in tables.
         meaning: a sentence without its end.
-        mask: of a seed, what holds; None where it was not looked at.
-        among: of a seed, what counts; None for everything. A share of nothing is left out.
+        mask: the property, as a mask of a seed; None where not recorded.
+        among: the population, as a mask of a seed; None for everything. Undefined ratios are omitted.
         unit: of the value; shares have none.
-        safety: whether it says nothing where no requirement is tagged `@safety`.
+        safety: whether the metric is omitted where no requirement is tagged `@safety`.
     """
 
     key: str
@@ -85,7 +84,7 @@ class Metric:
     safety: bool = False
 
     def of(self, seed: Seed) -> float:
-        """The value of a seed; NaN where nothing counts."""
+        """Value for a seed; NaN for an empty population."""
         mask = self.mask(seed)
         among = None if self.among is None else self.among(seed)
         if mask is None or (self.among is not None and among is None):
@@ -218,25 +217,25 @@ _ALL = (
     ),
 )
 METRICS = {metric.key: metric for metric in _ALL}
-"""All metrics by key, in the order in which they are shown."""
+"""All metrics by key, in display order."""
 HOLDS = "holds."
-"""`holds.NAME`: the share of starts from which the drive satisfies one requirement."""
+"""Prefix of `holds.NAME`: the share of starts from which the run satisfies one requirement."""
 
 
 def is_progress(key: str) -> bool:
-    """True for a metric that the world reports itself."""
+    """True for a metric reported by the world itself."""
     return key not in METRICS and not key.startswith(HOLDS)
 
 
 def measure(
     recording: DeploymentRecording, executed: Executed, feasible: NDArray[np.float64] | None = None
 ) -> dict[str, MeanInterval]:
-    """All metrics over the seeds that have them, the requirements one by one, and the progress of the world.
+    """Compute all metrics over the seeds that have them, the share per requirement, and the world's progress.
 
     Args:
-        recording: what happened.
-        executed: the verdicts on it.
-        feasible: (rows, steps), 1 with a known satisfying plan, 0 without, NaN where nobody has looked.
+        recording: trajectories and decisions.
+        executed: its verdicts.
+        feasible: (rows, steps), 1 with a known satisfying plan, 0 without, NaN where not searched.
     """
     rows = [slice(at, at + recording.agents) for at in range(0, len(recording.states), recording.agents)]
     each = [dict(_of_seed(recording, executed, feasible, own)) for own in rows]

@@ -1,7 +1,8 @@
-"""The rules that drives are judged by: the specification of `test: {judge: …}`, and who obeyed it.
+"""Rules for closed-loop runs: the specification of `test: {judge: …}` and its verdicts.
 
-Plans are judged window by window by the specification that they are made for. What was driven is judged once,
-from its first sample to its last, by another one, which may look back and knows what a world does.
+Plans are judged window by window by the specification that they are made for. A closed-loop run is judged
+once, from first to last sample, by this other specification, which may use past operators and describe the
+world.
 """
 
 from __future__ import annotations
@@ -41,17 +42,17 @@ if TYPE_CHECKING:
 JUDGE = "judge"
 _INDEX = f"{JUDGE}/{INDEX}"
 MOST_TIMED = 200
-"""Broken rules of one guard whose moment is looked for: each takes some milliseconds."""
+"""Maximum number of broken rules per guard whose time is located: each takes some milliseconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """A specification of drives.
+    """A specification for closed-loop runs.
 
     Attributes:
-        spec: as parsed, with the texts that it imports.
-        path: where it was read when the run was made, as a person finds it.
-        overrides: those of its constants that the run or the deployment changed, as texts.
+        spec: as parsed, with its imported texts.
+        path: the user's path of the file when the run was made.
+        overrides: constants changed by the run or the deployment, as texts.
     """
 
     spec: ast.Spec
@@ -60,28 +61,29 @@ class Rules:
 
     @property
     def name(self) -> str:
-        """Of the specification."""
+        """Name of the specification."""
         return self.spec.name or Path(self.path).stem
 
     @property
     def docs(self) -> dict[str, str]:
-        """Rule -> what its `##` comment says."""
+        """Rule -> text of its `##` comment."""
         return {item.name: " ".join((item.doc or "").split()) for item in _requirements(self.spec)}
 
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """The end of what could be done before a rule was broken.
+    """Loss: the instant after which a broken rule could no longer be kept, as far as known.
 
-    A plan is known where the one that was followed keeps what plans are asked for (what is tagged `@safety`,
-    where such a rule was broken), or a search finds one.
+    A plan is known where the followed plan satisfies the plans' specification (its requirements tagged
+    `@safety`, where such a rule was broken), or a search finds a plan.
 
     Attributes:
-        why: `start`: no plan is known at any instant before. `told`: the plan that was followed was such a
-            plan; then the world did more than move on (an obstacle came into view), and since then none is
-            known. `later`: the same where the world only moved on: a window of plans ended too early to see
-            it, or the model is not the truth. `missed`: a plan was known, and another one was followed.
-        time: since when no plan is known, seconds from the start; of `missed` when the last one was.
+        why: `start`: no plan is known at any instant before. `told`: the followed plan was such a plan; then
+            an exogenous event (an obstacle came into view), and no plan is known since. `later`: the same
+            without an exogenous event: the horizon of plans was too short, or the model is wrong. `missed`: a
+            plan was known, but another one was followed.
+        time: the instant since which no plan is known, seconds from the start; of `missed` the last known
+            one.
     """
 
     why: Literal["start", "told", "later", "missed"]
@@ -90,13 +92,13 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class Broken:
-    """A drive that broke rules.
+    """A run that broke rules.
 
     Attributes:
         row: of the recording.
-        rules: rule -> when, in seconds from the start; None where nobody has looked.
-        lost: when it was lost, and to what; None where plans were good until a rule was broken, or where
-            nobody has looked.
+        rules: rule -> time of the violation, seconds from the start; None where not located.
+        lost: time and cause of the loss; None where plans were good until a rule was broken, or where not
+            determined.
     """
 
     row: int
@@ -105,7 +107,7 @@ class Broken:
 
     @property
     def excused(self) -> bool:
-        """True where the controller is excused: lost from the start, or to an exogenous event."""
+        """True if the controller is excused: lost from the start, or by an exogenous event."""
         return self.lost is not None and self.lost.why in ("start", "told")
 
 
@@ -114,11 +116,11 @@ class Drives:
     """Verdicts on closed-loop runs, one agent over one seed each.
 
     Attributes:
-        rules: rule -> status of each drive, (rows,): `satisfied`, `violated` or `inconclusive`.
-        broken: the drives that broke a rule, in order.
-        viable: (rows,), who could have obeyed as far as is known: who did, and who was neither lost from the
-            start nor to what the world told later. Of undecided drives those from whose start a safe plan is
-            known.
+        rules: rule -> status of each run, (rows,): `satisfied`, `violated` or `inconclusive`.
+        broken: the runs that broke a rule, in order.
+        viable: (rows,), runs that could have obeyed as far as is known: those that did, and those lost
+            neither from the start nor to a later exogenous event. Of inconclusive runs those with a known
+            safe plan from the start.
     """
 
     rules: Mapping[str, NDArray[np.str_]]
@@ -127,27 +129,27 @@ class Drives:
 
     @property
     def obeyed(self) -> NDArray[np.bool_]:
-        """(rows,), who obeyed every rule."""
+        """Runs that satisfy every rule, (rows,)."""
         return obeying(self.rules, len(self.viable))
 
 
 def obeying(rules: Mapping[str, NDArray[np.str_]], rows: int) -> NDArray[np.bool_]:
-    """(rows,), who satisfies every rule."""
+    """Runs that satisfy every rule, (rows,)."""
     held = np.ones(rows, dtype=bool)
     for statuses in rules.values():
         held &= statuses == "satisfied"
     return held
 
 
-# ------------------------------------------------------------------------ where rules are
+# ------------------------------------------------------------------------ files of rules
 
 
 def read_rules(judge: JudgeRef) -> ast.Spec:
-    """The specification that a system file names, with what it imports.
+    """Read the rules that a system file names, with their imports.
 
     Raises:
-        SystemFileError: S210, there is no such file.
-        SpecError: it is no specification.
+        SystemFileError: S210, the file does not exist.
+        SpecError: it is not a specification.
     """
     try:
         spec = parse(read_source(judge.path))
@@ -160,10 +162,10 @@ def read_rules(judge: JudgeRef) -> ast.Spec:
 
 
 def keep_rules(folder: RunDir, task: Task) -> None:
-    """Write the rules that a system names into the folder of a run, whether they fit checked before.
+    """Check the rules that a system names, and copy them into the run folder.
 
     Raises:
-        SystemFileError: S210, there is no such file.
+        SystemFileError: S210, the file does not exist.
         SpecError: they are invalid, or do not fit the system.
     """
     decl = task.system.decl
@@ -178,7 +180,7 @@ def keep_rules(folder: RunDir, task: Task) -> None:
 
 
 def _fitting(judge: JudgeRef, task: Task) -> ast.Spec:
-    """The rules, compiled for the states that will be recorded: findings come before the training."""
+    """Compile the rules for the recorded states, so that errors are reported before the training."""
     spec, system = read_rules(judge), task.plain
     changed = _own(spec, system.decl.overrides)
     compile_spec(
@@ -188,15 +190,15 @@ def _fitting(judge: JudgeRef, task: Task) -> ast.Spec:
 
 
 def rules_of(run: Run) -> Rules | None:
-    """The rules of a run's system as it is deployed; None where drives are judged as plans are.
+    """Rules of a run's system as deployed; None where runs are judged by the plans' specification.
 
-    They are those that the run keeps of the file that its `system.yaml` names. A file that is named there
-    since (or with `--set test.judge=…`) is read where it lies. A run that was trained before systems named
-    such files has the rules that its system file names now.
+    They are the run's copy of the file that its `system.yaml` names. A file named there later (or with `--set
+    test.judge=…`) is read in place. A run from before `test.judge` existed uses the rules that its system
+    file names now.
 
     Raises:
-        RunError: R101, what the run keeps is damaged.
-        SystemFileError, SpecError: the file is missing, or is no specification.
+        RunError: R101, the run's copy is damaged.
+        SystemFileError, SpecError: the file is missing, or not a specification.
     """
     decl = run.task.system.decl
     judge, overrides = decl.test.judge, decl.overrides
@@ -225,7 +227,7 @@ def _kept(folder: RunDir, judge: JudgeRef, overrides: Mapping[str, str]) -> Rule
 
 
 def _named_since(folder: RunDir, decl: SystemDecl) -> JudgeRef | None:
-    """Rules that the system file of a run names today, for the scenario that is laid over."""
+    """Rules that the system file of a run names today, under the chosen scenario."""
     path = Path(str(folder.record().get("system_path") or ""))
     if "test.judge" in decl.overrides or not path.is_file():
         return None
@@ -243,7 +245,7 @@ def _library_of(name: str) -> str:
 
 
 def _own(spec: ast.Spec, overrides: Mapping[str, str]) -> dict[str, str]:
-    """Overrides of constants that a specification declares."""
+    """Overrides of constants that the specification declares."""
     own = {item.name for item in spec.items if isinstance(item, (ast.Const, ast.Param))}
     return {name: text for name, text in overrides.items() if name in own}
 
@@ -252,22 +254,22 @@ def _requirements(spec: ast.Spec) -> Iterator[ast.Require]:
     return (item for item in spec.items if isinstance(item, ast.Require))
 
 
-# ----------------------------------------------------------------------- who obeyed
+# ----------------------------------------------------------------------- verdicts
 
 
 def judge_drives(
     rules: Rules, task: Task, recording: DeploymentRecording, savable: NDArray[np.bool_]
 ) -> Drives:
-    """Judge every drive from its first sample to its last.
+    """Judge every run from its first sample to its last.
 
     Args:
-        rules: to judge by.
-        task: the states by name, the time step and the functions from outside.
-        recording: what was driven.
-        savable: (rows,), from whose start a safe plan is known.
+        rules: specification of the runs.
+        task: gives state names, time step and external functions.
+        recording: the runs.
+        savable: (rows,), whether a safe plan from the start is known.
 
     Raises:
-        SpecError: the rules do not fit what was recorded.
+        SpecError: the rules do not fit the recording.
     """
     verdict = verdict_on_drives(rules, task, recording)
     found = {judgement.name: np.array(judgement.statuses) for judgement in verdict}
@@ -283,7 +285,7 @@ def judge_drives(
 
 
 def verdict_on_drives(rules: Rules, task: Task, recording: DeploymentRecording) -> Verdict:
-    """The verdict on every drive from its first sample to its last; raises SpecError as `judge_drives`."""
+    """Verdict on every run from its first sample to its last; raises SpecError like `judge_drives`."""
     outside = any(isinstance(item, ast.Extern) for item in rules.spec.items)
     decl = task.system.decl
     monitor = Monitor(
@@ -300,19 +302,19 @@ def verdict_on_drives(rules: Rules, task: Task, recording: DeploymentRecording) 
 def _lost(
     broken: Broken, safety: frozenset[str], task: Task, recording: DeploymentRecording, savable: bool
 ) -> Lost | None:
-    """Time and cause of a loss, by the first broken rule tagged `@safety`, else by the first broken one."""
+    """Time and cause of a loss, for the first broken rule tagged `@safety`, else the first broken one."""
     row, unsafe = broken.row, not safety.isdisjoint(broken.rules)
     asked = safety_task(task) if unsafe and task.compiled.safety else task
     times = [time for name, time in broken.rules.items() if not unsafe or name in safety]
     looked = [time for time in times if time is not None]
-    if not looked:  # nobody has looked when: by the start alone
+    if not looked:  # time not located: decided by the start alone
         known = savable if unsafe else bool(solvable(task, torch.from_numpy(recording.states[row, :1]))[0])
         return None if known else Lost("start", 0.0)
     dt = float(task.system.decl.dt)
     last = min(round(min(looked) / dt), recording.steps)
     good = recording.safe[row] if unsafe else recording.rho[row] >= -TOLERANCE
     followed = np.flatnonzero(good[: last + 1])
-    since = int(followed[-1]) + 1 if len(followed) else 0  # from here on nothing good was followed
+    since = int(followed[-1]) + 1 if len(followed) else 0  # no satisfying plan is followed from here on
     if since > last:
         return None
     states = torch.from_numpy(recording.states[row, since : last + 1])
@@ -326,7 +328,7 @@ def _lost(
 
 
 def _violating(rules: Mapping[str, NDArray[np.str_]], rows: int) -> NDArray[np.bool_]:
-    """(rows,), who violates any rule."""
+    """Runs that violate any rule, (rows,)."""
     found = np.zeros(rows, dtype=bool)
     for statuses in rules.values():
         found |= statuses == "violated"
@@ -334,9 +336,9 @@ def _violating(rules: Mapping[str, NDArray[np.str_]], rows: int) -> NDArray[np.b
 
 
 def drives_of_plans(held: Mapping[str, NDArray[np.bool_]], savable: NDArray[np.bool_], dt: float) -> Drives:
-    """The same where drives are judged as plans are: requirement -> (starts, rows), whether it holds there.
+    """Verdicts where runs are judged by the plans' specification: requirement -> (starts, rows) booleans.
 
-    A requirement is obeyed where it holds at every start; it was broken at the first one where it does not.
+    A requirement is obeyed if it holds at every start; it is broken at the first start where it does not.
     """
     rules = {name: np.where(starts.all(0), "satisfied", "violated") for name, starts in held.items()}
     rules |= {name: np.full(len(savable), "inconclusive") for name, starts in held.items() if not len(starts)}
@@ -364,24 +366,23 @@ def _broken(verdict: Verdict, rules: Mapping[str, NDArray[np.str_]]) -> Iterator
 
 
 def _moments(verdict: Verdict, row: int, names: Sequence[str]) -> dict[str, float | None]:
-    """Times at which a drive broke rules: the samples that decide."""
+    """Times at which a run broke rules: the samples that decide."""
     alone = np.zeros(verdict.traces, dtype=bool)
     alone[row] = True
     causes = {name: explain(verdict.within(alone), name) for name in names}
     return {name: None if cause is None else float(cause.time) for name, cause in causes.items()}
 
 
-# ------------------------------------------------------------------------- as data
+# ------------------------------------------------------------------------- JSON
 
 
 def drives_json(drives: Drives, seeds: Sequence[int], agents: int) -> dict[str, Any]:
     """The entry `drives` of a guard in `eval/simulate.json`.
 
-    `count` drives, of which `obeyed` kept every rule and `undecided` ended too early to say; `lost` of the
-    others were lost (`Drives.viable`): `told` of them by what the world
-    told later, the others from their start. `rules`: the same for each rule. `broken`: who broke which, and
-    when (seconds from the start, null where nobody has looked), and `cause`, since when no plan is known and
-    why (`Lost`).
+    Of `count` runs `obeyed` satisfy every rule and `undecided` are inconclusive; `lost` of the others were
+    lost (`Drives.viable`): `told` of them to a later exogenous event, the others from the start. `rules`: the
+    same per rule. `broken`: run, rules and times (seconds from the start, null where not located), and
+    `cause`: since when no plan is known and why (`Lost`).
     """
     obeyed, rows = drives.obeyed, len(drives.viable)
     violated = _violating(drives.rules, rows)

@@ -13,7 +13,7 @@ _Z = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2)
 
 @dataclass(frozen=True, slots=True)
 class MeanInterval:
-    """A mean over seeds and where it lies with 95 % confidence; no `low` and `high` for a single seed."""
+    """Mean over seeds with its 95 % confidence interval; a single seed has no `low` and `high`."""
 
     mean: float
     low: float | None
@@ -22,7 +22,7 @@ class MeanInterval:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> MeanInterval:
-        """Of at least one value; values that are not finite leave the interval open."""
+        """Mean of at least one value; without interval where a value is not finite."""
         mean = fmean(values)
         if len(values) < 2 or not all(map(math.isfinite, values)):
             return cls(mean, None, None, tuple(values))
@@ -30,12 +30,12 @@ class MeanInterval:
         return cls(mean, mean - half, mean + half, tuple(values))
 
     def summary(self) -> dict[str, object]:
-        """For JSON documents."""
+        """Entry for JSON documents."""
         return {"mean": self.mean, "low": self.low, "high": self.high, "values": list(self.values)}
 
     @property
     def half(self) -> float | None:
-        """Half its width."""
+        """Half-width of the interval."""
         return None if self.high is None else self.high - self.mean
 
 

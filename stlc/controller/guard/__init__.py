@@ -1,1 +1,1 @@
-"""Runtime safety filters: a plan is judged, and replaced where it is not safe."""
+"""Runtime safety filters: plans are judged, and unsafe ones replaced."""

@@ -1,4 +1,4 @@
-"""Plans with their verdicts, and the one order in which guards prefer them."""
+"""Candidate plans with their verdicts, and the order in which guards prefer them."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ if TYPE_CHECKING:
 
 Mode: TypeAlias = Literal["none", "paper", "full"]
 RobustnessMargins: TypeAlias = Mapping[str, float]
-"""Safety requirement -> robustness that plans must keep, in its own unit; none if left out."""
+"""Safety requirement -> required robustness margin, in its own unit; none if left out."""
 
 SOURCES = ("policy", "backup", "safest", "polished")
 TO_SPARE = 0.05
-"""Share of the paper's gamma that plan repair goes on for, beyond what satisfies."""
+"""Share of the paper's gamma that plan repair aims for beyond satisfaction."""
 POLICY, BACKUP, SAFEST, REPAIRED = range(len(SOURCES))
-"""Origins of a plan: the policy; a prefix that the policy finishes; the longest safe prefix; plan repair."""
+"""Sources of a plan: the policy; a prefix continued by the policy; the longest safe prefix; plan repair."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """Plans with their verdicts. All fields share their first dimensions: (agents,), or (agents, choices).
+    """Plans with their verdicts. Leading dimensions of all fields: (agents,), or (agents, choices).
 
     Attributes:
         plans: (…, T, m) float64, physical units.
         rho: robustness of phi, (…).
-        safe: robustness of phi_safe, (…); +inf where nothing is tagged `@safety`.
-        cost: performance terms, (…); 0 where they do not matter.
+        safe: robustness of phi_safe, (…); +inf where no requirement is tagged `@safety`.
+        cost: performance terms, (…); 0 where not computed.
         source: index into `SOURCES`, (…) int64.
-        prefix_length: T0, (…) int64; 0 where no prefix was drawn.
+        prefix_length: T0, (…) int64; 0 without a sampled prefix.
     """
 
     plans: Tensor
@@ -54,7 +54,7 @@ class Candidates:
     def judged(
         cls, task: Task, x: Tensor, plans: Tensor, source: int, prefix_length: int = 0, *, cost: bool = False
     ) -> Candidates:
-        """Judge plans (agents, …, T, m) from states (agents, n) float64; `cost`: whether it matters."""
+        """Judge plans (agents, …, T, m) from states (agents, n) float64; `cost`: whether to compute it."""
         shape, rows = plans.shape[:-2], plans.flatten(0, -3)
         starts = x.repeat_interleave(len(rows) // max(len(x), 1), 0)
         found = task.judge(starts, rows, states=cost)
@@ -70,7 +70,7 @@ class Candidates:
 
     @classmethod
     def unjudged(cls, plans: Tensor) -> Candidates:
-        """Plans (agents, T, m) that nobody has judged, source -1: all others rank higher."""
+        """Plans (agents, T, m) without verdict, source -1: they rank below all others."""
         worst = torch.full(plans.shape[:-2], -torch.inf, dtype=plans.dtype, device=plans.device)
         number = torch.zeros(worst.shape, dtype=torch.int64, device=plans.device)
         return cls(plans.clone(), worst, worst.clone(), torch.zeros_like(worst), number - 1, number)
@@ -86,36 +86,36 @@ class Candidates:
         return self.safe >= -TOLERANCE
 
     def of(self, rows: Tensor) -> Candidates:
-        """Rows of some agents, (k,) indices or (agents,) booleans."""
+        """Select agents, (k,) indices or (agents,) booleans."""
         return Candidates(*(getattr(self, name)[rows] for name in _FIELDS))
 
     def pick(self, choice: Tensor) -> Candidates:
-        """One choice an agent, (agents,), of (agents, choices)."""
+        """Select one choice per agent, (agents,), from (agents, choices)."""
         rows = torch.arange(len(choice), device=choice.device)
         return Candidates(*(getattr(self, name)[rows, choice] for name in _FIELDS))
 
     def put(self, rows: Tensor, other: Candidates) -> None:
-        """Overwrite those of some agents, (k,) indices, by `other`, (k, …)."""
+        """Overwrite the plans of some agents, (k,) indices, with `other`, (k, …)."""
         for name in _FIELDS:
             getattr(self, name)[rows] = getattr(other, name)
 
     def improve(self, rows: Tensor, other: Candidates) -> None:
-        """Overwrite those of some agents, (k,) indices, where `other`, (k,), ranks higher."""
+        """Overwrite the plans of some agents, (k,) indices, where `other`, (k,), ranks higher."""
         better = (rank(other) > rank(self.of(rows))).nonzero()[:, 0]
         self.put(rows[better], other.of(better))
 
     @classmethod
     def concatenated(cls, parts: Sequence[Candidates]) -> Candidates:
-        """The agents of all parts, one after the other."""
+        """Concatenate along the agents."""
         return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS))
 
     def view(self, agents: int) -> Candidates:
-        """The same with the choices of each agent in a row: (agents * choices,) -> (agents, choices)."""
+        """Reshape (agents * choices,) to (agents, choices)."""
         parts = (getattr(self, name) for name in _FIELDS)
         return Candidates(*(part.view(agents, -1, *part.shape[1:]) for part in parts))
 
     def beside(self, other: Candidates) -> Candidates:
-        """The choices of both for the same agents: (agents, j), (agents, k) -> (agents, j + k)."""
+        """Concatenate the choices of the same agents: (agents, j), (agents, k) -> (agents, j + k)."""
         pairs = ((getattr(self, name), getattr(other, name)) for name in _FIELDS)
         return Candidates(*(torch.cat(pair, 1) for pair in pairs))
 
@@ -124,11 +124,11 @@ _FIELDS = tuple(each.name for each in fields(Candidates))
 
 
 def rank(plans: Candidates) -> Tensor:
-    """A number to prefer plans by, (…); larger is better.
+    """Rank of plans, (…); larger is better.
 
-    Plans that satisfy phi come first, by robustness; then safe ones that begin with a prefix and go on as the
-    policy plans, as these lead back to the training distribution; then other safe ones; then those of the
-    longest safe prefix; then the rest, by the lesser of both robustnesses.
+    Order: plans that satisfy phi, by robustness; safe plans whose prefix the policy continues, as these
+    return to the training distribution; other safe plans; longest-safe-prefix plans; the rest, by the smaller
+    of both robustness values.
     """
     good, safe = plans.satisfies, plans.is_safe
     within = torch.where(good | safe, plans.rho, torch.minimum(plans.rho, plans.safe)).nan_to_num(
@@ -142,7 +142,7 @@ def rank(plans: Candidates) -> Tensor:
 
 
 def best(allowed: Tensor, keys: Sequence[Tensor]) -> Tensor:
-    """Per row the first allowed choice that is best by the keys in order; (rows, choices) each -> (rows,)."""
+    """Best allowed choice per row by the keys in lexicographic order: (rows, choices) each -> (rows,)."""
     for key in keys:
         value = torch.where(allowed & ~key.isnan(), key, -torch.inf)
         allowed = allowed & (value >= value.amax(1, keepdim=True) - TOLERANCE)
@@ -150,41 +150,42 @@ def best(allowed: Tensor, keys: Sequence[Tensor]) -> Tensor:
 
 
 def finite(plan: Tensor, task: Task) -> Tensor:
-    """Plans (B, T, m) with every entry that is no number replaced by the control's value nearest to 0."""
+    """Plans (B, T, m) with non-finite entries replaced by the control value nearest to 0."""
     low, high = task.system.control_low.to(plan), task.system.control_high.to(plan)
     return torch.where(torch.isfinite(plan), plan, torch.zeros_like(plan).clamp(low, high))
 
 
-# ------------------------------------------------------------------------------------ what a search may cost
+# ------------------------------------------------------------------------------------ limits of a search
 
 
 class Deadline:
-    """The end of the time of a decision for some agents; never without a limit."""
+    """Deadline of a decision for some agents; none without a limit."""
 
     def __init__(self, seconds: float | None = None, agents: int = 1) -> None:
         self.until = inf if seconds is None else perf_counter() + seconds * agents
 
     @property
     def over(self) -> bool:
-        """True once it has come."""
+        """True after the deadline."""
         return perf_counter() >= self.until
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Cost that a decision may have.
+    """Computational limits of a decision.
 
     Attributes:
-        seconds: per agent of the full guard; then the best plan so far is taken. None: no limit.
-        tries: plans that a local search tries per place that it starts from.
-        prefixes: of one length, at most, that the paper's rule tries where nothing safe was found.
-        drawn: prefixes of one length, at most, for sampled shooting; of more a sample.
-        places: of the plans of sampled shooting, how many local search starts from.
-        again: plans that each of these searches tries.
-        rescue: whether phi_safe alone is searched for, without the policy, where nothing else was safe.
-        margin: robustness that safety requirements must keep before the guard lets a plan pass, by their
-            names, in their units; of the paper's guard too.
-        paper: seconds per agent of the paper's guard, which nobody hurries by default.
+        seconds: time limit per agent of the full guard, which then takes the best plan so far. None: no
+            limit.
+        tries: evaluations of a local search per starting plan.
+        prefixes: maximum number per length in the paper's rule where nothing safe was found.
+        drawn: maximum number of prefixes per length for sampled shooting; of more a sample.
+        places: number of sampled-shooting plans that local search starts from.
+        again: evaluations of each of these searches.
+        rescue: whether to search for phi_safe alone, without the policy, where nothing else was safe.
+        margin: robustness margins of safety requirements that an accepted plan must have, by their names, in
+            their units; also for the paper's guard.
+        paper: time limit per agent of the paper's guard; none by default.
     """
 
     seconds: float | None = 0.1
@@ -199,7 +200,7 @@ class Limits:
 
 
 def grid_of(task: Task) -> Grid:
-    """The grid of a system: `levels` of its backup, or of a control, else values evenly over its range."""
+    """Control grid of a system: `levels` of its backup or of a control, else evenly spaced values."""
     decl = task.system.decl
     values = tuple(
         decl.backup.levels.get(control.name)

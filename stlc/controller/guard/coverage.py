@@ -1,8 +1,8 @@
-"""Probability that the backup policy's grid meets a plan that works: the paper's Theorem 1 and the truth.
+"""Probability that the backup policy's grid contains a working plan: the paper's Theorem 1 and exact.
 
-Suppose that there is a prefix u* of T0 actions such that every prefix within `radius` of it, in every control
-at every step, leads to satisfaction, and that u* lies anywhere in the control ranges with equal probability.
-The backup policy finds it if a grid point lies within `radius` of it in every control at every step.
+Assume a prefix u* of T0 actions, uniformly distributed over the control ranges, such that every prefix within
+`radius` of it, in every control at every step, leads to satisfaction. The backup policy finds it if a grid
+point lies within `radius` of it in every control at every step.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from stlc.runtime.prefixes import Grid
 
 RADII = (0.01, 0.02, 0.05, 0.1, 0.2, 0.25)
-"""Shares of the control ranges."""
+"""Radii as shares of the control ranges."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,9 +27,9 @@ class Axis:
 
     Attributes:
         name: of the control.
-        low: of its range.
-        high: of its range.
-        values: that are tried, rising.
+        low: lower end of its range.
+        high: upper end of its range.
+        values: grid values, ascending.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Axis:
     values: tuple[float, ...]
 
     def covered(self, radius: float) -> float:
-        """The share of the range within `radius`, in its unit, of a value; exact."""
+        """Exact share of the range within `radius`, in its unit, of a grid value."""
         total, reached = 0.0, self.low
         for value in self.values:
             left, right = max(value - radius, reached), min(value + radius, self.high)
@@ -47,23 +47,23 @@ class Axis:
         return total / (self.high - self.low)
 
     def bound(self, radius: float) -> float:
-        """Theorem 1 for this control and one step: (2 L - 4) radius / range, which leaves out the ends."""
+        """Theorem 1 for this control and one step: (2 L - 4) radius / range, which ignores the ends."""
         return max(2 * len(self.values) - 4, 0) * radius / (self.high - self.low)
 
 
 @dataclass(frozen=True, slots=True)
 class Chance:
-    """Probabilities that prefixes of `length` steps meet a plan that works.
+    """Probabilities that the prefixes of `length` steps contain a working one.
 
     Attributes:
         radius: share of each control's range.
         length: T0.
-        candidates: prefixes that are tried: M = L^(m T0), or a sample of them.
-        theorem: as the paper writes it, min{1, product}.
-        bound: the same with the minimum taken control by control. Where a control is covered more than once
-            the paper's product counts it more than once, and may exceed the truth.
-        exact: what the grid covers, under the same assumptions; of a sample at least that much.
-        sampled: whether the grid has more prefixes than are tried.
+        candidates: number of prefixes tried: M = L^(m T0), or a sample of them.
+        theorem: the paper's bound, min{1, product}.
+        bound: the same with the minimum taken per control. The paper's product counts overlapping cover of a
+            control more than once and may exceed the exact value.
+        exact: probability under the same assumptions; a lower bound for a sample.
+        sampled: whether only a sample of the prefixes is tried.
     """
 
     radius: float
@@ -76,16 +76,16 @@ class Chance:
 
 
 def axes_of(task: Task, grid: Grid) -> tuple[Axis, ...]:
-    """The controls of a task with the values that a grid tries."""
+    """The controls of a task with their grid values."""
     controls = zip(task.system.controls, grid.values, strict=True)
     return tuple(Axis(each.name, each.low, each.high, tuple(sorted(values))) for each, values in controls)
 
 
 def chance(axes: Sequence[Axis], radius: float, length: int, samples: int | None = None) -> Chance:
-    """The probabilities for one radius, a share of each range, and one length of prefixes.
+    """Compute the probabilities for one radius, a share of each range, and one prefix length.
 
-    Of a grid with more than `samples` prefixes as many are drawn, with replacement: a prefix of the grid is
-    among them with probability 1 - (1 - 1 / M)^samples, and at least one that works is if one that does is.
+    From a grid with more than `samples` prefixes that many are drawn with replacement: any given prefix is
+    among them with probability 1 - (1 - 1 / M)^samples, so a working one is with at least this probability.
     """
     radii = [radius * (axis.high - axis.low) for axis in axes]
     bounds = [axis.bound(each) for axis, each in zip(axes, radii, strict=True)]
@@ -106,6 +106,6 @@ def chance(axes: Sequence[Axis], radius: float, length: int, samples: int | None
 
 
 def chances(task: Task, grid: Grid, radii: Sequence[float] = RADII) -> list[Chance]:
-    """All radii for each length of the grid."""
+    """Probabilities for all radii and all prefix lengths of the grid."""
     axes = axes_of(task, grid)
     return [chance(axes, radius, length, grid.samples) for length in grid.lengths for radius in radii]

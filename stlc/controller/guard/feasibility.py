@@ -1,4 +1,4 @@
-"""Feasibility: a search for any satisfying plan, or any safe one, from each state."""
+"""Feasibility: search for any satisfying plan, or any safe one, from each state."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 PASSES = 4
 TRIES = 20_000
-"""Plans that are tried for one start in one pass, where native code judges them."""
+"""Evaluations per start and pass, where native code judges plans."""
 ENOUGH = 1e-4
-"""Robustness at which a start is left alone."""
+"""Target robustness at which the search of a start ends."""
 PIECES = 3
 MOST = 2048
-"""Plans of the library, at most."""
+"""Maximum size of the plan library."""
 
 
 @torch.no_grad()
@@ -42,17 +42,17 @@ def solve(
 ) -> SearchResult:
     """Search for a satisfying plan from each state; the same arguments give the same plans.
 
-    The first pass climbs from `start`, each later one from plans of the library, where none was found yet. A
-    state with a plan has it, judged exactly; one without may have a plan that was not found.
+    The first pass of local search starts from `start`, each later one, for unsolved states, from plans of the
+    library. Found plans are exact verdicts; a state without one may still be feasible.
 
     Args:
         task: specification and system.
         x0: states, (B, n).
         start: plans, (B, T, m); the middle of every control if None.
-        library: plans that a climb also borrows from, (k, T, m); `extremes` if None.
-        passes: at most.
-        tries: plans of one pass for one state.
-        generator: of the changes; one of seed 0 if None.
+        library: plans that the search also recombines, (k, T, m); `extremes` if None.
+        passes: maximum number.
+        tries: evaluations per pass and state.
+        generator: random numbers of the search; seed 0 if None.
         stop: ends the search early.
 
     Returns:
@@ -81,24 +81,24 @@ def solve(
 
 
 def solvable(task: Task, x0: Tensor) -> Tensor:
-    """States from which a search finds a plan that satisfies phi: (B, n) -> (B,) booleans."""
+    """Mask of the states from which a search finds a plan that satisfies phi: (B, n) -> (B,)."""
     return solve(task, x0).rho >= -TOLERANCE
 
 
 def viable(task: Task, x0: Tensor) -> Tensor:
-    """States from which a search finds a plan that satisfies phi_safe: (B, n) -> (B,) booleans."""
+    """Mask of the states from which a search finds a plan that satisfies phi_safe: (B, n) -> (B,)."""
     if not task.compiled.safety:
         return torch.ones(len(x0), dtype=torch.bool)
     return solvable(safety_task(task), x0)
 
 
 def safety_task(task: Task) -> Task:
-    """The task of phi_safe alone."""
+    """The task with phi_safe as its only specification."""
     return Task(replace(task.compiled, requirements=task.compiled.safety), task.plain)
 
 
 def extremes(task: Task, generator: torch.Generator) -> Tensor:
-    """Plans that hold each control at a low, middle or high value, piece by piece: (k, T, m)."""
+    """Piecewise constant plans with each control at a low, middle or high value: (k, T, m)."""
     low, high = task.system.control_low, task.system.control_high
     levels = torch.stack((low, 0.5 * (low + high), high))
     shape = (PIECES, len(low))

@@ -1,4 +1,4 @@
-"""Deployment in MPC fashion: plan at every step, judge the plan, execute its first action."""
+"""Runtime guard for receding-horizon deployment: plan, judge and execute the first action at every step."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import PlanVerdicts, Task
 
 GUARD_VERSION = 1
-"""Raised with every change of a guard's decisions; benchmarks drive anew what older guards drove."""
+"""Version of the guard's decisions; benchmarks rerun results of older versions."""
 
 
 @dataclass(frozen=True, slots=True)
 class GuardDecision:
-    """Decisions of a guard: actions, the plans that they begin, and their sources.
+    """Decisions of a guard: plans, their first actions, and their sources.
 
     Attributes:
         action: (agents, m) float64, physical units.
-        plan: (agents, T, m) that it begins.
+        plan: (agents, T, m), the followed plan.
         source: (agents,) int64, an index into `SOURCES`.
-        t0: (agents,) int64, length of the backup's prefix; 0 for the policy's own plan.
+        t0: (agents,) int64, prefix length of the backup policy; 0 for the policy's own plan.
         rho: (agents,) float64, robustness of `plan`.
         safe: (agents,) bool, whether `plan` satisfies phi_safe.
-        policy_rho: (agents,) float64, robustness of what the policy planned; -inf where that is no number.
-        proposed: (agents, T, m), what the policy planned, whether it was followed or not.
+        policy_rho: (agents,) float64, robustness of the policy's plan; -inf where that is not finite.
+        proposed: (agents, T, m), the policy's plan, followed or not.
     """
 
     action: Tensor
@@ -50,9 +50,9 @@ class GuardDecision:
     proposed: Tensor
 
     def later(self, steps: int | Tensor = 1) -> GuardDecision:
-        """The same decision so many steps later, (agents,) or one number: what is left of the plans.
+        """The decision some steps later, (agents,) or one number: the remainders of the plans.
 
-        Their last actions are held on.
+        Their last actions are held.
         """
         agents, length, controls = self.plan.shape
         ahead = torch.as_tensor(steps).expand(agents)[:, None] + torch.arange(length)
@@ -61,11 +61,11 @@ class GuardDecision:
         return replace(self, plan=plan, action=plan[:, 0])
 
     def of(self, rows: Tensor) -> GuardDecision:
-        """Rows of some agents, (k,) indices."""
+        """Select agents, (k,) indices."""
         return GuardDecision(*(getattr(self, name)[rows] for name in _FIELDS))
 
     def with_new(self, rows: Tensor, new: GuardDecision) -> GuardDecision:
-        """The same with the rows of some agents, (k,) indices, replaced by `new`."""
+        """The decision with the rows of some agents, (k,) indices, replaced by `new`."""
         pairs = ((getattr(self, name), getattr(new, name)) for name in _FIELDS)
         return GuardDecision(*(old.index_copy(0, rows, fresh) for old, fresh in pairs))
 
@@ -74,16 +74,16 @@ _FIELDS = tuple(each.name for each in fields(GuardDecision))
 
 
 class Guard:
-    """Runtime safety filter: judges every plan of a policy, and replaces it where it is not safe.
+    """Runtime safety filter: judges every plan of a policy and replaces unsafe ones.
 
     Args:
         task: specification and system.
-        policy: plans.
-        mode: where the monitor finds a plan violated, "paper" calls the paper's backup policy and "full" the
-            polishing one; "none" only records.
-        grid: candidates of the backup; by default what the system file says.
-        limits: of a decision. With a margin robustness and verdicts of decisions are those of the task all
-            the same; only what the guard lets pass is another.
+        policy: proposes plans.
+        mode: for rejected plans "paper" calls the paper's backup policy, "full" the stages of plan repair;
+            "none" only records.
+        grid: control values of the backup; by default those of the system file.
+        limits: of a decision. A margin changes which plans are accepted; reported robustness and verdicts
+            stay those of the task without margin.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Guard:
         self.strict = with_margins(task, {} if mode == "none" or limits is None else limits.margin)
         self.policy: Policy = policy
         if isinstance(policy, BestOfKPolicy):
-            self.policy = policy.for_task(self.strict)  # the choice among its plans keeps the margin
+            self.policy = policy.for_task(self.strict)  # it selects among its plans with the margin
         self.backup: StagedSearch | RelaxedSearch | None = None
         if mode == "full" and self.strict is not task and limits is not None:
             self.backup = RelaxedSearch(task, self.strict, self.policy, grid=grid, limits=limits)
@@ -108,18 +108,18 @@ class Guard:
 
     @torch.no_grad()
     def decide(self, x: Tensor, begun: GuardDecision | None = None) -> GuardDecision:
-        """Decide for (agents, n) states; verdicts are taken in float64.
+        """Decide for (agents, n) states; verdicts are computed in float64.
 
-        A plan that was begun and still satisfies the specification is gone on with where the new one is no
-        better; otherwise an agent that may do something later could put it off at every step. So is one that
-        is about to keep a promise of a mission with more to spare (`stlc.controller.problem.pending_goals`).
+        A previous plan that still satisfies the specification is kept where the new one is no better;
+        otherwise an agent could postpone a goal at every step. So is one that is about to increase the margin
+        of a pending goal (`stlc.controller.problem.pending_goals`).
 
         Args:
             x: (agents, n) states.
-            begun: what is left of the decision before; see `GuardDecision.later`.
+            begun: remainder of the previous decision; see `GuardDecision.later`.
 
         Returns:
-            The decision. Without a guard a plan that is no number is handed on, with robustness -inf.
+            The decision. Mode "none" passes a non-finite plan on, with robustness -inf.
         """
         x = x.to(torch.float64)
         fresh, judged = plan_judged(self.strict, self.policy, x)
@@ -141,22 +141,22 @@ class Guard:
         return decision if self.strict is self.task else self._plainly(decision, x, fresh)
 
     def _plainly(self, decision: GuardDecision, x: Tensor, fresh: Tensor) -> GuardDecision:
-        """The decision with the verdicts of the task itself."""
+        """The decision with the verdicts of the task without margin."""
         taken = self.task.judge(x, decision.plan, states=False)
         policy_rho = self.task.judge(x, fresh, states=False).rho
         return replace(decision, rho=taken.rho, safe=taken.safe >= -TOLERANCE, policy_rho=policy_rho)
 
     @torch.no_grad()
     def endangered(self, x: Tensor, begun: GuardDecision, steps: int | Tensor) -> Tensor:
-        """Agents that would, by the model, violate safety requirements with the next steps of a begun plan.
+        """Agents whose previous plan, by the model, violates safety requirements in its next steps.
 
         Args:
             x: (agents, n) states.
-            begun: what is left of the decision before.
-            steps: how many count, one number or (agents,).
+            begun: remainder of the previous decision.
+            steps: number of steps to check, one number or (agents,).
 
         Returns:
-            (agents,) booleans; nobody without the full guard: the paper's looks at plans as they are made.
+            (agents,) booleans; all False without the full guard: the paper's judges new plans only.
         """
         formulas = [rule.formula for rule in self.strict.compiled.safety]
         if self.mode != "full" or not formulas:
@@ -166,11 +166,11 @@ class Guard:
 
     @torch.no_grad()
     def prefer(self, options: Tensor, begun: GuardDecision | None = None) -> Tensor:
-        """Option of each agent that it plans best for; of equals the first.
+        """Option with the best plan for each agent; the first of equals.
 
         Args:
-            options: (agents, k, n) states; option 0 is how things are.
-            begun: what is left of the decision before, which belongs to option 0.
+            options: (agents, k, n) states; option 0 is the present state.
+            begun: remainder of the previous decision, which belongs to option 0.
 
         Returns:
             (agents,) int64.
@@ -189,9 +189,9 @@ class Guard:
 
     @torch.no_grad()
     def carried_on(self, x: Tensor, begun: GuardDecision, taken: Tensor) -> GuardDecision:
-        """Remainders of plans for (agents, n) states, continued by the policy from their end on.
+        """Remainders of plans for (agents, n) states, extended by the policy at their ends.
 
-        `taken`: how many steps of each are behind it, (agents,); so many of its last actions are replaced.
+        `taken`: executed steps per agent, (agents,); as many held actions at the end are replaced.
         """
         x, plan = x.to(torch.float64), begun.plan.clone()
         length = plan.shape[1]
@@ -208,7 +208,7 @@ class Guard:
     def _kept(
         self, x: Tensor, begun: GuardDecision | None, fresh: Tensor, judged: PlanVerdicts
     ) -> Candidates:
-        """The policy's plans, or what is left of those that were begun."""
+        """The policy's plans, or the previous ones where they are kept."""
         zero, free = torch.zeros(len(x), dtype=torch.int64, device=x.device), torch.zeros_like(judged.rho)
         found = Candidates(fresh.clone(), judged.rho.clone(), judged.safe.clone(), free, zero, zero.clone())
         if begun is None:

@@ -1,10 +1,9 @@
-"""Robustness margins of guards: requested, measured, and required of a task.
+"""Robustness margins of guards: requests, calibration, and tightened tasks.
 
-A guard passes a plan that is safe by the model. When it judges again the agent is where the truth has brought
-it, from where it really was. Had the plan a larger margin than its robustness has lost by then, what is left
-of it is still safe by the model, and so there is a safe plan to be found. That loss is measured: plans of the
-policy, from starts as in training, are followed on the truth of the scenario until a guard judges again, and
-by the model from there.
+A guard accepts a plan that is safe by the model. By its next judgement the true dynamics and the true initial
+state have reduced the plan's robustness. If its margin was larger than this loss, its remainder is still safe
+by the model, so a safe plan exists. Calibration measures the loss: the policy's plans, from training starts,
+are executed on the scenario's true dynamics until the next judgement, and by the model from there.
 """
 
 from __future__ import annotations
@@ -34,9 +33,9 @@ if TYPE_CHECKING:
 
 
 def with_margins(task: Task, margin: RobustnessMargins) -> Task:
-    """The task whose safety requirements are tightened: their robustness is less by their `margin`.
+    """The task with tightened safety requirements: their robustness is reduced by their `margin`.
 
-    Time tests and constants, which never limit a robustness, stay.
+    Time tests and constants, which never limit a robustness, are unchanged.
     """
     if not any(margin.values()):
         return task
@@ -50,7 +49,7 @@ def _tightened(rule: CompiledRequirement, margin: float) -> CompiledRequirement:
 
 
 def tightened(formula: ir.Formula, margin: float) -> ir.Formula:
-    """The formula whose robustness is less by `margin`, everywhere and exactly."""
+    """The formula with its robustness reduced by `margin`, everywhere and exactly."""
     if isinstance(formula, ir.Predicate):
         less = add(formula.num, ir.Const(-formula.sign * margin))
         return formula if formula.guard else replace(formula, num=less)
@@ -58,24 +57,24 @@ def tightened(formula: ir.Formula, margin: float) -> ir.Formula:
 
 
 SHARE = 0.99
-"""Of plans whose loss a margin covers."""
+"""Default share of plans whose robustness loss a margin covers."""
 STARTS = 4000
 SEED = 20_251
 
 
 @torch.no_grad()
 def calibrated_margins(task: Task, policy: Policy, steps: int = 1, share: float = SHARE) -> RobustnessMargins:
-    """Quantile of the robustness that safe plans lose, for each safety requirement.
+    """Quantile of the robustness loss of safe plans, for each safety requirement.
 
     Args:
-        task: under its scenario, whose errors, disturbances and noise count.
+        task: under its scenario with errors, disturbances and noise.
         policy: planner.
-        steps: between two judgements of the guard; the full guard judges at every step.
-        share: of plans whose loss the margin covers.
+        steps: number between two judgements of the guard; the full guard judges at every step.
+        share: share of plans whose loss the margin covers.
 
     Returns:
-        Requirement -> robustness, at least 0 each; empty where the scenario has nothing that is wrong, or the
-        policy has no safe plan.
+        Requirement -> margin, at least 0 each; empty where the scenario has no error, or the policy no safe
+        plan.
     """
     x0 = task.sample(STARTS, generator=seeded(SEED, 0), dtype=torch.float64)
     disturbance = Disturbance(task.plain, [seeded(SEED, 1)], STARTS)
@@ -94,7 +93,7 @@ def calibrated_margins(task: Task, policy: Policy, steps: int = 1, share: float 
 
 
 def _followed(task: Task, disturbance: Disturbance, x: Tensor, plan: Tensor, steps: int) -> Tensor:
-    """States (B, T+1, n) of plans that are followed on the truth for some steps, then by the model."""
+    """States (B, T+1, n) under plans on the true dynamics for some steps, then on the model."""
     (truth,) = disturbance.truths(task.plain.truth)
     count, states = len(task.plain.names), [x]
     for step in range(steps):
@@ -112,12 +111,12 @@ FORMS = "--margin 0.2, --margin NAME=0.2, --margin auto, or auto:95 to cover 95 
 
 @dataclass(frozen=True, slots=True)
 class MarginRequest:
-    """Margins of a command line; see `parse_margins`.
+    """Margins requested on the command line; see `parse_margins`.
 
     Attributes:
-        every: of each safety requirement that is not named.
+        every: margin of each safety requirement that is not named.
         named: requirement -> margin.
-        share: of plans that a measured margin covers; None where nothing is measured.
+        share: share of plans that a calibrated margin covers; None without calibration.
     """
 
     every: float = 0.0
@@ -125,9 +124,9 @@ class MarginRequest:
     share: float | None = None
 
     def of(self, task: Task, policy: Policy, mode: Mode, replan: int = 1) -> RobustnessMargins:
-        """The margins of a task under its scenario, where every agent plans every `replan` steps.
+        """Margins of a task under its scenario, where agents replan every `replan` steps.
 
-        Raises UsageError (U101) where a name is no safety requirement.
+        Raises UsageError (U101) where a name is not a safety requirement.
         """
         names = [rule.name for rule in task.compiled.safety]
         for name in self.named:
@@ -147,10 +146,10 @@ class MarginRequest:
 
 
 def parse_margins(texts: Sequence[str]) -> MarginRequest:
-    """Margins such as `0.2`, `avoid=0.2`, `auto`, `auto:99`; of several of a kind the last counts.
+    """Parse margins such as `0.2`, `avoid=0.2`, `auto`, `auto:99`; the last of a kind counts.
 
     Raises:
-        UsageError: U101, one is none of these.
+        UsageError: U101, a text is not a margin.
     """
     asked = MarginRequest()
     for text in texts:

@@ -1,4 +1,4 @@
-"""Robustness of every prefix of a plan, whatever comes after it."""
+"""Robustness of the prefixes of a plan over all continuations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def open_ended(formula: ir.Formula) -> ir.Formula:
     """The formula with every predicate true where the column `BEYOND` is positive.
 
     In negation normal form robustness grows with that of each predicate, so this is the upper bound over all
-    ways in which the trace may go on: negative exactly where the known samples already violate the formula.
+    continuations of the trace: negative exactly where the known samples already violate the formula.
     """
     if isinstance(formula, ir.Predicate):
         return ir.BoolOp("or", (formula, ir.Predicate(ir.Signal(BEYOND), strict=True, guard=True)))
@@ -28,10 +28,10 @@ def open_ended(formula: ir.Formula) -> ir.Formula:
 
 
 def anchored(formula: ir.Formula) -> ir.Formula:
-    """The formula with what is said of the start alone turned into guards: it decides, but limits no margin.
+    """The formula with predicates on the initial state as conditions that do not limit the margin.
 
-    All plans share their start. Where plans that violate it are compared, `a -> always b` should tell how far
-    b is violated, not how clearly a holds.
+    All plans share the initial state. To compare plans that violate `a -> always b`, the violation of b
+    counts, not the robustness of a.
     """
     match formula:
         case ir.Predicate():
@@ -45,9 +45,9 @@ def anchored(formula: ir.Formula) -> ir.Formula:
 def robustness_until(
     formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor], last: int | Tensor
 ) -> Tensor:
-    """The least robustness of formulas on the samples 0 to `last`, whatever comes after them: (batch,).
+    """Minimum robustness of formulas on the samples 0 to `last`, over all continuations: (batch,).
 
-    `columns`: name -> (time, batch), as long as the formulas look. `last`: one number, or (batch,).
+    `columns`: name -> (time, batch), as long as the formulas' horizon. `last`: one number, or (batch,).
     """
     like = next(iter(columns.values()))
     index = torch.arange(len(like), device=like.device)[:, None].expand(like.shape)
@@ -57,14 +57,14 @@ def robustness_until(
 
 
 def prefix_robustness(formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor]) -> Tensor:
-    """The least robustness of the anchored formulas on every prefix, whatever comes after it; exact.
+    """Minimum robustness of the anchored formulas on every prefix, over all continuations; exact.
 
     Args:
         formulas: the safety requirements.
         columns: name -> (time, batch).
 
     Returns:
-        (time, batch), never rising over time: entry k is that of the samples 0 to k.
+        (time, batch), non-increasing over time: entry k is that of the samples 0 to k.
     """
     like = next(iter(columns.values()))
     steps, batch = like.shape

@@ -1,4 +1,4 @@
-"""Search for a better plan by the stages of a guard, and the same where plans must keep a margin."""
+"""Staged search for better plans, without and with robustness margins."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
 
 class StagedSearch:
-    """The stages of a guard, one after the other.
+    """Search by the stages of a guard, in order.
 
     Args:
         task: specification and system.
-        policy: finishes prefixes.
+        policy: continues prefixes.
         guard: name of the guard: "paper" or "full".
-        grid: values of the controls; by default what the system file says.
+        grid: values of the controls; by default those of the system file.
         limits: of a decision; those of `Limits` if None.
     """
 
@@ -50,15 +50,15 @@ class StagedSearch:
 
     @torch.no_grad()
     def search(self, x: Tensor, plan: Tensor, previous: Tensor | None = None) -> Candidates:
-        """Better plans for states whose own plan was found wanting.
+        """Search for better plans in states whose plan was rejected.
 
         Args:
             x: (agents, n) float64.
             plan: (agents, T, m), the policy's plan; entries that are not finite are replaced.
-            previous: (agents, T, m), what is left of the plans that were followed until now.
+            previous: (agents, T, m), remainders of the previous plans.
 
         Returns:
-            One plan an agent: the highest in rank that any stage has proposed.
+            The highest-ranked proposal of any stage, one plan per agent.
         """
         deadline = Deadline(self.seconds, len(x))
         plan = finite(plan.to(x.dtype), self.task)
@@ -76,16 +76,16 @@ class StagedSearch:
 
 
 class RelaxedSearch:
-    """The full guard for a task with margins: where no plan keeps them, the one that comes closest counts.
+    """Full guard with margins; where no plan has them, the safe plan with the largest margin is taken.
 
-    A plan that is safe by less than was asked for is worth more than a prefix that keeps the whole margin for
-    as long as it can and then does not: a rover beside a wall can stay there.
+    A safe plan with a smaller margin is preferred to a prefix that has the full margin for some steps and
+    then violates: a rover beside a wall can stay there.
 
     Args:
-        task: the one that counts.
-        strict: the same with margins.
-        policy: finishes prefixes.
-        grid: values of the controls; by default what the system file says.
+        task: without margins.
+        strict: the task with margins.
+        policy: continues prefixes.
+        grid: values of the controls; by default those of the system file.
         limits: of a decision.
     """
 
@@ -103,17 +103,17 @@ class RelaxedSearch:
 
     @torch.no_grad()
     def search(self, x: Tensor, plan: Tensor, previous: Tensor | None = None) -> Candidates:
-        """Better plans for states whose own plan was found wanting; verdicts are those of the strict task.
+        """Search for better plans in states whose plan was rejected; verdicts are those of the strict task.
 
         Args:
             x: (agents, n) float64.
             plan: (agents, T, m), the policy's plan.
-            previous: (agents, T, m), what is left of the plans that were followed until now.
+            previous: (agents, T, m), remainders of the previous plans.
 
         Returns:
-            One plan an agent: what the full guard finds; where that keeps too small a margin, the plan that
-            is safe and keeps the largest, as far as one was found. Where already the present state lacks the
-            margin, every plan does, and what satisfies or is safe without a margin is begun with.
+            One plan per agent: that of the full guard; where its margin is too small, the safe plan with the
+                largest margin found. Where already the present state lacks the margin, so does every plan,
+                and this search starts from plans that satisfy or are safe without margin.
         """
         plan = finite(plan.to(x.dtype), self.task)
         previous = plan if previous is None else finite(previous.to(x.dtype), self.task)
@@ -130,12 +130,12 @@ class RelaxedSearch:
         return found
 
     def _lacking(self, x: Tensor, plan: Tensor) -> Tensor:
-        """Agents that lack the margin in their present state, (agents,)."""
+        """Agents whose present state lacks the margin, (agents,)."""
         columns = self.task.system.rollout_columns(x, plan)
         return ~(robustness_until(self._formulas, columns, 0) >= -TOLERANCE)
 
     def _plain_found(self, x: Tensor, plan: Tensor, previous: Tensor, lacking: Tensor) -> Candidates:
-        """For agents that lack the margin now what is found without one; unjudged plans for others."""
+        """Plans of the guard without margin for agents that lack it now; unjudged plans for others."""
         found = Candidates.unjudged(plan)
         rows = lacking.nonzero()[:, 0]
         if len(rows):
@@ -148,7 +148,7 @@ class RelaxedSearch:
         return found
 
     def _closer(self, found: Candidates, rows: Tensor, x: Tensor, start: Tensor) -> Tensor:
-        """Search from `start`, (rows, T, m), and enter what is safe; returns the rows where it is not."""
+        """Search from `start`, (rows, T, m), and store safe plans; return the rows without one."""
         if not len(rows):
             return rows
         climbed = self._searcher.at_once(x[rows], start, tries=self.limits.tries).plans.to(x.dtype)
